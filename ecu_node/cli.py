@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from ecu_node import __version__
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from ecu_node.database import VehicleDatabase
 
 
-_Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
 _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
 _AT_WORK = "done (also when ended by a signal at work)"
 
@@ -56,26 +55,6 @@ def _main(arguments: list[str]) -> int:
     logging.getLogger("can").addHandler(logging.NullHandler())
     load_python_can()
     return options.command(options) or 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = CommandParser(
-        prog="ecu-node",
-        description="Corrects the high-voltage currents on a CAN bus with the parameters of this vehicle.",
-        done=_AT_WORK,
-    )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error; may stand anywhere")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    _add_run(commands)
-    _add_monitor(commands)
-    add_update_commands(commands, _VEHICLE)
-    _add_faults(commands)
-    _add_check(commands)
-    _add_template(commands)
-    schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
-    schema.set_defaults(command=_schema)
-    return parser
 
 
 def _option(read: Callable[[str], Any], is_right: Callable[[Any], Any], refusal: str) -> Callable[[str], Any]:
@@ -114,30 +93,146 @@ def _read_target(text: str) -> Path | tuple[str, int] | None:
 _TARGET = _option(_read_target, bool, "a file or udp://HOST:PORT is expected, found {}")
 
 
-def _add_layout(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC")
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "--layout": {"type": Path, "required": True, "metavar": "FILE", "help": "layout (TOML), which names the DBC"},
+    "--vehicle": {
+        "type": _VEHICLE,
+        "metavar": "ID",
+        "help": f"this vehicle; parameters of another are refused (default: ${_VEHICLE_VARIABLE}; else not checked)",
+    },
+    "--interface": {"default": "socketcan", "help": "python-can interface (default: %(default)s)"},
+    "--channel": {"required": True, "type": _NAME, "help": "channel of the interface, such as can0 or vcan0"},
+    "--fd": {"action": "store_true", "help": "open the bus for CAN FD"},
+    "--bitrate": {
+        "type": int,
+        "metavar": "BIT_PER_S",
+        "help": "bit rate, where the adapter sets it; this and other settings may stand in python-can's can.conf",
+    },
+    "--data-bitrate": {"type": int, "metavar": "BIT_PER_S", "help": "the same of the data of CAN FD frames"},
+    "--listen-only": {
+        "action": "store_true",
+        "help": "send nothing; adapters that can do so acknowledge no frame either",
+    },
+    "--unsigned": {"action": "store_true", "help": "use parameters that nobody signed, as on a test bench"},
+    "--gateway": {
+        "type": _NAME,
+        "metavar": "CHANNEL",
+        "help": "be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed "
+        "on with the corrected current in place, all others as they are",
+    },
+    "--shadow": {"action": "store_true", "help": "compute and report the corrected sum, but change nothing"},
+    "--dry-run": {"action": "store_true", "help": "print what would be opened, read and sent; open nothing"},
+    "--metrics-port": {"type": _PORT, "metavar": "PORT", "help": "let Prometheus ask here (needs prometheus-client)"},
+    "--telemetry": {
+        "type": _TARGET,
+        "metavar": "TARGET",
+        "help": "a line of JSON per second, added to a file or sent to udp://HOST:PORT",
+    },
+    "--summary": {
+        "type": Path,
+        "metavar": "FOLDER",
+        "help": "sum up each drive for the calibrator, in FOLDER/VEHICLE: kilobytes per hour in place of logs",
+    },
+    "--realtime": {
+        "action": "store_true",
+        "help": "run as a real-time process: SCHED_FIFO, locked memory, one processor",
+    },
+    "--once": {"type": _SECONDS, "metavar": "SECONDS", "help": "listen this long, print what was seen, and end"},
+    "--json": {"action": "store_true", "help": "print JSON"},
+    "--state": {"type": Path, "required": True, "metavar": "FOLDER", "help": "state of this vehicle"},
+    "--params": {"type": Path, "required": True, "metavar": "FILE", "help": "parameter file of this vehicle"},
+}
+"""Of all commands; what a command says otherwise stands with it."""
+_BUS = ("--interface", "--channel", "--fd", "--bitrate", "--data-bitrate", "--listen-only")
 
 
-def _add_vehicle(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--vehicle",
-        type=_VEHICLE,
-        default=os.environ.get(_VEHICLE_VARIABLE) or None,
-        metavar="ID",
-        help=f"this vehicle; parameters of another are refused (default: ${_VEHICLE_VARIABLE}; else not checked)",
+def _parser() -> argparse.ArgumentParser:
+    parser = CommandParser(
+        prog="ecu-node",
+        description="Corrects the high-voltage currents on a CAN bus with the parameters of this vehicle.",
+        done=_AT_WORK,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error; may stand anywhere")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
+    def command(name: str, work: Callable[[argparse.Namespace], Any], options: Sequence[str], **words: Any) -> Any:
+        added = commands.add_parser(name, **words)
+        for option in options:
+            added.add_argument(option, **_OPTIONS[option])
+        added.set_defaults(command=work, error=added.error, vehicle=os.environ.get(_VEHICLE_VARIABLE) or None)
+        return added
 
-def _add_bus(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
-    parser.add_argument("--channel", required=True, type=_NAME, help="channel of the interface, such as can0 or vcan0")
-    parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
-    for name, what in (("--bitrate", "bit rate"), ("--data-bitrate", "bit rate of the data of CAN FD frames")):
-        words = f"{what}, where the adapter sets it; this and other settings may stand in python-can's can.conf"
-        parser.add_argument(name, type=int, metavar="BIT_PER_S", help=words)
-    parser.add_argument(
-        "--listen-only", action="store_true", help="send nothing; adapters that can do so acknowledge no frame either"
+    run = command(
+        "run",
+        _run,
+        ("--unsigned", "--layout", "--vehicle", *_BUS, "--gateway", "--shadow", "--dry-run", "--metrics-port",
+         "--telemetry", "--summary", "--realtime"),
+        help="correct until SIGTERM or SIGINT",
+        description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
+        "own on the same bus, or, with --gateway, in place on another bus. With parameters that do not fit it passes "
+        "the measured values through and says so in its status message. SIGHUP, or a changed parameter file, makes it "
+        "read the parameters again.",
+        done=_AT_WORK,
+    )  # fmt: skip
+    source = run.add_mutually_exclusive_group(required=True)
+    source.add_argument("--state", type=Path, metavar="FOLDER", help="state of this vehicle, with signed parameters")
+    source.add_argument("--params", type=Path, metavar="FILE", help="parameter file that nobody signed; --unsigned")
+    command(
+        "monitor",
+        _monitor,
+        ("--layout", *_BUS, "--once", "--json"),
+        help="show the branches, their sum and the node, live",
+        description="Listens to a bus, and never sends: measured and corrected currents, frame rates, faults, the "
+        "Kirchhoff sum, and what the node says of itself. A table in a terminal, else a block of text per second; "
+        "--json goes with --once.",
+        done=_AT_WORK,
+        failed="failed, or with --once no branch was seen",
     )
+    add_update_commands(commands, _VEHICLE)
+    command(
+        "faults",
+        _faults,
+        ("--json", "--state"),
+        help="why the node fell back: first, last, how often, with which currents",
+        description="Prints the fault memory of a state folder, the last fault first. What is active keeps a node from "
+        "correcting, also after a restart.",
+    )
+    command(
+        "clear",
+        _clear,
+        ("--state",),
+        help="forget the faults, and correct again",
+        description="Empties the fault memory of a state folder. A node that runs corrects again within a second; find "
+        "out first what was wrong.",
+    )
+    command(
+        "check",
+        _check,
+        ("--params", "--layout", "--vehicle", "--gateway", "--json"),
+        help="would these parameters be applied?",
+        description="Checks parameters against layout, DBC and vehicle, and shows the integer plan of each branch, "
+        "with --gateway as a gateway would apply it; no bus is opened. What it accepts, 'ecu-node run' accepts.",
+        done="they fit",
+        failed="they do not",
+    )
+    template = command(
+        "template",
+        _template,
+        ("--layout",),
+        help="print a parameter file to be filled in by hand",
+        description="Prints a parameter file that fits the layout and corrects nothing yet. Where the fault of a "
+        "sensor was measured, write it there: drift [1], offset_a [A, positive into the junction], and "
+        '"apply": true; measured = (1 + drift) * true + offset. A load that no branch measures stands in '
+        "expected_a [A], as [unmeasured_load] of the layout says. Take out branches that this vehicle does not have: "
+        "the node would wait for their frames. All else can stay as it is.",
+    )
+    template.add_argument("--vehicle", required=True, type=_VEHICLE, metavar="ID", help="identity of the vehicle")
+    command("schema", _schema, (), help="print the JSON Schema of the parameter file")
+    return parser
+
+
+# The commands import what stands on python-can, after load_python_can.
 
 
 def _bus_settings(options: argparse.Namespace) -> dict[str, Any]:
@@ -146,168 +241,57 @@ def _bus_settings(options: argparse.Namespace) -> dict[str, Any]:
     return {**settings, "bitrates": {"bitrate": options.bitrate, "data_bitrate": options.data_bitrate}}
 
 
-def _add_run(commands: _Commands) -> None:
-    run = commands.add_parser(
-        "run",
-        help="correct until SIGTERM or SIGINT",
-        description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
-        "own on the same bus, or, with --gateway, in place on another bus. With parameters that do not fit it passes "
-        "the measured values through and says so in its status message. SIGHUP, or a changed parameter file, makes it "
-        "read the parameters again.",
-        done=_AT_WORK,
-    )
-    source = run.add_mutually_exclusive_group(required=True)
-    source.add_argument("--state", type=Path, metavar="FOLDER", help="state of this vehicle, with signed parameters")
-    source.add_argument("--params", type=Path, metavar="FILE", help="parameter file that nobody signed; --unsigned")
-    run.add_argument("--unsigned", action="store_true", help="use parameters that nobody signed, as on a test bench")
-    _add_layout(run)
-    _add_vehicle(run)
-    _add_bus(run)
-    run.add_argument(
-        "--gateway",
-        type=_NAME,
-        metavar="CHANNEL",
-        help="be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed on "
-        "with the corrected current in place, all others as they are",
-    )
-    run.add_argument("--shadow", action="store_true", help="compute and report the corrected sum, but change nothing")
-    run.add_argument("--dry-run", action="store_true", help="print what would be opened, read and sent; open nothing")
-    run.add_argument(
-        "--metrics-port", type=_PORT, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
-    )
-    words = "a line of JSON per second, added to a file or sent to udp://HOST:PORT"
-    run.add_argument("--telemetry", type=_TARGET, metavar="TARGET", help=words)
-    words = "sum up each drive for the calibrator, in FOLDER/VEHICLE: kilobytes per hour in place of logs"
-    run.add_argument("--summary", type=Path, metavar="FOLDER", help=words)
-    words = "run as a real-time process: SCHED_FIFO, locked memory, one processor"
-    run.add_argument("--realtime", action="store_true", help=words)
-    run.set_defaults(command=_run)
-
-
 def _run(options: argparse.Namespace) -> int:
-    from ecu_node.bus.run import run_node  # noqa: PLC0415  # after load_python_can
+    from ecu_node.bus.run import run_node  # noqa: PLC0415
 
-    if options.gateway == options.channel:
-        return _wrong_use(f"--gateway {options.gateway} is the bus of the sensors itself; two buses are expected")
-    if options.gateway is not None and options.listen_only:
-        return _wrong_use("--listen-only sends nothing, and a gateway must pass frames on; leave one of them out")
-    if options.state is not None and options.unsigned:
-        return _wrong_use("--state holds signed parameters; leave --unsigned out")
-    if options.params is not None and not options.unsigned:
-        return _wrong_use(
-            "--params names a file that nobody signed: give --state with signed parameters, or --unsigned as well"
-        )
+    for is_wrong, text in (
+        (options.gateway == options.channel,
+         f"--gateway {options.gateway} is the bus of the sensors itself; two buses are expected"),
+        (options.gateway is not None and options.listen_only,
+         "--listen-only sends nothing, and a gateway must pass frames on; leave one of them out"),
+        (options.state is not None and options.unsigned, "--state holds signed parameters; leave --unsigned out"),
+        (options.params is not None and not options.unsigned,
+         "--params names a file that nobody signed: give --state with signed parameters, or --unsigned as well"),
+    ):  # fmt: skip
+        if is_wrong:
+            say_error(f"ecu-node: {text}")
+            return 2
     return run_node(options, _bus_settings(options))
 
 
-def _wrong_use(text: str) -> int:
-    say_error(f"ecu-node: {text}")
-    return 2
-
-
-def _add_monitor(commands: _Commands) -> None:
-    monitor = commands.add_parser(
-        "monitor",
-        help="show the branches, their sum and the node, live",
-        description="Listens to a bus, and never sends: measured and corrected currents, frame rates, faults, the "
-        "Kirchhoff sum, and what the node says of itself. A table in a terminal, else a block of text per second.",
-        done=_AT_WORK,
-        failed="failed, or with --once no branch was seen",
-    )
-    _add_layout(monitor)
-    _add_bus(monitor)
-    monitor.add_argument(
-        "--once", type=_SECONDS, metavar="SECONDS", help="listen this long, print what was seen, and end"
-    )
-    monitor.add_argument("--json", action="store_true", help="print JSON; with --once")
-    monitor.set_defaults(command=_monitor, error=monitor.error)
-
-
 def _monitor(options: argparse.Namespace) -> int:
-    from ecu_node.monitor import run_monitor  # noqa: PLC0415  # after load_python_can
+    from ecu_node.monitor import run_monitor  # noqa: PLC0415
 
     if options.json and options.once is None:
         options.error("--json needs --once SECONDS")
     return run_monitor(options.layout, _bus_settings(options), once_s=options.once, as_json=options.json)
 
 
-def _add_faults(commands: _Commands) -> None:
-    faults = commands.add_parser(
-        "faults",
-        help="why the node fell back: first, last, how often, with which currents",
-        description="Prints the fault memory of a state folder, the last fault first. What is active keeps a node from "
-        "correcting, also after a restart.",
-    )
-    faults.add_argument("--json", action="store_true", help="print JSON")
-    clear = commands.add_parser(
-        "clear",
-        help="forget the faults, and correct again",
-        description="Empties the fault memory of a state folder. A node that runs corrects again within a second; find "
-        "out first what was wrong.",
-    )
-    for command, run in ((faults, _faults), (clear, _clear)):
-        command.add_argument("--state", type=Path, required=True, metavar="FOLDER", help="state of this vehicle")
-        command.set_defaults(command=run)
-
-
 def _faults(options: argparse.Namespace) -> None:
     from msgspec import to_builtins  # noqa: PLC0415
 
-    from ecu_node.bus.faults import faults_text, read_faults  # noqa: PLC0415  # after load_python_can
+    from ecu_node.bus.faults import faults_text, read_faults  # noqa: PLC0415
 
     faults = read_faults(options.state)
     write_result(to_builtins(faults), faults_text(faults), as_json=options.json)
 
 
 def _clear(options: argparse.Namespace) -> None:
-    from ecu_node.bus.faults import clear_faults  # noqa: PLC0415  # after load_python_can
+    from ecu_node.bus.faults import clear_faults  # noqa: PLC0415
 
     clear_faults(options.state)
 
 
-def _add_check(commands: _Commands) -> None:
-    check = commands.add_parser(
-        "check",
-        help="would these parameters be applied?",
-        description="Checks parameters against layout, DBC and vehicle, and shows the integer plan of each branch. "
-        "What it accepts, 'ecu-node run' accepts.",
-        done="they fit",
-        failed="they do not",
-    )
-    check.add_argument("--params", type=Path, required=True, metavar="FILE", help="parameter file of this vehicle")
-    _add_layout(check)
-    _add_vehicle(check)
-    words = "as a gateway would apply them; no bus is opened"
-    check.add_argument("--gateway", type=_NAME, metavar="CHANNEL", help=words)
-    check.add_argument("--json", action="store_true", help="print JSON")
-    check.set_defaults(command=_check)
-
-
 def _check(options: argparse.Namespace) -> int:
-    from ecu_node.bus.run import check_report, report_text  # noqa: PLC0415  # after load_python_can
+    from ecu_node.bus.run import check_report, report_text  # noqa: PLC0415
 
     report = check_report(options.params, options.layout, options.vehicle, is_gateway=options.gateway is not None)
     write_result(report, report_text(report), as_json=options.json)
     return 0 if report["fit"] else 1
 
 
-def _add_template(commands: _Commands) -> None:
-    template = commands.add_parser(
-        "template",
-        help="print a parameter file to be filled in by hand",
-        description="Prints a parameter file that fits the layout and corrects nothing yet. Where the fault of a "
-        "sensor was measured, write it there: drift [1], offset_a [A, positive into the junction], and "
-        '"apply": true; measured = (1 + drift) * true + offset. A load that no branch measures stands in '
-        "expected_a [A], as [unmeasured_load] of the layout says. Take out branches that this vehicle does not have: "
-        "the node would wait for their frames. All else can stay as it is.",
-    )
-    _add_layout(template)
-    template.add_argument("--vehicle", required=True, type=_VEHICLE, metavar="ID", help="identity of the vehicle")
-    template.set_defaults(command=_template)
-
-
 def _template(options: argparse.Namespace) -> None:
-    from ecu_node.database import node_database  # noqa: PLC0415  # after load_python_can
+    from ecu_node.database import node_database  # noqa: PLC0415
 
     write_output(template_text(node_database(options.layout), options.vehicle, datetime.now(UTC)))
 
@@ -362,6 +346,6 @@ def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> s
 
 
 def _schema(options: argparse.Namespace) -> None:  # noqa: ARG001
-    from ecu_node.parameters import parameter_schema  # noqa: PLC0415  # after load_python_can
+    from ecu_node.parameters import parameter_schema  # noqa: PLC0415
 
     write_output(json.dumps(parameter_schema(), indent=2))

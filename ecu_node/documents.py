@@ -19,6 +19,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import msgspec
 
+from ecu_node.errors import shown_name
+
 
 class UnsuitableFileError(OSError):
     """What a name leads to is no regular file, or too large; its text is to stand behind that name."""
@@ -196,23 +198,23 @@ def _shown(value: Any) -> str:
     return f"{text[:_LONGEST_VALUE]}... ({len(value) if isinstance(value, str) else len(text)} characters)"
 
 
-def json_error(error: Exception, content: bytes) -> str:
-    """Say why a text is no JSON; other errors of its decoding in the words that they have."""
+def read_json(content: bytes) -> Any:
+    """Document of a JSON text; ValueError says in one line why it is none, or which key stands twice in one place."""
+
+    def without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        for key, times in Counter(key for key, _ in pairs).items():
+            if times > 1:
+                raise ValueError(f"'{shown_name(key)}' stands there twice in one place")
+        return dict(pairs)
+
     if not content.strip():
-        return "it is empty"
+        raise ValueError("it is empty")
     if content.startswith(codecs.BOM_UTF8):
-        return "it begins with a byte order mark (BOM); save it as UTF-8 without one"
-    if isinstance(error, RecursionError):
-        return "it is nested too deeply"
-    return "it is no text in UTF-8" if isinstance(error, UnicodeDecodeError) else str(error)
-
-
-def repeated_key(content: bytes) -> str | None:
-    """Find a key that stands twice in one object of sound JSON; None if there is none."""
-    repeated: list[str] = []
-
-    def collect(pairs: list[tuple[str, Any]]) -> None:
-        repeated.extend(key for key, times in Counter(key for key, _ in pairs).items() if times > 1)
-
-    json.loads(content, object_pairs_hook=collect, parse_float=str, parse_int=str)
-    return repeated[0] if repeated else None
+        raise ValueError("it begins with a byte order mark (BOM); save it as UTF-8 without one")
+    try:
+        msgspec.json.decode(content)  # which is stricter than json with numbers
+        return json.loads(content, object_pairs_hook=without_repetition)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    except UnicodeDecodeError:
+        raise ValueError("it is no text in UTF-8") from None

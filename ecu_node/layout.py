@@ -14,32 +14,6 @@ import msgspec
 from ecu_node.documents import field_error, read_user_file, text_digest
 from ecu_node.errors import LayoutError, printable
 
-__all__ = [
-    "MAX_LAYOUT_BYTES",
-    "AutosarProfile",
-    "Branch",
-    "CounterCrc8",
-    "E2EWindow",
-    "EndToEnd",
-    "Input",
-    "Layout",
-    "ProfileP01",
-    "ProfileP02",
-    "ProfileP04",
-    "ProfileP05",
-    "ProfileP06",
-    "ProfileP07",
-    "ProfileP11",
-    "SignalName",
-    "StatusMessage",
-    "UnmeasuredLoad",
-    "file_digest",
-    "joint_digest",
-    "layout_of",
-    "read_layout",
-    "split_signal",
-]
-
 Name = Annotated[str, msgspec.Meta(pattern=r"^[_A-Za-z][_A-Za-z0-9]*\Z", description="a name of letters, digits and _")]
 """A name without blanks."""
 SignalName = Annotated[
@@ -58,12 +32,16 @@ def split_signal(name: SignalName) -> tuple[str, str]:
     return message, signal
 
 
+class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of the file."""
+
+
 _DataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]
 _LongDataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
 _Offset = Annotated[int, msgspec.Meta(ge=0, le=60)]
 
 
-class E2EWindow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class E2EWindow(_Table, frozen=True, kw_only=True):
     """When a message is VALID, by the last frames of it."""
 
     window: Annotated[int, msgspec.Meta(ge=1, le=64)]
@@ -74,7 +52,7 @@ class E2EWindow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """Most of them that may be corrupt."""
 
 
-class _Protected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Protected(_Table, frozen=True, kw_only=True):
     messages: Annotated[list[Name], msgspec.Meta(min_length=1)]
     init: E2EWindow = E2EWindow(window=1, min_ok=1, max_error=0)
     """To become VALID at the start."""
@@ -84,6 +62,11 @@ class _Protected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """To become VALID again, also after a silence."""
     max_delta_counter: Annotated[int, msgspec.Meta(ge=1, le=255)] = 3
     """Largest step of the counter between two frames that is used: one more than the frames that may be lost."""
+
+    @property
+    def profile(self) -> str:
+        """Which one it is, as the file says."""
+        return str(self.__struct_config__.tag)
 
 
 class _WithHeader(_Protected, frozen=True, kw_only=True):
@@ -174,7 +157,7 @@ _VssName = Annotated[
 ]
 
 
-class Bus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Bus(_Table, frozen=True, kw_only=True):
     """One of the buses that a log holds."""
 
     name: Name
@@ -184,7 +167,7 @@ class Bus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Path of its DBC, relative to the layout file."""
 
 
-class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Branch(_Table, frozen=True, kw_only=True):
     """One HV current at the junction: a current, a power divided by a voltage, or computed by a formula [A]."""
 
     name: Name
@@ -224,21 +207,21 @@ class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return source
 
 
-class Input(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Input(_Table, frozen=True, kw_only=True):
     """One signal that the vehicle model may be driven by."""
 
     name: Name
     signal: SignalName
 
 
-class Derived(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Derived(_Table, frozen=True, kw_only=True):
     """One input computed from others at each instant of the aligned time base."""
 
     name: Name
     formula: str
 
 
-class Contactor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Contactor(_Table, frozen=True, kw_only=True):
     """Which input tells that the contactors are open, so that no HV current flows."""
 
     input: Name
@@ -246,7 +229,7 @@ class Contactor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """Values of the input that mean open."""
 
 
-class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Limits(_Table, frozen=True, kw_only=True):
     """Largest parameters that the node accepts."""
 
     drift: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.4
@@ -255,7 +238,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Largest magnitude of an offset [A]; 40 % of full scale where not given."""
 
 
-class UnmeasuredLoad(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class UnmeasuredLoad(_Table, frozen=True, kw_only=True):
     """What flows out of the junction where no branch measures it, as control units take it."""
 
     mean_a: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
@@ -264,7 +247,7 @@ class UnmeasuredLoad(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """Standard deviation over vehicles. [A]"""
 
 
-class StatusMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class StatusMessage(_Table, frozen=True, kw_only=True):
     """The message in which the node reports itself, and its signals."""
 
     message: Name
@@ -285,7 +268,7 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return {key: f"{self.message}.{name}" for key, name in names.items() if name is not None}
 
 
-class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Watch(_Table, frozen=True, kw_only=True):
     """When the node holds its own corrections for wrong."""
 
     window_s: Annotated[float, msgspec.Meta(ge=1.0, le=3600.0)] = 10.0
@@ -302,7 +285,7 @@ class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Its values with which they are; the sums of other times are not judged."""
 
 
-class Activation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Activation(_Table, frozen=True, kw_only=True):
     """What it takes until signed parameters are in force."""
 
     trial_s: Annotated[float, msgspec.Meta(ge=1.0, le=86400.0)] = 300.0
@@ -315,7 +298,7 @@ class Activation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Largest difference from the offset that is in force [A]; 20 % of full scale where not given."""
 
 
-class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LayoutKeys(_Table, frozen=True, kw_only=True):
     """What a layout file may say."""
 
     schema: Literal[1]
@@ -386,10 +369,6 @@ class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def protection(self, message: str) -> EndToEnd | None:
         """How a message is protected; None if it is not."""
         return next((entry for _, entry in self.protections if message in entry.messages), None)
-
-    def protection_place(self, message: str) -> str:
-        """Where the file says how a message is protected, which it does."""
-        return next(place for place, entry in self.protections if message in entry.messages)
 
 
 class Layout(LayoutKeys, frozen=True, kw_only=True):
@@ -512,71 +491,59 @@ def joint_digest(digests: Sequence[str]) -> str:
 
 def _contradictions(layout: LayoutKeys) -> Iterator[str]:
     """Keys that are right by themselves, but contradict each other or name what the layout does not have."""
-    inputs = [item.name for item in layout.input]
-    if twice := _repeated([*layout.branch_names, *inputs, *(item.name for item in layout.derived)]):
-        yield f"{twice} is named twice; branches, inputs and derived inputs need different names"
-    for branch in layout.branch:
+    branches, inputs = layout.branch, [item.name for item in layout.input]
+    known = [*inputs, *(item.name for item in layout.derived)]
+    outputs = [name for branch in branches for name in (branch.corrected, branch.quality) if name is not None]
+    read = {name for branch in branches for name in (branch.signal, branch.power, branch.voltage)}
+    read |= {item.signal for item in layout.input}
+    for branch in branches:
         yield from (f"branch {branch.name}: {text}" for text in _contradictions_of_branch(branch))
-    if sum(branch.balance for branch in layout.branch) > 1:
+    sources = [branch.source for branch in branches]
+    sharing = " and ".join(branch.name for branch in branches if sources.count(branch.source) > 1)
+    for names, text in (
+        ([*layout.branch_names, *known], "{} is named twice; branches, inputs and derived inputs need different names"),
+        (sources, f"branches {sharing}: both read {{}}; each branch needs a signal of its own"),
+        ([item.vss for item in branches if item.vss], "vss '{}' stands at two branches; each needs a name of its own"),
+        (outputs, "{} is written twice; each 'corrected' and 'quality' needs a signal of its own"),
+        ([*{*outputs}, *({*outputs} & read)], "{} is both read and written; give the output a signal of its own"),
+        ([bus.name for bus in layout.bus], "[[bus]] name: {} stands there twice; each bus needs one of its own"),
+        ([bus.channel for bus in layout.bus], "[[bus]] channel: {} stands there twice; each bus needs one of its own"),
+    ):  # fmt: skip
+        yield from (text.format(name) for name in names if names.count(name) > 1)
+    if sum(branch.balance for branch in branches) > 1:
         yield "more than one branch has 'balance = true'; at most one can take what the others leave"
-    if name := _repeated([branch.source for branch in layout.branch]):
-        sharing = " and ".join(branch.name for branch in layout.branch if branch.source == name)
-        yield f"branches {sharing}: both read {name}; each branch needs a signal of its own"
-    if name := _repeated([branch.vss for branch in layout.branch if branch.vss is not None]):
-        yield f"vss {name!r} stands at two branches; each needs a name of its own"
-    yield from _contradictions_of_outputs(layout)
-    yield from _contradictions_of_buses(layout)
+    if layout.dbc is not None and layout.bus:
+        yield "give either 'dbc', or [[bus]] with a 'dbc' each"
     yield from _contradictions_of_protection(layout)
     if (layout.watch.input is None) != (not layout.watch.valid):
         yield "[watch]: give both 'input' and 'valid', or neither"
-    known = [*inputs, *(item.name for item in layout.derived)]
-    for key, names, allowed in (
-        ("[contactor] input", [layout.contactor.input] if layout.contactor is not None else [], inputs),
-        ("temperature", [layout.temperature], inputs),
-        ("[watch] input", [layout.watch.input], inputs),
+    for key, wanted, allowed in (
+        ("[contactor] input", [layout.contactor.input] if layout.contactor else [], inputs),
+        ("temperature", [layout.temperature] if layout.temperature else [], inputs),
+        ("[watch] input", [layout.watch.input] if layout.watch.input else [], inputs),
         ("model_inputs", layout.model_inputs, known),
         ("fleet_inputs", layout.fleet_inputs, known),
     ):
-        if unknown := [repr(name) for name in names if name is not None and name not in allowed]:
+        if unknown := [repr(name) for name in wanted if name not in allowed]:
             yield f"{key}: {', '.join(unknown)} is no [[input]]; declare the signal as one, or leave the name out"
 
 
-def _repeated(names: Sequence[str]) -> str:
-    """The first name that stands there twice; empty if there is none."""
-    return next((name for name in names if names.count(name) > 1), "")
-
-
 def _contradictions_of_branch(branch: Branch) -> Iterator[str]:
-    ways = (branch.signal, branch.power, branch.formula)
-    if sum(way is not None for way in ways) != 1 or (branch.power is None) != (branch.voltage is None):
-        yield "give either 'signal' (a current), 'power' and 'voltage', or 'formula'"
-    if branch.formula is not None and (branch.corrected is not None or branch.unit is not None):
-        yield "'formula' gives A and is not written; leave out 'corrected' and 'unit'"
-    if branch.formula is None and branch.uncertainty:
-        yield "'uncertainty' is that of a 'formula'; a sensor's is what is estimated"
-    if branch.quality is not None:
-        if branch.corrected is None:
-            yield "'quality' without 'corrected'"
-        elif split_signal(branch.quality)[0] != split_signal(branch.corrected)[0]:
-            yield "'quality' and 'corrected' must be signals of one message"
-
-
-def _contradictions_of_outputs(layout: LayoutKeys) -> Iterator[str]:
-    outputs = [name for branch in layout.branch for name in (branch.corrected, branch.quality) if name is not None]
-    if name := _repeated(outputs):
-        yield f"{name} is written twice; each 'corrected' and 'quality' needs a signal of its own"
-    read = {name for branch in layout.branch for name in (branch.signal, branch.power, branch.voltage)}
-    read |= {item.signal for item in layout.input}
-    if both := [name for name in outputs if name in read]:
-        yield f"{both[0]} is both read and written; give the output a signal of its own"
-
-
-def _contradictions_of_buses(layout: LayoutKeys) -> Iterator[str]:
-    if layout.dbc is not None and layout.bus:
-        yield "give either 'dbc', or [[bus]] with a 'dbc' each"
-    for what in ("name", "channel"):
-        if twice := _repeated([getattr(bus, what) for bus in layout.bus]):
-            yield f"[[bus]] {what}: {twice} stands there twice; each bus needs one of its own"
+    ways = [way for way in (branch.signal, branch.power, branch.formula) if way is not None]
+    message = branch.corrected and split_signal(branch.corrected)[0]
+    for is_wrong, text in (
+        (len(ways) != 1 or (branch.power is None) != (branch.voltage is None),
+         "give either 'signal' (a current), 'power' and 'voltage', or 'formula'"),
+        (branch.formula and (branch.corrected or branch.unit),
+         "'formula' gives A and is not written; leave out 'corrected' and 'unit'"),
+        (not branch.formula and branch.uncertainty,
+         "'uncertainty' is that of a 'formula'; a sensor's is what is estimated"),
+        (branch.quality and not branch.corrected, "'quality' without 'corrected'"),
+        (branch.quality and split_signal(branch.quality)[0] != message,
+         "'quality' and 'corrected' must be signals of one message"),
+    ):  # fmt: skip
+        if is_wrong:
+            yield text
 
 
 def _contradictions_of_protection(layout: LayoutKeys) -> Iterator[str]:
@@ -587,10 +554,10 @@ def _contradictions_of_protection(layout: LayoutKeys) -> Iterator[str]:
                 how = "is named twice" if places[name] == place else f"stands in {places[name]} too"
                 yield f"{place}, messages: {name} {how}; a message has one protection"
             places[name] = place
-        given, key = (
-            (entry.data_id_list, "data_id_list") if isinstance(entry, ProfileP02) else (entry.data_id, "data_id")
-        )
+        is_list = isinstance(entry, ProfileP02)
+        key = "data_id_list" if is_list else "data_id"
+        given = getattr(entry, key)
         if unknown := [name for name in given if name not in entry.messages]:
             yield f"{place}, {key}: {', '.join(unknown)} is not in 'messages'; add it there, or leave its {key} out"
-        if isinstance(entry, ProfileP02) and (missing := [name for name in entry.messages if name not in given]):
+        if is_list and (missing := [name for name in entry.messages if name not in given]):
             yield f"{place}, {key}: {', '.join(missing)} has none; profile P02 needs 16 numbers per message"

@@ -103,8 +103,7 @@ class BusMonitor:
             id(branch.answering): deque(maxlen=REMEMBERED_FRAMES) for branch in self._branches if branch.answering
         }
         """Frames that were not answered yet, by the message that answers them."""
-        self._status = _Status(database, self._heard) if database.layout.status is not None else None
-        self._latency = Latency()
+        self._database, self._latency = database, Latency()
 
     def take(self, key: tuple[int, bool], payload: bytearray, time_s: float) -> None:
         """Take a frame.
@@ -159,9 +158,9 @@ class BusMonitor:
         return {
             "branches": [branch.view(now_s) for branch in self._branches],
             "sums": _sums([branch for branch in self._branches if branch.measured.seen], now_s, publishes=publishes),
-            "node": self._status.view(now_s) if self._status is not None else None,
+            "node": _status_view(self._database, self._heard, now_s),
             "latency_us": self._latency.microseconds() if any(self._latency.counts) else None,
-            "has_status": self._status is not None,
+            "has_status": self._database.layout.status is not None,
             "publishes_corrected": publishes,
             "is_bus_open": True,
         }
@@ -171,22 +170,22 @@ class _BranchOnBus:
     """One branch: the measured current, and the corrected one, of which nothing comes if the layout has none."""
 
     def __init__(self, database: VehicleDatabase, branch: Branch, heard: _Heard) -> None:
-        def heard_of(name: str) -> _HeardMessage:
-            return heard[key_of(database.signal(name)[0])]
-
-        self._branch, signals = branch, branch_signals(database, branch, Mode.OVERLAY)
+        signals, corrected = branch_signals(database, branch, Mode.OVERLAY), branch.corrected
         voltage = None
         if branch.voltage is not None and signals.voltage is not None:
             voltage = HeardSignal(signals.voltage, branch.timeout_s)
-            voltage.follow(placed_signal(*database.signal(branch.voltage)), heard_of(branch.voltage).frames)
+            message, signal = database.signal(branch.voltage)
+            voltage.follow(placed_signal(message, signal), heard[key_of(message)].frames)
         make = partial(LiveBranch, name=branch.name, sign=branch.sign, timeout_s=branch.timeout_s, voltage=voltage)
         self.measured, self.corrected = make(codes=signals.source), make(codes=signals.target)
-        self.asking = heard_of(branch.source)
-        self.answering = heard_of(branch.corrected) if branch.corrected is not None else None
+        message, signal = database.signal(branch.source)
+        self.asking = heard[key_of(message)]
+        self.measured.follow(placed_signal(message, signal), self.asking.frames)
+        message, signal = database.signal(corrected or branch.source)
+        self.answering = heard[key_of(message)] if corrected is not None else None
         self.answers: Frames = deque(maxlen=REMEMBERED_FRAMES)
         """Intact corrected frames, at the times of those that they answer."""
-        self.measured.follow(placed_signal(*database.signal(branch.source)), self.asking.frames)
-        self.corrected.follow(placed_signal(*database.signal(branch.corrected or branch.source)), self.answers)
+        self.corrected.follow(placed_signal(message, signal), self.answers)
         self._quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
 
     @property
@@ -203,7 +202,7 @@ class _BranchOnBus:
         if self._quality is not None and self.answers:
             quality = _name(Quality, self._quality.extract(self.answers[-1][1]))
         return {
-            "name": self._branch.name,
+            "name": measured.name,
             "is_seen": measured.seen,
             "measured_a": measured_a,
             "corrected_a": corrected_a,
@@ -220,9 +219,8 @@ class _BranchOnBus:
 
 
 def _current_at(branch: LiveBranch, time_s: float) -> float | None:
-    """Current at a time [A]; None if no value is known of then."""
-    currents = branch.currents_at(time_s)
-    return currents[0] if currents is not None else None
+    """Measured current at a time [A]; None if no value is known of then."""
+    return (branch.currents_at(time_s) or (None,))[0]
 
 
 def _difference(later_a: float | None, earlier_a: float | None) -> float | None:
@@ -239,10 +237,9 @@ def _sums(branches: Sequence[_BranchOnBus], now_s: float, *, publishes: bool) ->
     is_published = publishes and all(branch.seen for branch in shown)
     after = aligned_currents(shown, {}, now_s) if is_published else None
     found = after or aligned_currents(measured, {}, now_s)
-    currents = [] if found is None else [_current_at(branch, found[0]) for branch in measured]
-    known = [current_a for current_a in currents if current_a is not None]
+    known = [] if found is None else [_current_at(branch, found[0]) for branch in measured]
     return {
-        "measured_a": sum(known) if known and len(known) == len(currents) else None,
+        "measured_a": sum(x for x in known if x is not None) if known and None not in known else None,
         "corrected_a": sum(current_a for current_a, _ in after[1].values()) if after is not None else None,
     }
 
@@ -251,44 +248,36 @@ _SILENT_PERIODS, _LEAST_SILENCE_S = 5.0, 1.0
 """Without a status for so many of its periods, and at least so long [s], the node is taken for gone."""
 
 
-class _Status:
-    """The node's status message."""
-
-    def __init__(self, database: VehicleDatabase, heard: _Heard) -> None:
-        status = database.layout.status
-        assert status is not None
-        self._heard = heard[key_of(database.message(status.message))]
-        self._silent_s = max(_SILENT_PERIODS * status.period_s, _LEAST_SILENCE_S)
-        signals = {key: database.signal(name)[1] for key, name in status.signals.items()}
-        self._places = {key: bit_place(signal) for key, signal in signals.items()}
-        where = f"{database.layout.path}: status"
-        self._sums = {key: read_codes(signals[key], AMPERE, where) for key in signals if key.startswith("sum_")}
-
-    def view(self, now_s: float) -> View | None:
-        """What is to be shown; None if no intact status ever came."""
-        if not self._heard.frames:
-            return None
-        time_s, payload = self._heard.frames[-1]
-        codes = {key: place.extract(payload) for key, place in self._places.items()}
-        sums: View = {"measured_a": None, "corrected_a": None}
-        for key, known in self._sums.items():
-            code = codes[key]
-            if code is not None and known.is_value(code):
-                sums[f"{key.removeprefix('sum_')}_a"] = float(known.worth(code))
-        age_s = max(now_s - time_s, 0.0)
-        return {
-            "state": _name(State, codes["state"]),
-            "reason": _name(Reason, codes["reason"]),
-            "parameter_set": codes.get("parameter_set"),
-            "sums": sums,
-            "age_s": age_s,
-            "is_silent": age_s > self._silent_s,
-            "faults": dict(self._heard.faults),
-        }
+def _status_view(database: VehicleDatabase, heard: _Heard, now_s: float) -> View | None:
+    """What the node's last intact status says; None if none ever came."""
+    status = database.layout.status
+    message = heard[key_of(database.message(status.message))] if status is not None else None
+    if status is None or message is None or not message.frames:
+        return None
+    time_s, payload = message.frames[-1]
+    codes, sums = dict[str, int | None](), View(measured_a=None, corrected_a=None)
+    for key, name in status.signals.items():
+        signal = database.signal(name)[1]
+        code = codes[key] = bit_place(signal).extract(payload)
+        if key.startswith("sum_") and code is not None:
+            known = read_codes(signal, AMPERE, f"{database.layout.path}: status")
+            sums[f"{key.removeprefix('sum_')}_a"] = float(known.worth(code)) if known.is_value(code) else None
+    age_s = max(now_s - time_s, 0.0)
+    return {
+        "state": _name(State, codes["state"]),
+        "reason": _name(Reason, codes["reason"]),
+        "parameter_set": codes.get("parameter_set"),
+        "sums": sums,
+        "age_s": age_s,
+        "is_silent": age_s > max(_SILENT_PERIODS * status.period_s, _LEAST_SILENCE_S),
+        "faults": dict(message.faults),
+    }
 
 
-_AMPERES = {"measured": "[A]", "corrected": "[A]", "correction": "[A]"}
-_COLUMNS = {"branch": "", **_AMPERES, "quality": "", "rate": "[1/s]", "answers": "[1/s]", "age": "[s]", "faults": ""}
+_COLUMNS = {
+    "branch": "", "measured": "[A]", "corrected": "[A]", "correction": "[A]", "quality": "",
+    "rate": "[1/s]", "answers": "[1/s]", "age": "[s]", "faults": "",
+}  # fmt: skip
 """Names and units: "rate" of the measured frames, "answers" of the corrected ones; words stand at the left."""
 
 

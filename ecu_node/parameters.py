@@ -6,7 +6,6 @@ made from them, which stands in ``ecu_node/parameters.schema.json``. Currents ar
 """
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,14 +14,7 @@ from msgspec import Meta, Struct
 
 from ecu_node.core.status import Reason, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.documents import (
-    UnsuitableFileError,
-    field_error,
-    json_error,
-    read_user_file,
-    repeated_key,
-    write_atomically,
-)
+from ecu_node.documents import UnsuitableFileError, field_error, read_json, read_user_file, write_atomically
 from ecu_node.errors import ParameterError, printable, shown_name
 
 __all__ = [
@@ -216,11 +208,9 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
         With reason MALFORMED_PARAMETERS if it is no JSON, outside the schema, signed, or has a key twice.
     """
     try:
-        document = msgspec.json.decode(content)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise _malformed(where, json_error(error, content)) from None
-    if twice := repeated_key(content):
-        raise _malformed(where, f"'{shown_name(twice)}' stands there twice in one place")
+        document = read_json(content)
+    except (msgspec.DecodeError, ValueError) as error:
+        raise _malformed(where, str(error)) from None
     try:
         return msgspec.json.decode(content, type=VehicleParameters)
     except msgspec.ValidationError as error:
@@ -320,55 +310,43 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
     UnfitError
         With the reason that the node then publishes; the message gives both values.
     """
-    for reason, text in (*_foreign(parameters, database, vehicle), *_implausible(parameters, database)):
-        raise UnfitError(reason, text)
-
-
-def _foreign(
-    parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None
-) -> Iterator[tuple[Reason, str]]:
-    """Why parameters were not made for this vehicle, layout and DBC."""
-    layout = database.layout
+    layout, verdict = database.layout, parameters.verdict
     if vehicle is not None and parameters.vehicle != vehicle:
-        yield Reason.WRONG_VEHICLE, f"parameters are for vehicle {parameters.vehicle!r}, this is {vehicle!r}"
+        text = f"parameters are for vehicle {parameters.vehicle!r}, this is {vehicle!r}"
+        raise UnfitError(Reason.WRONG_VEHICLE, text)
     for reason, what, made_with, path, digest in (
         (Reason.WRONG_LAYOUT, "layout", parameters.layout, layout.path, layout.digest),
         (Reason.WRONG_DBC, "DBC", parameters.dbc, layout.dbc_path, database.digest),
     ):
         if made_with.sha256 != digest:
-            yield (
+            raise UnfitError(
                 reason,
                 f"parameters were made with {what} {shown_name(made_with.name)} ({made_with.sha256[:12]}), this is "
                 f"{path} ({digest[:12]}); calibrate with this {what}; for a file made by hand print a new "
                 f"'ecu-node template'",
             )
     for name in parameters.branches.keys() - set(layout.branch_names):
-        yield Reason.WRONG_LAYOUT, f"parameters for branch {shown_name(name)!r}, which {layout.path} does not have"
-
-
-def _implausible(parameters: VehicleParameters, database: VehicleDatabase) -> Iterator[tuple[Reason, str]]:
-    """What was not decided, or is beyond the limits of the layout."""
-    limits, largest_a = database.layout.limits, database.layout.offset_limit_a
+        text = f"parameters for branch {shown_name(name)!r}, which {layout.path} does not have"
+        raise UnfitError(Reason.WRONG_LAYOUT, text)
+    drift, offset_a, expected_a = layout.limits.drift, layout.offset_limit_a, parameters.junction_residual.expected_a
     applied = {name: branch for name, branch in parameters.branches.items() if branch.apply}
     texts = []
-    if parameters.verdict in {"cannot tell", "not enough data"} and applied:
+    if verdict in {"cannot tell", "not enough data"} and applied:
         texts.append(
-            f"verdict {parameters.verdict!r}, yet branch {', '.join(map(shown_name, applied))} has 'apply': true; "
-            f"nothing was found to apply, calibrate with more drives"
+            f"verdict {verdict!r}, yet branch {', '.join(map(shown_name, applied))} has 'apply': true; nothing was "
+            f"found to apply, calibrate with more drives"
         )
-    if not abs(parameters.junction_residual.expected_a) <= largest_a:
-        texts.append(
-            f"an expected Kirchhoff sum of {parameters.junction_residual.expected_a:+.4g} A is beyond the layout's "
-            f"limit of offsets, {largest_a:g} A"
-        )
+    if not abs(expected_a) <= offset_a:
+        beyond = f"beyond the layout's limit of offsets, {offset_a:g} A"
+        texts.append(f"an expected Kirchhoff sum of {expected_a:+.4g} A is {beyond}")
     for name, branch in parameters.branches.items():
-        if abs(branch.delay_s or 0.0) > _LARGEST_DELAY_S:
-            texts.append(f"branch {name}: delay {branch.delay_s:g} s is beyond {_LARGEST_DELAY_S:g} s")
-    for name, branch in applied.items():
-        if not abs(branch.drift) <= limits.drift:
-            texts.append(f"branch {name}: drift {branch.drift:+.4g} is beyond the layout's limit of {limits.drift:g}")
-        if not abs(branch.offset_a) <= largest_a:
-            texts.append(
-                f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of {largest_a:g} A"
-            )
-    yield from ((Reason.IMPLAUSIBLE_PARAMETERS, text) for text in texts)
+        for what, value, limit, unit, is_applied in (
+            ("delay", branch.delay_s or 0.0, _LARGEST_DELAY_S, " s", True),
+            ("drift", branch.drift, drift, "", branch.apply),
+            ("offset", branch.offset_a, offset_a, " A", branch.apply),
+        ):
+            if is_applied and not abs(value) <= limit:
+                of = "" if what == "delay" else "the layout's limit of "
+                texts.append(f"branch {name}: {what} {value:+.4g}{unit} is beyond {of}{limit:g}{unit}")
+    if texts:
+        raise UnfitError(Reason.IMPLAUSIBLE_PARAMETERS, texts[0])

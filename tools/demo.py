@@ -29,7 +29,7 @@ from calibrator.recordings.frames import read_frames
 from calibrator.recordings.live import play_frames
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import progress_bar
-from ecu_node.bus.node import OverlayNode
+from ecu_node.bus.node import Node
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.wiring import Mode, choose_parameters, open_bus, wire
 from ecu_node.database import read_database
@@ -190,7 +190,7 @@ def running_node(parameters: Path, vehicle: str, interface: str, channel: str) -
         corrector.counters,
         say,
     )
-    run_node = OverlayNode(bus, corrector, period_s=0.1).run
+    run_node = Node(bus, bus, corrector, period_s=0.1).run
     node = threading.Thread(target=run_node, args=(stop.is_set, at_work.set))
     node.start()
     at_work.wait()

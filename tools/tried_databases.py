@@ -26,10 +26,8 @@ def found_in(database: Path) -> tuple[str, str]:
         proposal = look_at(database, logs[0] if logs else None, "tried")
     except UserError as error:
         return "refused", str(error).removeprefix(f"{database}: ")
-    battery = next((item.candidate.name for item in proposal.branches if item.place == "battery"), "")
-    others = ", ".join(
-        f"{item.branch} `{item.candidate.name}`" for item in proposal.branches if item.place != "battery"
-    )
+    battery = proposal.battery.name if proposal.battery is not None else ""
+    others = ", ".join(f"{item.branch} `{item.name}`" for item in proposal.branches if item.place != "battery")
     return battery, proposal.problem() or others
 
 

@@ -15,7 +15,7 @@ from calibrator.terminal.text import counted, dumps, figure, table
 from ecu_node.program import write_output
 
 if TYPE_CHECKING:
-    from calibrator.doctor.facts import ChannelFacts, Facts
+    from calibrator.doctor.facts import Facts
     from calibrator.findings import Finding
 
 __all__ = ["doctor", "doctor_json", "doctor_text"]
@@ -25,10 +25,7 @@ _SEVERITY_WIDTH = 9
 
 def doctor(
     layout: LayoutOption,
-    log: Annotated[
-        list[Path],
-        typer.Option("--log", metavar="PATH", help="Log or table of the vehicle."),
-    ],
+    log: Annotated[list[Path], typer.Option("--log", metavar="PATH", help="Log or table of the vehicle.")],
     dbc: DbcOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -55,7 +52,6 @@ def doctor(
 def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
     """Tables of branches and inputs, findings, and what can be done next; long lines are for the terminal to fold."""
     seconds, frames = sum(log.duration_s for log in facts.logs), sum(log.report.frames for log in facts.logs)
-    shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in facts.explained.items())
     reasons: dict[str, list[str]] = {}
     for name, why in steps.items():
         reasons.setdefault(why, []).append(name)
@@ -64,10 +60,9 @@ def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[st
     lines = [f"ready for: {', '.join(ready) or 'nothing'}"]
     lines += [f"not ready for: {waits}"] if waits else []
     parts = [
-        f"{facts.layout.path.name}: {counted(len(facts.logs), 'log')}, {figure(seconds)} s, {frames:,} frames",
-        _channels("branch", facts.branches),
-        _channels("input", facts.inputs) if facts.inputs else "",
-        f"of the currents' variation the model inputs explain: {shares}" if shares else "",
+        f"{facts.database.layout.path.name}: {counted(len(facts.logs), 'log')}, {figure(seconds)} s, {frames:,} frames",
+        _channels("branch", facts),
+        _channels("input", facts),
         "\n".join(f"{item.severity.value:<{_SEVERITY_WIDTH}}{item.line}" for item in findings)
         or "nothing to complain of",
         "\n".join([*lines, *_next_commands(facts, ready)]),
@@ -78,62 +73,52 @@ def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[st
 def _next_commands(facts: "Facts", ready: Sequence[str]) -> list[str]:
     from calibrator.estimator.settings import FEWEST_VEHICLES
 
-    layout = f"--layout {shlex.quote(str(facts.layout.path))}"
-    branches = [facts.layout.find_branch(name) for name in facts.junction.branches]
+    layout = f"--layout {shlex.quote(str(facts.database.layout.path))} "
+    branches = [facts.database.layout.find_branch(name) for name in facts.junction.branches]
     computed = ", ".join(branch.name for branch in branches if branch.signal is None)
     poor = f" ({computed}: computed from other signals, a poor reference)" if computed else ""
     trusted = next((branch.name for branch in branches if branch.signal is not None), "BRANCH")
     log = shlex.quote(facts.logs[0].name) if len(facts.logs) == 1 else "FOLDER"
-    offsets = "--load A:SD, what flows where nobody measures, tells offsets"
+    one = f"one vehicle and a sensor you trust{poor}; --load A:SD, what flows where nobody measures, tells offsets"
+    many = f"{FEWEST_VEHICLES} vehicles or more"
     lines = {
-        "calibrate --trusted": f"one vehicle and a sensor you trust{poor}; {offsets}: calibrator calibrate {log} "
-        f"{layout} --trusted {trusted} --out result",
-        "calibrate": f"{FEWEST_VEHICLES} vehicles or more: calibrator calibrate FOLDER_OF_VEHICLES {layout} "
-        f"--out result",
+        "calibrate --trusted": f"{one}: calibrator calibrate {log} {layout}--trusted {trusted} --out result",
+        "calibrate": f"{many}: calibrator calibrate FOLDER_OF_VEHICLES {layout}--out result",
     }
     return [text for step, text in lines.items() if step in ready]
 
 
 def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
     """The report for programs: facts by branch and input, findings with their figures, next steps."""
-    sum_a, comparisons = facts.junction.sum_a, facts.junction.comparisons
-    return dumps(
-        {
-            "layout": str(facts.layout.path),
-            "logs": [log.name for log in facts.logs],
-            "branches": {item.name: item for item in facts.branches},
-            "inputs": {item.name: item for item in facts.inputs},
-            "explained": facts.explained,
-            "sum": {
-                "mean_a": float(sum_a.mean()),
-                "sd_a": float(sum_a.std()),
-                "instants": sum(len(comparison.valid) for comparison in comparisons),
-                "valid": len(sum_a),
-            }
-            if len(sum_a)
-            else None,
-            "findings": findings,
-            "ready": [name for name, why in steps.items() if not why],
-            "not_ready": {name: why for name, why in steps.items() if why},
-        }
-    )
+    sum_a, channels = facts.junction.sum_a, facts.channels
+    rows = channels.drop(columns=["is_branch", "needed", "good"]).set_index("name", drop=False)
+    total = None
+    if len(sum_a):
+        instants = sum(len(comparison.valid) for comparison in facts.junction.comparisons)
+        total = {"mean_a": float(sum_a.mean()), "sd_a": float(sum_a.std()), "instants": instants, "valid": len(sum_a)}
+    report = {
+        "layout": str(facts.database.layout.path),
+        "logs": [log.name for log in facts.logs],
+        "branches": rows[channels.is_branch.to_numpy()].to_dict("index"),
+        "inputs": rows[~channels.is_branch.to_numpy()].to_dict("index"),
+        "sum": total,
+        "findings": findings,
+        "ready": [name for name, why in steps.items() if not why],
+        "not_ready": {name: why for name, why in steps.items() if why},
+    }
+    return dumps(report)
 
 
-def _channels(what: str, facts: Sequence["ChannelFacts"]) -> str:
-    """Table of branches, or of inputs with their units."""
+def _channels(what: str, facts: "Facts") -> str:
+    """Table of branches, or of inputs with their units; empty without any."""
     header = [what, "frames", "Hz", "jitter ms", "gap s", "bad %", "least", "greatest", ""]
-    rows = [header]
-    for item in facts:
-        values = (
-            1.0 / item.period_s if item.period_s > 0.0 else math.nan,
-            1e3 * item.jitter_s,
-            item.gap_s,
-            100.0 * item.bad_frames / max(item.frames, 1),
-            item.low,
-            item.high,
-        )
-        cells = [figure(value) for value in values] if item.frames else [""] * len(values)
-        rows.append([item.name, f"{item.frames:,}" if item.frames else "none", *cells, item.unit])
+    channels, rows = facts.channels, []
+    for row in channels[channels.is_branch == (what == "branch")].itertuples():
+        rate = 1.0 / row.period_s if row.period_s > 0.0 else math.nan
+        bad = 100.0 * sum(row.bad.values()) / max(row.frames, 1)
+        values = (rate, 1e3 * row.jitter_s, row.gap_s, bad, row.low, row.high)
+        cells = [figure(value) if row.frames else "" for value in values]
+        rows.append([row.name, f"{row.frames:,}" if row.frames else "none", *cells, row.unit])
     if what == "input":  # names are longer, and their jitter does not matter
-        rows = [[*row[:3], *row[4:]] for row in rows]
-    return table(rows[0], rows[1:])
+        header, *rows = ([*row[:3], *row[4:]] for row in (header, *rows))
+    return table(header, rows) if rows else ""

@@ -325,7 +325,7 @@ def _moved_sensors(before: VehicleParameters, now: FleetEstimate, task: FleetTas
         return {}
     return {
         branches[k]: (
-            f"drift {was[0, k]:+.2%} -> {is_now[0, k]:+.2%}, offset {was[1, k]:+.2f} A -> {is_now[1, k]:+.2f} A"
+            f"drift {was[0, k]:+z.2%} -> {is_now[0, k]:+z.2%}, offset {was[1, k]:+.2f} A -> {is_now[1, k]:+.2f} A"
         )
         for k in np.flatnonzero((np.abs(is_now - was) > same).any(axis=0)).tolist()
     }

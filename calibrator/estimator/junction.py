@@ -437,7 +437,7 @@ def _disagreements(readings: Sequence[tuple[Array, Array]], name: str) -> list[s
     for (a, a_sd), (b, b_sd) in combinations(readings, 2):
         apart = np.abs(a - b) > CONTRADICTION * np.hypot(a_sd, b_sd)
         if apart[0]:
-            found.append(f"the gain error of {name} is known as {a[0]:+.2%} and as {b[0]:+.2%}")
+            found.append(f"the gain error of {name} is known as {a[0]:+z.2%} and as {b[0]:+z.2%}")
         if apart[1]:
             found.append(f"the offset of {name} is known as {a[1]:+.2f} A and as {b[1]:+.2f} A")
     return found
@@ -451,8 +451,8 @@ def _contradictions(system: _System, names: Sequence[str], scale_a: float) -> li
         sd[p] = OPEN_GAIN_SD if p < S else OPEN_OFFSET_SD if p < 2 * S else OPEN_LOAD_SD
         mean, covariance, _ = _condition(system, sd)
         if abs(mean[p] - system.mean[p]) > CONTRADICTION * np.hypot(np.sqrt(covariance[p, p]), system.sd[p]):
-            text = f"gain error of {names[p % S]} is known as {np.expm1(system.mean[p]):+.2%}, the rest makes it "
-            text += f"{np.expm1(mean[p]):+.2%}"
+            text = f"gain error of {names[p % S]} is known as {np.expm1(system.mean[p]):+z.2%}, the rest makes it "
+            text += f"{np.expm1(mean[p]):+z.2%}"
             if p >= S:
                 known_a, rest_a = system.mean[p] * scale_a, mean[p] * scale_a
                 what = f"offset of {names[p % S]}" if p < 2 * S else "load that no branch measures"
@@ -695,7 +695,7 @@ def _same_error(parameters: VehicleParameters, trusted: Collection[str]) -> list
         return []
     (reference,), error = trusted, drifts.mean()
     own = 1.0 / (1.0 + error) - 1.0
-    return [f"all others read {error:+.1%} against {reference}: a gain error of its own of {own:+.1%} looks the same"]
+    return [f"all others read {error:+z.1%} against {reference}: a gain error of its own of {own:+z.1%} looks the same"]
 
 
 def calibrate_junctions(

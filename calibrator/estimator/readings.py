@@ -345,7 +345,7 @@ def untrusted_vehicles(
         k = int(np.argmax(off[j]))
         found[j] = f"its currents sum to {sum_a[j]:+.1f} A on average, which {why}"
         if off[j, k]:
-            found[j] = f"the gains of its sensors {branches[k + 1]} and {branches[0]} differ by {ratio[j, k]:+.1%}"
+            found[j] = f"the gains of its sensors {branches[k + 1]} and {branches[0]} differ by {ratio[j, k]:+z.1%}"
     return found
 
 

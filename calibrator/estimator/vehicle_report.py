@@ -187,7 +187,7 @@ def deciding_evidence(
     if beyond := those("beyond the limits"):
         k = branches.index(beyond[0])
         return (
-            f"the {branches[k]} sensor is off by {drift[k]:+.1%} and {offset_a[k]:+.1f} A, beyond the limits of "
+            f"the {branches[k]} sensor is off by {drift[k]:+z.1%} and {offset_a[k]:+.1f} A, beyond the limits of "
             f"{layout}: replace the sensor"
         ), None
     if unfit := those("does not fit"):  # a finding of such a branch, else of no branch, else of another one
@@ -235,7 +235,7 @@ def _rival(
         return f"{what} {best[1, k] * full_scale_a:+.1f} A or {rival[1, k] * full_scale_a:+.1f} A", explanation
     k = int(np.argmax(drift))
     what = f"a check of the {branches[k]} sensor against a reference would decide: its gain is off by"
-    return f"{what} {best[0, k]:+.1%} or {rival[0, k]:+.1%}", explanation
+    return f"{what} {best[0, k]:+z.1%} or {rival[0, k]:+z.1%}", explanation
 
 
 def explained(parameters: VehicleParameters) -> str:
@@ -272,7 +272,7 @@ def sensor_text(branch: BranchParameters) -> str:
     drift_sd = "" if branch.drift_sd is None else f" +- {branch.drift_sd:.2%}"
     offset_sd = "" if branch.offset_sd_a is None else f" +- {branch.offset_sd_a:.2f} A"
     fate = "corrected" if branch.apply else "not corrected"
-    return f"gain error (drift) {branch.drift:+.2%}{drift_sd}, offset {branch.offset_a:+.2f} A{offset_sd}: {fate}"
+    return f"gain error (drift) {branch.drift:+z.2%}{drift_sd}, offset {branch.offset_a:+.2f} A{offset_sd}: {fate}"
 
 
 def explanation_text(explanation: Explanation) -> str:
@@ -280,9 +280,9 @@ def explanation_text(explanation: Explanation) -> str:
     sensors = []
     for name in dict.fromkeys([*explanation.drift, *explanation.offset_a]):
         drift, offset_a = explanation.drift.get(name), explanation.offset_a.get(name)
-        values = [f"drift {drift:+.2%}"] if drift else []
+        values = [f"drift {drift:+z.2%}"] if drift else []
         values += [f"offset {offset_a:+.2f} A"] if offset_a else []
         sensors.append(f"{name} sensor: {', '.join(values)}")
-    hardware = [f"all currents {explanation.hardware_drift:+.2%}"] if explanation.hardware_drift else []
+    hardware = [f"all currents {explanation.hardware_drift:+z.2%}"] if explanation.hardware_drift else []
     hardware += [f"{name} {value:+.2f} A" for name, value in explanation.hardware_offset_a.items()]
     return "; ".join([*sensors, *(f"hardware: {text}" for text in hardware)]) or "no fault"

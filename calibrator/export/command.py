@@ -51,8 +51,10 @@ def export(
     flashed, a2l tells calibration tools where it stands. dcm (DCM 2.0) and cdfx (ASAM CDF 2.0) are for these tools,
     csv is one row per branch. Parameters that the node would not apply are refused.
     """
-    if (elf is not None) != (format_ in {ExportFormat.HEX, ExportFormat.A2L}):
-        raise ContradictionError("--elf PROGRAM belongs to --format hex and a2l, which need it, and to no other")
+    needs_elf = format_ in {ExportFormat.HEX, ExportFormat.A2L}
+    if (elf is not None) != needs_elf:
+        verb = "needs" if needs_elf else "takes no"
+        raise ContradictionError(f"--format {format_.value} {verb} --elf PROGRAM; hex and a2l alone have one")
     database = node_database(layout)
     reading = shown(params, "read parameters", len(params), "files") if len(params) > 1 else params
     tables = [read_checked(path, database, vehicle) for path in reading]
@@ -90,7 +92,7 @@ def _content(tables: Sequence[Checked], format_: ExportFormat, output: Path, elf
         return dcm_text(checked).encode()
     if elf is None:
         return c_text(checked).encode()
-    image = find_image(elf)
+    image = find_image(elf, checked.database)
     if format_ is ExportFormat.A2L:
         return a2l_text(checked.database, image).encode()
     write = s_records if output.suffix.lower() in _S_RECORDS else intel_hex

@@ -250,13 +250,15 @@ class Image(NamedTuple):
     order: Literal["little", "big"]
 
 
-def find_image(elf: Path) -> Image:
+def find_image(elf: Path, database: VehicleDatabase) -> Image:
     """Find the calibration in a compiled program.
 
     Parameters
     ----------
     elf : Path
         ELF file with symbols, linked with the core and a calibration.
+    database : VehicleDatabase
+        Layout and DBC with which the program must have been compiled.
 
     Returns
     -------
@@ -266,7 +268,7 @@ def find_image(elf: Path) -> Image:
     Raises
     ------
     ExportError
-        If it cannot be read, or has no calibration of this core.
+        If it cannot be read, is not linked, or has no calibration of this core and layout.
     """
     try:
         with elf.open("rb") as file:
@@ -275,6 +277,7 @@ def find_image(elf: Path) -> Image:
             symbols = (table.get_symbol_by_name(_SYMBOL) or []) if isinstance(table, SymbolTableSection) else []
             found = [(symbol["st_value"], symbol["st_size"]) for symbol in symbols if symbol["st_size"]]
             order: Literal["little", "big"] = "little" if program.little_endian else "big"
+            kind, content = program["e_type"], _content_at(program, found[0][0]) if found else b""
     except OSError as error:
         raise ExportError(f"{elf}: cannot be read: {error.strerror}; name the linked program (ELF)") from None
     except ELFError as error:
@@ -289,7 +292,27 @@ def find_image(elf: Path) -> Image:
             f"{elf}: {_SYMBOL} has {size} bytes, and {_BYTES} are expected; compile it with the hv_correction.h of "
             f"this version"
         )
+    if kind != "ET_EXEC":
+        raise ExportError(
+            f"{elf}: has no fixed addresses ({kind}: an object file, or position independent); link it, on a computer "
+            f"with -no-pie, and name the program"
+        )
+    compiled, wanted = int.from_bytes(content, order), _layout_digest(database)
+    if compiled != wanted:
+        raise ExportError(
+            f"{elf}: was compiled with layout {compiled:016X}, and the one given is {wanted:016X}; write its "
+            f"'--format c' anew and build it again, or give the layout that it was built with"
+        )
     return Image(address=address, order=order)
+
+
+def _content_at(program: ELFFile, address: int) -> bytes:
+    """The eight bytes at an address of a program: the digest of the layout, where the calibration stands."""
+    for section in program.iter_sections():
+        start = section["sh_addr"]
+        if section["sh_type"] == "SHT_PROGBITS" and start <= address < start + section["sh_size"]:
+            return bytes(section.data()[address - start :][:8])
+    return b""
 
 
 _RECORD_BYTES = 32

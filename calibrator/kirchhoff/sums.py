@@ -21,10 +21,11 @@ of a formula that gives branch k, and L the spread of the declared load.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
+import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.align import align_channels
@@ -35,16 +36,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
 
-__all__ = [
-    "BAND",
-    "SUM",
-    "VOLTAGE",
-    "Comparison",
-    "compare_kirchhoff",
-    "junction_voltage",
-    "sensor_of",
-    "with_voltages",
-]
+__all__ = ["BAND", "SUM", "VOLTAGE", "Comparison", "compare_kirchhoff", "step_of", "with_voltages"]
 
 VOLTAGE = "_junction_voltage"
 """Input that is the battery's voltage; drives may lack it."""
@@ -58,54 +50,8 @@ LEVELS = 10
 """Fewer different values do not show a step: a heater is on or off. [1]"""
 FEWEST = 50
 """Valid instants, to divide the sum into shares."""
-
-
-class Figures(NamedTuple):
-    """Root mean square, largest magnitude, mean and standard deviation of one current. [A]"""
-
-    rmse_a: float
-    max_a: float
-    mean_a: float
-    sd_a: float
-
-
-class Sensor(NamedTuple):
-    """What is known of one branch without any other: step and white noise [A], and the period of its frames [s]."""
-
-    step_a: float
-    noise_a: float
-    period_s: float
-
-
-@dataclass(frozen=True)
-class GainAlone:
-    """Gain error of a branch that the sum asks for, and the share of the sum's variation that it explains. [1]"""
-
-    gain_error: float
-    gain_share: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Residual:
-    """Shares in the mean square of the sum about what is expected.
-
-    Attributes
-    ----------
-    constant, gains, delays, rest : float
-        Of its mean; of what gain errors of the branches explain about the mean; of what delays explain of the rest; and
-        of what remains. They add up to 1. [1]
-    rest_a : float
-        Root mean square of what remains. [A]
-    alone : mapping of str to GainAlone
-        By branch, as if its gain alone were wrong. Branches that move too little to tell are absent.
-    """
-
-    constant: float
-    gains: float
-    delays: float
-    rest: float
-    rest_a: float
-    alone: Mapping[str, GainAlone]
+_AFTER = " (corrected)"
+"""End of the name of a corrected current beside the measured one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,20 +62,15 @@ class Comparison:
     ----------
     full_scale_a : float
         Full scale of the junction. [A]
-    branches : tuple of str
-        The K branches in the sum.
     left_out : tuple of str
         Branches of the layout without usable values: not in the sum.
     uncorrected : tuple of str
         Branches that are not corrected, and enter the sum after with their measured values; empty without a sum after.
-    time_s : ndarray of shape (T,)
-        Instants. [s]
-    valid : ndarray of bool, shape (T,)
-        Instants that the figures use.
     masked : mapping of str to int
         How many instants are not valid for which reason.
-    currents_a : mapping of str to ndarray of shape (T, K)
-        Currents ``before`` and, if something is corrected, ``after``, positive into the junction. [A]
+    stages : mapping of str to DataFrame of shape (T, K + 1)
+        ``before`` and, if something is corrected, ``after``: a column per branch and :data:`SUM`, positive into the
+        junction, by the instant [s]; NaN where not valid. [A]
     expected_a : float
         Sum that right sensors show: the declared load, or 0. [A]
     expected_sd_a : ndarray of shape (T,)
@@ -137,38 +78,44 @@ class Comparison:
     parts_a : mapping of str to float
         Each part of that in the median: ``quantisation``, ``noise``, ``sampling``, ``delays``, ``formulas``,
         ``load``. [A]
-    residual : mapping of str to Residual or None
-        Shares in the sum before and after; None of few instants, or of a sum that is exact.
+    residual : mapping of str to dict, or None
+        Shares in the mean square of the sum about what is expected, before and after: ``constant`` of its mean;
+        ``gains`` of what gain errors explain about the mean; ``delays`` of what delays explain of the rest; ``rest``.
+        They add up to 1. ``rest_a``: root mean square of the rest [A]. ``alone``: by branch, as if its gain alone were
+        wrong, ``gain_error`` and ``gain_share`` of the sum's variation; branches that move too little are absent.
+        None of few instants, or of a sum that is exact.
     """
 
     full_scale_a: float
-    branches: tuple[str, ...]
     left_out: tuple[str, ...]
     uncorrected: tuple[str, ...]
-    time_s: Array
-    valid: Mask
     masked: Mapping[str, int]
-    currents_a: Mapping[str, Array]
+    stages: Mapping[str, pd.DataFrame]
     expected_a: float
     expected_sd_a: Array
     parts_a: Mapping[str, float]
-    residual: Mapping[str, Residual | None]
+    residual: Mapping[str, dict[str, Any] | None]
 
     @property
-    def figures(self) -> dict[str, dict[str, Figures]]:
-        """Figures ``before``, and ``after`` and ``change`` if something is corrected, by branch and for the sum."""
-        stages = {stage: current_a[self.valid] for stage, current_a in self.currents_a.items()}
+    def branches(self) -> tuple[str, ...]:
+        """The K branches in the sum."""
+        return tuple(self.stages["before"].columns[:-1])
+
+    @property
+    def valid(self) -> Mask:
+        """Instants that the figures use, shape (T,)."""
+        return np.asarray(self.stages["before"][SUM].notna())
+
+    @property
+    def figures(self) -> dict[str, pd.DataFrame]:
+        """Rows for the branches and the sum, columns ``rmse_a``, ``max_a``, ``mean_a``, ``sd_a``, by stage. [A]
+
+        The stages are ``before``, and ``after`` and ``change`` if something is corrected.
+        """
+        stages = dict(self.stages)
         if "after" in stages:
             stages["change"] = stages["after"] - stages["before"]
-        names = (*self.branches, SUM)
-        return {
-            stage: dict(zip(names, map(_figures, (*a.T, a.sum(axis=1))), strict=True)) for stage, a in stages.items()
-        }
-
-    @property
-    def sums_a(self) -> dict[str, Array]:
-        """Sum before and after, shape (T,) each; NaN where not valid. [A]"""
-        return {stage: np.where(self.valid, a.sum(axis=1), np.nan) for stage, a in self.currents_a.items()}
+        return {stage: _figures(frame) for stage, frame in stages.items()}
 
     @property
     def usual_sd_a(self) -> float:
@@ -178,51 +125,40 @@ class Comparison:
     @property
     def in_band(self) -> dict[str, float]:
         """Share of the valid instants at which the sum lies within :data:`BAND` of what is expected. [1]"""
-        far_a = BAND * self.expected_sd_a + 1e-9 * self.full_scale_a  # rounding
-        inside = {stage: np.abs(sum_a - self.expected_a) <= far_a for stage, sum_a in self.sums_a.items()}
-        return {stage: float(np.mean(item[self.valid])) for stage, item in inside.items()}
+        far_a = (BAND * self.expected_sd_a + 1e-9 * self.full_scale_a)[self.valid]  # rounding
+        sums_a = {stage: frame[SUM].to_numpy()[self.valid] for stage, frame in self.stages.items()}
+        return {stage: float(np.mean(np.abs(sum_a - self.expected_a) <= far_a)) for stage, sum_a in sums_a.items()}
 
     def notices(self) -> list[str]:
         """Return what a reader of the figures must know, one short text each."""
-        texts = [f"no usable frames of {', '.join(self.left_out)}: left out of the sum"] if self.left_out else []
-        if self.uncorrected:
-            texts.append(f"no correction of {', '.join(self.uncorrected)}: the sum after has measured values")
-        if "after" not in self.currents_a:
-            texts.append("no corrected frames: only the figures before")
-        reasons = ", ".join(f"{count:,} {reason}" for reason, count in self.masked.items() if count)
-        texts += [f"{np.sum(~self.valid):,} of {len(self.valid):,} instants not used: {reasons}"] if reasons else []
-        return texts
+        unused, reasons = int(np.sum(~self.valid)), (f"{n:,} {reason}" for reason, n in self.masked.items() if n)
+        texts = {
+            f"no usable frames of {', '.join(self.left_out)}: left out of the sum": self.left_out,
+            f"no correction of {', '.join(self.uncorrected)}: the sum after has measured values": self.uncorrected,
+            "no corrected frames: only the figures before": "after" not in self.stages,
+            f"{unused:,} of {len(self.valid):,} instants not used: {', '.join(reasons)}": unused,
+        }
+        return [text for text, is_said in texts.items() if is_said]
 
     def as_json(self) -> dict[str, object]:
         """Everything but the samples, with figures in A and in percent of full scale."""
-
-        def both(found: dict[str, float]) -> dict[str, float]:
-            percent = {f"{key[:-2]}_percent": 100.0 * value / self.full_scale_a for key, value in found.items()}
-            return found | percent
-
-        tables = {
-            stage: {name: both(item._asdict()) for name, item in found.items()} for stage, found in self.figures.items()
-        }
-        names = ("full_scale_a", "branches", "left_out", "uncorrected", "masked")
-        return {
-            **{name: getattr(self, name) for name in names},
+        found: dict[str, Any] = dict.fromkeys(("before", "after", "change"))
+        for stage, table in self.figures.items():
+            percent = (table * (100.0 / self.full_scale_a)).rename(columns=lambda key: f"{key[:-2]}_percent")
+            found[stage] = table.join(percent).to_dict("index")
+        names = ("full_scale_a", "branches", "left_out", "uncorrected", "masked", "residual")
+        expected = {"mean_a": self.expected_a, "sd_a": self.usual_sd_a}
+        return {name: getattr(self, name) for name in names} | {
+            **found,
             "instants": len(self.valid),
             "valid": int(self.valid.sum()),
-            **(dict.fromkeys(("before", "after", "change")) | tables),
-            "expected": {
-                "mean_a": self.expected_a,
-                "sd_a": self.usual_sd_a,
-                "parts_a": self.parts_a,
-                "in_band": self.in_band,
-            },
-            "residual": self.residual,
+            "expected": {**expected, "parts_a": self.parts_a, "in_band": self.in_band},
         }
 
 
-def _figures(a: Array) -> Figures:
-    """Figures of one current of shape (n,), n > 0; the standard deviation is that of the n values, not n - 1. [A]"""
-    rmse_a = float(np.sqrt(np.mean(a**2)))
-    return Figures(rmse_a=rmse_a, max_a=float(np.abs(a).max()), mean_a=float(a.mean()), sd_a=float(a.std()))
+def _figures(a: pd.DataFrame) -> pd.DataFrame:
+    rmse_a = np.sqrt((a**2).mean())
+    return pd.DataFrame({"rmse_a": rmse_a, "max_a": a.abs().max(), "mean_a": a.mean(), "sd_a": a.std(ddof=0)})
 
 
 def _noise(value: Array) -> float:
@@ -235,40 +171,36 @@ def _noise(value: Array) -> float:
 
 
 def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
-    """The same with inputs more: voltages of branches that are powers, for :func:`sensor_of`, and :data:`VOLTAGE`."""
-    layout, signal = database.layout, junction_voltage(database)
-    more = [Input(name=f"_voltage_{item.name}", signal=item.voltage) for item in layout.branch if item.voltage]
-    more += [Input(name=VOLTAGE, signal=signal)] if signal is not None else []
+    """The same with inputs more: voltages of branches that are powers, for :func:`step_of`, and :data:`VOLTAGE`.
+
+    The latter is the signal that powers are divided by, or else the first input in volts.
+    """
+    layout = database.layout
+    volts = [item.signal for item in layout.input if database.signal(item.signal)[1].unit == "V"]
+    divisors = {f"_voltage_{item.name}": item.voltage for item in layout.branch if item.voltage}
+    for signal in [*divisors.values(), *volts][:1]:
+        divisors[VOLTAGE] = signal
+    more = [Input(name=name, signal=signal) for name, signal in divisors.items()]
     return replace(database, layout=msgspec.structs.replace(layout, input=[*layout.input, *more]))
 
 
-def junction_voltage(database: VehicleDatabase) -> str | None:
-    """The signal that powers are divided by, or else the first input in volts."""
-    layout = database.layout
-    volts = [item.signal for item in layout.input if database.signal(item.signal)[1].unit == "V"]
-    return next((item.voltage for item in layout.branch if item.voltage), volts[0] if volts else None)
+def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
+    """Step of the current of a branch; 0 if nothing tells it. [A]
 
-
-def sensor_of(database: VehicleDatabase, name: str, drive: Drive) -> Sensor:
-    """Step, noise and period of a branch.
-
-    Its step is the least distance of two values seen, or the scale of its signal if that is less; of a power the scale
-    of the power over the usual voltage, where that is recorded. Its noise is not less than that of the step.
+    It is the least distance of two values seen, or the scale of its signal if that is less; of a power the scale of the
+    power over the usual voltage, where that is recorded.
     """
     branch, channel = database.layout.find_branch(name), drive.branches[name]
-    time_s, value = channel.time_s[channel.good], channel.value[channel.good]
-    levels_a = np.unique(np.round(value, 9))
-    steps_a = [float(np.diff(levels_a).min())] if len(levels_a) >= LEVELS else []
     if branch.power is not None and branch.voltage is not None:
         signal, voltage = database.signal(branch.power)[1], drive.inputs.get(f"_voltage_{name}")
-        volts = float(np.median(np.abs(voltage.value[voltage.good]))) if voltage is not None else np.inf
-        volts *= unit_factor(database.signal(branch.voltage)[1], VOLT, name)
-        steps_a = [] if signal.is_float else [abs(float(signal.scale)) * unit_factor(signal, WATT, name) / volts]
-    elif scale_a := abs(database.current_step_a(name)):
-        steps_a.append(scale_a)
-    step_a = min(steps_a, default=0.0)
-    period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-    return Sensor(step_a=step_a, noise_a=max(_noise(value), step_a / np.sqrt(12.0)), period_s=period_s)
+        if signal.is_float or voltage is None:
+            return 0.0
+        volts = np.median(np.abs(voltage.value[voltage.good]))
+        per_volt = unit_factor(signal, WATT, name) / unit_factor(database.signal(branch.voltage)[1], VOLT, name)
+        return float(abs(float(signal.scale)) * per_volt / volts)
+    levels_a = np.unique(np.round(channel.value[channel.good], 9))
+    steps_a = [float(np.diff(levels_a).min())] if len(levels_a) >= LEVELS else []
+    return min([*steps_a, *filter(None, [abs(database.current_step_a(name))])], default=0.0)
 
 
 def compare_kirchhoff(
@@ -290,11 +222,6 @@ def compare_kirchhoff(
     parameters : VehicleParameters or None
         Corrections to apply here instead, i = (i_m - offset) / (1 + drift), as the node would.
 
-    Returns
-    -------
-    Comparison
-        The currents, and from them the figures.
-
     Raises
     ------
     DriveError
@@ -302,16 +229,15 @@ def compare_kirchhoff(
         other branches.
     """
     layout, where = database.layout, f"vehicle {drive.vehicle}, drive {drive.name}"
-    measured = {name: channel for name, channel in drive.branches.items() if channel.good.any()}
-    names = tuple(name for name in layout.branch_names if name in measured)
+    usable = {name: channel for name, channel in drive.branches.items() if channel.good.any()}
+    names = [name for name in layout.branch_names if name in usable]
     if len(names) < 2:
         what = f"usable frames of {', '.join(names)} only" if names else "no branch has usable frames"
         raise DriveError(f"{where}: {what}; a sum needs two branches")
-    found = {} if parameters is not None else corrected or {}
-    beside = {f"{name} (corrected)": found[name] for name in names if name in found and found[name].good.any()}
-    timeouts_s = {branch.name: branch.timeout_s for branch in layout.branch}
-    limits_s = timeouts_s | {f"{name} (corrected)": limit_s for name, limit_s in timeouts_s.items()}
-    time_s, values, reasons = align_channels(measured | beside, limits_s, period_s=layout.period_s, where=where)
+    found = {} if parameters is not None or corrected is None else corrected
+    beside = {f"{name}{_AFTER}": found[name] for name in names if name in found and found[name].good.any()}
+    limits_s = {f"{branch.name}{end}": branch.timeout_s for branch in layout.branch for end in ("", _AFTER)}
+    time_s, values, reasons = align_channels(usable | beside, limits_s, period_s=layout.period_s, where=where)
     valid = ~np.any(list(reasons.values()), axis=0)
     if not valid.any():
         raise DriveError(f"{where}: no instant at which all of {', '.join(names)} are fresh; check timeout_s")
@@ -320,25 +246,24 @@ def compare_kirchhoff(
             f"parameters of vehicle {parameters.vehicle}: they are of {', '.join(parameters.branches)}, and the sum "
             f"has {', '.join(names)}; give those of this junction"
         )
-    after = {name: values[f"{name} (corrected)"] for name in names if f"{name} (corrected)" in beside}
+    after = {name: values[f"{name}{_AFTER}"] for name in names if f"{name}{_AFTER}" in beside}
     for name, fault in parameters.branches.items() if parameters is not None else ():
         if name in names and fault.apply:
             after[name] = (values[name] - fault.offset_a) / (1.0 + fault.drift)
-    currents_a = {"before": np.column_stack([values[name] for name in names])}
-    if after or parameters is not None:
-        currents_a["after"] = np.column_stack([after.get(name, values[name]) for name in names])
-    load = layout.unmeasured_load
-    sd_a, parts_a, residual = _explained(currents_a, time_s, valid, database, drive)
+    before = {name: values[name] for name in names}
+    stages = {"before": before} | ({"after": before | after} if after or parameters is not None else {})
+    frames = {stage: pd.DataFrame(each, index=pd.Index(time_s, name="time_s")) for stage, each in stages.items()}
+    sd_a, parts_a, residual = _explained(frames, valid, database, drive)
+    for frame in frames.values():
+        frame[SUM] = frame.sum(axis=1)
+        frame[~valid] = np.nan
     return Comparison(
         full_scale_a=layout.full_scale_a,
-        branches=names,
         left_out=tuple(name for name in layout.branch_names if name not in names),
-        uncorrected=tuple(name for name in names if name not in after) if "after" in currents_a else (),
-        time_s=time_s,
-        valid=valid,
+        uncorrected=tuple(name for name in names if name not in after) if "after" in frames else (),
         masked={reason: int(mask.sum()) for reason, mask in reasons.items()},
-        currents_a=currents_a,
-        expected_a=load.mean_a if load is not None else 0.0,
+        stages=frames,
+        expected_a=layout.unmeasured_load.mean_a if layout.unmeasured_load is not None else 0.0,
         expected_sd_a=sd_a,
         parts_a=parts_a,
         residual=residual,
@@ -346,84 +271,88 @@ def compare_kirchhoff(
 
 
 def _explained(
-    currents_a: Mapping[str, Array], time_s: Array, valid: Mask, database: VehicleDatabase, drive: Drive
-) -> tuple[Array, dict[str, float], dict[str, Residual | None]]:
+    frames: Mapping[str, pd.DataFrame], valid: Mask, database: VehicleDatabase, drive: Drive
+) -> tuple[Array, dict[str, float], dict[str, dict[str, Any] | None]]:
     """Standard deviation of the sum by the formula at the top of this module, its parts, and the shares in the sum."""
-    channels = {name: drive.branches[name] for name in database.layout.branch_names if name in drive.branches}
-    sensors = {name: sensor_of(database, name, drive) for name, item in channels.items() if item.good.any()}
-    load, measured_a = database.layout.unmeasured_load, currents_a["before"]
-    mean_a, load_sd_a = (load.mean_a, load.sd_a) if load is not None else (0.0, 0.0)
+    time_s, measured_a = frames["before"].index.to_numpy(), frames["before"].to_numpy()
+    channels = {name: drive.branches[name] for name in frames["before"]}
+    good_s = [channel.time_s[channel.good] for channel in channels.values()]
+    load, formulas = (
+        database.layout.unmeasured_load,
+        [database.layout.find_branch(name).uncertainty for name in channels],
+    )
     slope = np.gradient(measured_a, time_s, axis=0) if len(time_s) > 1 else np.zeros_like(measured_a)
+    step_a = np.array([step_of(database, name, drive) for name in channels])
+    noise_a = np.array([_noise(channel.value[channel.good]) for channel in channels.values()])
     # The noise of each branch is in the sum. Of rows seconds apart a current itself looks like noise, the sum less so,
     # and what gain errors and delays leave of the sum does not.
     most_a = _noise(measured_a.sum(axis=1)[valid])
     for _ in range(2):
-        sensors = {
-            name: sensor._replace(noise_a=max(min(sensor.noise_a, most_a), sensor.step_a / np.sqrt(12.0)))
-            for name, sensor in sensors.items()
+        noise_a = np.maximum(np.minimum(noise_a, most_a), step_a / np.sqrt(12.0))
+        shares = {
+            stage: _shares(frame[valid], slope[valid], noise_a, load.mean_a if load is not None else 0.0)
+            for stage, frame in frames.items()
         }
-        shares = {name: _residual(a[valid], slope[valid], sensors, mean_a) for name, a in currents_a.items()}
         _, delay_s, left_a = shares["before"]
         most_a = min(most_a, _noise(left_a))
-    together = _together([channels[name] for name in sensors], time_s)
+    period_s = np.array([np.median(np.diff(each_s)) if len(each_s) > 1 else 0.0 for each_s in good_s])
     parts = {
-        "quantisation": np.array(sum(sensor.step_a**2 for sensor in sensors.values()) / 12.0),
-        "noise": np.array(most_a**2),
-        "sampling": ~together * (slope**2 @ np.array([sensor.period_s**2 / 12.0 for sensor in sensors.values()])),
+        "quantisation": np.sum(step_a**2) / 12.0,
+        "noise": most_a**2,
+        "sampling": ~_together(good_s, time_s) * (slope**2 @ period_s**2) / 12.0,
         "delays": (slope @ delay_s) ** 2,
-        "formulas": (measured_a**2)
-        @ np.array([database.layout.find_branch(name).uncertainty ** 2 for name in sensors]),
-        "load": np.array(load_sd_a**2),
+        "formulas": measured_a**2 @ np.square(formulas),
+        "load": load.sd_a**2 if load is not None else 0.0,
     }
-    parts_a = {name: float(np.median(np.sqrt(part if part.ndim == 0 else part[valid]))) for name, part in parts.items()}
-    sd_a = np.sqrt(sum(parts.values()) - np.minimum(parts["quantisation"], parts["noise"]))
-    return sd_a, parts_a, {stage: residual for stage, (residual, *_) in shares.items()}
+    whole = {name: np.broadcast_to(part, time_s.shape) for name, part in parts.items()}
+    parts_a = {name: float(np.median(np.sqrt(part[valid]))) for name, part in whole.items()}
+    sd_a = np.sqrt(sum(parts.values()) - np.minimum(parts["quantisation"], parts["noise"]) + np.zeros(len(time_s)))
+    return sd_a, parts_a, {stage: found for stage, (found, *_) in shares.items()}
 
 
-def _together(channels: Sequence[Channel], time_s: Array) -> Mask:
+def _together(good_s: Sequence[Array], time_s: Array) -> Mask:
     """Instants between, or at, good frames that have the same times in all channels."""
     sides = []
-    for channel in channels:
-        good_s = np.concatenate([[-np.inf], channel.time_s[channel.good], [np.inf]])
-        before = np.searchsorted(good_s, time_s + 1e-6, side="right") - 1  # 1 us: rounding
-        sides.append(good_s[np.stack([before, np.searchsorted(good_s, time_s - 1e-6)])])
+    for each_s in good_s:
+        known_s = np.concatenate([[-np.inf], each_s, [np.inf]])
+        before = np.searchsorted(known_s, time_s + 1e-6, side="right") - 1  # 1 us: rounding
+        sides.append(known_s[np.stack([before, np.searchsorted(known_s, time_s - 1e-6)])])
     return np.asarray(np.all([side == sides[0] for side in sides], axis=(0, 1)))
 
 
-def _residual(
-    currents_a: Array, slope: Array, sensors: Mapping[str, Sensor], mean_a: float
-) -> tuple[Residual | None, Array, Array]:
+def _shares(
+    currents_a: pd.DataFrame, slope: Array, noise_a: Array, mean_a: float
+) -> tuple[dict[str, Any] | None, Array, Array]:
     """Shares in the sum, the delays that it shows relative to the branch that moves most, shape (K,) [s], and the rest.
 
     The sum holds the noise of each branch, too: its variance is taken out of both sides of the regression on the gains.
     The branch that moves most is left out of the regressions, since all gains together cannot be told from its own.
     """
-    x, total = currents_a - currents_a.mean(axis=0), currents_a.sum(axis=1) - mean_a
+    a = currents_a.to_numpy()
+    x, total = a - a.mean(axis=0), a.sum(axis=1) - mean_a
     power, s, delay_s = float(np.mean(total**2)), total - total.mean(), np.zeros(x.shape[1])
     if len(total) < FEWEST or power <= 0.0:
         return None, delay_s, s
-    noise2 = np.array([sensor.noise_a**2 for sensor in sensors.values()])
     variance, covariance, change = x.var(axis=0), x.T @ s / len(s), slope - slope.mean(axis=0)
-    moving = variance > MOVES**2 * noise2
+    moving = variance > MOVES**2 * noise_a**2
     alone = {}
-    for k, name in enumerate(sensors):
-        if moving[k]:
-            gain = float((covariance[k] - noise2[k]) / (variance[k] - noise2[k]))
-            error = gain / (1.0 - gain) if gain < 1.0 else np.inf
-            alone[name] = GainAlone(error, _gone(s, s - gain * x[:, k]))
+    for k in np.flatnonzero(moving):
+        gain = float((covariance[k] - noise_a[k] ** 2) / (variance[k] - noise_a[k] ** 2))
+        error = gain / (1.0 - gain) if gain < 1.0 else np.inf
+        alone[currents_a.columns[k]] = {"gain_error": error, "gain_share": _gone(s, s - gain * x[:, k])}
     others = np.flatnonzero(moving & (np.arange(len(moving)) != np.argmax(variance)))
-    gram = x[:, others].T @ x[:, others] / len(s) - np.diag(noise2[others])
-    straight = s - x[:, others] @ (np.linalg.pinv(gram) @ (covariance - noise2)[others])
+    gram = x[:, others].T @ x[:, others] / len(s) - np.diag(noise_a[others] ** 2)
+    straight = s - x[:, others] @ (np.linalg.pinv(gram) @ (covariance - noise_a**2)[others])
     late = -np.linalg.lstsq(change[:, others], straight, rcond=1e-6)[0]
     delay_s[others] = np.where(np.abs(late) < MAX_DELAY_S, late, 0.0)
+    left = straight + change @ delay_s
     varying = float(np.mean(s**2)) / power
     gains = varying * _gone(s, straight)
-    left = straight + change @ delay_s
     delays = (varying - gains) * _gone(straight, left)
     rest = max(varying - gains - delays, 0.0)
     constant, rest_a = float(np.mean(total)) ** 2 / power, float(np.sqrt(rest * power))
-    residual = Residual(constant=constant, gains=gains, delays=delays, rest=rest, rest_a=rest_a, alone=alone)
-    return residual, delay_s, left
+    found = {"constant": constant, "gains": gains, "delays": delays, "rest": rest, "rest_a": rest_a, "alone": alone}
+    return found, delay_s, left
 
 
 def _gone(before: Array, after: Array) -> float:

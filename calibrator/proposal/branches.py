@@ -1,17 +1,17 @@
 """Which candidates are the branches of the junction: a score with its reasons for each, a choice, and the signs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from calibrator.drive import Array, Channel
-from calibrator.kirchhoff.signs import WELL_CORRELATED, bands_of, likely_multipliers, sag
+from calibrator.kirchhoff.signs import WELL_CORRELATED, Bands, bands_of, likely_multipliers, sag
 from calibrator.proposal.candidates import Candidate
 from calibrator.terminal.text import figure
 from calibrator.words import CURRENT, PLACES, POSITIONS, POWER, places_of, word_set, words_of
 
-__all__ = ["ONLY_CHARGING", "TAKEN", "Verdict", "close_sum", "closure", "find_signs", "judge_all", "with_usual_sign"]
+__all__ = ["ONLY_CHARGING", "TAKEN", "close_sum", "closure", "find_signs", "judge_all", "with_usual_sign"]
 
 TAKEN = 50.0
 """Score from which on a candidate is a branch: names, comments or sender say where it flows."""
@@ -36,13 +36,11 @@ _OTHER_SIDE = {"dcdc": word_set("output out secondary")}
 HIGH_VOLTAGE = word_set("hv high traction trac hvb hvem bms becm pack pck lb lbc sme ess ress isolation isolationres")
 """Words that a database of a low-voltage battery does not have beside it."""
 MAIN = ("battery", "motor")
-NOWHERE = ""
-"""The place of what no word gives one."""
 NAMED, NAMED_AROUND, HV, MEASURED, BESIDE = 35.0, 40.0, 15.0, 10.0, 20.0
 AGAINST, WEAK, STEADY, NEVER = -65.0, -30.0, -40.0, -150.0
 """Points: for a place in the name, in message or sender, ...; against a word, a range, and for what decides alone."""
-LEAST_OF_LOADS = {"current": 3.0, "power": 500.0}
-"""Ranges that a database gives to heaters, converters and chargers: valves and clutches have less. [A, W]"""
+UNITS, LEAST_OF_LOADS = {"current": "A", "power": "W"}, {"current": 3.0, "power": 500.0}
+"""Units, and ranges that a database gives to heaters, converters and chargers: valves and clutches have less. [A, W]"""
 CELL_V, LOW_V, HIGH_V = 6.0, 40.0, 60.0
 """A voltage beside a current is of a cell, of 12 or 24 V, of neither, or of a junction. [V]"""
 STEADY_SHARE = 0.1
@@ -58,86 +56,44 @@ MEANS = 50
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """What is thought of one candidate.
-
-    Attributes
-    ----------
-    candidate : Candidate
-        The signal or column.
-    place : str
-        Where it probably flows, of :data:`calibrator.words.PLACES`.
-    score : float
-        From 0 on it is worth looking at; from :data:`TAKEN` on it can be a branch.
-    why : str
-        What speaks for it if it is taken, else why it is not.
-    branch : str
-        Name of the branch that it is; empty if it is not taken.
-    sign : int
-        1 if it is positive into the junction, -1 if out of it; of a branch.
-    sign_reason : str
-        How that is known.
-    """
-
-    candidate: Candidate
-    place: str
-    score: float
-    why: str
-    branch: str = ""
-    sign: int = 1
-    sign_reason: str = ""
-
-    @property
-    def points(self) -> float:
-        """Score as people see it, 0 to 100."""
-        return min(max(self.score, 0.0), 100.0)
-
-
 def _score(
     item: Candidate, place: str, everything: Sequence[Candidate], volts: Sequence[Candidate]
 ) -> tuple[float, str]:
     """Score of a current or power as the branch at a place, and what speaks most against it, or for it."""
-    own, near = set(item.own), set(item.words)
-    named = PLACES.get(place, frozenset())
-    points = [(NAMED * bool(own & named) + NAMED_AROUND * bool(near & named), "")]
-    points.append((5.0 * bool(named & set(words_of(item.name.rpartition(".")[2]))), ""))
-    if not near & named:
-        points.append((-20.0, "neither name, comment nor sender says where it flows"))
-    points.append((HV * bool(near & {"hv", "high", "dc", "traction", "trac"}), ""))
-    points.append((MEASURED * bool(own & (CURRENT | POWER)) + MEASURED * (item.quantity == "current"), ""))
-    points.append((-0.3 * len(item.name) - 15.0 * ("raw" in own), ""))
+    own, near, named = set(item.own), set(item.words), PLACES.get(place, frozenset())
     # "Iheat" of a table is a heater's current; in a database, or beside a motor, heat is a loss.
-    if words := own & NOT_MEASURED - (named if item.message is None and places_of(near) == {place} else set()):
-        points.append((AGAINST * len(words), f"{_quoted(words)}: a limit, demand, estimate or part of one"))
-    elif words := (near - own) & LIMITS:
-        points.append((AGAINST, f"its message has {_quoted(words)}: no measured flow"))
-    if words := near & (_OTHER_SIDE.get(place, ELSEWHERE) - named):
-        points.append((AGAINST, f"{_quoted(words)}: another circuit"))
-    points.append(_of_range(item, place) if item.channel is None else _of_recording(item, item.channel))
-    if item.message is not None:
-        points.append(_of_voltage(item, place, everything, volts))
-    score = sum(value for value, _ in points)
-    worst, best = min(points, key=lambda point: point[0]), max(points, key=lambda point: point[0] * bool(point[1]))
+    allowed = named if item.message is None and places_of(near) == {place} else set()
+    no_flow, elsewhere = own & NOT_MEASURED - allowed, near & (_OTHER_SIDE.get(place, ELSEWHERE) - named)
+    limits = set() if no_flow else (near - own) & LIMITS
+    points = [
+        (NAMED * bool(own & named) + NAMED_AROUND * bool(near & named), ""),
+        (5.0 * bool(named & set(words_of(item.name.rpartition(".")[2]))), ""),
+        (-20.0 * (not near & named), "neither name, comment nor sender says where it flows"),
+        (HV * bool(near & {"hv", "high", "dc", "traction", "trac"}), ""),
+        (MEASURED * bool(own & (CURRENT | POWER)) + MEASURED * (item.quantity == "current"), ""),
+        (-0.3 * len(item.name) - 15.0 * ("raw" in own), ""),
+        (AGAINST * len(no_flow), f"{_quoted(no_flow)}: a limit, demand, estimate or part of one"),
+        (AGAINST * bool(limits), f"its message has {_quoted(limits)}: no measured flow"),
+        (AGAINST * bool(elsewhere), f"{_quoted(elsewhere)}: another circuit"),
+        _of_range(item, place) if item.channel is None else _of_recording(item, item.channel),
+        _of_voltage(item, place, everything, volts) if item.message is not None else (0.0, ""),
+    ]
+    score, worst = sum(value for value, _ in points), min(points, key=lambda point: point[0])
+    best = max(points, key=lambda point: point[0] * bool(point[1]))
     return score, worst[1] if worst[0] < 0.0 and score < TAKEN else best[1]
 
 
 def _of_range(item: Candidate, place: str) -> tuple[float, str]:
-    reach = max(abs(item.low), abs(item.high))
-    if place not in MAIN and reach < LEAST_OF_LOADS[item.quantity]:
-        return AGAINST, f"its range ends at {reach:g} {_unit(item)}: no load of a junction"
+    if place not in MAIN and item.reach < LEAST_OF_LOADS[item.quantity]:
+        return AGAINST, f"its range ends at {item.reach:g} {UNITS[item.quantity]}: no load of a junction"
     if place in MAIN and item.low >= 0.0:
         ranged = item.signal is not None and bool(item.signal.minimum or item.signal.maximum)
         return WEAK if ranged else 0.5 * WEAK, "in the database it cannot be negative"
     return 0.0, ""
 
 
-def _unit(item: Candidate) -> str:
-    return "A" if item.quantity == "current" else "W"
-
-
 def _of_recording(item: Candidate, channel: Channel) -> tuple[float, str]:
-    value, unit = item.good, _unit(item)
+    value, unit = item.good, UNITS[item.quantity]
     if len(value) < 0.5 * len(channel.value):
         unusable = f"{1.0 - len(value) / len(channel.value):.0%} of its values are not usable"
         return NEVER, item.comment if item.signal is None and item.comment else unusable
@@ -154,7 +110,7 @@ def _of_voltage(
 ) -> tuple[float, str]:
     """What the greatest voltage of the same message says of it."""
     beside = [v for v in volts if v.message is item.message and not {"cell", "brick", "ref"} & set(v.own)]
-    rated = [(float(np.median(v.good)) if len(v.good) else max(abs(v.low), abs(v.high)), v.name) for v in beside]
+    rated = [(float(np.median(v.good)) if len(v.good) else v.reach, v.name) for v in beside]
     greatest_v, name = max(rated, default=(np.nan, ""))
     if CELL_V < greatest_v < LOW_V and place != "dcdc":
         return NEVER, f"{name.rpartition('.')[2]} beside it is at most {greatest_v:.3g} V: not at the junction"
@@ -164,7 +120,9 @@ def _of_voltage(
         setting = item.channel is None and item.quantity == "current"
         return 1.5 * WEAK * setting, "no voltage is beside it: perhaps a setting"
     around = _names(item)
-    if any(HIGH_VOLTAGE & set(other.words) for other in everything if other is item or around & _names(other)):
+    if any(
+        HIGH_VOLTAGE & set(other.words) for other in everything if other.name == item.name or around & _names(other)
+    ):
         return 0.0, ""
     return AGAINST, "nothing says that it is of a high-voltage battery"
 
@@ -178,7 +136,7 @@ def _quoted(words: set[str]) -> str:
     return ", ".join(f"'{word}'" for word in sorted(words))
 
 
-def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> list[Verdict]:
+def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> list[Candidate]:
     """Judge all currents and powers, and choose branches among them.
 
     Parameters
@@ -190,52 +148,60 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
 
     Returns
     -------
-    list of Verdict
+    list of Candidate
         The branches first, in the order of a layout; then the rest, the best first. Signs are not looked at.
     """
     volts = [item for item in found if item.quantity == "voltage"]
-    verdicts = []
+    judged = []
     for item in (item for item in found if item.quantity in {"current", "power"}):
-        rated = {
-            place: _score(item, place, everything, volts)
-            for place in [*filter(places_of(item.words).__contains__, PLACES)] or [NOWHERE]
-        }
+        places = [*filter(places_of(item.words).__contains__, PLACES)] or [""]
+        rated = {place: _score(item, place, everything, volts) for place in places}
         place = max(rated, key=lambda name: rated[name][0])
-        verdicts.append(Verdict(candidate=item, place=place, score=rated[place][0], why=rated[place][1]))
-    verdicts.sort(key=lambda verdict: -verdict.score)
-    taken = _named_branches(verdicts)
-    for k, verdict in enumerate(verdicts):
+        judged.append(replace(item, place=place, score=rated[place][0], why=rated[place][1]))
+    judged.sort(key=lambda item: -item.score)
+    taken = _named_branches(judged)
+    for k, item in enumerate(judged):
         if k in taken:
-            verdicts[k] = replace(verdict, branch=taken[k])
-        elif verdict.score >= TAKEN:
-            rival = next((v for j, v in enumerate(verdicts) if j in taken and v.place == verdict.place), None)
-            why = f"{rival.candidate.name.rpartition('.')[2]} fits better" if rival is not None else ONLY_CHARGING
-            verdicts[k] = replace(verdict, why=why)
+            judged[k] = replace(item, branch=taken[k])
+        elif item.score >= TAKEN:
+            rival = next((other.name for j, other in enumerate(judged) if j in taken and other.place == item.place), "")
+            why = f"{rival.rpartition('.')[2]} fits better" if rival else ONLY_CHARGING
+            judged[k] = replace(item, why=why)
     order = list(PLACES)
-    chosen = [verdict for verdict in verdicts if verdict.branch]
-    chosen.sort(key=lambda verdict: (order.index(verdict.place), -verdict.score))
-    return [*chosen, *(verdict for verdict in verdicts if not verdict.branch)]
+    return sorted(judged, key=lambda item: order.index(item.place) if item.branch else len(order))
 
 
-def _named_branches(verdicts: Sequence[Verdict]) -> dict[int, str]:
-    """The best verdict for each position that is named at a place, by number."""
+def _named_branches(judged: Sequence[Candidate]) -> dict[int, str]:
+    """The best candidate for each position that is named at a place, by number."""
     taken: dict[int, str] = {}
+    is_recorded = any(item.channel is not None for item in judged)
     for place in PLACES:
-        if place == "charger" and any(name.startswith("motor") for name in taken.values()) and not _seen(verdicts):
+        if place == "charger" and any(name.startswith("motor") for name in taken.values()) and not is_recorded:
             continue  # it carries nothing while the motor does
-        good = [k for k, v in enumerate(verdicts) if v.place == place and v.score >= TAKEN]
-        positions = {k: "" if place == "battery" else _position(verdicts[k], verdicts) for k in good}
+        good = [k for k, item in enumerate(judged) if item.place == place and item.score >= TAKEN]
+        positions = {k: "" if place == "battery" else _position(judged[k], judged) for k in good}
         if len({position for position in positions.values() if position}) > 1:
             good = [k for k in good if positions[k]]  # one for all of them is no branch beside them
         best = {positions[k]: k for k in reversed(good)}
-        several = len(best) > 1
         for position, k in best.items():
-            is_number = position.isdigit() and not several
-            taken[k] = f"{place}_{position}" if position and not is_number else place
+            is_named = position and (len(best) > 1 or not position.isdigit())
+            taken[k] = f"{place}_{position}" if is_named else place
     return taken
 
 
-def close_sum(verdicts: Sequence[Verdict], voltage: Candidate | None) -> list[Verdict]:
+def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
+    """Front, rear, left, right or a number, as name, comment or message say; empty if none."""
+    for words in (item.own, item.words):
+        if found := [position for position in POSITIONS if position in words]:
+            return found[0]
+    if item.place != "motor":
+        return ""
+    letters = [word for word in item.own if not word.isdigit()]
+    alike = [v for v in judged if [w for w in v.own if not w.isdigit()] == letters and v.score >= TAKEN]
+    return next((word for word in item.own if word.isdigit()), "") if len(alike) > 1 else ""
+
+
+def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
     """Take measured currents that no word places, where the recording shows that they close the sum of the others.
 
     The battery's current is fitted by the other branches, each with a gain: with the current, all gains must be near 1,
@@ -243,139 +209,112 @@ def close_sum(verdicts: Sequence[Verdict], voltage: Candidate | None) -> list[Ve
 
     Parameters
     ----------
-    verdicts : sequence of Verdict
+    judged : sequence of Candidate
         The branches first, the battery first of them.
     voltage : Candidate or None
         What powers are divided by.
 
     Returns
     -------
-    list of Verdict
+    list of Candidate
         All, the branches first.
     """
-    result = list(verdicts)
-    for k, verdict in enumerate(result):
-        taken = [v for v in result if v.branch]
-        is_free = not verdict.branch and verdict.place == NOWHERE and verdict.score > 0.5 * AGAINST
-        if not is_free or verdict.candidate.quantity != "current" or len(taken) < 2 or taken[0].place != "battery":
+    result = list(judged)
+    for k, item in enumerate(result):
+        taken = [other for other in result if other.branch]
+        is_free = not item.branch and not item.place and item.score > 0.5 * AGAINST and item.quantity == "current"
+        if not is_free or len(taken) < 2 or taken[0].place != "battery":
             continue
-        channels = _channels((*taken, verdict), voltage)
+        channels = _channels((*taken, item), voltage)
         if not channels or len(current := bands_of([channels]).current_a) < FEWEST_BINS:
             continue
         battery, others = current[:, 0], current[:, 1:]
         gain = np.abs(np.linalg.lstsq(others, battery)[0])
         left = [_rms(battery - part @ np.linalg.lstsq(part, battery)[0]) for part in (others[:, :-1], others)]
         if CLEAR * left[1] < left[0] and np.all((gain > 1.0 / OWN_GAIN) & (gain < OWN_GAIN)):
-            name = "auxiliary" if all(v.branch != "auxiliary" for v in taken) else f"auxiliary_{len(taken)}"
+            name = "auxiliary" if all(other.branch != "auxiliary" for other in taken) else f"auxiliary_{len(taken)}"
             why = f"closes the sum: it varies by {left[1]:.2g} A with it, and by {left[0]:.2g} A without"
-            result[k] = replace(verdict, place="auxiliary", branch=name, score=TAKEN, why=why)
-    return sorted(result, key=lambda v: not v.branch)
+            result[k] = replace(item, place="auxiliary", branch=name, score=TAKEN, why=why)
+    return sorted(result, key=lambda item: not item.branch)
 
 
-def _seen(verdicts: Sequence[Verdict]) -> bool:
-    return any(verdict.candidate.channel is not None for verdict in verdicts)
-
-
-def _position(verdict: Verdict, verdicts: Sequence[Verdict]) -> str:
-    """Front, rear, left, right or a number, as name, comment or message say; empty if none."""
-    item = verdict.candidate
-    for words in (item.own, item.words):
-        if found := [position for position in POSITIONS if position in words]:
-            return found[0]
-    if verdict.place != "motor":
-        return ""
-    letters = [word for word in item.own if not word.isdigit()]
-    alike = [v for v in verdicts if [w for w in v.candidate.own if not w.isdigit()] == letters and v.score >= TAKEN]
-    return next((word for word in item.own if word.isdigit()), "") if len(alike) > 1 else ""
-
-
-def with_usual_sign(verdict: Verdict) -> Verdict:
-    """The verdict with the sign that a comment tells, or that of convention: discharge and consumption are positive."""
-    gives = verdict.place in {"battery", "charger"}
-    words = set(words_of(verdict.candidate.comment))
+def with_usual_sign(item: Candidate) -> Candidate:
+    """The candidate with the sign that a comment tells, or that of convention: discharge and consumption positive."""
+    gives, words = item.place in {"battery", "charger"}, set(words_of(item.comment))
     out, into = ("discharge", "charge") if gives else ("recuperation", "consumption")
     if "positive" in words and (out in words) != (into in words):
         said = out if out in words else into
-        return replace(verdict, sign=1 if said == out else -1, sign_reason=f"its comment says that {said} is positive")
-    what = {"battery": "discharge", "charger": "feeding the junction"}.get(verdict.place, "consumption")
+        return replace(item, sign=1 if said == out else -1, sign_reason=f"its comment says that {said} is positive")
+    what = {"battery": "discharge", "charger": "feeding the junction"}.get(item.place, "consumption")
     sign = 1 if gives else -1
-    return replace(verdict, sign=sign, sign_reason=f"if {what} counts as positive; else {-sign}")
+    return replace(item, sign=sign, sign_reason=f"if {what} counts as positive; else {-sign}")
 
 
-def _current_of(item: Candidate, voltage: Candidate | None) -> Channel | None:
-    """Current of a candidate in a recording, a power divided by the voltage [A]; None without what it takes."""
-    if item.channel is None or item.quantity == "current":
-        return item.channel
-    volts = voltage.at(item.channel.time_s) if voltage is not None else np.full(len(item.channel.time_s), np.nan)
-    good = item.channel.good & (np.abs(volts) > 1.0)
-    return replace(item.channel, value=np.divide(item.channel.value, volts, out=np.zeros_like(volts), where=good))
+def _channels(branches: Sequence[Candidate], voltage: Candidate | None) -> list[Channel]:
+    """Currents of some candidates, powers divided by the voltage [A]; empty if the recording does not have all."""
+    channels = []
+    for item in branches:
+        if (channel := item.channel) is None:
+            return []
+        if item.quantity != "current":
+            volts = voltage.at(channel.time_s) if voltage is not None else np.full(len(channel.time_s), np.nan)
+            good = channel.good & (np.abs(volts) > 1.0)
+            value = np.divide(channel.value, volts, out=np.zeros_like(volts), where=good)
+            channel = replace(channel, value=value, good=good)
+        channels.append(channel)
+    return channels if all(channel.good.any() for channel in channels) else []
 
 
-def _channels(verdicts: Sequence[Verdict], voltage: Candidate | None) -> list[Channel]:
-    """Currents of some verdicts; empty if the recording does not have all of them."""
-    found = [_current_of(verdict.candidate, voltage) for verdict in verdicts]
-    channels = [channel for channel in found if channel is not None and channel.good.any()]
-    return channels if len(channels) == len(found) else []
-
-
-def find_signs(chosen: Sequence[Verdict], voltage: Candidate | None) -> list[Verdict]:
+def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
     """Give branches the signs with which the sum of all varies least, and the battery's voltage sags under its load.
 
     Parameters
     ----------
-    chosen : sequence of Verdict
+    chosen : sequence of Candidate
         The branches, with the usual signs.
     voltage : Candidate or None
         The battery's.
 
     Returns
     -------
-    list of Verdict
+    list of Candidate
         The same with signs and how they are known; the usual ones where the recording does not tell.
     """
-    known = _channels(chosen, voltage)
-    battery = next((k for k, verdict in enumerate(chosen) if verdict.place == "battery"), None)
-    if battery is None or not known:
+    known, places = _channels(chosen, voltage), [item.place for item in chosen]
+    if "battery" not in places or not known:
         return list(chosen)
-    current = _with_means(known)
-    usual = np.array([verdict.sign for verdict in chosen], np.float64)
-    volts = voltage.channel if voltage is not None else None
-    falls = 0.0 if volts is None else sag([(known[battery], volts)])
-    charger = next((k for k, verdict in enumerate(chosen) if verdict.place == "charger"), battery)
+    current, battery = bands_of([known]).current_a, places.index("battery")
+    # Means for a share of the rows: they tell where the currents are steady.
+    mean = [float(channel.value[channel.good].mean()) for channel in known]
+    current = np.concatenate([current, np.tile(mean, (len(current) // MEANS + 1, 1))])
+    usual = np.array([item.sign for item in chosen], np.float64)
+    falls = sag([(known[battery], voltage.channel)]) if voltage is not None and voltage.channel is not None else 0.0
     by_voltage = abs(falls) >= WELL_CORRELATED
-    sure = battery if by_voltage else charger  # which only feeds
+    sure = battery if by_voltage or "charger" not in places else places.index("charger")  # which only feeds
     usual[sure] = -np.sign(falls) if by_voltage else usual[sure]
-    part = current * usual
+    part = Bands(current * usual, np.zeros(len(current), np.intp))
 
     def price(turned: Array) -> float:
         return np.inf if turned[sure] < 0.0 else 1e-6 * float(np.sum(turned < 0.0))
 
-    best = usual * likely_multipliers((part.T @ part)[None], price, factors=(1.0,))
-    told = []
-    for k, verdict in enumerate(chosen):
+    best, told = usual * likely_multipliers(part, price, factors=(1.0,), sure=False), []
+    for k, item in enumerate(chosen):
         other = best * np.where(np.arange(len(chosen)) == k, -1.0, 1.0)
         with_it, without = _rms(current @ best), _rms(current @ other)
         sign, reason = int(best[k]), f"with it the sum of all varies by {with_it:.2g} A, else by {without:.2g} A"
         if k == sure:
-            reason = "with it the voltage falls when the current rises" if by_voltage else verdict.sign_reason
+            reason = "with it the voltage falls when the current rises" if by_voltage else item.sign_reason
         elif without < CLEAR * with_it or without == 0.0:
-            sign, reason = verdict.sign, f"{verdict.sign_reason}; too little current for the sum to tell"
-        told.append(replace(verdict, sign=sign, sign_reason=reason))
+            sign, reason = item.sign, f"{item.sign_reason}; too little current for the sum to tell"
+        told.append(replace(item, sign=sign, sign_reason=reason))
     return told
 
 
-def _with_means(channels: Sequence[Channel]) -> Array:
-    """Comparable currents, and their means for a share of the rows: they tell where the currents are steady."""
-    current = bands_of([channels]).current_a
-    mean = [float(channel.value[channel.good].mean()) for channel in channels]
-    return np.concatenate([current, np.tile(mean, (len(current) // MEANS + 1, 1))])
-
-
-def closure(chosen: Sequence[Verdict], voltage: Candidate | None) -> float:
+def closure(chosen: Sequence[Candidate], voltage: Candidate | None) -> float:
     """How much the sum of all varies, as a share of the greatest current [1]; NaN where no recording tells."""
     if not (known := _channels(chosen, voltage)):
         return float("nan")
-    current = bands_of([known]).current_a * np.array([verdict.sign for verdict in chosen])
+    current = bands_of([known]).current_a * np.array([item.sign for item in chosen])
     steady = [STEADY_SHARE * float(np.abs(channel.value[channel.good]).max(initial=0.0)) for channel in known]
     greatest = max(float(current.std(axis=0).max()), *steady) if len(current) else 0.0
     return _rms(current.sum(axis=1)) / greatest if greatest > 0.0 else float("nan")

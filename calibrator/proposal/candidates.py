@@ -1,14 +1,13 @@
 """Signals of a database or columns of a table: what units, words and ranges say of them, and what a recording shows."""
 
-import copy
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from cantools.database.can import Database, Message, Signal
-from numpy.typing import NDArray
 
 from calibrator.drive import Array, Channel, Mask
 from calibrator.errors import LogError
@@ -16,10 +15,10 @@ from calibrator.recordings.decode import decode_signal, raw_values, signal_range
 from calibrator.recordings.frame_arrays import Frames, frame_key, repaired_time
 from calibrator.recordings.tables import Table
 from calibrator.words import CURRENT, POWER, VOLTAGE, words_of
-from ecu_node.core.signals import AMPERE, VOLT, WATT, unit_factor
+from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, unit_factor
 from ecu_node.errors import DatabaseError
 
-__all__ = ["FLOWS", "Candidate", "of_database", "of_table", "with_log", "with_table"]
+__all__ = ["Candidate", "of_database", "of_table", "with_log", "with_table"]
 
 FLOWS = {"current": AMPERE, "power": WATT, "voltage": VOLT}
 """Quantities of branches, with the units that the layout knows."""
@@ -43,7 +42,7 @@ WRONG_RANGE, FEWEST_OUTSIDE = 0.01, 5
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """A signal or column.
+    """A signal or column, and what is thought of it as a branch.
 
     Attributes
     ----------
@@ -67,6 +66,18 @@ class Candidate:
         Of inputs, if it is computed; empty for what is measured.
     wrong : str
         What the recording shows to be wrong in the database: ``range`` or ``sign``; empty for nothing.
+    place : str
+        Where it probably flows, of :data:`calibrator.words.PLACES`; empty if no word says it.
+    score : float
+        From 0 on it is worth looking at; from :data:`.TAKEN` on it can be a branch.
+    why : str
+        What speaks for it if it is taken, else why it is not.
+    branch : str
+        Name of the branch that it is; empty if it is not taken.
+    sign : int
+        1 if it is positive into the junction, -1 if out of it; of a branch.
+    sign_reason : str
+        How that is known.
     """
 
     name: str
@@ -83,12 +94,28 @@ class Candidate:
     channel: Channel | None = field(default=None, repr=False)
     formula: str = ""
     wrong: str = ""
+    place: str = ""
+    score: float = 0.0
+    why: str = ""
+    branch: str = ""
+    sign: int = 1
+    sign_reason: str = ""
 
     @property
     def about(self) -> str:
         """Unit and comment, for a remark."""
         comment = " ".join(self.comment.split())
         return (self.unit or "no unit") + (f', "{comment}"' if comment else "")
+
+    @property
+    def points(self) -> float:
+        """Score as people see it, 0 to 100."""
+        return min(max(self.score, 0.0), 100.0)
+
+    @property
+    def reach(self) -> float:
+        """Greatest magnitude that bits and range allow. [A, V, W]"""
+        return max(abs(self.low), abs(self.high))
 
     @cached_property
     def good(self) -> Array:
@@ -102,7 +129,7 @@ class Candidate:
 
     def at(self, time_s: Array) -> Array:
         """Good values of the recording at some instants, interpolated; NaN without any."""
-        if self.channel is None or not self.channel.good.any():
+        if self.channel is None or not len(self.good):
             return np.full(len(time_s), np.nan)
         return np.interp(time_s, self.channel.time_s[self.channel.good], self.good)
 
@@ -112,64 +139,66 @@ def of_database(database: Database) -> list[Candidate]:
 
     Signals that no control unit sends (``VECTOR__INDEPENDENT_SIG_MSG``) are none.
     """
+    return [
+        _of_signal(message, signal)
+        for message in database.messages
+        for signal in message.signals
+        if message.name != "VECTOR__INDEPENDENT_SIG_MSG"
+        if _NAME.fullmatch(message.name) and _NAME.fullmatch(signal.name)
+    ]
+
+
+def _of_signal(message: Message, signal: Signal) -> Candidate:
+    own, unit = words_of(signal.name, signal.comment), signal.unit or ""
+    is_state = not unit and (signal.length < _FEWEST_BITS or bool(signal.choices))
+    quantity, factor = ("", 1.0) if is_state else _quantity(signal.name, unit, partial(unit_factor, signal))
+    first = -(1 << signal.length - 1) if signal.is_signed else 0
+    codes = (first, first + (1 << signal.length) - 1)
+    low, high = sorted(factor * (code * float(signal.scale) + float(signal.offset)) for code in codes)
+    span = signal_range(signal, factor)
+    if span.high - span.low >= NO_RANGE * (high - low):
+        low, high = max(low, span.low), min(high, span.high)
+    return Candidate(
+        name=f"{message.name}.{signal.name}",
+        quantity=quantity,
+        unit=unit,
+        comment=signal.comment or "",
+        own=own,
+        words=(*own, *words_of(message.name, message.comment, *message.senders)),
+        factor=factor,
+        low=low,
+        high=high,
+        message=message,
+        signal=signal,
+    )
+
+
+def of_table(table: Table) -> list[Candidate]:
+    """The columns of a table, in its order."""
     found = []
-    for message in database.messages:
-        if message.name == "VECTOR__INDEPENDENT_SIG_MSG" or not _NAME.fullmatch(message.name):
-            continue
-        rest = words_of(message.name, message.comment, *message.senders)
-        for signal in message.signals:
-            if not _NAME.fullmatch(signal.name):
-                continue
-            quantity, factor = _quantity(signal)
-            span = signal_range(signal, factor)
-            codes = (-(1 << signal.length - 1), (1 << signal.length - 1) - 1)
-            codes = codes if signal.is_signed else (0, (1 << signal.length) - 1)
-            ends = sorted(factor * (code * float(signal.scale) + float(signal.offset)) for code in codes)
-            if span.high - span.low < NO_RANGE * (ends[1] - ends[0]):
-                span = replace(span, low=-np.inf, high=np.inf)
-            own = words_of(signal.name, signal.comment)
-            found.append(
-                Candidate(
-                    name=f"{message.name}.{signal.name}",
-                    quantity=quantity,
-                    unit=signal.unit or "",
-                    comment=signal.comment or "",
-                    own=own,
-                    words=(*own, *rest),
-                    factor=factor,
-                    low=max(ends[0], span.low),
-                    high=min(ends[1], span.high),
-                    message=message,
-                    signal=signal,
-                )
-            )
+    unknown = {name: np.full(len(table.time_s), np.nan) for name in table.texts}
+    for name, value in (table.columns | unknown).items():
+        own, unit = words_of(name), table.units.get(name, "")
+        quantity, factor = _quantity(name, unit, partial(factor_of, unit))
+        channel = Channel(time_s=table.time_s, value=factor * value, good=np.isfinite(value))
+        item = Candidate(name=name, quantity=quantity, unit=unit, comment=table.texts.get(name, ""), own=own, words=own)
+        found.append(replace(item, factor=factor, channel=channel))
     return found
 
 
-def _quantity(signal: Signal) -> tuple[str, float]:
+def _quantity(name: str, unit: str, factor_in: Callable[[Mapping[str, float], str], float]) -> tuple[str, float]:
+    """Quantity, and the factor that turns its values into A, V or W, by the unit, or else by the name."""
+    if not unit:
+        letters = [word for word in words_of(name) if not word.isdigit()] or [""]
+        for quantity, words in _MEASURED.items():
+            if letters[-1] in words or letters[0] in words & {"i", "u", "p"}:
+                return quantity, 1.0
+        return "", 1.0
     for quantity, units in FLOWS.items():
-        try:
-            factor = unit_factor(signal, units, "")
-        except DatabaseError:
-            continue
-        if signal.unit:
-            return quantity, factor
-        is_state = signal.length < _FEWEST_BITS or bool(signal.choices)
-        return "" if is_state else _named_quantity(words_of(signal.name)), 1.0
-    return _other(signal.unit or ""), 1.0
-
-
-def _named_quantity(named: Sequence[str]) -> str:
-    letters = [word for word in named if not word.isdigit()] or [""]
-    for quantity, words in _MEASURED.items():
-        if letters[-1] in words or letters[0] in words & {"i", "u", "p"}:
-            return quantity
-    return ""
-
-
-def _other(unit: str) -> str:
+        with suppress(DatabaseError):
+            return quantity, factor_in(units, "")
     plain = re.sub(r"^(unit_|\w+:)|\s", "", unit.lower()).partition("*0")[0]  # "Nm *0.5": as the scale has it
-    return next((quantity for quantity, units in _OTHERS.items() if plain in units), "")
+    return next((quantity for quantity, units in _OTHERS.items() if plain in units), ""), 1.0
 
 
 def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
@@ -188,35 +217,28 @@ def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
         Without those whose message, or multiplexed part of it, never comes.
     """
     time = repaired_time(frames.time_ns)
-    ordered, kept = frames.take(time.order), list[Candidate]()
-    rows: dict[int, NDArray[np.intp]] = {}
+    ordered, kept, parts = frames.take(time.order), list[Candidate](), dict[int, tuple[Array, Frames]]()
     for item in found:
         if item.message is None or item.signal is None or not item.quantity:
             continue
         key = frame_key(item.message.frame_id, extended=item.message.is_extended_frame)
-        if key not in rows:
-            rows[key] = _on_one_bus(np.flatnonzero(ordered.key == np.uint32(key)), ordered)
-        part, is_flow = ordered.take(rows[key]), item.quantity in FLOWS
-        unlimited = copy.copy(item.signal)
-        unlimited.minimum = unlimited.maximum = None
+        if key not in parts:
+            rows = np.flatnonzero(ordered.key == np.uint32(key))
+            channels = ordered.channel[rows]
+            rows = rows[channels == np.bincount(channels, minlength=1).argmax()]
+            parts[key] = time.time_s[rows], ordered.take(rows)
+        (time_s, part), is_flow = parts[key], item.quantity in FLOWS
         named = frozenset(map(int, item.signal.choices or {})) if is_flow else None
-        every = decode_signal(item.message, unlimited, part.data, part.length, named)
-        if not every.present.any():
-            continue
-        turned = _signed(item.signal, part, every.good) if is_flow else None
-        value = item.factor * (every.value if turned is None else turned)
-        inside = signal_range(item.signal).holds(every.value) | (turned is not None)
-        here = every.present
-        seen = _recorded(
-            item, Channel(time_s=time.time_s[rows[key]][here], value=value[here], good=every.good[here]), inside[here]
-        )
-        kept.append(seen if turned is None else replace(seen, wrong="sign"))
+        every = decode_signal(item.message, item.signal, part.data, part.length, named)
+        good = every.present & np.isfinite(every.value) & ~(every.bad["too short"] | every.bad["not available"])
+        if every.present.any():
+            turned = _signed(item.signal, part, good) if is_flow else None
+            value = item.factor * (every.value if turned is None else turned)
+            inside, here = ~every.bad["out of range"] | (turned is not None), every.present
+            channel = Channel(time_s=time_s[here], value=value[here], good=good[here])
+            seen = _recorded(item, channel, inside[here])
+            kept.append(seen if turned is None else replace(seen, wrong="sign"))
     return kept
-
-
-def _on_one_bus(rows: NDArray[np.intp], frames: Frames) -> NDArray[np.intp]:
-    channels = frames.channel[rows]
-    return np.asarray(rows[channels == np.bincount(channels).argmax()]) if len(rows) else rows
 
 
 def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
@@ -231,18 +253,6 @@ def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
 
 def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
     """Those of some signals that a table has as columns, called ``Message.Signal`` or ``Signal``, with their values.
-
-    Parameters
-    ----------
-    found : sequence of Candidate
-        Signals of the database.
-    table : Table
-        The recording.
-
-    Returns
-    -------
-    list of Candidate
-        Without those that have no column.
 
     Raises
     ------
@@ -275,30 +285,3 @@ def _signed(signal: Signal, frames: Frames, good: Mask) -> Array | None:
     if len(negative) < FEWEST_OUTSIDE or turned[good].std() > 0.3 * raw[good].std():
         return None
     return turned * float(signal.scale) + float(signal.offset)
-
-
-def of_table(table: Table) -> list[Candidate]:
-    """The columns of a table, in its order."""
-    found = []
-    unknown = {name: np.full(len(table.time_s), np.nan) for name in table.texts}
-    for name, value in (table.columns | unknown).items():
-        own = words_of(name)
-        unit = table.units.get(name, "")
-        quantity, factor = next(
-            ((quantity, units[unit]) for quantity, units in FLOWS.items() if unit in units),
-            (_other(unit) if unit else _named_quantity(own), 1.0),
-        )
-        channel = Channel(time_s=table.time_s, value=factor * value, good=np.isfinite(value))
-        found.append(
-            Candidate(
-                name=name,
-                quantity=quantity,
-                unit=unit,
-                comment=table.texts.get(name, ""),
-                own=own,
-                words=own,
-                factor=factor,
-                channel=channel,
-            )
-        )
-    return found

@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-from collections.abc import Sequence
 from os import environ
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,7 +19,7 @@ from ecu_node.errors import printable
 from ecu_node.program import say_error, write_output
 
 if TYPE_CHECKING:
-    from calibrator.proposal.branches import Verdict
+    from calibrator.proposal.proposal import Proposal
 
 __all__ = ["layout"]
 
@@ -37,6 +36,7 @@ def propose(
     source: Annotated[
         Path, typer.Argument(help="Database of the vehicle (DBC, KCD, SYM, ARXML), or a table.", metavar="FILE")
     ],
+    more: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
     out: Annotated[Path | None, typer.Option("--out", help="File to write; without it, standard output.")] = None,
     log: Annotated[
         Path | None, typer.Option("--log", help="Log or table of a drive: only what it holds is proposed, with signs.")
@@ -59,6 +59,9 @@ def propose(
         from calibrator.recordings.frames import is_log
         from calibrator.recordings.tables import is_table
 
+    if more:
+        line = f"calibrator layout init {source} --log {more[0]}"
+        raise typer.BadParameter(f"{more[0]}: one file is expected here, and the log behind --log: {line}")
     if out is not None:
         if out.exists() or out.is_symlink():
             raise ProposalError(f"{out}: exists, and is not overwritten; choose another --out")
@@ -71,51 +74,50 @@ def propose(
     if branches is not None:
         proposal = parsed_branches(branches, proposal)
         problem = proposal.unready()
-    elif asked and proposal.verdicts:
+    elif asked and proposal.candidates:
         proposal = ask(proposal)
         problem = proposal.unready()
     else:
         problem = proposal.problem()
         for line in candidate_lines(proposal) if not json else []:
             say_error(line)
-    if problem:
-        if json:
-            write_output(dumps(_as_json(proposal.verdicts, None, None, problem)))
-        raise ProposalError(f"{source}: {problem}; --branches battery=SIGNAL,-motor=SIGNAL names them without a guess")
-    text = layout_text(proposal, out)
-    if out is not None:
+    text = "" if problem else layout_text(proposal, out)
+    if out is not None and text:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, text.encode())
     if json:
-        write_output(dumps(_as_json(proposal.verdicts, out, text, "")))
+        write_output(dumps(_as_json(proposal, out if text else None, text, problem)))
+    if problem:
+        raise ProposalError(f"{source}: {problem}; --branches battery=SIGNAL,-motor=SIGNAL names them without a guess")
+    if json:
         return
     if out is None:
         write_output(text.rstrip("\n"))
         return
-    names = ", ".join(verdict.branch for verdict in proposal.branches)
+    names = ", ".join(item.branch for item in proposal.branches)
     write_output(f"{printable(str(out))}: branches {names}; {text.count('# confirm:')} guesses to confirm")
     recording = "LOG" if proposal.recording is None else shlex.quote(str(proposal.recording))
     say_error(f"next: calibrator doctor --layout {shlex.quote(str(out))} --log {recording}")
 
 
-def _as_json(verdicts: "Sequence[Verdict]", out: Path | None, text: str | None, problem: str) -> dict[str, object]:
+def _as_json(proposal: "Proposal", out: Path | None, text: str, problem: str) -> dict[str, object]:
     return {
         "file": None if out is None else str(out),
-        "branches": [verdict.branch for verdict in verdicts if verdict.branch],
-        "guesses": 0 if text is None else text.count("# confirm:"),
-        "layout": text,
+        "branches": [item.branch for item in proposal.candidates if item.branch],
+        "guesses": text.count("# confirm:"),
+        "layout": text or None,
         "problem": problem or None,
         "candidates": [
             {
-                "signal": verdict.candidate.name,
-                "unit": verdict.candidate.unit,
-                "place": verdict.place or None,
-                "score": round(verdict.points, 1),
-                "branch": verdict.branch or None,
-                "sign": verdict.sign if verdict.branch else None,
-                "why": verdict.why,
+                "signal": item.name,
+                "unit": item.unit,
+                "place": item.place or None,
+                "score": round(item.points, 1),
+                "branch": item.branch or None,
+                "sign": item.sign if item.branch else None,
+                "why": item.why,
             }
-            for verdict in verdicts
+            for item in proposal.candidates
         ],
     }
 

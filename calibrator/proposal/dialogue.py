@@ -26,14 +26,13 @@ _MOVES = {"\x1b[A": -1, "\x1bOA": -1, "\x1b[B": 1, "\x1bOB": 1}
 
 def candidate_lines(proposal: Proposal) -> list[str]:
     """Candidates with score and reason, the branches first; at most :data:`SHOWN` and all branches."""
-    shown = proposal.verdicts[: max(SHOWN, len(proposal.branches))]
-    lines = []
-    for verdict in shown:
-        taken = f"{verdict.branch} ({verdict.sign:+d})" if verdict.branch else "not taken"
-        lines.append(printable(f"{verdict.points:3.0f}  {taken:<17} {verdict.candidate.name}"))
-        lines.append(printable(f"     {verdict.why or verdict.candidate.about}"[:79]))
-    left = len(proposal.verdicts) - len(shown)
-    return [*lines, f"     and {left} more, of fewer points (--json has them all)"] if left else lines
+    shown, lines = proposal.candidates[: max(SHOWN, len(proposal.branches))], list[str]()
+    for item in shown:
+        taken = f"{item.branch} ({item.sign:+d})" if item.branch else "not taken"
+        lines += [f"{item.points:3.0f}  {taken:<17} {item.name}", f"     {item.why or item.about}"[:79]]
+    if left := len(proposal.candidates) - len(shown):
+        lines.append(f"     and {left} more, of fewer points (--json has them all)")
+    return [*map(printable, lines)]
 
 
 def ask(proposal: Proposal) -> Proposal:
@@ -54,7 +53,7 @@ def ask(proposal: Proposal) -> Proposal:
     ProposalError
         If they quit.
     """
-    chosen = {k: verdict.branch for k, verdict in enumerate(proposal.verdicts) if verdict.branch}
+    chosen = {k: item.branch for k, item in enumerate(proposal.candidates) if item.branch}
     at, note, terminal = 0, "", sys.stdin.fileno()
     before = termios.tcgetattr(terminal)
     console = Console(stderr=True, highlight=False)
@@ -65,7 +64,7 @@ def ask(proposal: Proposal) -> Proposal:
                 live.update(_screen(proposal, chosen, at, note, console.height), refresh=True)
                 typed, told, note = os.read(terminal, 64), note, ""
                 for key in [part.decode(errors="replace") for part in _KEY.findall(typed)] or ["q"]:
-                    at = min(max(at + _MOVES.get(key, 0), 0), len(proposal.verdicts) - 1)
+                    at = min(max(at + _MOVES.get(key, 0), 0), len(proposal.candidates) - 1)
                     if key in {"q", "\x1b"}:
                         raise ProposalError("nothing was written")
                     if key == " ":
@@ -84,7 +83,7 @@ def _toggle(proposal: Proposal, chosen: dict[int, str], at: int) -> None:
     """Take a candidate or leave it; one battery takes the place of the other."""
     if chosen.pop(at, None) is not None:
         return
-    name = proposal.verdicts[at].place or "branch"
+    name = proposal.candidates[at].place or "branch"
     for k in [k for k, branch in chosen.items() if branch == name == "battery"]:
         del chosen[k]
     names = [name, *(f"{name}_{number}" for number in range(2, len(chosen) + 3))]
@@ -92,15 +91,14 @@ def _toggle(proposal: Proposal, chosen: dict[int, str], at: int) -> None:
 
 
 def _screen(proposal: Proposal, chosen: Mapping[int, str], at: int, note: str, height: int) -> Text:
-    rows = max(height - 10, 3)
-    top = min(max(at - rows + 2, 0), max(len(proposal.verdicts) - rows, 0))
+    items, rows = proposal.candidates, max(height - 10, 3)
+    top = min(max(at - rows + 2, 0), max(len(items) - rows, 0))
     lines = [f"Which of these currents meet at the junction?   {proposal.files}", ""]
-    for k, verdict in enumerate(proposal.verdicts[top : top + rows], start=top):
-        mark, branch = ("x", chosen[k]) if k in chosen else (" ", "")
-        name = verdict.candidate.name.rpartition(".")[2]
-        why = verdict.why or verdict.candidate.about
-        lines.append(f"{'>' if k == at else ' '} [{mark}] {verdict.points:3.0f} {branch:<12} {name:<24} {why}")
-    hidden, verdict = len(proposal.verdicts) - top - rows, proposal.verdicts[at]
+    for k, item in enumerate(items[top : top + rows], start=top):
+        mark, name = "x" if k in chosen else " ", item.name.rpartition(".")[2]
+        row = f"[{mark}] {item.points:3.0f} {chosen.get(k, ''):<12} {name:<24} {item.why or item.about}"
+        lines.append(f"{'>' if k == at else ' '} {row}")
+    hidden, item = len(items) - top - rows, items[at]
     lines.append(f"     ... {hidden} more below" if hidden > 0 else "")
-    lines += [f"  {verdict.candidate.name}: {verdict.candidate.about}", f"  {verdict.why}", f"  {note}", f"  {KEYS}"]
+    lines += [f"  {item.name}: {item.about}", f"  {item.why}", f"  {note}", f"  {KEYS}"]
     return Text("\n".join(map(printable, lines)), no_wrap=True, overflow="ellipsis")

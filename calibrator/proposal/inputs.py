@@ -1,10 +1,10 @@
 """Which candidates are inputs that drive the currents, what is derived from them, and a motor's computed current."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from calibrator.drive import Channel
 from calibrator.proposal.candidates import Candidate
 from calibrator.words import PLACES, POSITIONS, word_set
 
@@ -47,12 +47,7 @@ _ROLES = {
     "heater_demand": ("power", "heater ptc heating htr heizer heizung hzg", _ORDERED, _CAPS),
     "aircon_demand": ("power", "aircon compressor cmpd hvac evap ac klima komp", _ORDERED, _CAPS),
     "low_voltage_demand": ("power", "lv dcdc", _ORDERED, _CAPS),
-    "sensor_temperature": (
-        "temperature",
-        "temperature temp temperatur",
-        "current box",
-        "cabin ambient coolant cell",
-    ),
+    "sensor_temperature": ("temperature", "temperature temp temperatur", "current box", "cabin ambient coolant cell"),
 }
 """Of each input, in the order in which a layout lists them: its quantity, words of which its own name or comment has
 one, words of its message and sender for it, and against it."""
@@ -93,14 +88,16 @@ def find_inputs(
     """
     chosen: dict[str, Candidate] = {}
     for role in roles:
-        rated = [(_points(item, role, battery), item) for item in found if item.name not in taken]
-        fitting = [item for points, item in sorted(rated, key=lambda pair: -pair[0]) if points >= 0.0]
-        by_position: dict[str, Candidate] = {}
+        points = {item.name: _points(item, role, battery) for item in found if item.name not in taken}
+        fitting = sorted(
+            (item for item in found if points.get(item.name, -1.0) >= 0.0), key=lambda item: -points[item.name]
+        )
         for item in fitting if role == "torque" else fitting[:1]:
-            by_position.setdefault(next((f"_{p}" for p in POSITIONS if p in item.words), ""), item)
-        for position, item in by_position.items():
-            if item is fitting[0] or position:
-                chosen[role if item is fitting[0] else f"{role}{position}"] = item
+            position = next((f"_{p}" for p in POSITIONS if p in item.words), "")
+            if item is fitting[0]:
+                chosen[role], first = item, position
+            elif position and position != first:
+                chosen.setdefault(f"{role}{position}", item)
     return chosen
 
 
@@ -117,9 +114,8 @@ def _points(item: Candidate, role: str, battery: Candidate | None) -> float:
         points -= 4.0 * (len(value) < 0.5 * len(item.channel.value))
     if role == "voltage":
         at_home = LEAST_V <= abs(float(np.median(value))) <= GREATEST_V if len(value) else item.channel is None
-        if not at_home or max(abs(item.low), abs(item.high)) < LEAST_REACH_V:
-            return -1.0
         points += SAME_MESSAGE * (battery is not None and battery.message in {item.message} - {None})
+        return points if at_home and item.reach >= LEAST_REACH_V else -1.0
     return points
 
 
@@ -139,7 +135,7 @@ def computed_motor(
     if channel is not None:
         rpm, volts = speed.at(channel.time_s), voltage.at(channel.time_s)
         value = np.divide(channel.value * rpm * RPM, volts, out=np.full(len(rpm), np.nan), where=volts != 0.0)
-        channel = Channel(time_s=channel.time_s, value=value, good=channel.good & np.isfinite(value))
+        channel = replace(channel, value=value, good=channel.good & np.isfinite(value))
     motor = Candidate(
         name=f"{torque.name} x {speed.name.rpartition('.')[2]}",
         quantity="current",
@@ -157,13 +153,10 @@ def derive(inputs: Mapping[str, Candidate]) -> dict[str, str]:
     """Formulas of currents that physics expects of the inputs: power over voltage, losses, demands over voltage."""
     if "voltage" not in inputs:
         return {}
-    torques = [name for name in inputs if name.startswith("torque") and "speed" in inputs]
-    formulas = {
-        f"{name}{torque.removeprefix('torque')}": formula.format(torque=torque)
-        for torque in torques
-        for name, formula in _OF_TORQUE.items()
-    }
+    formulas = dict[str, str]()
+    for torque in [name for name in inputs if name.startswith("torque") and "speed" in inputs]:
+        end = torque.removeprefix("torque")
+        formulas |= {f"{name}{end}": formula.format(torque=torque) for name, formula in _OF_TORQUE.items()}
+    of_speed = _OF_SPEED if formulas else {}
     demands = [name.removesuffix("_demand") for name in inputs if name.endswith("_demand")]
-    return (
-        formulas | {f"{name}_current": f"{name}_demand / voltage" for name in demands} | (_OF_SPEED if torques else {})
-    )
+    return formulas | {f"{name}_current": f"{name}_demand / voltage" for name in demands} | of_speed

@@ -17,31 +17,24 @@ __all__ = ["report"]
 MAX_LIMIT_A, MAX_VOLTAGE_V = 10_000.0, 2000.0
 """Beyond any battery of a road vehicle. [A], [V]"""
 
-ResultArgument = Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")]
-PageOption = Annotated[
-    Path | None, typer.Option("--out", help="HTML file to write; report.html, or VEHICLE.html, without it.")
-]
-VehicleOption = Annotated[str | None, typer.Option("--vehicle", help="The page of this vehicle alone.")]
-BatteryOption = Annotated[
-    str | None, typer.Option("--battery", help="Branch of the battery, for its protection margin; default: battery.")
-]
-LimitOption = Annotated[
-    float | None,
-    number_option("--limit", 0.1, MAX_LIMIT_A, "Current limit of the battery [A]; full scale without it"),
-]
-VoltageOption = Annotated[
-    float | None,
-    number_option("--voltage", 1, MAX_VOLTAGE_V, "Voltage of the battery, to have its margin in kW [V]"),
-]
-
 
 def report(
-    result: ResultArgument,
-    out: PageOption = None,
-    vehicle: VehicleOption = None,
-    battery: BatteryOption = None,
-    limit: LimitOption = None,
-    voltage: VoltageOption = None,
+    result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
+    out: Annotated[
+        Path | None, typer.Option(help="HTML file to write; report.html, or VEHICLE.html, without it.")
+    ] = None,
+    vehicle: Annotated[str | None, typer.Option(help="The page of this vehicle alone.")] = None,
+    battery: Annotated[
+        str | None, typer.Option(help="Branch of the battery, for its protection margin; default: battery.")
+    ] = None,
+    limit: Annotated[
+        float | None,
+        number_option("--limit", 0.1, MAX_LIMIT_A, "Current limit of the battery [A]; full scale without it"),
+    ] = None,
+    voltage: Annotated[
+        float | None,
+        number_option("--voltage", 1, MAX_VOLTAGE_V, "Voltage of the battery, to have its margin in kW [V]"),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Show a result as one HTML page, of the fleet or of one vehicle; it needs no network."""

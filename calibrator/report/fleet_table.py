@@ -22,7 +22,7 @@ from ecu_node.parameters import Explanation, SensorFinding
 OPEN_GAIN, OPEN_OFFSET = 0.1, 0.05
 """Standard deviations beyond which a gain, and an offset over full scale, are not known. [1]"""
 
-__all__ = ["Details", "FleetTable", "ParameterDetails", "read_details", "read_fleet_table"]
+__all__ = ["FleetTable", "ParameterDetails", "read_details", "read_fleet_table"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,9 @@ class FleetTable:
     columns : mapping of str to ndarray of shape (N, K)
         Columns of ``results.parquet``, in its order of the vehicles that have parameters: numbers (NaN where the method
         gives none), flags, texts (empty where there is none). What belongs to the vehicle as a whole is the same in all
-        K places.
+        K places. Beside them the sensors that are ``faulty``: corrected, held back, or found without a probability;
+        their error at full scale ``error_a`` [A]; and those of which the gain (``open_gain``) or the offset
+        (``open_offset``) is as open as before the recordings.
     left_out : mapping of str to str
         Vehicles, or files of unclear vehicle, without parameters, and why.
     """
@@ -76,30 +78,9 @@ class FleetTable:
         return self.run.branches
 
     @property
-    def open_gain(self) -> Mask:
-        """Sensors whose gain is as open as before the recordings, shape (N, K)."""
-        return np.asarray(~(self["drift_sd"] <= OPEN_GAIN))
-
-    @property
-    def open_offset(self) -> Mask:
-        """Sensors whose offset is as open as before the recordings, shape (N, K)."""
-        return np.asarray(~(self["offset_sd_a"] <= OPEN_OFFSET * self.run.full_scale_a))
-
-    @property
-    def faulty(self) -> Mask:
-        """Sensors in which a fault was found, shape (N, K): corrected, held back, or found without a probability."""
-        settled = ~self["applied"] & ~self["held_back"].astype(bool) & np.isfinite(self["fault_probability"])
-        return np.asarray(((self["drift"] != 0.0) | (self["offset_a"] != 0.0)) & ~settled)
-
-    @property
-    def error_a(self) -> Array:
-        """Error of each faulty sensor at full scale: of its gain and of its offset, shape (N, K). [A]"""
-        return np.asarray(self.faulty * (np.abs(self["drift"]) * self.run.full_scale_a + np.abs(self["offset_a"])))
-
-    @property
     def corrected(self) -> Mask:
         """Vehicles of which the node corrects a branch, shape (N,); a fault of size 0 corrects nothing."""
-        return np.asarray((self["applied"] & self.faulty).any(axis=1))
+        return np.asarray((self["applied"] & self["faulty"]).any(axis=1))
 
     @property
     def deployed_a(self) -> Array:
@@ -118,26 +99,30 @@ def read_fleet_table(result: Path) -> FleetTable:
     except (OSError, pa.ArrowException) as error:
         why = str(error).partition("\n")[0]
         raise FleetError(f"{path}: cannot be read: {why}; give a folder that 'calibrator calibrate' wrote") from None
-    missing = [name for name in SCHEMA.names if name not in frame]
-    if missing:
+    if missing := [name for name in SCHEMA.names if name not in frame]:
         raise FleetError(f"{path}: no column {', '.join(missing)}; calibrate again with this version")
     if not run.full_scale_a:
         raise FleetError(f"{result / 'run.json'}: no full_scale_a, it is of an older version; calibrate again")
-    flags = dict.fromkeys((field.name for field in SCHEMA if field.type == pa.bool_()), False)
-    texts = dict.fromkeys((field.name for field in SCHEMA if field.type == pa.string()), "")
-    frame = frame.fillna(flags | texts).astype(dict.fromkeys(flags, bool) | dict.fromkeys(texts, object))
-    rows, K = frame[frame["branch"] != ""], len(run.branches)
+    types = {field.name: {pa.bool_(): bool, pa.string(): object}.get(field.type) for field in SCHEMA}
+    types = {name: kind for name, kind in types.items() if kind is not None}
+    frame = frame.fillna({name: False if kind is bool else "" for name, kind in types.items()}).astype(types)
+    is_row, K = frame["branch"] != "", len(run.branches)
+    rows, others = frame[is_row], frame[~is_row]
     if not K or rows["branch"].tolist() != list(run.branches) * (len(rows) // K):
         raise FleetError(
             f"{path}: the rows are not those of vehicles with the branches {', '.join(run.branches)} of run.json; "
             f"calibrate again"
         )
-    others = frame[frame["branch"] == ""]
     left_out = dict(zip(others["vehicle"], others["reason"].replace("", "no reason is stored"), strict=True))
     if rows.empty:
         raise FleetError(f"{result}: no vehicle in it has parameters{few_reasons(left_out)}")
-    columns = {name: rows[name].to_numpy().reshape(-1, K) for name in SCHEMA.names}
-    return FleetTable(folder=result, run=run, columns=columns, left_out=left_out)
+    c = {name: rows[name].to_numpy().reshape(-1, K) for name in SCHEMA.names}
+    settled = ~c["applied"] & ~c["held_back"].astype(bool) & np.isfinite(c["fault_probability"])
+    c["faulty"] = ((c["drift"] != 0.0) | (c["offset_a"] != 0.0)) & ~settled
+    c["error_a"] = c["faulty"] * (np.abs(c["drift"]) * run.full_scale_a + np.abs(c["offset_a"]))
+    c["open_gain"] = ~(c["drift_sd"] <= OPEN_GAIN)
+    c["open_offset"] = ~(c["offset_sd_a"] <= OPEN_OFFSET * run.full_scale_a)
+    return FleetTable(folder=result, run=run, columns=c, left_out=left_out)
 
 
 class _Identifiable(msgspec.Struct, frozen=True):
@@ -155,28 +140,24 @@ class ParameterDetails(msgspec.Struct, frozen=True):
     """Of the check of fit."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Details:
-    """What the parameter files of n vehicles add.
+def read_details(table: FleetTable, listed: NDArray[np.int64]) -> tuple[dict[int, ParameterDetails], list[str], Array]:
+    """Read what the parameter files of n vehicles, given by their places in the table, add.
 
-    Attributes
-    ----------
-    files : mapping of int to ParameterDetails
+    Returns
+    -------
+    files : dict of int to ParameterDetails
         By the vehicle's place in the table.
-    names : sequence of str
+    names : list of str
         Of the R rows of evidence: ratios [1], then constants [A]; none if the method keeps no evidence.
     rows : ndarray of shape (n, 3, R)
         What was measured, its standard deviation, and what the estimate predicts; NaN where it is not known.
+
+    Raises
+    ------
+    FleetError
+        If a file is missing or damaged.
     """
-
-    files: Mapping[int, ParameterDetails]
-    names: Sequence[str]
-    rows: Array
-
-
-def read_details(table: FleetTable, listed: NDArray[np.int64]) -> Details:
-    """Read the parameter files of some vehicles, given by their places; FleetError if one is missing or damaged."""
-    run, names = table.run, table.run.details.get("evidence", [])
+    run, names = table.run, list(table.run.details.get("evidence", []))
     order = {str(table.vehicle[j]): i for i, j in enumerate(listed.tolist())}
     files: dict[int, ParameterDetails] = {}
     rows = np.full((len(listed), 3, len(names)), np.nan)
@@ -193,10 +174,9 @@ def read_details(table: FleetTable, listed: NDArray[np.int64]) -> Details:
             evidence = written.evidence
             if evidence is not None and len(evidence.value) == len(names):
                 rows[i] = np.array([evidence.value, evidence.sd, evidence.explained], float)
-    if len(files) < len(listed):
-        missing = next(str(table.vehicle[j]) for j in listed.tolist() if j not in files)
+    if missing := [str(table.vehicle[j]) for j in listed.tolist() if j not in files]:
         raise FleetError(
-            f"{table.folder / 'parameters'}: no parameters of vehicle {missing} there; give the whole folder that "
+            f"{table.folder / 'parameters'}: no parameters of vehicle {missing[0]} there; give the whole folder that "
             f"'calibrator calibrate' wrote"
         )
-    return Details(files=files, names=names, rows=rows)
+    return files, names, rows

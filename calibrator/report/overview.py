@@ -4,7 +4,6 @@ import hashlib
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from calibrator.report.fleet_table import FleetTable, ParameterDetails
 from calibrator.terminal.text import few
 from ecu_node.parameters import HeldBack
 
-__all__ = ["FLEET_CAUSES", "SIGMAS", "WorkshopRow", "amperes", "battery_margin"]
+__all__ = ["FLEET_CAUSES", "SIGMAS", "amperes", "battery_margin"]
 __all__ += ["overview_of", "percent", "probability", "steps_to_take", "workshop_list"]
 
 MOST_REASONS = 20
@@ -56,7 +55,7 @@ def overview_of(table: FleetTable) -> dict[str, Any]:
     reference = table.run.details.get("reference", {})
     spread = table.run.details.get("hyperparameters", {}).get("model_spread", {})
     agreeing = reference.get("agreeing_share", {})
-    held_back, faulty, suspected = table["held_back"], table.faulty, table.of_vehicles("hardware_fault")
+    held_back, faulty, suspected = table["held_back"], table["faulty"], table.of_vehicles("hardware_fault")
     seen = suspected.any() or np.isfinite(table.of_vehicles("hardware_probability")).any()
     return {
         "vehicles": len(table),
@@ -92,18 +91,7 @@ def _spread(values: Array) -> dict[str, float]:
     return dict(zip(("median", "p05", "p95"), found, strict=True))
 
 
-@dataclass(frozen=True)
-class WorkshopRow:
-    """What a workshop should look at: which vehicle and branch (empty: the vehicle), cause, probability [1], why."""
-
-    vehicle: str
-    branch: str
-    cause: str
-    probability: float | None
-    text: str
-
-
-def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> list[WorkshopRow]:
+def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> list[dict[str, Any]]:
     """List what parameters do not mend, by falling probability: hardware, sensors, what many vehicles share.
 
     Parameters
@@ -112,27 +100,33 @@ def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> l
         The result.
     files : mapping of int to ParameterDetails
         What the parameter files add, by the vehicle's place in the table.
+
+    Returns
+    -------
+    list of dict
+        What a workshop should look at: ``vehicle``, ``branch`` (empty: the vehicle), ``cause``, ``probability`` (1;
+        None if it is not known) and ``text``.
     """
-
-    def row(j: int, branch: str | None, cause: str, text: str, value: float) -> WorkshopRow:
-        return WorkshopRow(str(table.vehicle[j]), branch or "", cause, value if math.isfinite(value) else None, text)
-
-    hardware = table.of_vehicles("hardware_probability").tolist()
-    rows = [
-        row(j, None, "hardware", f"its currents differ from the fleet's{_changes(table, j)}", hardware[j])
-        for j in np.flatnonzero(table.of_vehicles("hardware_fault")).tolist()
-    ]
+    columns = ["vehicle", "branch", "cause", "probability", "text"]
+    rows, hardware = list[tuple[Any, ...]](), table.of_vehicles("hardware_probability")
+    for j in np.flatnonzero(table.of_vehicles("hardware_fault")).tolist():
+        rows.append((j, None, "hardware", hardware[j], f"its currents differ from the fleet's{_changes(table, j)}"))
     for j, k in np.argwhere(table["held_back"] == "beyond the limits").tolist():
         fault = f"gain error {percent(table['drift'][j, k], 1, sign=True)}, offset {amperes(table['offset_a'][j, k])}"
         text = f"{fault}: {REASONS['beyond the limits']}"
-        rows.append(row(j, table.branches[k], "beyond the limits", text, float(table["fault_probability"][j, k])))
+        rows.append((j, table.branches[k], "beyond the limits", table["fault_probability"][j, k], text))
     unfit = (table["held_back"] == "does not fit").any(axis=1)
     for j, file in files.items():
-        rows += [row(j, each.branch, each.cause, each.text, each.probability) for each in file.findings]
+        rows += [(j, each.branch, each.cause, each.probability, each.text) for each in file.findings]
         if unfit[j] and not file.findings:
-            rows.append(row(j, None, "does not fit", f"a sensor to check: {REASONS['does not fit']}", math.nan))
-    rows.sort(key=lambda row: (row.cause in FLEET_CAUSES, row.cause != "hardware", -(row.probability or 0.0)))
-    return rows
+            rows.append((j, None, "does not fit", None, f"a sensor to check: {REASONS['does not fit']}"))
+    known = [
+        (str(table.vehicle[j]), branch or "", cause, None if p is None or math.isnan(p) else float(p), text)
+        for j, branch, cause, p, text in rows
+    ]
+    ranks = {"hardware": 0, **dict.fromkeys(FLEET_CAUSES, 2)}
+    known.sort(key=lambda row: (ranks.get(row[2], 1), -(row[3] or 0.0)))
+    return [dict(zip(columns, row, strict=True)) for row in known]
 
 
 def _changes(table: FleetTable, j: int) -> str:
@@ -144,7 +138,7 @@ def _changes(table: FleetTable, j: int) -> str:
     return f": {', '.join(parts)}" if parts else ""
 
 
-def steps_to_take(table: FleetTable, workshop: Sequence[WorkshopRow]) -> list[str]:
+def steps_to_take(table: FleetTable, workshop: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say what to do with a result, one sentence each, the first step first."""
     steps = []
     if corrected := table.vehicle[table.corrected].tolist():
@@ -170,10 +164,10 @@ def steps_to_take(table: FleetTable, workshop: Sequence[WorkshopRow]) -> list[st
         text, (first, *_) = next(iter(asked.items()))
         every = few([name for names in asked.values() for name in names])
         steps.append(f"{every}{why}: what would decide stands with each. Of {first}: {text}.")
-    if hardware := [row.vehicle for row in workshop if row.cause == "hardware"]:
+    if hardware := [row["vehicle"] for row in workshop if row["cause"] == "hardware"]:
         steps.append(f"Look at the hardware of {few(hardware)}: their currents differ from the fleet's.")
-    if sensors := [row for row in workshop if row.cause not in {"hardware", *FLEET_CAUSES}]:
-        named = dict.fromkeys(f"{row.vehicle} ({row.branch})" if row.branch else row.vehicle for row in sensors)
+    sensors = [row for row in workshop if row["cause"] not in {"hardware", *FLEET_CAUSES}]
+    if named := dict.fromkeys(f"{row['vehicle']} ({row['branch']})".removesuffix(" ()") for row in sensors):
         steps.append(f"Check the sensors of {few(list(named))}: see the workshop list.")
     if table.left_out:
         most = Counter(table.left_out.values()).most_common(1)[0][0]
@@ -207,7 +201,7 @@ def battery_margin(
         of no vehicle is known.
     """
     k, limit_a = table.branches.index(branch), limit_a or table.run.full_scale_a
-    known = np.flatnonzero(~(table.open_gain | table.open_offset)[:, k])
+    known = np.flatnonzero(~(table["open_gain"] | table["open_offset"])[:, k])
     if not len(known):
         return None
     error_a = np.abs(table["drift"][known, k]) * limit_a + np.abs(table["offset_a"][known, k])

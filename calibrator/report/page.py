@@ -13,15 +13,17 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 from plotly.offline import get_plotlyjs
 
+from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.estimator.results import written_of
 from calibrator.estimator.vehicle_report import REASONS
-from calibrator.report.figures import MOST_POINTS, junction_figure, sensor_figure
-from calibrator.report.fleet_table import Details, FleetTable, read_details, read_fleet_table
+from calibrator.report.fleet_table import FleetTable, ParameterDetails, read_details, read_fleet_table
 from calibrator.report.overview import (
     FLEET_CAUSES,
     SIGMAS,
@@ -49,14 +51,26 @@ BATTERY = "battery"
 METHOD_WITHOUT_SD = "published"
 """Method that gives no standard deviations: what it does not find is taken for 0."""
 DIGITS = {"drift": 6, "drift_sd": 4, "offset_a": 2, "offset_sd_a": 2, "fault_probability": 3, "harm_probability": 4}
-DIGITS_OF_VEHICLE = {
-    "confidence": 3,
-    "hardware_probability": 3,
-    "hardware_fault": 0,
-    "junction_rms_measured_a": 2,
-    "duration_s": 1,
-}
+DIGITS_OF_VEHICLE = {"confidence": 3, "hardware_probability": 3, "hardware_fault": 0}
+DIGITS_OF_VEHICLE |= {"junction_rms_measured_a": 2, "duration_s": 1}
 """Decimals of the columns of sensors and of vehicles: what a reader can see."""
+BEFORE, AFTER, OTHER = "#D55E00", "#0072B2", "#767676"
+"""Of Okabe and Ito's colours, which colour-blind readers can tell apart."""
+MOST_POINTS = 1000
+"""Sensors drawn one by one in each branch: those with the largest faults. A browser draws some thousand at once."""
+MOST_BESIDE = 4
+"""Panels beside each other: more leave no room for their titles."""
+SMALLEST_A = 1e-3
+"""Below what any sensor resolves; where a logarithmic axis begins. [A]"""
+LEAST_LOAD_A = 0.05
+"""Load without a sensor from which on it is worth a line. [A]"""
+RIVAL, RIVALS = 0.02, "what it may be instead"
+"""Probability from which on another explanation of a sensor is drawn, and its label. [1]"""
+MARKERS = {
+    "corrected": {"color": AFTER, "symbol": "circle"},
+    "not corrected": {"color": BEFORE, "symbol": "circle"},
+    RIVALS: {"color": BEFORE, "symbol": "circle-open"},
+}
 
 
 def fleet_report(result: Path, **options: Any) -> tuple[str, dict[str, Any]]:
@@ -115,35 +129,27 @@ def _page(
         raise FleetError(f"--battery {branch}: no such branch; expected one of {few(list(table.branches))}")
     # Vehicles with a suspicion, a question or a fault come before those without, the largest faults first.
     plain = (table.of_vehicles("verdict") == "no sensor fault") & ~table.of_vehicles("hardware_fault")
-    order = np.lexsort((-table.error_a.max(axis=1), plain))
+    order = np.lexsort((-table["error_a"].max(axis=1), plain))
     listed: NDArray[np.int64] = order[: MOST_SENSORS // len(table.branches)]
-    details, overview, alone = read_details(table, listed), overview_of(table), len(table) == 1
-    workshop = workshop_list(table, details.files)
-    numbers = {
-        "overview": overview,
-        "next_steps": steps_to_take(table, workshop),
-        "workshop": workshop,
-        "protection": protection,
-    }
+    (files, names, rows), overview, alone = read_details(table, listed), overview_of(table), len(table) == 1
+    workshop = workshop_list(table, files)
+    steps = steps_to_take(table, workshop)
+    numbers = {"overview": overview, "next_steps": steps, "workshop": workshop, "protection": protection}
     reasons = dict[str, str](REASONS.items())
     if "reference" not in table.run.details:  # no fleet
         reasons["reference in doubt"] = "only ratios of gains are known"
-    sums_a = table.of_vehicles("junction_rms_measured_a"), table.deployed_a
-    figures = (
-        {}
-        if alone
-        else {
-            "junction": junction_figure(*sums_a, expected_a=overview["unmeasured_a"]),
-            "sensors": sensor_figure(table, details.files),
-        }
-    )
+    figures = {}
+    if not alone:
+        sums_a = table.of_vehicles("junction_rms_measured_a"), table.deployed_a
+        figures["junction"] = _junction_figure(*sums_a, expected_a=overview["unmeasured_a"])
+        figures["sensors"] = _sensor_figure(table, files)
     detailed = [
         {
-            "explanations": details.files[j].explanations,
-            "findings": details.files[j].findings,
+            "explanations": files[j].explanations,
+            "findings": files[j].findings,
             "delays_ms": (1e3 * table["delay_s"][j]).round().tolist(),
             "reason": table["reason"][j, 0],
-            "evidence": details.rows[i].round(4).tolist(),
+            "evidence": rows[i].round(4).tolist(),
         }
         for i, j in enumerate(listed[:MOST_DETAILED].tolist())
     ]
@@ -152,10 +158,11 @@ def _page(
         "alone": alone,
         "full_scale_a": table.run.full_scale_a,
         "fleet_causes": FLEET_CAUSES,
-        "evidence": details.names,
-        "ratios": sum(not name.startswith(("intercept ", "junction ", "offset ")) for name in details.names),
+        "evidence": names,
+        "ratios": sum(not name.startswith(("intercept ", "junction ", "offset ")) for name in names),
         "figures": figures,
     }
+    packed = {"columns": _columns(table, listed, files, reasons), "details": detailed}
     moved = np.argwhere(table["moved"] != "")[:MOST_MOVED].tolist()
     text: str = _template().render(
         run=table.run,
@@ -164,41 +171,29 @@ def _page(
         table=table,
         listed=len(listed),
         **numbers,
-        most_workshop=MOST_WORKSHOP,
-        drawn_limited=bool((table.faulty.sum(axis=0) > MOST_POINTS).any()),
-        most_points=MOST_POINTS,
         moved=[f"{table.vehicle[j]}, {table.branches[k]}: {table['moved'][j, k]}" for j, k in moved],
         reasons=reasons,
-        left_out=[
-            (count, reason, few([name for name, why in table.left_out.items() if why == reason]))
-            for reason, count in overview["left_out_reasons"].items()
-        ],
         no_protection=no_protection,
-        sigmas=f"{SIGMAS:g}",
         facts=facts,
-        data={
-            "columns": _as_text(msgspec.json.encode(_columns(table, listed, details, reasons))),
-            "details": _as_text(msgspec.json.encode(detailed)),
-            "plotly": _plotly(),
-        },
+        data={name: _as_text(msgspec.json.encode(each)) for name, each in packed.items()} | {"plotly": _plotly()},
     )
     return text, numbers
 
 
 def _columns(
-    table: FleetTable, listed: NDArray[np.int64], details: Details, reasons: Mapping[str, str]
+    table: FleetTable, listed: NDArray[np.int64], files: Mapping[int, ParameterDetails], reasons: Mapping[str, str]
 ) -> dict[str, list[Any]]:
     """Columns of the vehicles that are listed; of sensors K values per vehicle, null for what is not known."""
-    gain = np.array([[not details.files[j].branches[name].identifiable for name in table.branches] for j in listed])
+    gain = np.array([[not files[j].branches[name].identifiable for name in table.branches] for j in listed])
     unknown = 1 * gain
     if table.run.method != METHOD_WITHOUT_SD:
-        unknown = 1 * (gain | table.open_gain[listed]) + 2 * table.open_offset[listed]
+        unknown = 1 * (gain | table["open_gain"][listed]) + 2 * table["open_offset"][listed]
     numbers = {
         **{name: (table[name][listed], digits) for name, digits in DIGITS.items()},
         **{name: (table.of_vehicles(name)[listed], digits) for name, digits in DIGITS_OF_VEHICLE.items()},
         "deployed_a": (table.deployed_a[listed], 2),
         "applied": (table["applied"][listed], 0),
-        "faulty": (table.faulty[listed], 0),
+        "faulty": (table["faulty"][listed], 0),
         "corrected": (table.corrected[listed], 0),
         "unknown": (unknown, 0),  # 1 the gain error, 2 the offset, 3 both
     }
@@ -236,4 +231,88 @@ def _template() -> Any:
     )
     environment.policies["json.dumps_function"] = lambda value, **_: msgspec.json.encode(value).decode()
     environment.globals |= {"amperes": amperes, "counted": counted, "percent": percent, "probability": probability}
+    environment.globals |= {"few": few, "MOST_POINTS": MOST_POINTS, "MOST_WORKSHOP": MOST_WORKSHOP, "SIGMAS": SIGMAS}
     return environment.get_template("page.html")
+
+
+# ---- figures; assets/page.js adds fonts and grids
+
+
+def _json(figure: go.Figure) -> msgspec.Raw:
+    return msgspec.Raw(figure.update_layout(template="none").to_json().encode())
+
+
+def _junction_figure(before_a: Array, after_a: Array, *, expected_a: float | None) -> msgspec.Raw:
+    """Distributions of the Kirchhoff sum's root mean square over vehicles, on a logarithmic axis.
+
+    Counts in bins, so that a page holds no more for a million vehicles than for a hundred.
+    """
+    before_a, after_a = (np.maximum(values[np.isfinite(values)], SMALLEST_A) for values in (before_a, after_a))
+    load_a = abs(expected_a or 0.0)
+    marks = [load_a] if load_a >= LEAST_LOAD_A else []
+    both = np.concatenate([marks, before_a, after_a, [] if len(before_a) else [SMALLEST_A]])
+    bins = int(np.clip(3.0 * np.sqrt(len(before_a)), 12, 60))  # few bins for few vehicles
+    edges = np.geomspace(both.min() / 1.05, both.max() * 1.05, bins + 1)
+    figure, most = go.Figure(), 0
+    for name, values, colour in (("as measured", before_a, BEFORE), ("after correction", after_a, AFTER)):
+        counts = np.histogram(values, edges)[0].tolist()
+        most = max(most, *counts)
+        figure.add_scatter(
+            x=[float(edges[0]), *edges.tolist()],
+            y=[0, *counts, 0],
+            name=name,
+            line={"shape": "hv", "color": colour, "width": 1.5},
+            fill="tozeroy",
+            hovertemplate=f"{name}<br>from %{{x:.3g}} A: %{{y}} vehicles<extra></extra>",
+        )
+    for x in marks:
+        style, name = {"color": OTHER, "dash": "dash", "width": 1.5}, f"load without a sensor: {x:.1f} A"
+        figure.add_scatter(x=[x, x], y=[0, most], mode="lines", line=style, name=name)
+    figure.update_xaxes(type="log", dtick="D2", title_text="RMS of a vehicle's Kirchhoff sum [A]")
+    figure.update_yaxes(title_text="vehicles", rangemode="tozero")
+    return _json(figure.update_layout(height=260))
+
+
+def _sensor_figure(table: FleetTable, files: Mapping[int, ParameterDetails]) -> msgspec.Raw:
+    """Gain error over offset of the largest faults, one panel per branch, and what else the undecided ones may be."""
+    K, figure, points = len(table.branches), go.Figure(), list[tuple[object, ...]]()
+    for k, branch in enumerate(table.branches):
+        faulty = np.flatnonzero(table["faulty"][:, k])
+        shown = faulty[np.argsort(-table["error_a"][faulty, k], kind="stable")][:MOST_POINTS]
+        for j in shown.tolist():
+            label = "corrected" if table["applied"][j, k] else "not corrected"
+            numbers = (table[name][j, k] for name in ("drift", "offset_a", "drift_sd", "offset_sd_a"))
+            points.append((k, label, table.vehicle[j], *numbers))
+            for each in files[j].explanations[1:] if label == "not corrected" and j in files else ():
+                if each.probability >= RIVAL:
+                    what, values = f"{table.vehicle[j]}, {each.probability:.0%}", (each.drift, each.offset_a)
+                    points.append((k, RIVALS, what, *(value.get(branch, 0.0) for value in values), 0.0, 0.0))
+        axis = str(k + 1 if k else "")
+        for letter, name, title, factor in (
+            ("x", "drift", f"{branch}: gain error [%]", 100.0), ("y", "offset_a", "" if k else "offset [A]", 1.0),
+        ):  # fmt: skip
+            largest = 1.1 * max(factor * float(np.abs(table[name][:, k]).max(initial=0.0)), 1.0)
+            figure.layout[f"{letter}axis{axis}"] = {"title": {"text": title}, "range": [-largest, largest]}
+    frame = pd.DataFrame(points, columns=["k", "label", "vehicle", "drift", "offset_a", "drift_sd", "offset_sd_a"])
+    first = ~frame["label"].duplicated()
+    frame = frame.fillna(0.0)
+    for (k, label), part in frame.groupby(["k", "label"], sort=False):
+        axis, bars = str(k + 1 if k else ""), {"thickness": 0.7, "width": 0}
+        figure.add_scatter(
+            x=(100.0 * part["drift"]).round(3).tolist(),
+            y=part["offset_a"].round(3).tolist(),
+            error_x={"array": (100.0 * part["drift_sd"]).round(3).tolist(), **bars},
+            error_y={"array": part["offset_sd_a"].round(3).tolist(), **bars},
+            text=part["vehicle"].tolist(),
+            mode="markers",
+            marker={"size": 7, "opacity": 0.7, **MARKERS[label]},
+            name=label,
+            legendgroup=label,
+            showlegend=bool(first[part.index].any()),
+            xaxis=f"x{axis}",
+            yaxis=f"y{axis}",
+            hovertemplate="%{text}<br>gain error %{x:.2f} %<br>offset %{y:.2f} A<extra></extra>",
+        )
+    rows = -(-K // MOST_BESIDE)
+    grid = {"rows": rows, "columns": -(-K // rows), "pattern": "independent", "ygap": 0.25}
+    return _json(figure.update_layout(height=340 * rows, grid=grid))

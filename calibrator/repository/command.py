@@ -51,6 +51,8 @@ def _new_keys(role: str, paths: Sequence[Path], threshold: int | None) -> "NewKe
     from ecu_node.update.signers import public_key_of
 
     keys = list({key.keyid: key for key in map(public_key_of, paths)}.values())
+    if len(keys) < len(paths):
+        raise ContradictionError(f"{role}: the same key is given twice; give each once")
     needed = threshold if threshold is not None else len(keys) // 2 + 1
     if needed > len(keys):
         raise ContradictionError(
@@ -75,7 +77,7 @@ def key(
         raise ContradictionError(f"give either a passphrase for the private key (${_PASSPHRASE}) or --no-passphrase")
     if passphrase is not None and len(passphrase) < _SHORTEST_PASSPHRASE:
         raise ContradictionError(f"${_PASSPHRASE}: at least {_SHORTEST_PASSPHRASE} characters are expected")
-    if not name.isprintable() or "/" in name or name.startswith("."):
+    if not name or not name.isprintable() or "/" in name or name.startswith("."):
         raise ContradictionError(f"{name!r}: a name for a file is expected")
     encryption = (
         serialization.BestAvailableEncryption(os.fsencode(passphrase))
@@ -144,32 +146,62 @@ def add(
     allow_large_step: Annotated[
         bool, typer.Option("--allow-large-step", help="They may differ a lot from what is in force, as after a repair.")
     ] = False,
+    layout: Annotated[Path | None, typer.Option("--layout", help="Refuse files that do not fit this layout.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Add parameter files, each for its vehicle; 'publish' signs them."""
-    found = _open(folder)
+    from ecu_node.database import node_database
+
+    found, database = _open(folder), node_database(layout) if layout is not None else None
     files = [file for path in params for file in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
     if not files:
         raise RepositoryStateError(f"{params[0]}: no parameter files (*.json) in it")
-    bins = found.add(shown(files, "add", len(files), "files"), days=days, allow_large_step=allow_large_step)
-    _tell(
-        {"added": len(files), "bins": bins}, f"{folder}: {len(files)} added in {bins} bins; to be published", json=json
-    )
+    reading = shown(files, "add", len(files), "files")
+    bins = found.add(reading, days=days, allow_large_step=allow_large_step, database=database)
+    facts = {"added": len(files), "bins": bins}
+    _tell(facts, f"{folder}: {len(files)} parameter files added, {bins} bins changed; to be published", json=json)
 
 
 @repository.command("publish", epilog=example("calibrator repository publish repo --key anna.key --key online.key"))
 def publish(folder: FolderArgument, key: KeysOption, json: JsonOption = False) -> None:
     """Sign what is staged; once all signatures are there, vehicles see it.
 
-    With nothing staged it makes a new timestamp: vehicles take no metadata that is older than 30 days.
+    The keys of snapshot and timestamp also make a new timestamp of what is published, whatever is staged: vehicles take
+    no metadata that is older than 30 days.
     """
+    from calibrator.repository.repository import missing_text
     from ecu_node.update.signers import signer_of
 
     signers, found = [signer_of(text) for text in key], _open(folder)
     found.renew()
     count = len(list((folder / "staged").glob("*.json")))
-    signed = len(list(shown(found.publish(signers), "sign", count, "roles")))
-    _tell({"published": signed}, f"{folder}: published, {signed} changed", json=json)
+    signed = list(shown(found.sign(signers), "sign", count, "roles"))
+    found.publish(signers)
+    waiting = found.waiting
+    if waiting:
+        text = f"the timestamp is new; what is staged is not published: {missing_text(waiting)}"
+    else:
+        text = f"published, {len(signed)} roles changed"
+    _tell({"published": 0 if waiting else len(signed), "waiting": waiting}, f"{folder}: {text}", json=json)
+
+
+@repository.command("status", epilog=example("calibrator repository status repo"))
+def status(
+    folder: FolderArgument,
+    unstage: Annotated[bool, typer.Option("--unstage", help="Drop what is staged; what is published stays.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Show until when vehicles take what is published, and what is staged and lacks signatures."""
+    from calibrator.repository.repository import missing_text
+
+    found = _open(folder)
+    dropped = found.unstage() if unstage else []
+    staged, until = list(found.sign([])), found.valid_until
+    words = [f"valid until {until:%Y-%m-%d}" if until else "nothing is published yet"]
+    words += [f"{len(dropped)} staged roles dropped"] if unstage else []
+    words += [f"{len(staged)} roles staged" + (f": {missing_text(found.waiting)}" if found.waiting else "")]
+    facts = {"valid_until": until, "staged": staged, "waiting": found.waiting, "dropped": dropped}
+    _tell(facts, f"{folder}: {'; '.join(words)}", json=json)
 
 
 @repository.command("rotate", epilog=example("calibrator repository rotate repo timestamp --public keys/new.pub"))
@@ -178,15 +210,18 @@ def rotate(
     role: Annotated[Literal["root", "targets", "snapshot", "timestamp"], typer.Argument(help="Whose keys.")],
     public: Annotated[list[Path], typer.Option("--public", help="All public keys that it has from now on.")],
     threshold: Annotated[
-        int | None, whole_option("--threshold", 1, 16, "So many of them must sign (default: more than half)")
+        int | None, whole_option("--threshold", 1, 16, "So many of them must sign (default: as many as before)")
     ] = None,
     json: JsonOption = False,
 ) -> None:
     """Give a role other keys, as when somebody leaves or a key is stolen; 'publish' signs it."""
-    new = _new_keys(role, public, threshold)
-    _open(folder).rotate(role, new)
+    found = _open(folder)
+    before = found.threshold(role)
+    new = _new_keys(role, public, before if threshold is None else threshold)
+    found.rotate(role, new)
     facts = {"role": role, "keys": len(new.keys), "threshold": new.threshold}
-    _tell(facts, f"{folder}: {role} {new.threshold} of {len(new.keys)}; to be published", json=json)
+    was = f" (was {before})" if new.threshold != before else ""
+    _tell(facts, f"{folder}: {role} {new.threshold} of {len(new.keys)}{was}; to be published", json=json)
 
 
 @repository.command("revoke", epilog=example("calibrator repository revoke repo V001"))
@@ -220,8 +255,8 @@ def bundle(
     found = _open(folder)
     require_possible_folder(out)
     out.mkdir(parents=True, exist_ok=True)
-    written = []
-    for vehicle in shown(vehicles, "bundle", len(vehicles), "vehicles"):
-        written.append(out / f"{target_path(vehicle)}.xz")
-        write_files({written[-1]: found.bundle(vehicle)})
-    _tell({"bundles": list(map(str, written))}, "  ".join(map(str, written)), json=json)
+    going = shown(vehicles, "bundle", len(vehicles), "vehicles")
+    bundles = {out / f"{target_path(vehicle)}.xz": found.bundle(vehicle) for vehicle in going}
+    write_files(bundles)
+    names, until = list(map(str, bundles)), found.valid_until
+    _tell({"bundles": names, "valid_until": until}, f"{'  '.join(names)}  (valid until {until:%Y-%m-%d})", json=json)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 from msgspec.structs import replace
 from securesystemslib.signer import Key, Signer, SSlibKey
-from tuf.api.exceptions import RepositoryError, UnsignedMetadataError
+from tuf.api.exceptions import RepositoryError
 from tuf.api.metadata import (
     Delegations,
     Metadata,
@@ -36,11 +36,13 @@ from tuf.api.serialization.json import JSONSerializer
 
 from calibrator.errors import RepositoryStateError
 from calibrator.files.folders import write_files
-from ecu_node.parameters import decode_parameters, parameter_bytes
+from ecu_node.core.status import UnfitError
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import check_fit, decode_parameters, parameter_bytes
 from ecu_node.update.client import TargetFacts, expiry_of, target_path
 from ecu_node.update.sources import bundle_bytes
 
-__all__ = ["BIN_BITS", "ROLES", "NewKeys", "Repository"]
+__all__ = ["BIN_BITS", "ROLES", "NewKeys", "Repository", "missing_text"]
 
 ROLES = ("root", "targets", "snapshot", "timestamp")
 BIN_BITS = 11
@@ -50,6 +52,9 @@ _DAYS = {"root": 730, "targets": 730, "bins": 400, "snapshot": 60, "timestamp": 
 """How long metadata is valid. [d]"""
 _RENEW_DAYS = 60
 """Targets and bins that expire within this time are staged anew, to be signed again. [d]"""
+
+_SHOWN = 3
+"""Roles that a message names."""
 
 _Signed = TypeVar("_Signed", Root, Timestamp, Snapshot, Targets)
 
@@ -95,6 +100,9 @@ class Repository:
         if not roots and not (self._staged / "root.json").exists():
             raise RepositoryStateError(f"{folder}: no repository; make one with 'calibrator repository init'")
         self._root_version = max(roots, default=0)
+        self.waiting: dict[str, str] = {}
+        """Roles that :meth:`sign` left without enough signatures, and which are missing."""
+        self._staged_versions: dict[str, int] = {}
         self._versions: dict[str, int] = {}
         self._snapshot_version = self._timestamp_version = 0
         if (self._metadata / "timestamp.json").exists():
@@ -135,7 +143,9 @@ class Repository:
         try:
             found: Metadata[Any] = Metadata.from_file(str(path))
         except (RepositoryError, OSError, ValueError) as error:
-            raise RepositoryStateError(f"{path}: cannot be read as metadata: {error}") from None
+            raise RepositoryStateError(
+                f"{path}: cannot be read as metadata: {error}; take a copy of the repository"
+            ) from None
         if not isinstance(found.signed, kind):
             raise RepositoryStateError(f"{path}: metadata of another role; take a copy of the repository")
         return found
@@ -166,7 +176,9 @@ class Repository:
         assert root is not None, "the constructor has looked"
         return root
 
-    def add(self, files: Iterable[Path], *, days: int, allow_large_step: bool) -> int:
+    def add(
+        self, files: Iterable[Path], *, days: int, allow_large_step: bool, database: VehicleDatabase | None = None
+    ) -> int:
         """Stage parameter files, each in the place of what its vehicle had before.
 
         Parameters
@@ -177,6 +189,8 @@ class Repository:
             How long they may be used. [d]
         allow_large_step : bool
             They may differ a lot from what is in force, as after a repair.
+        database : VehicleDatabase or None
+            Layout and DBC that they must fit; None: each vehicle looks by itself.
 
         Returns
         -------
@@ -186,7 +200,7 @@ class Repository:
         Raises
         ------
         ParameterError
-            If one is no parameter file; nothing is staged then.
+            If one is no parameter file, or does not fit; nothing is staged then.
         """
         expires = (datetime.now(UTC) + timedelta(days=days)).replace(microsecond=0)
         bins: dict[str, list[_File]] = defaultdict(list)
@@ -194,6 +208,11 @@ class Repository:
         for path in files:
             content = parameter_bytes(path)
             parameters = decode_parameters(content, str(path))
+            if database is not None:
+                try:
+                    check_fit(parameters, database, None)
+                except UnfitError as error:
+                    raise RepositoryStateError(f"{path}: no vehicle will take it: {error}") from None
             target, digest = target_path(parameters.vehicle), sha256(content).hexdigest()
             if target in seen:
                 raise RepositoryStateError(f"{path}: a second file for vehicle {parameters.vehicle}; add one of them")
@@ -226,12 +245,20 @@ class Repository:
             if targets is None or path not in targets.targets:
                 raise RepositoryStateError(f"{self._folder}: no parameters of vehicle {vehicle!r} here")
             file = targets.targets[path]
-            facts = _facts(file)
-            revoked = sorted({*facts.revoked, digest or file.hashes["sha256"]})
+            facts, wanted = _facts(file), digest or file.hashes["sha256"]
+            if wanted in facts.revoked:
+                raise RepositoryStateError(f"{self._folder}: {wanted[:8]}... of vehicle {vehicle!r} is revoked already")
+            if not (self._folder / "targets" / f"{wanted}.{path}").exists():
+                raise RepositoryStateError(f"{self._folder}: vehicle {vehicle!r} never had a file {wanted[:8]}... here")
+            revoked = sorted({*facts.revoked, wanted})
             _set_target(targets, path, file.length, file.hashes["sha256"], replace(facts, revoked=revoked))
             bins[role] = targets
         for role, targets in bins.items():
             self._stage(role, targets)
+
+    def threshold(self, role: str) -> int:
+        """How many keys of a role must sign."""
+        return int(self._root().roles[role].threshold)
 
     def rotate(self, role: str, new: NewKeys) -> None:
         """Stage a root in which a role has other keys, and, for targets, all that the new keys must sign."""
@@ -264,8 +291,22 @@ class Repository:
             if not (self._staged / f"{role}.json").exists() and expiry_of(live.read_bytes()) < soon:
                 self._restage(role)
 
-    def publish(self, signers: Sequence[Signer]) -> Iterator[str]:
-        """Sign what is staged; where all signatures are there, let vehicles see it.
+    def unstage(self) -> list[str]:
+        """Drop what is staged and was never published; raises RepositoryStateError before the first publication."""
+        if not self._timestamp_version:
+            raise RepositoryStateError(f"{self._folder}: nothing was published yet; remove the folder to begin anew")
+        paths = sorted(self._staged.glob("*.json"))
+        for path in paths:
+            path.unlink()
+        return [path.stem for path in paths]
+
+    @property
+    def valid_until(self) -> datetime | None:
+        """When vehicles stop taking what is published, unless it is published anew; None before the first time."""
+        return expiry_of((self._metadata / "timestamp.json").read_bytes()) if self._timestamp_version else None
+
+    def sign(self, signers: Sequence[Signer]) -> Iterator[str]:
+        """Sign what is staged; what lacks signatures after that stands in :attr:`waiting`.
 
         Parameters
         ----------
@@ -275,19 +316,25 @@ class Repository:
         Yields
         ------
         str
-            Name of each role as it is signed; of those that lack signatures, with what is missing.
+            Name of each staged role.
+
+        Raises
+        ------
+        RepositoryStateError
+            If a key belongs to no role.
         """
-        root = self._root()
-        targets = self._latest("targets", Targets)
+        root, targets, live = self._root(), self._latest("targets", Targets), self._live("root", Root)
         assert targets is not None
-        missing = []
-        versions: dict[str, int] = {}
+        known = {*root.keys, *(live.keys if live else ()), *(targets.delegations.keys if targets.delegations else ())}
+        for signer in signers:
+            if signer.public_key.keyid not in known:
+                raise RepositoryStateError(f"{self._folder}: key {signer.public_key.keyid[:8]} belongs to no role here")
         for role in sorted(path.stem for path in self._staged.glob("*.json")):
             path = self._staged / f"{role}.json"
             metadata = self._read(path, Root) if role == "root" else self._read(path, Targets)
-            versions[role] = metadata.signed.version
+            self._staged_versions[role] = metadata.signed.version
             delegators: list[Root | Targets] = [targets] if role.startswith("bins-") else [root]
-            if role == "root" and (live := self._live("root", Root)) is not None:
+            if role == "root" and live is not None:
                 delegators.append(live)
             before = len(metadata.signatures)
             for signer in signers:
@@ -295,20 +342,38 @@ class Repository:
                     metadata.sign(signer, append=True)
             if len(metadata.signatures) > before:
                 _write(path, _encoded(metadata))
-            if not all(_is_signed(delegator, role, metadata) for delegator in delegators):
-                missing.append(role)
+            for delegator in delegators:
+                found = delegator.get_verification_result(role, metadata.signed_bytes, metadata.signatures)
+                if not found.verified:
+                    self.waiting[role] = _lacking(len(found.signed), found.threshold, found.unsigned)
             yield role
+
+    def publish(self, signers: Sequence[Signer]) -> None:
+        """Let vehicles see what :meth:`sign` has signed; while signatures are missing, only a new timestamp.
+
+        Parameters
+        ----------
+        signers : sequence of Signer
+            Of snapshot and timestamp.
+
+        Raises
+        ------
+        RepositoryStateError
+            If their keys are missing; vehicles see what they saw before.
+        """
+        root = self._live("root", Root) if self.waiting else self._root()
+        missing = dict(self.waiting)
         for role in ("snapshot", "timestamp"):
-            keyids = root.roles[role].keyids
-            if sum(signer.public_key.keyid in keyids for signer in signers) < root.roles[role].threshold:
-                missing.append(role)
-        if missing:
-            more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+            wanted = (root or self._root()).roles[role]
+            given = {signer.public_key.keyid for signer in signers} & set(wanted.keyids)
+            if len(given) < wanted.threshold:
+                missing[role] = _lacking(len(given), wanted.threshold, set(wanted.keyids) - given)
+        if root is None or not missing.keys() <= self.waiting.keys():
             raise RepositoryStateError(
-                f"{self._folder}: nothing is published yet: signatures of {missing[0]}{more} are missing; publish "
-                "again with --key of those who have not signed (what was signed is kept)"
+                f"{self._folder}: not published: {missing_text(missing)}; publish again with --key of those who have "
+                f"not signed (what was signed is kept)"
             )
-        self._put_in_place(root, versions, signers)
+        self._put_in_place(root, {} if self.waiting else self._staged_versions, signers)
 
     def _put_in_place(self, root: Root, staged: Mapping[str, int], signers: Sequence[Signer]) -> None:
         """Let what is staged be seen; a cut before the timestamp is replaced changes nothing, and a rerun goes on."""
@@ -338,7 +403,11 @@ class Repository:
 
     def bundle(self, vehicle: str) -> bytes:
         """All that one vehicle needs to update from any earlier version, in one file."""
-        path = target_path(vehicle)
+        path, until = target_path(vehicle), self.valid_until
+        if until is not None and until <= datetime.now(UTC):
+            raise RepositoryStateError(
+                f"{self._folder}: no vehicle takes it since {until:%Y-%m-%d}, when its timestamp expired; publish first"
+            )
         role = _BINS.get_role_for_target(path)
         targets = self._live(role, Targets)
         if targets is None or path not in targets.targets:
@@ -351,6 +420,16 @@ class Repository:
             return bundle_bytes({name: (self._folder / name).read_bytes() for name in names})
         except OSError as error:
             raise RepositoryStateError(f"{error.filename}: cannot be read: {error.strerror}") from None
+
+
+def missing_text(missing: Mapping[str, str]) -> str:
+    """Which signatures are missing, in words; of many roles the first three."""
+    words = [f"{role} has {what}" for role, what in [*missing.items()][:_SHOWN]]
+    return "; ".join(words) + (f"; and {len(missing) - _SHOWN} roles more" if len(missing) > _SHOWN else "")
+
+
+def _lacking(signed: int, threshold: int, others: Iterable[str]) -> str:
+    return f"{signed} of {threshold} signatures, not of {', '.join(sorted(keyid[:8] for keyid in others))}"
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -386,14 +465,6 @@ def _set_target(targets: Targets, path: str, length: int, digest: str, facts: Ta
 
 def _keyids(delegator: Root | Targets, role: str) -> Sequence[str]:
     return delegator.get_delegated_role(role).keyids
-
-
-def _is_signed(delegator: Root | Targets, role: str, metadata: Metadata[Any]) -> bool:
-    try:
-        delegator.verify_delegate(role, metadata.signed_bytes, metadata.signatures)
-    except UnsignedMetadataError:
-        return False
-    return True
 
 
 def _signed_by(root: Root, role: str, signed: Signed, signers: Sequence[Signer]) -> bytes:

@@ -124,7 +124,8 @@ def _in_words(parameter: Any) -> None:
         return
     parameter.metavar = parameter.metavar or parameter.name.upper()
     name = parameter.metavar + ("..." if parameter.nargs != 1 else "")
-    parameter.get_usage_pieces = lambda ctx: [name if parameter.required else f"[{name}]"]  # noqa: ARG005
+    pieces = [] if parameter.hidden else [name if parameter.required else f"[{name}]"]
+    parameter.get_usage_pieces = lambda ctx: pieces  # noqa: ARG005
     parameter.display_type_rich = lambda ctx: ""  # noqa: ARG005
 
 

@@ -11,27 +11,10 @@ from typing import Annotated, Any
 
 import typer
 
-__all__ = [
-    "TIME_LIMIT_S",
-    "BankOption",
-    "BranchesOption",
-    "DbcOption",
-    "FleetArgument",
-    "FleetOrSummariesArgument",
-    "JsonOption",
-    "LayoutOption",
-    "MagnitudeOption",
-    "SchedulerOption",
-    "SeedOption",
-    "SparsityOption",
-    "StoreOption",
-    "SymmetricOption",
-    "TimeLimitOption",
-    "WorkersOption",
-    "given_options",
-    "number_option",
-    "whole_option",
-]
+__all__ = ["TIME_LIMIT_S", "BankOption", "BranchesOption", "DbcOption", "FleetArgument", "FleetOrSummariesArgument"]
+__all__ += ["JsonOption", "LayoutOption", "MagnitudeOption", "SchedulerOption", "SeedOption", "SparsityOption"]
+__all__ += ["StoreOption", "SymmetricOption", "TimeLimitOption", "WorkersOption", "given_options", "number_option"]
+__all__ += ["whole_option"]
 
 MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
@@ -91,13 +74,14 @@ def _bounded(name: str, low: float, high: float, meaning: str, *, read: Callable
 
 
 def _branches(value: str | None) -> str | None:
-    names = [] if value is None else [name.strip() for name in value.split(",")]
+    if value is None:
+        return None
+    names = [name.strip() for name in value.split(",")]
     if "" in names:
         raise typer.BadParameter(f"{value!r}: expected names of branches with commas between them")
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
         raise typer.BadParameter(f"{', '.join(twice)} is named twice; name each branch once")
-    return None if value is None else ",".join(names)
+    return ",".join(names)
 
 
 def _magnitude(value: tuple[float, float]) -> tuple[float, float]:
@@ -107,14 +91,10 @@ def _magnitude(value: tuple[float, float]) -> tuple[float, float]:
 
 
 def _scheduler(value: str | None) -> str | None:
-    if value is None:
-        return None
-    found = SCHEDULER.fullmatch(value)
+    found = SCHEDULER.fullmatch(value or "tcp://none:1")
     if found is None or not 1 <= int(found["port"]) <= MAX_PORT:
-        raise typer.BadParameter(
-            f"{value!r}: expected the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT, port 1 to "
-            f"{MAX_PORT}"
-        )
+        where = f"tcp://HOST:PORT or tls://HOST:PORT, port 1 to {MAX_PORT}"
+        raise typer.BadParameter(f"{value!r}: expected the address of a Dask scheduler, {where}")
     return value
 
 
@@ -125,8 +105,7 @@ def _named(value: str) -> str:
 
 
 FleetArgument = Annotated[
-    str,
-    typer.Argument(callback=_named, help="Drive store, or folder with a folder of logs per vehicle; path or URL."),
+    str, typer.Argument(callback=_named, help="Drive store, or folder with a folder of logs per vehicle; path or URL.")
 ]
 FleetOrSummariesArgument = Annotated[
     str,
@@ -137,8 +116,7 @@ FleetOrSummariesArgument = Annotated[
     ),
 ]
 StoreOption = Annotated[
-    str,
-    typer.Option("--out", callback=_named, help="Store of summaries, path or URL; drives are added to one."),
+    str, typer.Option("--out", callback=_named, help="Store of summaries, path or URL; drives are added to one.")
 ]
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
 DbcOption = Annotated[Path | None, typer.Option("--dbc", help="DBC to use instead of the one the layout names.")]

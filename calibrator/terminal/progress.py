@@ -19,8 +19,6 @@ from rich.table import Column
 __all__ = ["no_progress", "numbered_passes", "one_pass", "progress_bar", "shown"]
 
 LINE_EVERY_S = 10.0
-DRAWN_EVERY_S = 0.1
-"""A bar is moved no more often: a step may have millions of units. [s]"""
 WORTH_A_LINE_S = 1.0
 """A step that is done sooner is not told in a log. [s]"""
 NARROW = 70
@@ -111,14 +109,11 @@ def _bars(console: Console) -> Iterator[Progress]:
 
 def _moving(bars: Progress, label: str, total: int | None, unit: str, begun: int) -> Callable[[float], None]:
     """A bar on the terminal; a narrow terminal gets no unit."""
-    unit, moved_s = "" if bars.console.width < NARROW else f" {unit}", -math.inf
+    unit = "" if bars.console.width < NARROW else f" {unit}"
     task = bars.add_task(label, total=total, completed=begun, count="")
 
     def move(done: float) -> None:
-        nonlocal moved_s
-        if done == total or time.monotonic() - moved_s >= DRAWN_EVERY_S:
-            moved_s = time.monotonic()
-            bars.update(task, completed=done, count="" if total is None else f"{done:.0f}/{total}{unit}")
+        bars.update(task, completed=done, count="" if total is None else f"{done:.0f}/{total}{unit}")
 
     return move
 

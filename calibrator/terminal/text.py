@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import typer
@@ -11,21 +11,8 @@ import typer
 from calibrator.errors import INTERNAL_ERROR as INTERNAL
 from ecu_node.program import INTERNAL_ERROR, say_error, write_output
 
-__all__ = [
-    "Notice",
-    "counted",
-    "dumps",
-    "end_if_internal",
-    "few",
-    "few_reasons",
-    "figure",
-    "left_out_text",
-    "merged_notices",
-    "print_report",
-    "reasons_text",
-    "table",
-    "told_once",
-]
+__all__ = ["Notice", "counted", "dumps", "end_if_internal", "few", "few_reasons", "figure", "left_out_text"]
+__all__ += ["merged_notices", "print_report", "reasons_text", "table", "told_once"]
 
 MOST_NAMES = 6
 """Names told on one line: half a line of a terminal."""
@@ -33,22 +20,9 @@ MOST_REASONS = 5
 """Vehicles whose reasons are told in one message."""
 
 
-class Report(Protocol):
-    """What a command found, for people and for programs."""
-
-    def as_text(self) -> str:
-        """The report for people."""
-
-    def as_json(self) -> str:
-        """The report as JSON."""
-
-
-def print_report(report: Report, *, json: bool) -> None:
-    """Print a report on standard output: one JSON document, or text that a terminal gets broken at words."""
-    if json:
-        write_output(report.as_json())
-    else:
-        write_output(report.as_text())
+def print_report(report: Any, *, json: bool) -> None:
+    """Print a report, by its ``as_json`` or its ``as_text``, on standard output."""
+    write_output(report.as_json() if json else report.as_text())
 
 
 def dumps(value: Any) -> str:
@@ -58,13 +32,10 @@ def dumps(value: Any) -> str:
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Columns of text: the first flush left, the others flush right."""
-    lines = [list(header), *map(list, rows)]
-    widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
+    lines = [header, *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
-        "  ".join(
-            cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
+        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines
     )
 
 
@@ -89,16 +60,14 @@ def told_once(texts: Iterable[tuple[str, str]]) -> list[str]:
 
 def reasons_text(title: str, reasons: Mapping[str, str], most: int = 10) -> str:
     """What is said of vehicles, one line per text with the vehicles that share it; empty if there is none."""
-    if not reasons:
-        return ""
     lines = told_once((name, reason or "no more is known") for name, reason in reasons.items())
-    more = [f"  and {len(lines) - most} other lines, see the parameter files"] if len(lines) > most else []
-    return "\n".join([f"{title}:", *(f"  {line}" for line in lines[:most]), *more])
+    more = [f"and {len(lines) - most} other lines, see the parameter files"] if len(lines) > most else []
+    return "\n  ".join([f"{title}:", *lines[:most], *more]) if lines else ""
 
 
 def left_out_text(left_out: Mapping[str, str]) -> str:
     """One line per reason why things were left out; empty if nothing was."""
-    return "\n".join(["left out:", *(f"  {line}" for line in told_once(left_out.items()))]) if left_out else ""
+    return reasons_text("left out", left_out, most=len(left_out))
 
 
 def end_if_internal(left_out: Mapping[str, str]) -> None:
@@ -198,11 +167,12 @@ def merged_notices(notices: Mapping[tuple[str, str], Sequence[Notice]]) -> list[
     list of str
         One line per notice, with the drive or the number of vehicles it is about.
     """
-    found: dict[str, dict[tuple[str, str], Notice]] = {}
+    found: dict[str, dict[tuple[str, str], tuple[int, ...]]] = {}
     for drive, items in notices.items():
         for item in items:
-            found.setdefault(item.text, {})[drive] = item
-    return [f"{_where(list(drives))}: {_sum(text, list(drives.values()))}" for text, drives in found.items()]
+            found.setdefault(item.text, {})[drive] = item.counts
+    totals = {text: map(sum, zip(*counts.values(), strict=True)) for text, counts in found.items()}
+    return [f"{_where(list(drives))}: {text.format(*totals[text])}" for text, drives in found.items()]
 
 
 def _where(drives: Sequence[tuple[str, str]]) -> str:
@@ -212,8 +182,3 @@ def _where(drives: Sequence[tuple[str, str]]) -> str:
     if vehicles == 1:
         return f"in {len(drives)} drives of {drives[0][0]}"
     return f"in {vehicles} vehicles" if vehicles == len(drives) else f"in {len(drives)} drives of {vehicles} vehicles"
-
-
-def _sum(text: str, items: Sequence[Notice]) -> str:
-    totals = (sum(counts) for counts in zip(*(item.counts for item in items), strict=True))
-    return str(Notice(text=text, counts=tuple(totals)))

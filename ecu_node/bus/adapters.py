@@ -7,7 +7,7 @@ An adapter's driver takes 500 kbit/s where nothing is said, which disturbs a bus
 import configparser
 import errno
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -168,48 +168,46 @@ def _wrong_speed(config: Mapping[str, Any]) -> str | None:
             f"the bit rate of {interface} is not set from here{how}; take {', '.join(rates) or 'f_clock'} out of the "
             f"options, CAN_BITRATE, CAN_CONFIG and can.conf, whose section [channel] is for one bus"
         )
-    return _wrong_timing(config, rates) if has_timing else _wrong_rates(config, rates)
+    return next(_wrong_timing(config, rates) if has_timing else _wrong_rates(config, rates), None)
 
 
-def _wrong_rates(config: Mapping[str, Any], rates: Mapping[str, int]) -> str | None:
-    """Which bit rate is missing, or is none of the adapter's; None if neither."""
-    interface, channel, fd = config["interface"], config["channel"], bool(config.get("fd"))
+def _wrong_timing(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterator[str]:
+    """Why python-can would drop a bit timing, or how it contradicts the bit rates given beside it."""
+    timing, fd = config.get("timing"), config.get("fd")
+    if config["interface"] not in _TAKE_TIMING:
+        yield "python-can cannot set a bit timing there; take f_clock out, and give a bit rate"
+    if not isinstance(timing, can.BitTimingFd if fd else can.BitTiming):
+        kind = "CAN FD" if fd else "classic CAN (CAN FD: --fd)"
+        yield f"the bit timing is incomplete, impossible, or not one of {kind}, which has {_timing_keys(fd=fd)}"
+    own = {"bitrate": getattr(timing, "nom_bitrate" if fd else "bitrate", None)}
+    own["data_bitrate"] = getattr(timing, "data_bitrate", None)
+    if wrong := [f"{name} = {rate}" for name, rate in rates.items() if own[name] != rate]:
+        yield f"{', '.join(wrong)} contradicts the bit timing ({timing}); leave one of them out"
+
+
+def _timing_keys(*, fd: Any) -> str:
+    return ", ".join((BitTimingFdDict if fd else BitTimingDict).__annotations__)
+
+
+def _wrong_rates(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterator[str]:
+    """Which bit rate is missing, or is none of the adapter's."""
+    interface, channel, fd = config["interface"], config["channel"], config.get("fd")
     if fd and interface in _TAKE_NO_DATA_BITRATE:
-        keys = ", ".join(BitTimingFdDict.__annotations__)
-        return f"CAN FD needs its bit timing: {keys} in section [{channel}] of can.conf"
+        yield f"CAN FD needs its bit timing: {_timing_keys(fd=fd)} in section [{channel}] of can.conf"
     for name in ("bitrate", "data_bitrate") if fd else ("bitrate",):
         if name not in rates:
-            return (
+            yield (
                 f"no {name}: this adapter sets the speed of the bus, and a wrong one disturbs it; give ecu-node "
                 f"--{name.replace('_', '-')} BIT_PER_S, or {name} in section [{channel}] of can.conf"
             )
-        if not isinstance(rates[name], int) or rates[name] <= 0:
-            return f"{name} = {rates[name]}: a number of bit/s is expected, such as 250000"
+        elif not isinstance(rates[name], int) or rates[name] <= 0:
+            yield f"{name} = {rates[name]}: a number of bit/s is expected, such as 250000"
     if interface == "pcan":
         from can.interfaces.pcan.basic import PCAN_BITRATES  # noqa: PLC0415  # warns of what it lacks
 
         if rates["bitrate"] not in PCAN_BITRATES:  # the driver would set 500 kbit/s
             known = ", ".join(map(str, PCAN_BITRATES))
-            return f"bitrate = {rates['bitrate']}: pcan has {known}; or give the bit timing"
-    return None
-
-
-def _wrong_timing(config: Mapping[str, Any], rates: Mapping[str, int]) -> str | None:
-    """Why python-can would drop a bit timing, or how it contradicts the bit rates given beside it; None if neither."""
-    timing, fd = config.get("timing"), bool(config.get("fd"))
-    if config["interface"] not in _TAKE_TIMING:
-        return "python-can cannot set a bit timing there; take f_clock out, and give a bit rate"
-    if isinstance(timing, can.BitTimingFd) and fd:
-        own = {"bitrate": timing.nom_bitrate, "data_bitrate": timing.data_bitrate}
-    elif isinstance(timing, can.BitTiming) and not fd:
-        own = {"bitrate": timing.bitrate}
-    else:
-        keys = ", ".join((BitTimingFdDict if fd else BitTimingDict).__annotations__)
-        kind = "CAN FD" if fd else "classic CAN (CAN FD: --fd)"
-        return f"the bit timing is incomplete, impossible, or not one of {kind}, which has {keys}"
-    if wrong := [f"{name} = {rate}" for name, rate in rates.items() if own.get(name) != rate]:
-        return f"{', '.join(wrong)} contradicts the bit timing ({timing}); leave one of them out"
-    return None
+            yield f"bitrate = {rates['bitrate']}: pcan has {known}; or give the bit timing"
 
 
 def config_text(config: Mapping[str, Any]) -> str:

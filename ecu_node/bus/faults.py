@@ -35,7 +35,7 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     first: str
     last: str
     """ISO 8601, UTC."""
-    count: int = 1
+    count: int = 0
     measured_a: dict[str, float] = {}
     corrected_a: dict[str, float] = {}
     """Currents of the last time, positive into the junction. [A]"""
@@ -132,19 +132,13 @@ class FaultMemory:
 
     def _add(self, reason: str, branches: list[str]) -> None:
         corrector, now = self._corrector, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-        before = next((item for item in self._faults if (item.reason, item.branches) == (reason, branches)), None)
-        currents_a = corrector.watch.currents_a
-        fault = Fault(
-            reason=reason,
-            branches=branches,
-            parameter_set=corrector.parameter_set,
-            first=before.first if before is not None else now,
-            last=now,
-            count=before.count + 1 if before is not None else 1,
-            measured_a={name: round(pair[0], 3) for name, pair in currents_a.items()},
-            corrected_a={name: round(pair[1], 3) for name, pair in currents_a.items()},
-        )
-        self._faults = [fault, *(item for item in self._faults if item is not before)][:_MOST_FAULTS]
+        found = [item for item in self._faults if (item.reason, item.branches) == (reason, branches)]
+        fault = found[0] if found else Fault(reason=reason, branches=branches, parameter_set=0, first=now, last=now)
+        fault.parameter_set, fault.last, fault.active = corrector.parameter_set, now, True
+        fault.count += 1
+        fault.measured_a = {name: round(pair[0], 3) for name, pair in corrector.watch.currents_a.items()}
+        fault.corrected_a = {name: round(pair[1], 3) for name, pair in corrector.watch.currents_a.items()}
+        self._faults = [fault, *(item for item in self._faults if item is not fault)][:_MOST_FAULTS]
 
     def _write(self, content: bytes) -> bool:
         try:

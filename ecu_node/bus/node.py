@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Required, TypedDict, Unpack
 
 import can
 
@@ -122,8 +121,14 @@ _LOOK_EVERY_S = 0.02
 _LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
 """So many status periods, but no longer than this [s], the node listens for another one before it says anything."""
 
-OnTick = Callable[[float, bool], None]
-"""Takes the steady clock's time [s], and whether the whole node works."""
+_LONGEST_TURN_S = 2.0
+"""A gateway's way back is at work if it has looked for frames within this time. [s]"""
+_LONGEST_DELAY_S = 1.0
+"""A gateway passes a branch's frame on only if it waited no longer than this, or than the branch's timeout. [s]"""
+_COPIES, _COPIES_WITHIN_S = 10, 2.0
+"""So many copies of one bus's frames on the other one, in so long [s], show that both are one."""
+_REMEMBERED_COPIES = 16
+"""Frames of each identifier that may be on their way round."""
 
 
 @dataclass
@@ -141,154 +146,52 @@ class _Job:
         self.due_s = in_step_s if in_step_s > now_s else now_s + self.period_s
 
 
-class NodeSettings(TypedDict, total=False):
-    """What both kinds of nodes take by keyword."""
-
-    period_s: Required[float]
-    """Between status messages. [s]"""
-    on_tick: OnTick
-    """Called after each look at the junction."""
-    latency: Latency
-    """Where it is counted how long answers take."""
-
-
-class _Node:
-    """What both nodes do: take frames as they come, and in between look, tell the status, and tick.
+class Node:
+    """Takes frames as they come, and in between looks, tells the status, and ticks.
 
     Of these one at a time is done: a frame that comes meanwhile waits for no more than that.
 
     Parameters
     ----------
-    heard, told : SteadyBus
-        Where the sensors are heard, and where the node answers and tells its status.
+    sensors, vehicle : SteadyBus
+        Where the sensors are heard, and where the node answers and tells its status: the same bus for an overlay node,
+        another one for a gateway.
     corrector : Corrector
         The core.
+    period_s : float
+        Between status messages. [s]
+    on_tick : callable
+        Called after each look at the junction, with the steady clock's time [s], and whether the whole node works.
+    latency : Latency
+        Where it is counted how long answers take.
+    routed : bool
+        Whether the kernel carries all identifiers but those that only the gateway may send to the vehicle.
     """
 
     def __init__(
         self,
-        heard: SteadyBus,
-        told: SteadyBus,
+        sensors: SteadyBus,
+        vehicle: SteadyBus,
         corrector: Corrector,
         *,
         period_s: float,
-        on_tick: OnTick = lambda _, __: None,
+        on_tick: Callable[[float, bool], None] = lambda _, __: None,
         latency: Latency | None = None,
+        routed: bool = False,
     ) -> None:
-        self._heard, self._told, self._corrector = heard, told, corrector
-        self._own = OwnFrames(corrector.own_keys)
+        self._sensors, self._vehicle, self._corrector = sensors, vehicle, corrector
         self._period_s, self._on_tick, self._latency = period_s, on_tick, latency or Latency()
+        self._is_gateway, self._routed = vehicle is not sensors, routed
+        self._take = self._pass_on if self._is_gateway else self._answer
+        self._own = self._not_from_vehicle = OwnFrames(corrector.own_keys)
+        if self._is_gateway:
+            self._not_from_vehicle = OwnFrames(corrector.own_keys | corrector.branch_keys, _REMEMBERED_COPIES)
+        self._copies: deque[float] = deque(maxlen=_COPIES)
+        """When copies of one bus's frames came from the other one. [s]"""
         self._time_of_day = TimeOfDay(corrector.counters)
-        self._heard_s = self._due_s = float("-inf")
+        self._heard_s = self._due_s = self._back_s = float("-inf")
         often_s = min(period_s, _LOOK_EVERY_S)
         self._jobs = [_Job(often_s, self._look), _Job(period_s, self._tell), _Job(often_s, self._tick)]
-
-    def _work(self, stop: Callable[[], bool]) -> None:
-        self._heard_s = time.monotonic()
-        while not stop():
-            now_s = self._heard.asked_s
-            job = min(self._jobs, key=lambda job: job.due_s)
-            if now_s >= job.due_s:
-                job.run(now_s)
-                self._due_s = min(job.due_s for job in self._jobs)
-            self._hear()
-
-    def _look(self, _: float) -> None:
-        self._corrector.look(self._heard_s)  # no branch is stale for what has not been heard yet
-
-    def _tell(self, _: float) -> None:
-        status = self._corrector.status()
-        if status is not None:
-            fields, data = status
-            self._own.sent(fields.key, data)
-            self._told.send(_data_frame(fields.key, data, fd=fields.fd))
-            self._corrector.counters.send_errors += self._told.flush()[1]
-
-    def _tick(self, now_s: float) -> None:
-        self._on_tick(now_s, self._works())
-
-    def _works(self) -> bool:
-        """Whether all that works beside this does."""
-        return True
-
-    def _hear(self) -> None:
-        """Take what comes until there is something else to do, and note up to when the bus was heard.
-
-        That is until it was asked last, or, if there may be more, until the last frame came. After a pause of the whole
-        process, frames of all branches wait to be read, and none of these is stale.
-        """
-        bus = self._heard
-        message = bus.receive(min(_LONGEST_WAIT_S, max(0.0, self._due_s - bus.asked_s)))
-        ahead_s = self._time_of_day.ahead_s()  # after the wait, in which the clock may have been set
-        while message is not None:
-            now_s = bus.read_s
-            self._take(message, now_s, ahead_s)
-            if not bus.at_hand:
-                self._flush()
-                if now_s >= self._due_s:
-                    if message.timestamp:
-                        self._heard_s = steady_time_s(message.timestamp, now_s, ahead_s)
-                    return
-            message = bus.receive(0.0)
-        self._flush()  # error frames may have ended a batch, or the bus
-        self._heard_s = bus.asked_s
-
-    def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
-        """Take a frame; given are the steady clock, and by how much the time of day is ahead of it. [s]"""
-        raise NotImplementedError
-
-    def _flush(self) -> int:
-        """Send what was made of the frames; how many the bus took."""
-        sent, not_sent = self._told.flush()
-        self._corrector.counters.send_errors += not_sent
-        self._latency.sent(not_sent)
-        return sent
-
-    def _listen(self, own: OwnFrames, stop: Callable[[], bool]) -> None:
-        """Hear whether another node sends what only this one may; what else comes is too old afterwards."""
-        end_s = time.monotonic() + min(_LISTEN_PERIODS * self._period_s, _LONGEST_LISTEN_S)
-        while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
-            message = self._told.receive(min(left_s, _LONGEST_WAIT_S))
-            if message is not None and not message.is_remote_frame:
-                key = (message.arbitration_id, message.is_extended_id)
-                if key in own and own.is_foreign(key, message.data):
-                    raise _another_node(message, self._told)
-
-
-def _data_frame(key: _Key, data: bytes | bytearray, *, fd: bool, bitrate_switch: bool = False) -> can.Message:
-    """Make a frame to be sent."""
-    return can.Message(
-        arbitration_id=key[0],
-        is_extended_id=key[1],
-        is_fd=fd,
-        bitrate_switch=bitrate_switch,
-        data=data,
-        is_rx=False,
-    )
-
-
-def _another_node(message: can.Message, bus: SteadyBus) -> BusError:
-    return BusError(
-        f"{bus.channel}: another node sends frames 0x{message.arbitration_id:X}, which only this one may send there; "
-        f"two nodes on one bus, or two buses that are joined? Stop one"
-    )
-
-
-class OverlayNode(_Node):
-    """Corrects on one bus.
-
-    Parameters
-    ----------
-    bus : SteadyBus
-        The bus.
-    corrector : Corrector
-        The core.
-    **settings : NodeSettings
-        By keyword.
-    """
-
-    def __init__(self, bus: SteadyBus, corrector: Corrector, **settings: Unpack[NodeSettings]) -> None:
-        super().__init__(bus, bus, corrector, **settings)
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop.
@@ -305,79 +208,13 @@ class OverlayNode(_Node):
         BusError
             If another node sends this node's messages.
         """
-        self._listen(self._own, stop)
-        ready()
-        self._work(stop)
-
-    def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
-        if message.is_remote_frame:
+        self._listen(stop)
+        if not self._is_gateway:
+            ready()
+            self._work(stop)
             return
-        key = (message.arbitration_id, message.is_extended_id)
-        corrector, own = self._corrector, self._own
-        if key in own:
-            if own.is_foreign(key, message.data):
-                raise _another_node(message, self._told)
-            corrector.counters.echoes += 1
-            return
-        source = corrector.sources.get(key)
-        if source is None:
-            return
-        time_s = steady_time_s(message.timestamp, now_s, ahead_s)
-        if now_s - time_s > source.timeout_s:
-            corrector.counters.late += 1
-            return
-        for target in source.answer(message.data, time_s):
-            own.sent(target.key, target.data)
-            fd = target.fd or message.is_fd
-            self._told.send(_data_frame(target.key, target.data, fd=fd, bitrate_switch=message.bitrate_switch))
-            self._latency.came(time_s)
-
-
-_LONGEST_TURN_S = 2.0
-"""A gateway's way back is at work if it has looked for frames within this time. [s]"""
-_LONGEST_DELAY_S = 1.0
-"""A gateway passes a branch's frame on only if it waited no longer than this, or than the branch's timeout. [s]"""
-_COPIES, _COPIES_WITHIN_S = 10, 2.0
-"""So many copies of one bus's frames on the other one, in so long [s], show that both are one."""
-_REMEMBERED_COPIES = 16
-"""Frames of each identifier that may be on their way round."""
-
-
-class GatewayNode(_Node):
-    """Corrects between two buses.
-
-    Parameters
-    ----------
-    sensors : SteadyBus
-        The bus on which the sensors are.
-    vehicle : SteadyBus
-        The bus on which the corrected values are needed; the status goes there too.
-    corrector, **settings :
-        As for :class:`~ecu_node.bus.node.OverlayNode`.
-    routed : bool
-        Whether the kernel carries all identifiers but those that only the gateway may send to the vehicle.
-    """
-
-    def __init__(
-        self,
-        sensors: SteadyBus,
-        vehicle: SteadyBus,
-        corrector: Corrector,
-        *,
-        routed: bool = False,
-        **settings: Unpack[NodeSettings],
-    ) -> None:
-        super().__init__(sensors, vehicle, corrector, **settings)
-        self._not_from_vehicle = OwnFrames(corrector.own_keys | corrector.branch_keys, _REMEMBERED_COPIES)
-        self._routed, self._back_s = routed, float("-inf")
-        self._copies: deque[float] = deque(maxlen=_COPIES)
-        """When copies of one bus's frames came from the other one. [s]"""
-
-    def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
-        """Correct until told to stop; parameters and errors as for :meth:`~ecu_node.bus.node.OverlayNode.run`."""
-        self._listen(self._not_from_vehicle, stop)
         end_s = time.monotonic() + _LONGEST_WAIT_S  # on a full bus more comes meanwhile
-        while time.monotonic() < end_s and self._heard.receive(0.0) is not None:
+        while time.monotonic() < end_s and self._sensors.receive(0.0) is not None:
             pass  # too old by now
         ready()
         self._back_s = time.monotonic()
@@ -390,15 +227,90 @@ class GatewayNode(_Node):
                 ended.set()
         back.result()  # raises what ended it
 
-    def _works(self) -> bool:
-        return time.monotonic() - self._back_s < _LONGEST_TURN_S
+    def _listen(self, stop: Callable[[], bool]) -> None:
+        """Hear whether another node sends what only this one may; what else comes is too old afterwards."""
+        end_s = time.monotonic() + min(_LISTEN_PERIODS * self._period_s, _LONGEST_LISTEN_S)
+        while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
+            message = self._vehicle.receive(min(left_s, _LONGEST_WAIT_S))
+            if message is not None and not message.is_remote_frame:
+                key = (message.arbitration_id, message.is_extended_id)
+                if key in self._not_from_vehicle and self._not_from_vehicle.is_foreign(key, message.data):
+                    raise _another_node(message, self._vehicle)
 
-    def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
-        key = (message.arbitration_id, message.is_extended_id)
-        source = None
+    def _work(self, stop: Callable[[], bool]) -> None:
+        self._heard_s = time.monotonic()
+        while not stop():
+            now_s = self._sensors.asked_s
+            job = min(self._jobs, key=lambda job: job.due_s)
+            if now_s >= job.due_s:
+                job.run(now_s)
+                self._due_s = min(job.due_s for job in self._jobs)
+            self._hear()
+
+    def _look(self, _: float) -> None:
+        self._corrector.look(self._heard_s)  # no branch is stale for what has not been heard yet
+
+    def _tell(self, _: float) -> None:
+        status = self._corrector.status()
+        if status is not None:
+            self._own.sent(status.key, status.data)
+            self._vehicle.send(_data_frame(status.key, status.data, fd=status.fd))
+            self._corrector.counters.send_errors += self._vehicle.flush()[1]
+
+    def _tick(self, now_s: float) -> None:
+        self._on_tick(now_s, not self._is_gateway or time.monotonic() - self._back_s < _LONGEST_TURN_S)
+
+    def _hear(self) -> None:
+        """Take what comes until there is something else to do, and note up to when the bus was heard.
+
+        That is until it was asked last, or, if there may be more, until the last frame came. After a pause of the whole
+        process, frames of all branches wait to be read, and none of these is stale.
+        """
+        bus = self._sensors
+        message = bus.receive(min(_LONGEST_WAIT_S, max(0.0, self._due_s - bus.asked_s)))
+        ahead_s = self._time_of_day.ahead_s()  # after the wait, in which the clock may have been set
+        while message is not None:
+            now_s = bus.read_s
+            self._take(message, now_s, ahead_s)
+            if not bus.at_hand:
+                self._flush()
+                if now_s >= self._due_s:
+                    if message.timestamp:
+                        self._heard_s = steady_time_s(message.timestamp, now_s, ahead_s)
+                    return
+            message = bus.receive(0.0)
+        self._flush()  # error frames may have ended a batch, or the bus
+        self._heard_s = bus.asked_s
+
+    def _answer(self, message: can.Message, now_s: float, ahead_s: float) -> None:
+        """Overlay: take a frame; given are the steady clock, and by how much the time of day is ahead of it. [s]"""
+        if message.is_remote_frame:
+            return
+        key, corrector = (message.arbitration_id, message.is_extended_id), self._corrector
+        if key in self._own:
+            if self._own.is_foreign(key, message.data):
+                raise _another_node(message, self._vehicle)
+            corrector.counters.echoes += 1
+            return
+        source = corrector.sources.get(key)
+        if source is None:
+            return
+        time_s = steady_time_s(message.timestamp, now_s, ahead_s)
+        if now_s - time_s > source.timeout_s:
+            corrector.counters.late += 1
+            return
+        for target in source.answer(message.data, time_s):
+            self._own.sent(target.key, target.data)
+            fd = target.fd or message.is_fd
+            self._vehicle.send(_data_frame(target.key, target.data, fd=fd, bitrate_switch=message.bitrate_switch))
+            self._latency.came(time_s)
+
+    def _pass_on(self, message: can.Message, now_s: float, ahead_s: float) -> None:
+        """Gateway: the same."""
+        key, source = (message.arbitration_id, message.is_extended_id), None
         if not message.is_remote_frame:
             if key in self._own:
-                self._refuse(message, self._heard, self._own)
+                self._refuse(message, self._sensors, self._own)
                 return
             source = self._corrector.sources.get(key)
         if source is not None:
@@ -414,35 +326,36 @@ class GatewayNode(_Node):
             message.data = data
             self._latency.came(time_s)
         if not self._routed or key in self._not_from_vehicle:
-            self._told.send(message)
+            self._vehicle.send(message)
 
-    def _flush(self) -> int:
-        sent = super()._flush()
-        self._corrector.counters.forwarded += sent
-        return sent
+    def _flush(self) -> None:
+        """Send what was made of the frames."""
+        sent, not_sent = self._vehicle.flush()
+        self._corrector.counters.send_errors += not_sent
+        self._latency.sent(not_sent)
+        if self._is_gateway:
+            self._corrector.counters.forwarded += sent
 
     def _pass_back(self, stop: Callable[[], bool]) -> None:
         """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
-        vehicle, sensors, own = self._told, self._heard, self._not_from_vehicle
+        vehicle, own, counters = self._vehicle, self._not_from_vehicle, self._corrector.counters
         while not stop():
             message = vehicle.receive(_LONGEST_WAIT_S)
-            while message is not None:
-                key = (message.arbitration_id, message.is_extended_id)
-                if key in own and not message.is_remote_frame:
-                    self._refuse(message, vehicle, own)
-                elif not self._routed or key in own:
-                    sensors.send(message)
-                if not vehicle.at_hand:
-                    self._flush_back()
-                message = None if stop() else vehicle.receive(0.0)
-            self._flush_back()
-
-    def _flush_back(self) -> None:
-        self._back_s = time.monotonic()
-        counters = self._corrector.counters
-        sent, not_sent = self._heard.flush()
-        counters.returned += sent
-        counters.not_returned += not_sent
+            while True:
+                if message is not None:
+                    key = (message.arbitration_id, message.is_extended_id)
+                    if key in own and not message.is_remote_frame:
+                        self._refuse(message, vehicle, own)
+                    elif not self._routed or key in own:
+                        self._sensors.send(message)
+                if message is None or not vehicle.at_hand:
+                    self._back_s = time.monotonic()
+                    sent, not_sent = self._sensors.flush()
+                    counters.returned += sent
+                    counters.not_returned += not_sent
+                if message is None or stop():
+                    break
+                message = vehicle.receive(0.0)
 
     def _refuse(self, message: can.Message, bus: SteadyBus, own: OwnFrames) -> None:
         """Drop a frame that only this node may send there: whoever sends it must not stop the branches' frames.
@@ -459,3 +372,17 @@ class GatewayNode(_Node):
             f"{bus.channel}: another node sends frames 0x{message.arbitration_id:X}, which only this one may send "
             f"there; they are dropped; find out who it is"
         )
+
+
+def _data_frame(key: _Key, data: bytes | bytearray, *, fd: bool, bitrate_switch: bool = False) -> can.Message:
+    """Make a frame to be sent."""
+    return can.Message(
+        arbitration_id=key[0], is_extended_id=key[1], is_fd=fd, bitrate_switch=bitrate_switch, data=data, is_rx=False
+    )
+
+
+def _another_node(message: can.Message, bus: SteadyBus) -> BusError:
+    return BusError(
+        f"{bus.channel}: another node sends frames 0x{message.arbitration_id:X}, which only this one may send there; "
+        f"two nodes on one bus, or two buses that are joined? Stop one"
+    )

@@ -126,7 +126,7 @@ class _Window(NamedTuple):
     middle: float
     pieces: _Column
     """Medians of its pieces."""
-    count: int
+    samples: int
     total: float
     squares: float
     """Number, sum and sum of squares of the distances from the median."""
@@ -175,7 +175,7 @@ class _ZeroCurrent:
     def reading(self, branch: str, step_a: float) -> tuple[float, float] | tuple[None, None]:
         """Offset of a branch and its standard deviation [A]; None if the windows are too short."""
         windows = self._windows[branch]
-        count = sum(window.count for window in windows)
+        count = sum(window.samples for window in windows)
         if count < rule.FEWEST_ZERO_SAMPLES:
             return None, None
         mean = sum(window.total for window in windows) / count
@@ -252,7 +252,11 @@ class OnBoardSummary:
         self._job: Future[None] | None = None
         """Sums and writes a batch; what stands below is its own meanwhile."""
         self._has_failed = False
-        self._heard_s = 0.0
+        self._zero_s: float | None = None
+        """When the drive began, by the time of day. [s]"""
+        self._next: int | None = None
+        """Instant of the time base from which on nothing was summed yet."""
+        self._heard_s = self._last_s = self._due_s = 0.0
         self._recorded: list[str] = []
         self._inputs: list[str] = []
         self._branches: list[str] = []
@@ -341,7 +345,7 @@ class OnBoardSummary:
             if item.name == layout.temperature:
                 self._read(item.signal, self._warm.put)
             if layout.contactor is not None and item.name == layout.contactor.input:
-                self._read(item.signal, self._take_state)
+                self._read(item.signal, lambda time_s, value: self._zero.state(time_s, value))  # noqa: PLW0108  # a new one
         for branch in layout.branch:
             where, units = f"{layout.path}: branch {branch.name}", AMPERE if branch.power is None else WATT
             factor = branch.sign * unit_factor(database.signal(branch.source)[1], units, where)
@@ -361,9 +365,6 @@ class OnBoardSummary:
         key = FrameKey(message.frame_id, message.is_extended_frame)
         _, readers = self.messages.setdefault(key, (protection.is_intact if protection else lambda _: True, []))
         readers.append((_reader(message, signal, codes_of_no_value(self._database, name)), take))
-
-    def _take_state(self, time_s: float, value: float) -> None:
-        self._zero.state(time_s, value)
 
     def _take_current(self, branch: str, channel: _Channel, factor: float, time_s: float, value: float) -> None:
         if not math.isnan(value):
@@ -411,8 +412,7 @@ class OnBoardSummary:
         warm = self._warm.until(last * self._period_s)
         self._next, self._due_s = last, (last + self._batch) * self._period_s + self._wait_s
         self._finish_job()
-        self._job = self._background.submit(self._sum, instants_s, samples, warm, is_first=self._drive_starts)
-        self._drive_starts = False
+        self._job = self._background.submit(self._sum, instants_s, samples, warm)
 
     def _finish_job(self) -> None:
         """Say when writing fails, and when it does no more."""
@@ -443,9 +443,7 @@ class OnBoardSummary:
         rows += [[math.nan] * len(rows[0])] * (-len(rows) % self._length)
         return [[*column] for column in zip(*rows, strict=True)]
 
-    def _sum(
-        self, instants_s: Sequence[float], samples: Mapping[str, _Samples], warm: _Samples, *, is_first: bool
-    ) -> None:
+    def _sum(self, instants_s: Sequence[float], samples: Mapping[str, _Samples], warm: _Samples) -> None:
         """Add the blocks of a batch to the file, and write it."""
         columns, K, length = self._columns(instants_s, samples), len(self._branches), self._length
         M = len(columns) - K
@@ -476,7 +474,8 @@ class OnBoardSummary:
         times_s = [time_s for time_s, _ in warm]
         warm_c = [warm[max(bisect_right(times_s, instants_s[t]) - 1, 0)][1] for t in chosen if warm]
         numbers["temperature_c"].append(sum(warm_c) / count if warm else math.nan)
-        self._starts.append(is_first)
+        self._starts.append(self._drive_starts)
+        self._drive_starts = False
         self._count.append(count)
         self._write()
         if len(self._count) == MOST_BATCHES:
@@ -600,11 +599,7 @@ def _add_levels(columns: Sequence[_Column], own: _Column, sums: dict[int, _Colum
         away = bisect_right(rule.LEVELS_A, int(abs(x)))
         sorted_rows.setdefault(len(rule.LEVELS_A) + (away if x > 0.0 else -away), []).append(t)
     for level, rows in sorted_rows.items():
-        new = [
-            *(sum(column[t] for t in rows) for column in columns),
-            len(rows),
-            sum(own[t] ** 2 for t in rows),
-        ]
+        new = [*(sum(column[t] for t in rows) for column in columns), len(rows), sum(own[t] ** 2 for t in rows)]
         old = sums.get(level)
         sums[level] = new if old is None else [a + b for a, b in zip(old, new, strict=True)]
 

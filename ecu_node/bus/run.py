@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ from cantools.database.can import Message
 from ecu_node.bus.adapters import acknowledgement, bus_config, carries_fd, config_text
 from ecu_node.bus.faults import FaultMemory
 from ecu_node.bus.kernel_routes import kernel_routes
-from ecu_node.bus.node import GatewayNode, NodeSettings, OverlayNode
+from ecu_node.bus.node import Node
 from ecu_node.bus.on_board_summary import on_board_summary
 from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time
 from ecu_node.bus.steady_bus import SteadyBus
@@ -149,43 +148,6 @@ class StateChanges:
         return "correcting again" if corrects_again else None
 
 
-class _Looks(Protocol):
-    """What has something to do now and then, beside the frames."""
-
-    def look(self, now_s: float) -> None:
-        """Do it if it is due."""
-
-
-@dataclass
-class _Tick:
-    """What is done beside the frames: watchdog, parameters, and a line in the log when the state changes."""
-
-    corrector: Corrector
-    buses: Sequence[SteadyBus]
-    source: ParameterSource
-    looks: Sequence[_Looks]
-    requests: Requests
-    manager: ServiceManager
-    say: Callable[[str], None]
-
-    def __post_init__(self) -> None:
-        self._changes = StateChanges(self.corrector)
-
-    def __call__(self, now_s: float, works: bool) -> None:
-        if works:
-            self.manager.alive(now_s)
-        for bus in self.buses:
-            bus.count_dropped()
-        if self.source.look(self.corrector, now_s, asked=self.requests.take_reload()):
-            self.manager.status(f"parameter set {self.corrector.parameter_set} is in force")
-        for each in self.looks:
-            each.look(now_s)
-        text = self._changes.news()
-        if text is not None:
-            self.say(text)
-            self.manager.status(text)
-
-
 _DEFAULT_PERIOD_S = 0.1
 _GARBAGE = 10_000
 """Objects that were made and not freed, after which garbage is looked for among them, in about a millisecond."""
@@ -229,10 +191,10 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         routes = kernel_routes(
             (options.channel, options.gateway), corrector.own_keys | corrector.branch_keys, fd=options.fd, say=say
         )
-    routed, latency = routes is not None, Latency()
+    latency = Latency()
     with ExitStack() as closed_at_end:
         # A node that only listens may stand beside the one that sends.
-        opener = partial(open_bus, database, mode=mode, routed=routed, own=not options.listen_only)
+        opener = partial(open_bus, database, mode=mode, routed=routes is not None, own=not options.listen_only)
         opened = (
             SteadyBus(partial(opener, **settings), corrector.counters, say, listen_only=options.listen_only)
             for settings in bus_settings
@@ -254,38 +216,48 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             say(f"running on {options.interface} {options.channel}{to}{shadow}, {correcting}")
             manager.ready(correcting)
 
-        looks: list[_Looks] = [] if routes is None else [routes]
+        looks: list[Callable[[float], None]] = [] if routes is None else [routes.look]
         if options.state is not None:
-            looks.append(FaultMemory(corrector, options.state, say, ThreadPoolExecutor(1, "faults")))
+            looks.append(FaultMemory(corrector, options.state, say, ThreadPoolExecutor(1, "faults")).look)
         if options.telemetry is not None:
-            looks.append(Telemetry(options.telemetry, corrector, database.layout, latency, buses, say))
+            looks.append(Telemetry(options.telemetry, corrector, database.layout, latency, buses, say).look)
         if options.summary is not None:
             summing = on_board_summary(options, bus, database, source.in_force.parameters, say)
-            looks.append(closed_at_end.enter_context(closing(summing)))
+            looks.append(closed_at_end.enter_context(closing(summing)).look)
+        changes = StateChanges(corrector)
+
+        def tick(now_s: float, works: bool) -> None:
+            if works:
+                manager.alive(now_s)
+            for each in buses:
+                each.count_dropped()
+            if source.look(corrector, now_s, asked=requests.take_reload()):
+                manager.status(f"parameter set {corrector.parameter_set} is in force")
+            for look in looks:
+                look(now_s)
+            if text := changes.news():
+                say(text)
+                manager.status(text)
+
         closed_at_end.callback(lambda: say(f"ended: {corrector.counters.text()}"))
         closed_at_end.callback(manager.stopping)
         if routes is not None:
             closed_at_end.enter_context(routes)
-        how: NodeSettings = {
-            "period_s": database.layout.status.period_s if database.layout.status is not None else _DEFAULT_PERIOD_S,
-            "on_tick": _Tick(corrector, buses, source, looks, requests, manager, say),
-            "latency": latency,
-        }
-        node: OverlayNode | GatewayNode
-        if is_gateway:
-            node = GatewayNode(buses[0], buses[1], corrector, routed=routed, **how)
-        else:
-            node = OverlayNode(buses[0], corrector, **how)
-        _freeze()
+        status = database.layout.status
+        node = Node(
+            buses[0],
+            buses[-1],
+            corrector,
+            period_s=status.period_s if status is not None else _DEFAULT_PERIOD_S,
+            on_tick=tick,
+            latency=latency,
+            routed=routes is not None,
+        )
+        gc.collect()  # what was made at the start is left out of all others, which come only when something grows
+        gc.freeze()
+        gc.set_threshold(_GARBAGE)
         node.run(requests.stop, ready)
     return 0
-
-
-def _freeze() -> None:
-    """Leave what was made at the start out of all garbage collections; others come only when something grows."""
-    gc.collect()
-    gc.freeze()
-    gc.set_threshold(_GARBAGE)
 
 
 def _source(

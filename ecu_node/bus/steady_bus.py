@@ -34,14 +34,12 @@ _BUS_OFF = 0x40
 """Class of error frames of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
 
-def means_gone(error: Exception) -> bool:
-    """Whether after an error of sending only opening the bus again helps."""
-    return _number(error) in {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
-
-
-def is_of_frame(error: Exception) -> bool:
-    """Whether it is this frame that the bus does not take, whatever its state, as one that is too long for it."""
-    return _number(error) in {errno.EINVAL, errno.EMSGSIZE}
+_GONE = frozenset((errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF))
+"""Errors of sending after which only opening the bus again helps."""
+_OF_FRAME = frozenset((errno.EINVAL, errno.EMSGSIZE))
+"""Errors with which a bus does not take this frame, whatever its state, as one that is too long for it."""
+_ERRORS = (can.CanError, OSError, ValueError)
+"""Of a bus in use; ValueError: just closed by the other thread."""
 
 
 def _number(error: Exception) -> int | None:
@@ -159,11 +157,11 @@ class SteadyBus:
                 try:
                     done += self._send_some(link, done)
                     continue
-                except (can.CanError, OSError, ValueError) as error:  # ValueError: just closed by the other thread
-                    if means_gone(error):
+                except _ERRORS as error:
+                    if _number(error) in _GONE:
                         # Whoever asks first is told that the bus is gone, and nobody after: receiving may not fail.
                         self._failed = link, error
-                    elif is_of_frame(error):
+                    elif _number(error) in _OF_FRAME:
                         refused = 1
             done, lost = done + refused, lost + refused
         sent = len(queue) - lost
@@ -177,11 +175,11 @@ class SteadyBus:
                 with self._closing:
                     taken = link.send(self._queue, first)
                 break
-            except (can.CanError, OSError, ValueError) as error:
-                if means_gone(error) or is_of_frame(error):
-                    raise
-                if not attempts_left:
+            except _ERRORS as error:
+                is_full = _number(error) not in _GONE | _OF_FRAME
+                if is_full and not attempts_left:
                     self._stays_full()
+                if not (is_full and attempts_left):
                     raise
             time.sleep(_SEND_PAUSE_S)
         if self._is_full_told:
@@ -229,15 +227,14 @@ class SteadyBus:
             return None
         self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
         self._retry_s = now_s + self._pause_s
+        link = None
         try:
             link = _link(self._open())
-        except BusError:
-            return None
-        try:
             message = link.receive(0.0)  # an interface that is down can be opened, but not received from
-        except (can.CanError, OSError):
-            with contextlib.suppress(can.CanError, OSError):
-                link.close()
+        except (BusError, can.CanError, OSError):
+            if link is not None:
+                with contextlib.suppress(can.CanError, OSError):
+                    link.close()
             return None
         self._link = link
         self._counters.reopened += 1

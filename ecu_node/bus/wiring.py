@@ -7,20 +7,19 @@ the other bus, and in its own name the status alone.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Unpack
 
 import can
 from can.typechecking import CanFilter
-from cantools.database.can import Message, Signal
+from cantools.database.can import Message
 
 from ecu_node.bus.adapters import Settings, connect, filters_of
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault, Signals, correction_plan
-from ecu_node.core.corrector import Corrector, Source, StatusFields, Target
+from ecu_node.core.corrector import Corrector, OwnMessage, Source, StatusFields
 from ecu_node.core.e2e import protection_of
 from ecu_node.core.junction import HeardSignal, JunctionWatch, LiveBranch, Written
 from ecu_node.core.signals import (
@@ -72,24 +71,26 @@ def is_fd(message: Message) -> bool:
     return bool(message.is_fd) or message.length > _CLASSIC_BYTES
 
 
+def _by_key(database: VehicleDatabase, names: Iterable[SignalName | None]) -> dict[FrameKey, Message]:
+    """Messages of signals, by identifier."""
+    return {key_of(message): message for message, _ in (database.signal(name) for name in names if name is not None)}
+
+
 def received(database: VehicleDatabase) -> dict[FrameKey, Message]:
     """Messages that carry the branches and what else the node needs of the vehicle, by identifier."""
     layout = database.layout
-    names = [name for branch in layout.branch for name in (branch.source, branch.voltage) if name is not None]
-    names += [item.signal for item in layout.input if item.name == layout.watch.input]
-    return {key_of(message): message for message, _ in map(database.signal, names)}
+    names = [name for branch in layout.branch for name in (branch.source, branch.voltage)]
+    return _by_key(database, [*names, *(item.signal for item in layout.input if item.name == layout.watch.input)])
 
 
 def rewritten(database: VehicleDatabase) -> dict[FrameKey, Message]:
     """Messages that a gateway rewrites, by identifier."""
-    pairs = (database.signal(branch.source) for branch in database.layout.branch)
-    return {key_of(message): message for message, _ in pairs}
+    return _by_key(database, (branch.source for branch in database.layout.branch))
 
 
 def transmitted(database: VehicleDatabase, mode: Mode) -> dict[FrameKey, Message]:
     """Messages that the node sends in its own name, by identifier."""
-    messages = [item.message for item in _written(database, mode) if item.own]
-    return {key_of(message): message for message in messages}
+    return _by_key(database, (item.name for item in _written(database, mode) if item.own))
 
 
 def needs_fd(database: VehicleDatabase, mode: Mode) -> list[str]:
@@ -98,32 +99,29 @@ def needs_fd(database: VehicleDatabase, mode: Mode) -> list[str]:
     return [message.name for message in messages.values() if is_fd(message)]
 
 
-class _Written(NamedTuple):
+class _WrittenSignal(NamedTuple):
     """A signal that the node writes."""
 
-    message: Message
-    signal: Signal
+    name: SignalName
     purpose: str
     largest: int
     """The greatest code it must hold."""
-    own: bool = True
+    own: bool
     """Whether the whole message is the node's."""
 
 
-def _written(database: VehicleDatabase, mode: Mode) -> Iterator[_Written]:
+def _written(database: VehicleDatabase, mode: Mode) -> list[_WrittenSignal]:
     """All signals that the node writes; a gateway writes the branches where it reads them."""
-    own = mode is Mode.OVERLAY
+    own, status = mode is Mode.OVERLAY, database.layout.status
+    found = []
     for branch in database.layout.branch:
-        for name, largest in (
-            ((branch.corrected, 0), (branch.quality, Quality.INVALID)) if own else ((branch.source, 0),)
-        ):
-            if name is not None:
-                yield _Written(*database.signal(name), f"branch {branch.name}", largest, own)
-    if database.layout.status is not None:
-        widths = {"state": max(State), "reason": Reason.ON_TRIAL, "alive_counter": 1}
-        widths["parameter_set"] = PARAMETER_SETS - 1
-        for key, name in database.layout.status.signals.items():
-            yield _Written(*database.signal(name), "status", widths.get(key, 0))
+        names = {branch.corrected: 0, branch.quality: Quality.INVALID} if own else {branch.source: 0}
+        found += [_WrittenSignal(name, f"branch {branch.name}", most, own) for name, most in names.items() if name]
+    if status is not None:
+        widths = {"state": max(State), "reason": Reason.ON_TRIAL, "parameter_set": PARAMETER_SETS - 1}
+        widths["alive_counter"] = 1
+        found += [_WrittenSignal(name, "status", widths.get(key, 0), True) for key, name in status.signals.items()]
+    return found
 
 
 def _check_output(database: VehicleDatabase, mode: Mode) -> None:
@@ -135,8 +133,7 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
             f"and layout (the documentation's page 'Layout' has the lines), or be a gateway, which needs none: "
             f"--gateway CHANNEL"
         )
-    inputs = (database.signal(item.signal)[0] for item in database.layout.input)
-    read = {**received(database), **{key_of(message): message for message in inputs}}
+    read = received(database) | _by_key(database, (item.signal for item in database.layout.input))
     if both := [message.name for key, message in sent.items() if key in read]:
         raise LayoutError(
             f"{where}: {', '.join(both)} would be both received and sent; corrected values and status need messages "
@@ -151,7 +148,8 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
             f"one control unit of their own, which sends no branch and no input"
         )
     taken: dict[FrameKey, int] = {}
-    for message, signal, purpose, largest, own in _written(database, mode):
+    for name, purpose, largest, own in _written(database, mode):
+        message, signal = database.signal(name)
         place, what = bit_place(signal), f"{purpose}: signal {message.name}.{signal.name}"
         if place.end > message.length:
             raise DatabaseError(f"{what} ends in byte {place.end}, but the message has {message.length} bytes")
@@ -240,14 +238,13 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
     str or None
         That reason in words, one line; None if the parameters fit.
     """
+    where = ""  # which errors of reading name themselves
     try:
         parameters = read_parameters(path)
-    except UnfitError as error:
-        return InForce(parameters=None, reason=error.reason), str(error)
-    try:
+        where = f"{path}: "
         check_fit(parameters, database, vehicle)
     except UnfitError as error:
-        return InForce(parameters=None, reason=error.reason), f"{path}: {error}"
+        return InForce(parameters=None, reason=error.reason), f"{where}{error}"
     return InForce(parameters=parameters), None
 
 
@@ -286,35 +283,25 @@ def put_in_force(
     found = parameters.branches if parameters is not None else {}
     changes = []  # all plans before the first is put in force: either all or none
     for branch in database.layout.branch:
-        fault, is_in_place = sensor_fault(in_force, branch.name), mode is Mode.GATEWAY or branch.corrected is None
-        plan = branch_plan(database, branch, fault, mode)
-        passing = AS_IT_IS if is_in_place else branch_plan(database, branch, NO_FAULT, mode)
-        changes.append((branch.name, fault, plan, passing))
-    for (name, fault, plan, passing), live in zip(changes, corrector.branches, strict=True):
-        live.put_in_force(
-            fault=fault,
-            plan=plan,
-            passing=passing,
-            delay_s=(found[name].delay_s if name in found else None) or 0.0,
-            expected_since_s=now_s if name in found else None,
-        )
-    if parameters is None:
-        corrector.put_in_force(reason=in_force.reason, parameter_set=0)
-        return
-    corrector.put_in_force(
-        reason=in_force.reason,
-        parameter_set=parameters.number % PARAMETER_SETS,
-        expected=parameters.junction_residual,
-    )
+        fault, said = sensor_fault(in_force, branch.name), found.get(branch.name)
+        is_in_place = mode is Mode.GATEWAY or branch.corrected is None
+        change = {
+            "fault": fault,
+            "plan": branch_plan(database, branch, fault, mode),
+            "passing": AS_IT_IS if is_in_place else branch_plan(database, branch, NO_FAULT, mode),
+            "delay_s": (said and said.delay_s) or 0.0,
+            "expected_since_s": now_s if said is not None else None,
+        }
+        changes.append(change)
+    for change, live in zip(changes, corrector.branches, strict=True):
+        live.put_in_force(**change)  # type: ignore[arg-type]
+    number = parameters.number % PARAMETER_SETS if parameters is not None else 0
+    expected = parameters.junction_residual if parameters is not None else None
+    corrector.put_in_force(reason=in_force.reason, parameter_set=number, expected=expected)
 
 
 def wire(
-    database: VehicleDatabase,
-    in_force: InForce,
-    start_s: float,
-    *,
-    mode: Mode = Mode.OVERLAY,
-    shadow: bool = False,
+    database: VehicleDatabase, in_force: InForce, start_s: float, *, mode: Mode = Mode.OVERLAY, shadow: bool = False
 ) -> Corrector:
     """Build the node's core.
 
@@ -380,14 +367,12 @@ def wire(
         margin_a=layout.watch_margin_a,
         full_scale_a=layout.full_scale_a,
     )
-    for item in layout.input:  # the input that tells whether all currents of the junction are measured
-        if item.name == layout.watch.input:
-            _, signal = database.signal(item.signal)
-            codes = signal_codes(database, item.signal, {usual_unit(signal.unit or ""): 1.0}, "[watch] input")
-            state = HeardSignal(replace(codes, named={}), layout.max_age_s)  # a state's names are no lack of a value
-            valid = frozenset(int(exact_code(signal, value)) for value in layout.watch.valid)
-            watch.is_whole = partial(_has_code, state, valid)
-            read(item.signal, state)
+    for name in (item.signal for item in layout.input if item.name == layout.watch.input):
+        _, signal = database.signal(name)
+        codes = signal_codes(database, name, {usual_unit(signal.unit or ""): 1.0}, "[watch] input")
+        state = HeardSignal(replace(codes, named={}), layout.max_age_s)  # a state's names are no lack of a value
+        watch.judge_only(state, frozenset(int(exact_code(signal, value)) for value in layout.watch.valid))
+        read(name, state)
     answers = _answers(database, branches) if mode is Mode.OVERLAY else {}
     corrector = Corrector(
         sources={
@@ -411,33 +396,26 @@ def wire(
     return corrector
 
 
-def _has_code(state: HeardSignal, valid: frozenset[int], now_s: float) -> bool:
-    return state.code_at(now_s) in valid
+def _own_message(database: VehicleDatabase, name: str) -> OwnMessage:
+    message = database.message(name)
+    protection = protection_of(database, message)
+    return OwnMessage(key_of(message), message.length, fd=is_fd(message), protection=protection)
 
 
-def _answers(database: VehicleDatabase, branches: Mapping[str, LiveBranch]) -> dict[FrameKey, list[Target]]:
+def _answers(database: VehicleDatabase, branches: Mapping[str, LiveBranch]) -> dict[FrameKey, list[OwnMessage]]:
     """Corrected messages of an overlay node, by the incoming messages that they answer."""
-    answers: dict[FrameKey, list[Target]] = defaultdict(list)
-    corrected: dict[str, list[Branch]] = defaultdict(list)
+    answers: dict[FrameKey, list[OwnMessage]] = defaultdict(list)
+    made: dict[str, OwnMessage] = {}
     for branch in database.layout.branch:
         if branch.corrected is not None:
-            corrected[split_signal(branch.corrected)[0]].append(branch)
-    for name, inside in corrected.items():
-        message, written = database.message(name), {}
-        for branch in inside:
+            name = split_signal(branch.corrected)[0]
+            message = made[name] = made.get(name) or _own_message(database, name)
             codes = branch_signals(database, branch, Mode.OVERLAY).target
             not_available = not_available_code(codes, f"{database.layout.path}: branch {branch.name}")
             quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
-            written[branches[branch.name]] = Written(codes.place, not_available, quality)
-        target = Target(
-            key=key_of(message),
-            length=message.length,
-            fd=is_fd(message),
-            branches=written,
-            protection=protection_of(database, message),
-        )
-        for incoming in dict.fromkeys(key_of(database.signal(branch.source)[0]) for branch in inside):
-            answers[incoming].append(target)
+            message.branches[branches[branch.name]] = Written(codes.place, not_available, quality)
+            for incoming in _by_key(database, [branch.source]):
+                answers[incoming] += [message] * (message not in answers[incoming])
     return answers
 
 
@@ -445,7 +423,7 @@ def _status_fields(database: VehicleDatabase) -> StatusFields | None:
     status, where = database.layout.status, f"{database.layout.path}: status"
     if status is None:
         return None
-    message, places, sums = database.message(status.message), {}, {}
+    places, sums = {}, {}
     for key, name in status.signals.items():
         signal = database.signal(name)[1]
         if key in {"sum_measured", "sum_corrected"}:
@@ -455,14 +433,7 @@ def _status_fields(database: VehicleDatabase) -> StatusFields | None:
             sums[key] = replace(codes, lowest=lowest, highest=highest), not_available_code(codes, where)
         else:
             places[key] = bit_place(signal)
-    return StatusFields(
-        key=key_of(message),
-        length=message.length,
-        fd=is_fd(message),
-        protection=protection_of(database, message),
-        places=places,
-        sums=sums,
-    )
+    return StatusFields(_own_message(database, status.message), places, sums)
 
 
 def open_bus(

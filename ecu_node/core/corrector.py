@@ -13,7 +13,6 @@ is corrected otherwise.
 
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from ecu_node.core.e2e import Check, E2EState, Protection, Receiver
@@ -101,8 +100,8 @@ def _in_one_word(
     return rewrite
 
 
-class Target:
-    """One corrected message that the node sends in its own name.
+class OwnMessage:
+    """A message that the node sends in its own name: an answer with corrected currents, or the status.
 
     Parameters
     ----------
@@ -112,24 +111,20 @@ class Target:
         Bytes of the message.
     fd : bool
         Whether the DBC sends it as CAN FD.
-    branches : mapping of LiveBranch to Written
-        The branches written into it.
     protection : Protection or None
         End-to-end protection.
+
+    Attributes
+    ----------
+    data : bytearray
+        The message as it was made last; a new one each time.
+    branches : dict of LiveBranch to Written
+        The branches that are written into it.
     """
 
-    def __init__(
-        self,
-        *,
-        key: FrameKey,
-        length: int,
-        fd: bool,
-        branches: Mapping[LiveBranch, Written],
-        protection: Protection | None,
-    ) -> None:
-        self.key, self.fd, self.branches = key, fd, branches
-        self.data = bytearray(length)
-        """The message as it was made last; a new one each time."""
+    def __init__(self, key: FrameKey, length: int, *, fd: bool, protection: Protection | None) -> None:
+        self.key, self.fd, self.data = key, fd, bytearray(length)
+        self.branches: dict[LiveBranch, Written] = {}
         self.protect = self.identity = None
         if protection is not None:
             protection.before_first(self.data)
@@ -142,7 +137,7 @@ class _Ways(NamedTuple):
     missing: list[LiveBranch]
     """Branches that such a payload is too short for."""
     in_place: _Rewrite
-    answers: list[tuple[Target, _Rewrite]]
+    answers: list[tuple[OwnMessage, _Rewrite]]
 
 
 class Source:
@@ -154,7 +149,7 @@ class Source:
         End-to-end protection.
     readers : sequence of tuple
         Who reads which signal.
-    targets : sequence of Target
+    targets : sequence of OwnMessage
         Messages that answer it.
     counters : Counters
         Where it is counted what happened.
@@ -163,7 +158,7 @@ class Source:
 
     Attributes
     ----------
-    targets : tuple of Target
+    targets : tuple of OwnMessage
         As given.
     branches : list of LiveBranch
         That are read from it.
@@ -176,7 +171,7 @@ class Source:
         *,
         protection: Protection | None,
         readers: Sequence[tuple[HeardSignal, PlacedSignal]],
-        targets: Sequence[Target],
+        targets: Sequence[OwnMessage],
         counters: Counters,
         pass_on_invalid: bool,
     ) -> None:
@@ -198,7 +193,7 @@ class Source:
         """Whether so many of its frames fail their check that the message cannot be relied on."""
         return self._receiver is not None and self._receiver.state is _INVALID
 
-    def answer(self, payload: bytearray, now_s: float) -> Sequence[Target]:
+    def answer(self, payload: bytearray, now_s: float) -> Sequence[OwnMessage]:
         """Overlay: take a frame, and make the messages that answer it.
 
         Parameters
@@ -210,7 +205,7 @@ class Source:
 
         Returns
         -------
-        sequence of Target
+        sequence of OwnMessage
             To be sent.
         """
         ways = self.ways.get(len(payload)) or self._find(len(payload))
@@ -310,14 +305,10 @@ _IN_4_BITS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class StatusFields:
+class StatusFields(NamedTuple):
     """The status message, with the fields that the layout has."""
 
-    key: FrameKey
-    length: int
-    fd: bool
-    protection: Protection | None
+    message: OwnMessage
     places: Mapping[str, BitPlace]
     """By their keys in the layout."""
     sums: Mapping[str, tuple[Codes, int]]
@@ -376,12 +367,9 @@ class Corrector:
         self._looked_s = self._foreign_until_s = float("-inf")
         self._silent, self._silent_since_s, self._was_awake = True, float("inf"), False
         self._foreign, self._alive = counters.foreign, 0
-        self._status_fields, self._payload = status_fields, bytearray()
+        self._status_fields = status_fields
         if status_fields is not None:
-            self.own_keys.add(status_fields.key)
-            self._payload = bytearray(status_fields.length)
-            if status_fields.protection is not None:
-                status_fields.protection.before_first(self._payload)
+            self.own_keys.add(status_fields.message.key)
 
     def put_in_force(self, *, reason: Reason, parameter_set: int, expected: JunctionResidual | None = None) -> None:
         """Begin with what the branches were just given; what was latched is released.
@@ -436,12 +424,12 @@ class Corrector:
             return State.PARTLY_CORRECTING, Reason.E2E_INVALID if is_invalid else Reason.INPUT_MISSING
         return State.CORRECTING, beside
 
-    def status(self) -> tuple[StatusFields, bytes] | None:
+    def status(self) -> OwnMessage | None:
         """Make the status message from the last look; None if the layout has none."""
         fields = self._status_fields
         if fields is None:
             return None
-        payload = self._payload
+        payload = bytearray(fields.message.data)
         state, reason = self.state()
         if reason > fields.places["reason"].highest:
             reason = _IN_4_BITS[reason]
@@ -453,9 +441,10 @@ class Corrector:
         for key, (codes, missing) in fields.sums.items():
             total_a = None if sums is None else getattr(sums, f"{key.removeprefix('sum_')}_a")
             codes.place.put(payload, missing if total_a is None else codes.nearest(as_written(total_a)))
-        if fields.protection is not None:
-            fields.protection.advance(payload)
-        return fields, bytes(payload)
+        if fields.message.protect is not None:
+            fields.message.protect(payload, fields.message.identity)
+        fields.message.data = payload
+        return fields.message
 
     def _see_whether_asleep(self, now_s: float) -> None:
         """All branches silent: the vehicle goes to sleep, which is no fault.

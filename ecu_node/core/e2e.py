@@ -17,18 +17,7 @@ from e2e import p01, p02, p04, p05, p06, p07, p11
 from ecu_node.core.signals import BitPlace, bit_place
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
-from ecu_node.layout import (
-    AutosarProfile,
-    CounterCrc8,
-    E2EWindow,
-    ProfileP01,
-    ProfileP02,
-    ProfileP04,
-    ProfileP05,
-    ProfileP06,
-    ProfileP07,
-    ProfileP11,
-)
+from ecu_node.layout import AutosarProfile, CounterCrc8, E2EWindow, ProfileP02
 
 
 class Check(IntEnum):
@@ -111,7 +100,12 @@ class Protection:
 
     def seal(self, payload: bytearray) -> None:
         """Write all but the counter, which stays."""
-        self.protect(payload, self.identity, increment_counter=False)
+        place, last = self.counter, self.counter.end - 1
+        if payload[last] & place.highest and not place.shift:
+            payload[last] -= 1  # then it counts on to what it was: a keyword argument costs three times as much
+            self.protect(payload, self.identity)
+        else:
+            self.protect(payload, self.identity, increment_counter=False)
 
     def advance(self, payload: bytearray) -> None:
         """Count on, and write all else."""
@@ -214,13 +208,13 @@ class _Profile(NamedTuple):
 
 
 _PROFILES = {
-    ProfileP01: _Profile(p01.e2e_p01_check, p01.e2e_p01_protect, 12, 1, 4, 15),
-    ProfileP02: _Profile(p02.e2e_p02_check, p02.e2e_p02_protect, 12, 1, 4, 16),
-    ProfileP04: _Profile(p04.e2e_p04_check, p04.e2e_p04_protect, 96, 2, 16, 1 << 16),
-    ProfileP05: _Profile(p05.e2e_p05_check, p05.e2e_p05_protect, 24, 2, 8, 1 << 8),
-    ProfileP06: _Profile(p06.e2e_p06_check, p06.e2e_p06_protect, 40, 4, 8, 1 << 8),
-    ProfileP07: _Profile(p07.e2e_p07_check, p07.e2e_p07_protect, 160, 12, 32, 1 << 32),
-    ProfileP11: _Profile(p11.e2e_p11_check, p11.e2e_p11_protect, 12, 1, 4, 15),
+    "P01": _Profile(p01.e2e_p01_check, p01.e2e_p01_protect, 12, 1, 4, 15),
+    "P02": _Profile(p02.e2e_p02_check, p02.e2e_p02_protect, 12, 1, 4, 16),
+    "P04": _Profile(p04.e2e_p04_check, p04.e2e_p04_protect, 96, 2, 16, 1 << 16),
+    "P05": _Profile(p05.e2e_p05_check, p05.e2e_p05_protect, 24, 2, 8, 1 << 8),
+    "P06": _Profile(p06.e2e_p06_check, p06.e2e_p06_protect, 40, 4, 8, 1 << 8),
+    "P07": _Profile(p07.e2e_p07_check, p07.e2e_p07_protect, 160, 12, 32, 1 << 32),
+    "P11": _Profile(p11.e2e_p11_check, p11.e2e_p11_protect, 12, 1, 4, 15),
 }
 _DATA_ID_MODES = {
     "both": p01.E2E_P01_DATAID_BOTH,
@@ -254,21 +248,18 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
         If the message cannot carry its protection.
     """
     layout = database.layout
-    entry = layout.protection(message.name)
+    place, entry = next((pair for pair in layout.protections if message.name in pair[1].messages), ("", None))
     if entry is None:
         return None
-    where = f"{layout.path}: {layout.protection_place(message.name)}: message {message.name}"
+    where = f"{layout.path}: {place}: message {message.name}"
     if message.length > _LONGEST_CLASSIC and message.length not in _FD_LENGTHS:
         raise LayoutError(
             f"{where} has {message.length} bytes in the DBC; CAN FD pads it, so that its CRC cannot be checked; "
             f"expected {', '.join(map(str, _FD_LENGTHS))}"
         )
-    make = _counter_crc8 if isinstance(entry, CounterCrc8) else _autosar
-    protection = Protection(
-        max_step=entry.max_delta_counter,
-        windows=(entry.init, entry.valid, entry.invalid),
-        **make(entry, message, where),  # type: ignore[operator]
-    )
+    how = _counter_crc8(entry, message, where) if isinstance(entry, CounterCrc8) else _autosar(entry, message)
+    windows = (entry.init, entry.valid, entry.invalid)
+    protection = Protection(max_step=entry.max_delta_counter, windows=windows, **how)
     if entry.max_delta_counter >= protection.modulus:
         raise LayoutError(
             f"{where}: max_delta_counter is {entry.max_delta_counter}, but the counter has {protection.modulus} codes "
@@ -285,22 +276,19 @@ def _data_id(given: dict[str, int], message: Message, highest: int = 0xFFFF) -> 
     return given.get(message.name, message.frame_id & highest)
 
 
-def _autosar(entry: AutosarProfile, message: Message, _: str) -> dict[str, Any]:
+def _autosar(entry: AutosarProfile, message: Message) -> dict[str, Any]:
     """Protection by a profile of AUTOSAR."""
-    profile = _PROFILES[type(entry)]
-    header_bits, options = profile.header_bits, {}
+    profile = _PROFILES[entry.profile]
+    header_bits, options = profile.header_bits, dict[str, int]()
     identity: int | bytes
     if isinstance(entry, ProfileP02):
         identity, offset = bytes(entry.data_id_list[message.name]), 0
     else:
-        highest = 0xFFFFFFFF if isinstance(entry, ProfileP04 | ProfileP07) else 0xFFFF
+        highest = 0xFFFFFFFF if entry.profile in {"P04", "P07"} else 0xFFFF
         identity, offset = _data_id(entry.data_id, message, highest), entry.offset
-        options = {"offset": offset} if offset else {}
-    if isinstance(entry, ProfileP01 | ProfileP11):
-        if mode := _DATA_ID_MODES[entry.data_id_mode]:
-            options["data_id_mode"] = mode
-        if entry.data_id_mode == "nibble":  # it is sent above the counter
-            header_bits += 4
+        mode = _DATA_ID_MODES[getattr(entry, "data_id_mode", "both")]
+        header_bits += 4 * (mode == p01.E2E_P01_DATAID_NIBBLE)  # it is sent above the counter
+        options = {key: value for key, value in (("offset", offset), ("data_id_mode", mode)) if value}
     first, bits = offset + profile.counter_byte, profile.counter_bits
     return {
         "header_mask": (1 << header_bits) - 1 << 8 * offset,
@@ -321,20 +309,21 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
         if name not in signals:
             raise LayoutError(f"{where} has no signal {name!r}; it has {', '.join(signals)}")
     counter_place, crc_place = bit_place(signals[entry.counter]), bit_place(signals[entry.crc])
-    if crc_place.length != 8 or crc_place.shift:
-        raise LayoutError(f"{where}: signal {entry.crc} must be one whole byte to be a CRC-8")
-    modulus = entry.counter_modulus or counter_place.highest + 1
-    if counter_place.end - counter_place.first > 1:
-        raise LayoutError(f"{where}: signal {entry.counter} must be within one byte to be a counter")
-    if counter_place.mask & crc_place.mask:
-        raise LayoutError(f"{where}: signals {entry.counter} and {entry.crc} overlap; each needs bits of its own")
-    if counter_place.signed or modulus > counter_place.highest + 1:
-        raise LayoutError(f"{where}: signal {entry.counter} cannot count from 0 to {modulus - 1}")
+    modulus, data_id = entry.counter_modulus or counter_place.highest + 1, _data_id(entry.data_id, message)
+    for is_wrong, text in (
+        (crc_place.length != 8 or crc_place.shift, f"signal {entry.crc} must be one whole byte to be a CRC-8"),
+        (counter_place.end - counter_place.first > 1,
+         f"signal {entry.counter} must be within one byte to be a counter"),
+        (counter_place.mask & crc_place.mask,
+         f"signals {entry.counter} and {entry.crc} overlap; each needs bits of its own"),
+        (counter_place.signed or modulus > counter_place.highest + 1,
+         f"signal {entry.counter} cannot count from 0 to {modulus - 1}"),
+        (message.name in entry.data_id and data_id >= 1 << 8 * entry.data_id_bytes,
+         f"data_id {data_id} does not fit into data_id_bytes = {entry.data_id_bytes}"),
+    ):  # fmt: skip
+        if is_wrong:
+            raise LayoutError(f"{where}: {text}")
     crc8 = _algorithm(entry.algorithm, where)
-    if message.name in entry.data_id and entry.data_id[message.name] >= 1 << 8 * entry.data_id_bytes:
-        raise LayoutError(
-            f"{where}: data_id {entry.data_id[message.name]} does not fit into data_id_bytes = {entry.data_id_bytes}"
-        )
     byte = crc_place.first
     counter_byte, shift, ones = counter_place.first, counter_place.shift, counter_place.highest
     is_before = entry.data_id_at == "before"
@@ -356,7 +345,7 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
         "counter": counter_place,
         "check": lambda payload, identity: payload[byte] == crc(payload, identity),
         "protect": protect,
-        "identity": _data_id(entry.data_id, message).to_bytes(2, "little")[: entry.data_id_bytes],
+        "identity": data_id.to_bytes(2, "little")[: entry.data_id_bytes],
     }
 
 

@@ -508,6 +508,10 @@ class JunctionWatch:
         self.is_whole: Callable[[float], bool] = lambda _: True
         self.restart()
 
+    def judge_only(self, state: HeardSignal, valid: frozenset[int]) -> None:
+        """Judge sums while a state has one of these codes: all currents of the junction are measured then."""
+        self.is_whole = lambda now_s: state.code_at(now_s) in valid
+
     def restart(self, expected: JunctionResidual = _NOTHING_EXPECTED) -> None:
         """Forget what was seen, and judge by what the parameter file says of the sum of right sensors from now on.
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 from cantools.database.can import Message, Signal
@@ -122,17 +123,17 @@ class BitPlace:
     length: int
     signed: bool
 
-    @property
+    @cached_property
     def lowest(self) -> int:
         """Least raw integer that the width can hold."""
         return -(1 << (self.length - 1)) if self.signed else 0
 
-    @property
+    @cached_property
     def highest(self) -> int:
         """Greatest raw integer that the width can hold."""
         return (1 << (self.length - self.signed)) - 1
 
-    @property
+    @cached_property
     def mask(self) -> int:
         """The signal's bits in the payload read as one little-endian integer."""
         field = ((1 << self.length) - 1) << self.shift

@@ -8,6 +8,7 @@ where our own checks then refuse the set; whatever TUF refuses leaves the state 
 
 import os
 from collections.abc import Callable
+from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -189,14 +190,14 @@ def update(
     UserError
         If the state cannot be written.
     """
-    with locked(folder, on_wait=on_wait):
+    with nullcontext() if dry_run else locked(folder, on_wait=on_wait):
         state = read_state(folder)
         try:
             offer = _verified_offer(state, source, max(now, state.latest))
             kept, told = _without_revoked(state, offer, now)
         except UnfitError as error:
             if not dry_run:
-                add_decision(folder, "refused", str(error), now)
+                add_decision(folder, "refused", str(error), now, reason=error.reason)
             raise
         refusal = None
         try:
@@ -207,7 +208,7 @@ def update(
             write_state(folder, taken)
             for entry, words in (("revoked", told), (event, text)):
                 if words and entry != "nothing new":
-                    add_decision(folder, entry, words, now)
+                    add_decision(folder, entry, words, now, reason=refusal.reason if refusal else None)
         if refusal is not None:
             raise type(refusal)(refusal.reason, f"{refusal}; {told}" if told else str(refusal))
     return f"revoked: {told}; {event}: {text}" if told else f"{event}: {text}"
@@ -261,7 +262,10 @@ def _refusal(error: Exception, source: str, vehicle: str) -> TrustError:
     hint = {
         Reason.NOT_VALID_NOW: "; get a newer one, or set the clock",
         Reason.REPLAYED: "; older than what was accepted before",
+        Reason.NOT_SIGNED: "; another repository than the one that this vehicle trusts, or it was changed on the way; "
+        "all N.root.json belong to it",
         Reason.NO_PARAMETERS: f"; is it complete, and for vehicle {vehicle!r}, which this is?",
+        Reason.MALFORMED_PARAMETERS: "; copy it again",
     }
     kinds = (
         (exceptions.ExpiredMetadataError, Reason.NOT_VALID_NOW),
@@ -274,7 +278,13 @@ def _refusal(error: Exception, source: str, vehicle: str) -> TrustError:
         (exceptions.RepositoryError, Reason.MALFORMED_PARAMETERS),
     )
     reason = next(reason for kind, reason in kinds if isinstance(error, kind))
-    return TrustError(reason, f"{source}: {error}{hint.get(reason, '')}")
+    advice = hint[reason]
+    if source.startswith("http") and isinstance(error, exceptions.DownloadError | HTTPError):
+        if not isinstance(error, exceptions.DownloadHTTPError):
+            advice = "; check address and connection"
+        while error.__context__ is not None:  # the innermost says what it was, such as a name that is not known
+            error = error.__context__  # type: ignore[assignment]
+    return TrustError(reason, f"{source}: {str(error) or type(error).__name__}{advice}")
 
 
 def _without_revoked(state: VehicleState, offer: _Offer, now: datetime) -> tuple[VehicleState, str]:
@@ -309,14 +319,17 @@ def _judged(
             raise TrustError(
                 Reason.MALFORMED_PARAMETERS, f"{source}: layout and DBC are not those of the signed description"
             )
+        require_not_expired(found, state, now)
+        check_fit(parameters, database, state.vehicle)
         if state.in_force == found:
             return replace(state, on_trial=None), "nothing new", f"{found} is in force"
         if state.on_trial == found:
             return state, "nothing new", f"{found} is on trial"
         if state.failed == found:
             raise TrustError(Reason.REPLAYED, f"{source}: {found} has failed its trial here; calibrate anew")
-        require_not_expired(found, state, now)
-        check_fit(parameters, database, state.vehicle)
+        if state.in_force is not None and state.in_force.content == found.content:
+            until = time_text(found.expires)
+            return replace(state, in_force=found, on_trial=None), "extended", f"{found} is in force until {until}"
         if not offer.facts.allow_large_step and state.in_force is not None:
             _require_small_step(state.in_force.parameters, parameters, database)
     except UnfitError as error:

@@ -106,7 +106,7 @@ def _update(options: argparse.Namespace) -> int:
         dry_run=options.dry_run,
         on_wait=lambda line: say_error(f"ecu-node: {line}"),
     )
-    text = f"would be taken: {text}" if options.dry_run else text
+    text = f"dry run, nothing is changed: {text}" if options.dry_run else text
     facts = {"taken": not options.dry_run, "text": text, **_facts(read_state(options.state))}
     write_result(facts, printable(text), as_json=options.json)
     return 0

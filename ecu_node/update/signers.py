@@ -1,7 +1,7 @@
 """Keys by name: a private key in a PEM file, or a public one with the URI of where its private half is kept.
 
-    anna.key                        PEM, PKCS #8; its passphrase, if it has one, in $CALIBRATOR_KEY_PASSPHRASE
-    anna.pub=hsm:2                  PKCS #11, such as a YubiKey; $PYKCS11LIB names its library
+    anna.key                        PEM, PKCS #8; its passphrase, if it has one, in $CALIBRATOR_KEY_PASSPHRASE or typed
+    anna.pub=hsm:2                  PKCS #11, such as a YubiKey; $PYKCS11LIB names its library; the PIN likewise
     release.pub=awskms:KEY          cloud key services; also gcpkms:, azurekms:, hv: (HashiCorp Vault)
 
 What stands behind the equals sign is a signer URI of securesystemslib, which says which package each kind needs.
@@ -9,12 +9,14 @@ What stands behind the equals sign is a signer URI of securesystemslib, which sa
 
 import os
 import stat
+import sys
+from collections.abc import Iterator
+from getpass import getpass
 from pathlib import Path
 
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.serialization import load_pem_private_key, load_pem_public_key
-from securesystemslib.exceptions import UnsupportedLibraryError
-from securesystemslib.signer import CryptoSigner, Signer, SSlibKey
+from securesystemslib.signer import SIGNER_FOR_URI_SCHEME, CryptoSigner, Signer, SSlibKey
 
 from ecu_node.documents import read_user_file
 from ecu_node.errors import UserError
@@ -55,30 +57,43 @@ def signer_of(text: str) -> Signer:
     """
     public, is_uri, uri = text.partition("=")
     if is_uri:
+        key = public_key_of(Path(public))
         try:
-            return Signer.from_priv_key_uri(uri, public_key_of(Path(public)))
-        except (ValueError, OSError, UnsupportedLibraryError) as error:
-            raise UserError(f"{text}: the key cannot be used: {error}") from None
+            return Signer.from_priv_key_uri(uri, key, lambda what: next(_secrets(f"{what} of {text}"), ""))
+        except Exception as error:  # noqa: BLE001 (each device and service has errors of its own)
+            known = ", ".join(f"{scheme}:" for scheme in SIGNER_FOR_URI_SCHEME)
+            raise UserError(
+                f"{text}: the key cannot be used: {type(error).__name__}: {error}; a URI of {known} is expected"
+            ) from None
     path = Path(text)
     try:
         content = read_user_file(path, largest_bytes=_LARGEST_KEY_BYTES)
         rights = stat.S_IMODE(path.stat().st_mode)
     except OSError as error:
         raise UserError(f"{path}: cannot read the private key: {error.strerror}; give NAME.key of a signer") from None
-    passphrase = os.environ.get(PASSPHRASE_VARIABLE)
-    secret = os.fsencode(passphrase) if passphrase and b"ENCRYPTED" in content else None
-    try:
-        signer = CryptoSigner(load_pem_private_key(content, secret))
-    except TypeError:
-        raise UserError(
-            f"{path}: the private key is encrypted; give its passphrase in ${PASSPHRASE_VARIABLE}"
-        ) from None
-    except (ValueError, UnsupportedAlgorithm):
-        why = f"it is damaged, or ${PASSPHRASE_VARIABLE} is not its passphrase" if secret else "it is none, or damaged"
-        raise UserError(f"{path}: cannot be used as a private key (PEM, PKCS #8): {why}") from None
+    is_encrypted = b"ENCRYPTED" in content
+    why = "it is none, or damaged"
+    for secret in _secrets(f"passphrase of {path}") if is_encrypted else (None,):
+        try:
+            signer = CryptoSigner(load_pem_private_key(content, os.fsencode(secret) if secret else None))
+            break
+        except (ValueError, TypeError, UnsupportedAlgorithm):
+            why = f"it is damaged, or ${PASSPHRASE_VARIABLE} is not its passphrase" if is_encrypted else why
+    else:
+        if is_encrypted and not os.environ.get(PASSPHRASE_VARIABLE):
+            raise UserError(f"{path}: the private key is encrypted; give its passphrase in ${PASSPHRASE_VARIABLE}")
+        raise UserError(f"{path}: cannot be used as a private key (PEM, PKCS #8): {why}")
     if rights & 0o066:
         raise UserError(
             f"{path}: others than its owner can read or write this private key (mode {rights:03o}); 'chmod 600' it, "
             f"and if somebody may have read it, make another key"
         )
     return signer
+
+
+def _secrets(what: str) -> Iterator[str]:
+    """A passphrase or PIN: that of the environment, then what a person at the terminal types, each in one try."""
+    if secret := os.environ.get(PASSPHRASE_VARIABLE):
+        yield secret
+    if sys.stdin.isatty():
+        yield getpass(f"{what}: ")

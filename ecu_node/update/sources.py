@@ -56,6 +56,8 @@ def open_source(text: str) -> tuple[FetcherInterface, str]:
     """
     if text.startswith(("http://", "https://")):
         return _WebFetcher(), text.rstrip("/") + "/"
+    if "://" in text:
+        raise TrustError(Reason.NO_PARAMETERS, f"{text}: only http:// and https:// are known; name a bundle or folder")
     path = Path(text)
     if (path / "metadata").is_dir():
         return _FolderFetcher(path), ""
@@ -103,7 +105,8 @@ class _BundleFetcher(FetcherInterface):
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         if url not in self._files:
-            raise DownloadHTTPError(f"{url} is not in the bundle", 404)
+            names = [PurePosixPath(name).name.partition(".")[2] for name in self._files if name.startswith("targets/")]
+            raise DownloadHTTPError(f"{url} is not in the bundle, which has {' '.join(names) or 'no parameters'}", 404)
         return iter([self._files[url].encode(errors="surrogatepass")])
 
 

@@ -177,9 +177,10 @@ def write_state(folder: Path, state: VehicleState) -> None:
         ) from None
 
 
-def add_decision(folder: Path, event: str, text: str, now: datetime) -> None:
+def add_decision(folder: Path, event: str, text: str, now: datetime, *, reason: Reason | None = None) -> None:
     """Add a line to the log of decisions; raises UserError if it cannot be written."""
     line = {"time": time_text(now), "event": event, "text": text[:1000].encode(errors="backslashreplace").decode()}
+    line |= {"reason": reason.name.title().replace("_", "")} if reason is not None else {}
     try:
         _write(folder / "decisions.log", os.O_CREAT | os.O_APPEND, msgspec.json.encode(line) + b"\n")
     except OSError as error:

@@ -16,13 +16,10 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 from selenium.webdriver.support.wait import WebDriverWait
 
-from calibrator.estimator.evidence import VehicleEvidence
-from calibrator.report.page import fleet_report, vehicle_report
+from calibrator.report.page import fleet_report
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-from ecu_node.parameters import VehicleParameters
-from tests.calibrator.report import results_at_hand
-from tests.calibrator.report.results_at_hand import evidence_of, sensor, six_vehicle_result, vehicle, write_result
+from tests.calibrator.report.results_at_hand import sensor, six_vehicle_result, vehicle, write_result
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 PATIENCE_S = 60.0
@@ -129,20 +126,6 @@ def test_the_table_shows_the_numbers_of_the_result(page: webdriver.Chrome, resul
         assert cells[8] == "30.0 min"
 
 
-def test_the_vehicle_shows_the_numbers_of_its_parameters(page: webdriver.Chrome) -> None:
-    text = vehicle_text(page, "V1")
-    for part in (
-        "+10.00 ± 0.10",
-        "+4.00 ± 0.10",
-        "99.5 %",
-        "corrects it",
-        "24.00 A as measured, 0.50 A after correction",
-    ):
-        assert part in text
-    assert "Yes: all that was measured is as the estimate predicts" in text
-    until(page, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 1")
-
-
 def test_an_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     text = vehicle_text(page, "V4")
     assert "battery 0.00 ± 2.00 +8.00 ± 2.00 (60 %) or none (40 %)" in text
@@ -175,32 +158,6 @@ def test_what_is_not_known_is_never_a_zero(
     assert "motor not known 0.00 ± 0.10" in vehicle_text(browser, "V2")
 
 
-def test_an_estimate_that_misses_what_was_measured_is_said_not_to_fit(
-    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    wrong = vehicle(database, "V1", sensor(0.1, 4.0, apply=True), sensor())
-
-    def missed(item: VehicleParameters) -> VehicleEvidence:
-        evidence = evidence_of(item)
-        return VehicleEvidence(
-            value=[None if each is None else each + 1.0 for each in evidence.value],
-            sd=evidence.sd,
-            explained=evidence.explained,
-        )
-
-    monkeypatch.setattr(results_at_hand, "evidence_of", missed)
-    opened(browser, vehicle_report(write_result(tmp_path / "r", [wrong]), "V1")[0], tmp_path / "page.html")
-    assert "Not all of it: what was measured is up to 500.0 standard deviations" in vehicle_text(browser, "V1")
-
-
-def test_a_place_that_there_is_not_changes_nothing(page: webdriver.Chrome) -> None:
-    page.execute_script("location.hash = 'vehicle=%E0%A4%A'")
-    page.execute_script("location.hash = 'vehicle=V99'")
-    assert not page.find_element(By.ID, "vehicle").is_displayed()
-    assert page.execute_script("return document.body.dataset.failed") is None
-    assert page.get_log("browser") == []
-
-
 def test_filters_leave_the_vehicles_that_are_asked_for(page: webdriver.Chrome) -> None:
     page.find_element(By.ID, "find").send_keys("v1")
     until(page, "return document.getElementById('count').textContent.startsWith('2 of 6')")
@@ -228,16 +185,6 @@ def test_headings_sort_and_say_so(page: webdriver.Chrome) -> None:
     assert names(page)[:2] == ["V5", "V1"]
     assert heads["sum before"].find_element(By.XPATH, "..").get_attribute("aria-sort") == "descending"
     assert heads["vehicle"].find_element(By.XPATH, "..").get_attribute("aria-sort") is None
-
-
-def test_what_is_listed_can_be_saved(page: webdriver.Chrome) -> None:
-    page.execute_script(
-        "URL.createObjectURL = (blob) => { window.saved = blob; return '#'; }; document.getElementById('save').click();"
-    )
-    lines = page.execute_async_script("const end = arguments[0]; window.saved.text().then(end)").splitlines()
-    assert lines[0].startswith('"vehicle","verdict","confidence","junction_rms_measured_a"')
-    assert '"V1","corrected",0.970,24.00,0.50,0.010,0.10000,4.00,1,0.00000,0.00,0' in lines
-    assert len(lines) == 7
 
 
 def test_the_keyboard_reaches_a_vehicle(page: webdriver.Chrome) -> None:
@@ -274,18 +221,6 @@ def test_text_can_be_read_against_its_background(page: webdriver.Chrome) -> None
     assert [item for item in found if item[0] < LEAST_CONTRAST] == []
 
 
-def test_the_page_of_a_vehicle_opens_without_an_error(browser: webdriver.Chrome, result: Path, tmp_path: Path) -> None:
-    opened(browser, vehicle_report(result, "V1")[0], tmp_path / "V1.html")
-    until(browser, "return document.querySelectorAll('.plot[data-drawn]').length === 1")
-    assert browser.get_log("browser") == []
-    assert browser.find_element(By.TAG_NAME, "h1").text == "Vehicle V1"
-    sizes = browser.execute_script(
-        "return [...document.querySelectorAll('.plot')].map((drawing) => drawing.getBoundingClientRect().width)"
-    )
-    assert min(sizes) > 300
-    assert [item for item in browser.execute_script(CONTRAST) if item[0] < LEAST_CONTRAST] == []
-
-
 def test_one_junction_by_itself_opens_without_an_error(
     browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
 ) -> None:
@@ -298,17 +233,6 @@ def test_one_junction_by_itself_opens_without_an_error(
     text = browser.find_element(By.TAG_NAME, "main").text
     assert "battery +10.00 ± 0.10 +4.00 ± 0.10 99.5 % 0.02 % 20 ms corrects it" in text
     assert "Not known: this calibration keeps no evidence." in text
-
-
-def test_nothing_is_wider_than_a_narrow_screen(page: webdriver.Chrome) -> None:
-    """What is wider, as tables, scrolls in itself."""
-    vehicle_text(page, "V4")
-    size = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": False}
-    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    try:
-        assert until(page, "return document.documentElement.scrollWidth <= 400")
-    finally:
-        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_it_prints_on_a4_with_its_figures_whole(page: webdriver.Chrome) -> None:

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from calibrator.cli import app, main
-from calibrator.experiments.experiments import EXPERIMENTS
+from calibrator.cli import app
 from calibrator.processes.interrupts import TERMINATED, interrupted_message, terminated_message
 from ecu_node.program import INTERRUPTED
 
@@ -32,21 +31,13 @@ def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
     ("options", "message"),
     [
         (["--noise", "inf"], "inf: expected a number from 0 to 1"),
-        (["--noise", "nan"], "nan: expected a number from 0 to 1"),
         (["--noise", "-0.1"], "-0.1: expected a number from 0 to 1"),
         (["--delay", "inf"], "inf: expected a number from 0 to 1000"),
-        (["--delay", "1e9"], "1e9: expected a number from 0 to 1000"),
         (["--minutes", "1e9"], "1e9: expected a number from 0.1 to 240"),
-        (["--minutes", "nan"], "nan: expected a number from 0.1 to 240"),
         (["--unseen-minutes", "inf"], "inf: expected a number from 0.1 to 240"),
-        (["--sparsity", "nan"], "nan: expected a number from 0 to 100"),
-        (["--sparsity", "-inf"], "-inf: expected a number from 0 to 100"),
         (["--sparsity", "few"], "few: expected a number from 0 to 100"),
         (["--unmeasured", "nan", "1"], "expected mean and standard deviation from 0 to 1000 A"),
         (["--unmeasured", "1", "-1"], "expected mean and standard deviation from 0 to 1000 A"),
-        (["--unmeasured", "1e6", "1"], "expected mean and standard deviation from 0 to 1000 A"),
-        (["--magnitude", "nan", "0.2"], "expected 0 <= LO <= HI < 1"),
-        (["--magnitude", "0.1", "inf"], "expected 0 <= LO <= HI < 1"),
         (["--magnitude", "0.2", "0.1"], "expected 0 <= LO <= HI < 1"),
         (["--vehicles", "1000000000"], ""),
         (["--seed", "1" + 30 * "0"], ""),
@@ -143,10 +134,6 @@ def test_output_that_cannot_be_made_is_refused_before_the_work(command: list[str
         (["snr", "--layout", "none.toml"], "--layout: snr takes the built-in vehicle; this is only for real, delay"),
         (["calibration", "--quick"], "--quick: calibration runs nothing, it pools what is recorded in --out"),
         (["calibration", "--repetitions", "3"], "--repetitions: calibration runs nothing"),
-        (["calibration", "--seed", "0"], "--seed: calibration runs nothing"),
-        (["calibration", "--drives", "store"], "--drives: calibration runs nothing"),
-        (["calibration", "--layout", "none.toml"], "--layout: calibration runs nothing"),
-        (["calibration", "--workers", "1"], "--workers: calibration runs nothing"),
         (["calibration", "--json"], "--out: calibration pools what is recorded there; first run 'calibrator "),
     ],
 )
@@ -157,72 +144,6 @@ def test_experiment_refuses_what_it_does_not_heed(arguments: list[str], message:
     (error,) = [line for line in run.stderr.splitlines() if line.startswith("Error")]
     assert message in error
     assert not (tmp_path / "x").exists()
-
-
-RECORDED = [name for name, row in EXPERIMENTS.items() if row.recorded]
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        *((name, ["--drives", "store", "--layout", "none.toml"]) for name in (*RECORDED, "all")),
-        ("sparsity", ["--quick", "--repetitions", "1", "--seed", "3", "--workers", "1"]),
-    ],
-)
-def test_experiment_heeds_its_own_options(name: str, options: list[str], tmp_path: Path) -> None:
-    # The folder is what is complained of: the options before it were not.
-    (tmp_path / "file").write_text("mine")
-    run = CliRunner().invoke(app, ["experiment", name, *options, "--out", str(tmp_path / "file" / "x")])
-    assert run.exit_code == 1
-    assert "cannot be made" in str(run.exception)
-
-
-@pytest.mark.parametrize("name", ["real", "all"])
-def test_experiment_on_recorded_trips_outside_a_checkout_asks_for_a_layout_before_it_runs(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["calibrator", "experiment", name, "--quick"])
-    assert main() == 1
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.startswith("calibrator: dbc/hv_powertrain.toml: not in this folder")
-    assert printed.err.endswith("name it with --layout\n")
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["simulate", "--vehicles", "2"],
-        ["calibrate", "nowhere"],
-        ["import", "nowhere.log"],
-        ["experiment", "snr"],
-    ],
-)
-def test_output_where_the_system_makes_nothing_is_refused_before_the_work(command: list[str]) -> None:
-    layout = [] if command[0] == "experiment" else ["--layout", str(LAYOUT)]
-    run = calibrator(*command, *layout, "--out", "/proc/x")
-    assert run.returncode == 1
-    (line,) = run.stderr.splitlines()
-    assert line.startswith("calibrator: /proc/x: nothing can be made in /proc: ")
-    assert line.endswith("; choose another folder")
-
-
-def test_layout_without_the_builtin_vehicles_names_is_told_them(tmp_path: Path) -> None:
-    text = LAYOUT.read_text().replace('"hv_powertrain.dbc"', f'"{LAYOUT.parent / "hv_powertrain.dbc"}"')
-    for name in ("battery", "motor", "auxiliary", "dcdc", "motor_rear"):
-        text = text.replace(f'name = "{name}"', f'name = "my_{name}"')
-    (tmp_path / "mine.toml").write_text(text)
-    run = calibrator("simulate", "--vehicles", 2, "--layout", tmp_path / "mine.toml", "--out", tmp_path / "x")
-    assert run.returncode == 1
-    assert "needs two or more branches named battery, motor, auxiliary, dcdc, motor_rear" in run.stderr
-    assert "--drives" in run.stderr
-
-
-def test_help_names_the_exit_codes() -> None:
-    run = calibrator("-h")
-    assert run.returncode == 0
-    assert "130 interrupted" in " ".join(run.stdout.split())
 
 
 def test_ctrl_c_during_start_up_ends_it_in_one_line() -> None:
@@ -243,8 +164,7 @@ def test_ctrl_c_during_start_up_ends_it_in_one_line() -> None:
     assert (run.returncode, run.stdout, run.stderr) == (INTERRUPTED, "", f"{interrupted_message([])}\n")
 
 
-@pytest.mark.parametrize("delay_s", [0.4, 0.8])
-def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(delay_s: float, tmp_path: Path) -> None:
+def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(tmp_path: Path) -> None:
     command = [
         *(sys.executable, "-m", "calibrator", "simulate", "--vehicles", "200", "--minutes", "2"),
         *("--layout", str(LAYOUT), "--out", str(tmp_path / "x")),
@@ -253,7 +173,7 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(delay_s: 
         while not list(tmp_path.iterdir()):  # the hidden folder: the workers are about to start
             assert process.poll() is None
             time.sleep(0.01)
-        time.sleep(delay_s)
+        time.sleep(0.4)
         os.killpg(process.pid, signal.SIGINT)
         _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (INTERRUPTED, f"{interrupted_message(command[3:])}\n")
@@ -267,7 +187,7 @@ def short_folder() -> Iterator[Path]:
         yield Path(folder)
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("delay_s", [0.0, 2.0])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_and_sigterm_while_logs_are_read_end_readers_too_in_one_line(
     how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path

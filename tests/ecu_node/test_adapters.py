@@ -111,19 +111,6 @@ def test_speed_that_would_be_another_one_is_refused(
         bus_config("pcan", "PCAN_USBBUS1", fd=fd)
 
 
-def test_bit_timing_that_the_driver_drops_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
-    with pytest.raises(BusError, match=r"^gs_usb 0: python-can cannot set a bit timing there"):
-        bus_config("gs_usb", "0", bitrates={"bitrate": 250_000})
-
-
-@pytest.mark.parametrize("text", ["bitrate = 250000\n", "[default\n"])
-def test_configuration_that_cannot_be_read_is_named(text: str, tmp_path: Path) -> None:
-    (tmp_path / "can.conf").write_text(text)
-    with pytest.raises(BusError, match=r"^pcan c0: cannot open the bus: File contains no section headers.*can\.conf"):
-        bus_config("pcan", "c0")
-
-
 # ---- python-can's configuration
 
 
@@ -166,37 +153,7 @@ def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
     assert "no bitrate" in capsys.readouterr().err
 
 
-def test_dry_run_of_a_gateway_shows_both_buses(
-    node: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    timing = "\n".join(f"{name} = {value}" for name, value in FD_TIMING.items())
-    (tmp_path / "can.conf").write_text(f"[0]\nbitrate = 500000\ndata_bitrate = 2000000\n[1]\n{timing}\n")
-    assert main([*node, "--interface", "kvaser", "--channel", "0", "--gateway", "1", "--fd", "--dry-run"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert "would open kvaser 0: fd True, bitrate 500000, data_bitrate 2000000" in lines
-    assert any(
-        re.match(r"would open kvaser 1: fd True, timing NBR: 500_000 bit/s, NSP: 80.00%,", line) for line in lines
-    )
-    assert "  sends Pair (0x100), Heater (0x200), corrected; nothing; " not in lines
-    assert lines[1] == "  reads all frames; corrects Pair (0x100), Heater (0x200)"
-
-
 # ---- listening only
-
-
-@pytest.mark.parametrize(
-    ("interface", "settings"),
-    [
-        ("pcan", {"state": can.BusState.PASSIVE}),
-        ("kvaser", {"driver_mode": False}),
-        ("vector", {"listen_only": True}),
-        ("slcan", {"listen_only": True}),
-        ("gs_usb", {}),
-    ],
-)
-def test_listen_only_settings_of_each_driver(interface: str, settings: dict[str, object]) -> None:
-    both = [bus_config(interface, "1", listen_only=only, bitrates={"bitrate": 250_000}) for only in (False, True)]
-    assert both[1] == {**both[0], **settings}
 
 
 @pytest.mark.parametrize(
@@ -311,13 +268,6 @@ def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected(node: list[str], 
         assert values["Motor"] == pytest.approx(CORRECTED_A)
 
 
-def test_slcan_with_a_bit_timing(node: list[str], adapter: SlcanAdapter, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CAN_CONFIG", json.dumps({**CLASSIC_TIMING, "sleep_after_open": 0}))
-    with running(*node, "--interface", "slcan", "--channel", adapter.path):
-        pass
-    assert adapter.lines == [b"C", b"s011C", b"O", b"O", b"C"]
-
-
 def test_slcan_that_only_listens_computes_and_never_sends(node: list[str], adapter: SlcanAdapter) -> None:
     bus = ("--interface", "slcan", "--channel", adapter.path, "--bitrate", "250000")
     with running(*node, *bus, "--listen-only") as log:
@@ -393,23 +343,3 @@ def test_serial_line_is_answered_corrected_also_after_a_disturbance(node: list[s
             while line.bus.recv(0.1) is not None:
                 pass  # answers to the frames before
     assert any("running on serial" in text for text in log)
-
-
-GROUP = "239.74.163.7"
-
-
-def test_node_that_only_listens_stands_beside_the_one_that_sends(node: list[str]) -> None:
-    try:
-        peer = can.Bus(GROUP, "udp_multicast", ignore_config=True, can_filters=[{"can_id": 0x200, "can_mask": 0x7FF}])
-    except (can.CanError, OSError) as error:
-        pytest.skip(str(error))
-    bus = ("--interface", "udp_multicast", "--channel", GROUP)
-    with peer, running(*node, *bus, "--shadow") as sends, running(*node, *bus, "--listen-only") as listens:
-        answers = []
-        for _ in range(50):
-            peer.send(can.Message(arbitration_id=0x100, data=MEASURED, is_extended_id=False))
-            answers.append(peer.recv(5.0))
-        assert peer.recv(0.2) is None
-    assert {message.arbitration_id for message in answers if message is not None} == {0x200}
-    assert "frames in 50, answers 50" in sends[-1]
-    assert "frames in 50, answers 50" in listens[-1]

@@ -55,17 +55,6 @@ def test_put_writes_what_cantools_encodes_and_keeps_all_other_bits(
     assert place.extract(payload) == raw
 
 
-@given(placed_signals(), st.data())
-def test_a_frame_too_short_gives_none_and_is_left_alone(case: tuple[Message, Signal], data: st.DataObject) -> None:
-    _, signal = case
-    place = bit_place(signal)
-    payload = bytearray(data.draw(st.binary(max_size=place.end - 1)))
-    before = bytes(payload)
-    assert place.extract(payload) is None
-    assert not place.put(payload, 0)
-    assert payload == before
-
-
 def test_a_code_beyond_the_width_is_refused_and_never_wraps() -> None:
     place = bit_place(Signal("S", start=0, length=8, is_signed=True))
     with pytest.raises(ValueError, match="128 does not fit into 8 bits"):

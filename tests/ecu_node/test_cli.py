@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node import __version__
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
-from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, as_document, parameters_for
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, parameters_for
 
 
 @pytest.fixture
@@ -56,24 +54,6 @@ def test_the_same_as_text(params: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert max(map(len, lines)) <= 80
 
 
-def test_a_fault_that_the_file_names_and_does_not_apply_is_shown_as_such(
-    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    document = as_document(parameters_for(database, battery=(-0.01, 4.1), motor=(0.0, 0.0)))
-    document["branches"]["battery"]["apply"] = document["branches"]["motor"]["apply"] = False
-    path = tmp_path / "held.json"
-    path.write_text(json.dumps(document))
-    assert main(check(path)) == 0
-    shown = [line.split(maxsplit=4) for line in capsys.readouterr().out.splitlines()[2:7] if line[0] != " "]
-    assert shown[:2] == [
-        ["battery", "-1.0000%", "+4.100", "A", 'passed through, "apply" is false'],
-        ["motor", "+0.0000%", "+0.000", "A", "passed through"],
-    ]
-    assert main(check(path, "--json")) == 0
-    found = json.loads(capsys.readouterr().out)["branches"]["battery"]
-    assert (found["drift"], found["offset_a"], found["apply"], found["applied"]) == (-0.01, 4.1, False, False)
-
-
 @pytest.fixture
 def small(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> Callable[..., list[str]]:
     """Options for a small vehicle whose parameters apply a fault to the heater, a power branch."""
@@ -85,77 +65,6 @@ def small(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> Call
         return ["--params", str(path), "--layout", str(database.layout.path), "--vehicle", "v1"]
 
     return make
-
-
-WITHOUT_SNA = SMALL_DBC.replace('VAL_ 512 Motor -32768 "SNA";\n', "")
-
-
-def test_check_refuses_what_run_refuses(small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:
-    options = small(WITHOUT_SNA)
-    run = ["run", "--unsigned", *options, "--interface", "virtual", "--channel", "c0"]
-    assert [main(["check", *options]), main(run)] == [1, 1]
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    first, second = captured.err.splitlines()
-    assert first == second
-    assert first.endswith("branch motor: signal Motor needs a code named SNA in the DBC (VAL_) that says 'no value'")
-
-
-def test_check_warns_of_a_correction_that_is_not_published(
-    small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = small()
-    words = "branch heater is not published: the parameters apply a fault to it, but the layout has no 'corrected'"
-    assert main(["check", *options]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-1].startswith(f"warning: {words}")
-    assert next(line for line in lines if line.startswith("heater")).endswith("A  not published")
-    assert main(["check", *options, "--json"]) == 0
-    (warning,) = json.loads(capsys.readouterr().out)["warnings"]
-    assert warning.startswith(words)
-
-
-def test_check_shows_how_an_offset_of_a_power_is_corrected_with_the_voltage(
-    make_database: Callable[..., VehicleDatabase], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    database = make_database()
-    write_parameters(parameters_for(database, heater=(0.0, 2.0)), tmp_path / "v1.json")
-    files = ["--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
-    assert main(["check", *files, "--gateway", "can1"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    heater = next(index for index, line in enumerate(lines) if line.startswith("heater"))
-    assert "voltage gain " in lines[heater + 2]
-    assert lines[-1] == "  of a power: + voltage code * voltage gain in the parentheses"
-
-
-def test_check_says_that_run_needs_fd(small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", *small(SMALL_DBC.replace("PairOut: 8", "PairOut: 16"))]) == 0
-    assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
-
-
-def test_run_does_not_claim_to_correct_what_it_cannot_publish(
-    small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ecu_node.bus.service.Requests.stop", lambda self: True)
-    handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)]
-    try:
-        assert main(["run", "--unsigned", *small(), "--interface", "virtual", "--channel", "c0"]) == 0
-    finally:
-        signal.signal(signal.SIGTERM, handlers[0])
-        signal.signal(signal.SIGHUP, handlers[2])
-    assert signal.getsignal(signal.SIGINT) == handlers[1]
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "ecu-node: parameters are used that nobody signed (--unsigned)"
-    assert lines[1].startswith("ecu-node: branch heater is not published: ")
-    assert lines[2] == "ecu-node: running on virtual c0, correcting battery"
-
-
-@pytest.mark.parametrize("more", [["--channel", ""], ["--channel", "c0", "--gateway", ""]])
-def test_an_empty_name_of_a_bus_is_wrong_use(params: Path, more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["run", "--unsigned", "--params", str(params), "--layout", str(LAYOUT), *more])
-    assert caught.value.code == 2
-    assert "a name is expected, such as can0, found none" in capsys.readouterr().err
 
 
 def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -207,21 +116,6 @@ def test_wrong_use_ends_in_2(arguments: list[str], capsys: pytest.CaptureFixture
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("ecu-node")
     assert line.endswith(" --help'")
-
-
-@pytest.mark.parametrize("option", ["-h", "--help"])
-@pytest.mark.parametrize("command", [[], ["run"], ["check"], ["schema"]])
-def test_help_is_given(command: list[str], option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main([*command, option])
-    assert caught.value.code == 0
-    assert "usage: ecu-node" in capsys.readouterr().out
-
-
-def test_the_version_is_given(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["--version"])
-    assert capsys.readouterr().out == f"ecu-node {__version__}\n"
 
 
 def run_node(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -1,8 +1,6 @@
 """One line for every error, the traceback only with --debug."""
 
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -64,19 +62,3 @@ def test_the_node_takes_debug_before_and_after_the_command(
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "Traceback (most recent call last):"
     assert lines[-1].startswith(f"ecu-node: {missing}: cannot read the layout")
-
-
-def test_where_standard_error_is_closed_the_exit_code_tells_it() -> None:
-    command = f'"{sys.executable}" -m ecu_node check --params p --layout missing.toml 2>&-'
-    done = subprocess.run(["/bin/sh", "-c", command], stdout=subprocess.PIPE, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stdout) == (FAILED, "")
-
-
-def test_a_file_that_must_not_be_read_is_no_internal_error(tmp_path: Path) -> None:
-    # The state is a file where a folder is expected: the operating system's own words, in one line.
-    (tmp_path / "state").write_text("")
-    command = [sys.executable, "-m", "ecu_node", "inspect", "--state", str(tmp_path / "state")]
-    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert run.returncode == FAILED
-    (line,) = run.stderr.splitlines()
-    assert str(tmp_path / "state") in line

@@ -114,25 +114,6 @@ def test_a_short_gap_on_the_bus_releases_nothing_and_sleep_does(
     assert not fault["active"]
 
 
-def test_the_same_fault_counts_up(vehicle: Vehicle, capsys: pytest.CaptureFixture[str]) -> None:
-    for _ in range(3):
-        vehicle.corrector.latch(Reason.BRANCH_STALE, ["motor"])
-        vehicle.memory.look(0.0)
-        vehicle.corrector.release()
-        vehicle.memory.look(0.0)
-    (fault,) = faults(vehicle, capsys)
-    assert fault["count"] == 3
-
-
-def test_another_set_is_tried(vehicle: Vehicle) -> None:
-    vehicle.break_battery()
-    vehicle.run(1)
-    content = (vehicle.state / "faults.json").read_text()
-    (vehicle.state / "faults.json").write_text(content.replace('"parameter_set": 44', '"parameter_set": 43'))
-    vehicle.start()
-    assert vehicle.corrector.latched is Reason.NONE
-
-
 def test_a_disk_that_is_full_is_told_and_ends_nothing(vehicle: Vehicle) -> None:
     vehicle.state.rmdir()
     vehicle.break_battery()

@@ -15,7 +15,7 @@ from tests.ecu_node.vehicles import Frame, answers, parameters_for, passed_on, p
 
 TABLE = Path(__file__).parents[2] / "docs" / "fault_table.md"
 TESTS = Path(__file__).parents[1]
-BATTERY, MOTOR = FrameKey(0x110, False), FrameKey(0x120, False)
+BATTERY = FrameKey(0x110, False)
 
 
 def corrector_for(database: VehicleDatabase, mode: Mode) -> Corrector:

@@ -1,9 +1,7 @@
 """A gateway on two of python-can's virtual buses: real bus objects, the node in threads of its own."""
 
-import errno
 import queue
 import random
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,14 +11,13 @@ from typing import Any
 
 import can
 import pytest
-from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
-from ecu_node.bus.node import GatewayNode
-from ecu_node.bus.steady_bus import SocketCanLink, SteadyBus
+from ecu_node.bus.node import Node
+from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.wiring import InForce, Mode, open_bus, wire
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.status import Counters, Reason, State
+from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from tests.ecu_node.vehicles import decoded, parameters_for, protected
@@ -58,7 +55,7 @@ def gateway(
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         ready = threading.Event()
-        node = GatewayNode(*buses, corrector, period_s=0.02, routed=routed)
+        node = Node(*buses, corrector, period_s=0.02, routed=routed)
         running = pool.submit(node.run, stop.is_set, ready.set)
         while not ready.wait(0.01) and not running.done():
             pass
@@ -130,110 +127,6 @@ def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
     assert sensors.recv(0.0) is None, "nothing comes back"
 
 
-def test_frames_of_the_vehicle_reach_the_sensors_bus_unchanged_and_in_order(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
-) -> None:
-    sensors, vehicle = ends
-    sent = [message for message in random_frames(database, 1000) if message.arbitration_id != 0x110]
-    with gateway(database, request.node.name):
-        received(vehicle, 1, status=True)
-        for message in sent:
-            vehicle.send(message)
-        found = received(sensors, len(sent))
-    assert list(map(as_sent, found)) == list(map(as_sent, sent))
-
-
-def test_what_the_kernel_carries_is_not_passed_on_once_more(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
-) -> None:
-    sensors, vehicle = ends
-    data = protected(database, "HV_Battery", 0, BatteryCurrent=100.0)
-    with gateway(database, request.node.name, routed=True):
-        received(vehicle, 1, status=True)
-        for bus in ends:
-            bus.send(can.Message(arbitration_id=0x200, is_extended_id=False, data=bytes(8)))
-            bus.send(can.Message(arbitration_id=0x200, is_extended_id=False, is_remote_frame=True))
-            bus.send(can.Message(arbitration_id=0x110, is_extended_id=False, is_remote_frame=True))
-        sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
-        to_vehicle, to_sensors = received(vehicle, 2), received(sensors, 1)
-    assert [(item.arbitration_id, item.is_remote_frame) for item in to_vehicle] == [(0x110, True), (0x110, False)]
-    assert [(item.arbitration_id, item.is_remote_frame) for item in to_sensors] == [(0x110, True)]
-
-
-class PairBus(SocketcanBus):
-    """A bus as of SocketCAN, of which the other end is at hand: datagrams between processes are its frames."""
-
-    def __init__(self, end: socket.socket) -> None:
-        self.socket, self.channel_info = end, "a pair of sockets"
-
-    def shutdown(self) -> None:
-        self.socket.close()
-
-
-DATA = can.Message(arbitration_id=0x300, is_extended_id=False, data=b"data")
-ERROR = can.Message(arbitration_id=0x20000004, is_extended_id=False, data=bytes(8))
-"""As an error frame is numbered on SocketCAN."""
-
-
-@pytest.mark.parametrize("to_vehicle", [True, False])
-def test_a_frame_is_passed_on_at_once_when_an_error_frame_came_with_it(
-    database: VehicleDatabase, to_vehicle: bool
-) -> None:
-    corrector = wire(database, InForce(parameters=None), time.monotonic(), mode=Mode.GATEWAY)
-    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
-    buses = [SteadyBus(lambda near=near: PairBus(near), corrector.counters) for near, _ in pairs]  # type: ignore[misc]
-    source, target = [SocketCanLink(far) for _, far in pairs][:: 1 if to_vehicle else -1]
-    stop, ready = threading.Event(), threading.Event()
-    with ThreadPoolExecutor(1) as pool:
-        node = GatewayNode(buses[0], buses[1], corrector, period_s=30.0)
-        running = pool.submit(node.run, stop.is_set, ready.set)
-        try:
-            assert ready.wait(LONGEST_WAIT_S)
-            source.send([DATA, ERROR], 0)
-            came = target.receive(5.0)
-            while came is not None and came.arbitration_id == 0x5F0:
-                came = target.receive(5.0)
-        finally:
-            stop.set()
-            running.result(LONGEST_WAIT_S)
-            for bus, (_, far) in zip(buses, pairs, strict=True):
-                bus.close()
-                far.close()
-    assert came is not None
-    assert came.data == DATA.data
-    counters = corrector.counters
-    assert (counters.forwarded if to_vehicle else counters.returned, counters.bus_errors) == (1, 1)
-
-
-def test_of_a_socket_that_was_closed_just_now_no_dropped_frames_are_known() -> None:
-    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    counters = Counters()
-    bus = SteadyBus(lambda: PairBus(near), counters)
-    bus.count_dropped()
-    near.close()
-    bus.count_dropped()
-    assert counters.dropped == 0
-    far.close()
-
-
-class ChoosyBus(VirtualBus):
-    """A bus that does not take CAN FD."""
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if msg.is_fd:
-            raise can.CanOperationError("Invalid argument", errno.EINVAL)
-        super().send(msg, timeout)
-
-
-def test_a_frame_that_a_bus_cannot_carry_costs_no_other(ends: Ends, request: pytest.FixtureRequest) -> None:
-    bus = SteadyBus(lambda: ChoosyBus(f"{request.node.name} a"), Counters())
-    for number in range(6):
-        bus.send(can.Message(arbitration_id=number, is_fd=number % 3 == 1))
-    assert bus.flush() == (4, 2)
-    assert [message.arbitration_id for message in received(ends[0], 4)] == [0, 2, 3, 5]
-    bus.close()
-
-
 class BlockingBus(VirtualBus):
     """A bus on which sending waits until it is let go."""
 
@@ -260,7 +153,7 @@ def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
     sensors = SteadyBus(lambda: near, corrector.counters)
     vehicle = SteadyBus(lambda: VirtualBus(f"{name} b"), corrector.counters)
     with ThreadPoolExecutor(1) as pool:
-        node = GatewayNode(sensors, vehicle, corrector, period_s=0.02, on_tick=feed)
+        node = Node(sensors, vehicle, corrector, period_s=0.02, on_tick=feed)
         running = pool.submit(node.run, stop.is_set)
         try:
             fed.get(timeout=LONGEST_WAIT_S)
@@ -315,20 +208,6 @@ def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
             while received(bus, 1)[0].arbitration_id != 0x301:
                 early += 1
             assert early < 10, "those of the listening, more than 10, are not passed on"
-
-
-def test_a_frame_of_a_branch_that_waited_too_long_is_not_passed_on(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
-) -> None:
-    _, vehicle = ends
-    with gateway(database, request.node.name) as (corrector, _):
-        with VirtualBus(f"{request.node.name} a", preserve_timestamps=True) as sensors:
-            for counter, age_s in enumerate((5.0, 0.0)):
-                data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0 * counter)
-                sensors.send(can.Message(time.time() - age_s, arbitration_id=0x110, is_extended_id=False, data=data))
-        (passed,) = received(vehicle, 1)
-    assert decoded(database, "HV_Battery", bytes(passed.data))["BatteryCurrent"] == pytest.approx(76.0)
-    assert corrector.counters.late == 1
 
 
 def test_a_remote_frame_passes_whatever_its_identifier(

@@ -2,12 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import cantools
 import pytest
 
-from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import file_digest, read_layout
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT
@@ -23,13 +21,6 @@ def test_the_projects_own_layout_is_read() -> None:
     assert layout.digest == file_digest(LAYOUT)
 
 
-def test_a_temperature_that_is_no_input_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "layout.toml"
-    path.write_text(LAYOUT.read_text().replace('temperature = "junction_box_temperature"', 'temperature = "oil"'))
-    with pytest.raises(LayoutError, match=r"layout\.toml: temperature: 'oil' is no \[\[input\]\]; declare the signal"):
-        read_layout(path)
-
-
 def test_a_power_branch_is_named_by_its_power(make_database: MakeDatabase) -> None:
     layout = make_database().layout
     assert layout.find_branch("heater").source == "Heater.Power"
@@ -41,11 +32,6 @@ def test_line_ends_do_not_change_the_digest(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"x\ny\n")
     (tmp_path / "b").write_bytes(b"x\r\ny\r\n")
     assert file_digest(tmp_path / "a") == file_digest(tmp_path / "b")
-
-
-def test_an_unknown_branch_is_answered_with_the_known_ones(database: VehicleDatabase) -> None:
-    with pytest.raises(LayoutError, match="no branch 'fridge'; known are battery, motor"):
-        database.layout.find_branch("fridge")
 
 
 BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
@@ -64,11 +50,7 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ("full_scale_a = 400.0", "", "'full_scale_a' is missing"),
         ("full_scale_a = 400.0", "full_scale_a = 4 00", "not TOML"),
         ('name = "battery", sign = 1', 'name = "battery", sign = 2', "sign"),
-        (
-            '"Pair.Battery"',
-            '"Battery"',
-            r"'Message.Signal' as in the DBC is expected, found \"Battery\"",
-        ),
+        ('"Pair.Battery"', '"Battery"', r"'Message.Signal' as in the DBC is expected, found \"Battery\""),
         ("sign = 1", "sign = 1, timout_s = 1", "'battery': unknown key 'timout_s'; did you mean 'timeout_s'"),
         ("sign = 1", 'sign = 1, timeout_s = "x"', "'battery', timeout_s: Expected float, got str, found \"x\""),
         ('name = "battery"', 'name = "motor"', "motor is named twice"),
@@ -120,20 +102,6 @@ def test_one_signal_in_two_roles_is_refused(make_database: MakeDatabase, old: st
         make_database(SMALL_LAYOUT.replace(old, new))
 
 
-def test_two_power_branches_may_share_a_voltage(make_database: MakeDatabase) -> None:
-    layout = SMALL_LAYOUT.replace(
-        "\n]\n", '\n{ name = "cooler", sign = -1, power = "Net.Cooling", voltage = "Net.Voltage" },\n]\n'
-    )
-    cooling = ' SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node\n SG_ Cooling : 16|8@1+ (1,0) [0|0] "W" Node\n'
-    dbc = SMALL_DBC.replace("Net: 2", "Net: 3").replace(' SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node\n', cooling)
-    assert make_database(layout, dbc).layout.branch_names[-1] == "cooler"
-
-
-def test_two_balancing_branches_are_refused(make_database: MakeDatabase) -> None:
-    with pytest.raises(LayoutError, match="more than one branch has 'balance = true'"):
-        make_database(SMALL_LAYOUT.replace("sign = -1", "sign = -1, balance = true"))
-
-
 @pytest.mark.parametrize(
     ("content", "words"), [(None, "cannot read the layout: No such file"), (b"\xff", "the file is not UTF-8")]
 )
@@ -161,32 +129,3 @@ def test_a_dbc_that_lacks_what_the_layout_names_is_refused(make_database: MakeDa
     with pytest.raises(DatabaseError, match=words) as caught:
         make_database(SMALL_LAYOUT, dbc)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.filterwarnings("ignore:.*diagnostics.Database is deprecated:DeprecationWarning")
-def test_a_database_of_diagnostics_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(SMALL_LAYOUT.replace("small.dbc", "small.cdd"))
-    (tmp_path / "small.cdd").write_text("<CANDELA><ECUDOC><ECU><VAR/></ECU></ECUDOC></CANDELA>")
-    with pytest.raises(DatabaseError, match=r"small\.cdd: a diagnostics database; a CAN database \(DBC\) is needed"):
-        read_database(read_layout(tmp_path / "small.toml"))
-
-
-def test_dbc_that_is_replaced_while_it_is_read(make_database: MakeDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its digest is of the text that is used."""
-    sound = make_database()
-
-    def change_and_load(text: str, *arguments: Any, **options: Any) -> Any:
-        sound.layout.dbc_path.write_text(SMALL_DBC.replace("Battery", "Accumulator"))
-        return load_string(text, *arguments, **options)
-
-    load_string = cantools.database.load_string
-    monkeypatch.setattr(cantools.database, "load_string", change_and_load)
-    found = make_database()
-    assert found.digest == sound.digest != file_digest(sound.layout.dbc_path)
-    assert found.signal("Pair.Battery")[1].name == "Battery"
-
-
-def test_a_missing_dbc_is_named_with_its_layout(tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
-    with pytest.raises(DatabaseError, match=r'small\.dbc: .* No such file .* line dbc = "small\.dbc" of .*\.toml$'):
-        read_database(read_layout(tmp_path / "small.toml"))

@@ -14,11 +14,9 @@ import pytest
 
 from ecu_node.bus.telemetry import serve_metrics
 from ecu_node.bus.wiring import InForce, wire
-from ecu_node.cli import main
-from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters, Latency, Reason, State
 from ecu_node.database import VehicleDatabase
-from tests.ecu_node.vehicles import LAYOUT, Frame, answers, parameters_for, protected
+from tests.ecu_node.vehicles import LAYOUT
 
 
 def command(tmp_path: Path, port: int) -> list[str]:
@@ -64,17 +62,6 @@ def test_every_counter_is_told_and_the_state(node: int) -> None:
     assert "ecu_node_sum_measured_amperes" not in told
 
 
-def test_the_sums_of_the_junction_are_told_while_they_are_known(database: VehicleDatabase, free_port: int) -> None:
-    corrector = wire(database, InForce(parameters=parameters_for(database, battery=(0.25, 5.0))), 0.0)
-    data = protected(database, "HV_Battery", 0, BatteryCurrent=80.0)
-    answers(corrector, Frame(FrameKey(0x110, False), data), 0.0)
-    corrector.look(0.0)
-    serve_metrics(corrector, Latency(), free_port)
-    told = asked(free_port)
-    assert told["ecu_node_sum_measured_amperes"] == pytest.approx(80.0)
-    assert told["ecu_node_sum_corrected_amperes"] == pytest.approx(60.0)
-
-
 def test_latency_is_a_histogram(database: VehicleDatabase, free_port: int) -> None:
     latency = Latency()
     latency.counts[7], latency.counts[40] = 3, 1
@@ -83,21 +70,6 @@ def test_latency_is_a_histogram(database: VehicleDatabase, free_port: int) -> No
         text = answer.read().decode()
     found = {float(le): float(count) for le, count in re.findall(r'latency_seconds_bucket\{le="(.+)"\} (.+)', text)}
     assert found == {2.0**bits * 1e-6: 3.0 * (bits >= 7) for bits in range(21)} | {float("inf"): 4.0}
-
-
-def test_only_this_machine_is_answered(node: int) -> None:
-    with socket.socket() as other:
-        other.settimeout(5.0)
-        with pytest.raises(ConnectionRefusedError):
-            other.connect(("127.0.0.2", node))  # an address that a node bound to all of them would answer on
-
-
-@pytest.mark.parametrize("port", ["70000", "0", "-1", "x"])
-def test_what_is_no_port_is_wrong_use(tmp_path: Path, port: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["run", "--unsigned", "--params", "p", "--layout", "l", "--channel", "c", f"--metrics-port={port}"])
-    assert caught.value.code == 2
-    assert "a TCP port from 1 to 65535 is expected" in capsys.readouterr().err
 
 
 def test_a_port_that_cannot_be_had_is_one_line(tmp_path: Path) -> None:

@@ -1,31 +1,25 @@
 """``ecu-node monitor``: what it makes of frames (by cantools and autosar-e2e), and how it shows it."""
 
-import errno
 import json
 import os
 import pty
 import signal
-import socket
-import struct
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Never
+from typing import Any
 
 import can
 import pytest
-from can.interfaces.socketcan import SocketcanBus
-from can.interfaces.virtual import VirtualBus
 
 from ecu_node.bus.wiring import key_of
 from ecu_node.cli import main
-from ecu_node.core.status import Counters, Quality, Reason, State
+from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.monitor import BusMonitor, View, view_lines
-from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, protected
+from tests.ecu_node.vehicles import LAYOUT, protected
 
 CHANNEL = "monitor"
 MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--channel", CHANNEL]
@@ -123,50 +117,6 @@ def test_sums_are_taken_in_one_instant_however_late_the_answers_come(bus: Bus) -
     assert corrected_a is not None
 
 
-MIXED_DBC = """VERSION ""
-BU_: Node Corrector
-BO_ 1 Fast: 2 Node
- SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" Node
-BO_ 2 Middle: 2 Node
- SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" Node
-BO_ 4 Out: 4 Corrector
- SG_ Battery : 0|16@1- (0.1,0) [-3000|3000] "A" Node
- SG_ Motor : 16|16@1- (0.1,0) [-3000|3000] "A" Node
-VAL_ 4 Battery -32768 "SNA";
-VAL_ 4 Motor -32768 "SNA";
-"""
-MIXED_LAYOUT = """
-schema = 1
-name = "small"
-dbc = "small.dbc"
-full_scale_a = 400.0
-branch = [
-    { name = "battery", sign = 1, signal = "Fast.I", corrected = "Out.Battery" },
-    { name = "motor", sign = -1, signal = "Middle.I", corrected = "Out.Motor" },
-]
-"""
-
-
-def test_message_that_answers_several_counts_for_each_at_its_own_frames(
-    make_database: Callable[..., VehicleDatabase],
-) -> None:
-    """At 100 and 50 Hz currents rise and sum to 0; every frame is answered by both, as they were last."""
-    monitor = BusMonitor(make_database(MIXED_LAYOUT, dbc=MIXED_DBC), 0.0)
-    latest, seen = {1: bytes(2), 2: bytes(2)}, 0
-    for k in range(200):
-        for identifier, late_s in ((1, 0.0), (2, 0.003)):
-            t = 0.01 * k + late_s
-            if k % identifier == 0:
-                latest[identifier] = round(4000.0 * t).to_bytes(2, "little", signed=True)
-                monitor.take((identifier, False), bytearray(latest[identifier]), t)
-                monitor.take((4, False), bytearray(b"".join(latest.values())), t + 0.0005)
-        sums = monitor.look(0.01 * k + 0.007)["sums"]
-        if k > 50 and sums["corrected_a"] is not None:
-            seen += 1
-            assert (sums["measured_a"], sums["corrected_a"]) == pytest.approx((0.0, 0.0), abs=0.3)
-    assert seen > 100
-
-
 def test_sum_needs_a_fresh_value_of_every_branch_seen_and_its_answer(bus: Bus) -> None:
     bus.send("HV_BatteryCorrected", 0.001, BatteryCurrentCorrected=500.0)
     assert bus.sums(0.002) == (None, None)
@@ -192,35 +142,6 @@ def test_frames_that_fail_their_check_are_counted_and_not_used(bus: Bus) -> None
     assert (battery["measured_a"], battery["age_s"]) == pytest.approx((100.0, 0.05))
     (row,) = [line for line in bus.lines(0.06) if line.startswith("battery ")]
     assert row.endswith("corrupt 2, repeated 1, lost 1, corrected: corrupt 1")
-
-
-def test_code_that_is_no_value_is_not_shown_as_a_current(bus: Bus) -> None:
-    sna_a = -32768 * 0.02
-    bus.battery(0.01, sna_a, sna_a, quality=Quality.NOT_AVAILABLE)
-    assert currents(bus.branch(0.02)) == (None, None, None)
-    assert " ".join(bus.lines(0.02)[3].split()) == "battery - - - not available 50.0 50.0 0.01 not available"
-
-
-def test_power_is_shown_as_a_current(make_database: Callable[..., VehicleDatabase]) -> None:
-    monitor = BusMonitor(make_database(dbc=SMALL_DBC), 0.0)
-    monitor.take((258, False), bytearray((40000).to_bytes(2, "little")), 0.05)
-    monitor.take((0x200, True), bytearray([*(4000).to_bytes(2, "little"), 0, 0]), 0.05)
-    view = monitor.look(0.06)
-    assert view["branches"][2]["measured_a"] == pytest.approx(-10.0)
-    assert (view["has_status"], view["node"]) == (False, None)
-    assert view_lines(view, "x", Counters())[0] == "x: the layout has no status message: nothing is known of a node"
-
-
-@pytest.mark.parametrize("looks_hz", [4, 1])
-def test_rates_are_those_of_the_last_seconds(bus: Bus, looks_hz: int) -> None:
-    """50 frames/s for 5 s, then 100 frames/s for 5 s, corrupt ones included."""
-    times = [0.02 * k for k in range(250)] + [5.0 + 0.01 * k for k in range(500)]
-    rates = {}
-    for look_s in [(k + 1) / looks_hz for k in range(10 * looks_hz)]:
-        while times and times[0] < look_s:
-            bus.send("HV_Battery", times.pop(0), spoilt=len(times) % 10 == 0)
-        rates[look_s] = bus.branch(look_s)["rate_hz"]
-    assert [rates[5.0], rates[6.0], rates[10.0]] == pytest.approx([50.0, 75.0, 100.0])
 
 
 def status(bus: Bus, time_s: float, **values: Any) -> None:
@@ -302,69 +223,6 @@ def test_bus_without_any_branch_ends_in_1(capsys: pytest.CaptureFixture[str]) ->
     line = f"ecu-node: virtual {CHANNEL}: no branch of {LAYOUT} was seen; see that the bus is the right one\n"
     assert captured.err == line
     assert captured.out.splitlines()[-1].startswith("no frame of any branch")
-
-
-class FailingBus(VirtualBus):
-    """A bus whose interface is down, as one of SocketCAN tells it."""
-
-    def _recv_internal(self, timeout: float | None) -> Never:
-        raise can.CanOperationError("Network is down", errno.ENETDOWN)
-
-
-class SlowSocket(socket.socket):
-    """A socket of which the kernel says that it has dropped three frames; a local one itself drops none."""
-
-    def getsockopt(self, level: int, name: int, length: int = 4) -> bytes:  # type: ignore[override]
-        return struct.pack("=9I", *8 * [0], 3) if name == 55 else super().getsockopt(level, name, length)
-
-
-class FullBus(SocketcanBus):
-    """A bus as of SocketCAN with an error frame and a remote frame."""
-
-    def __init__(self) -> None:
-        near, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.socket, self.channel_info = SlowSocket(fileno=near.detach()), "a pair of sockets"
-        self.far.send(struct.pack("=IB3x8s", 0x20000004, 8, bytes(8)))
-        self.far.send(struct.pack("=IB3x8s", 0x40000110, 8, bytes(8)))
-
-    def shutdown(self) -> None:
-        self.socket.close()
-        self.far.close()
-
-
-@pytest.mark.usefixtures("handlers")
-def test_what_is_wrong_with_its_own_interface_is_said(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ecu_node.monitor.open_bus", lambda *_, channel, **__: FailingBus(channel))
-    assert main([*MONITOR, "--once", "0.2"]) == 1
-    shown = capsys.readouterr().out
-    assert shown.startswith(f"virtual {CHANNEL}: this computer's interface failed or is down; trying to open it again")
-    assert "is the bus awake" not in shown
-    monkeypatch.setattr("ecu_node.monitor.open_bus", lambda *_, **__: FullBus())
-    assert main([*MONITOR, "--once", "0.2"]) == 1
-    assert capsys.readouterr().out.splitlines()[-2:] == [
-        "error frames of the bus: 1; a wrong bit rate, or a fault in the wiring?",
-        "frames that this computer was too slow to read: 3; they count as lost above",
-    ]
-
-
-@pytest.mark.usefixtures("handlers")
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_without_a_terminal_a_block_comes_per_second_until_a_signal(
-    how: signal.Signals, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if how is signal.SIGHUP:  # the terminal is gone, and with it standard output
-        monkeypatch.setattr(sys, "stdout", None)
-    timer = threading.Timer(1.3, os.kill, (os.getpid(), how))
-    timer.start()
-    start_s = time.monotonic()
-    assert main(MONITOR) == 0
-    timer.join()
-    assert time.monotonic() - start_s < 10.0
-    blocks = capsys.readouterr().out.strip().split("\n\n")
-    assert how is signal.SIGHUP or len(blocks) == 2
-    assert all(block.startswith(f"virtual {CHANNEL}: no node on this bus\n ") for block in blocks if block)
 
 
 def test_in_a_terminal_a_table_is_drawn_and_ctrl_c_ends_it_with_0() -> None:

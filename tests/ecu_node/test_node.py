@@ -3,18 +3,16 @@
 import errno
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import deepcopy
-from typing import Never
 
 import can
 import pytest
 from can.interfaces.virtual import VirtualBus
-from e2e.p01 import e2e_p01_check
 
-from ecu_node.bus.node import GatewayNode, OverlayNode, TimeOfDay
+from ecu_node.bus.node import Node
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.wiring import InForce, Mode, open_bus, receive_filters, wire
 from ecu_node.core.corrector import Corrector
@@ -33,7 +31,7 @@ def node_on(
     corrector = wire(database, InForce(parameters=parameters_for(database, battery=(0.25, 5.0))), time.monotonic())
     bus = SteadyBus(opened or (lambda: overlay_bus(database, channel)), corrector.counters)
     try:
-        with at_work(OverlayNode(bus, corrector, period_s=period_s)):
+        with at_work(Node(bus, bus, corrector, period_s=period_s)):
             yield corrector
     finally:
         bus.close()
@@ -44,7 +42,7 @@ def overlay_bus(database: VehicleDatabase, channel: str) -> can.BusABC:
 
 
 @contextmanager
-def at_work(node: OverlayNode | GatewayNode) -> Iterator[None]:
+def at_work(node: Node) -> Iterator[None]:
     """Run a node in a thread; what ends it, ends the test."""
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
@@ -97,15 +95,6 @@ def test_frames_are_corrected_on_the_bus_and_others_left_alone(
     assert (corrector.counters.frames_in, corrector.counters.answers) == (100, 100)
 
 
-def test_the_status_comes_again_and_again_without_any_frame(
-    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
-) -> None:
-    with node_on(database, request.node.name):
-        frames = receive(peer, 0x5F0, 5)
-    assert [frame.data[1] & 15 for frame in frames] == list(range(5))
-    assert all(e2e_p01_check(frame.data, 0x5F0) for frame in frames)
-
-
 def test_a_node_listens_as_long_as_another_one_may_be_silent(
     database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
 ) -> None:
@@ -114,17 +103,6 @@ def test_a_node_listens_as_long_as_another_one_may_be_silent(
         with pytest.raises(BusError, match="0x5F0"), node_on(database, request.node.name, period_s=0.5):
             receive(peer, 0x5F0, 3)
         receive(peer, 0x5F0, 1)
-
-
-def test_a_node_that_hears_its_own_messages_from_another_ends(
-    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
-) -> None:
-    words = "another node sends frames 0x510, which only this one may send there"
-    with pytest.raises(BusError, match=words), node_on(database, request.node.name):  # noqa: PT012
-        receive(peer, 0x5F0, 1)
-        peer.send(can.Message(arbitration_id=0x510, is_extended_id=False, data=bytes(8)))
-        while peer.recv(0.5) is not None:
-            pass  # until it is silent
 
 
 class EchoingBus(VirtualBus):
@@ -153,7 +131,7 @@ def gateway_between(database: VehicleDatabase, sensors: can.BusABC, vehicle: can
     corrector = wire(database, in_force, time.monotonic(), mode=Mode.GATEWAY)
     buses = [SteadyBus(lambda bus=bus: bus, corrector.counters) for bus in (sensors, vehicle)]  # type: ignore[misc]
     try:
-        with at_work(GatewayNode(buses[0], buses[1], corrector, period_s=0.02)):
+        with at_work(Node(buses[0], buses[1], corrector, period_s=0.02)):
             yield corrector
     finally:
         for bus in buses:
@@ -288,32 +266,6 @@ class SetClock:
         return time.time() + self.ahead_s
 
 
-class HeldUpClock:
-    """The module ``time`` as a process reads it that is held up for 80 ms now and then, also between two clocks."""
-
-    def __init__(self, held_up: Collection[int]) -> None:
-        self._held_up, self._now_s, self._reads = held_up, 100.0, 0
-
-    def monotonic(self) -> float:
-        self._now_s += 0.08 if self._reads in self._held_up else 0.0001
-        self._reads += 1
-        return self._now_s
-
-    def time(self) -> float:
-        return self.monotonic() + 1.7e9
-
-
-@pytest.mark.parametrize("held_up", [range(read, 100, every) for every in (7, 11, 1000) for read in range(7)])
-def test_a_process_that_is_held_up_between_two_clocks_does_not_take_that_for_a_clock_that_was_set(
-    held_up: range, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ecu_node.bus.node.time", HeldUpClock(held_up))
-    counters = Counters()
-    time_of_day = TimeOfDay(counters)
-    assert [time_of_day.ahead_s() for _ in range(20)] == pytest.approx([1.7e9] * 20, abs=0.05)
-    assert counters.clock_steps == 0
-
-
 def test_a_frame_that_comes_after_the_clock_was_set_is_not_taken_for_an_old_one(
     database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
@@ -373,73 +325,6 @@ def test_a_bus_of_which_only_sending_tells_that_it_is_gone_is_opened_again(
     with node_on(database, "", lambda: next(buses)) as corrector:
         receive(peer, 0x5F0, 3)
     assert corrector.counters.reopened == 1
-
-
-class GoneForBothBus(VirtualBus):
-    """A bus that is gone: who sends learns it later than who receives."""
-
-    sending, let_go = threading.Event(), threading.Event()
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        self.sending.set()
-        assert self.let_go.wait(LONGEST_WAIT_S)
-        raise can.CanOperationError("No such device or address", errno.ENXIO)
-
-    def _recv_internal(self, timeout: float | None) -> Never:
-        raise can.CanOperationError("Network is down", errno.ENETDOWN)
-
-
-def test_a_bus_that_is_gone_for_both_threads_is_opened_again_once(request: pytest.FixtureRequest) -> None:
-    channel = request.node.name
-    gone, said, counters = GoneForBothBus(channel), list[str](), Counters()
-    buses = iter([gone, VirtualBus(channel)])
-    bus = SteadyBus(lambda: next(buses), counters, said.append)
-    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
-    with ThreadPoolExecutor(2) as pool:
-        sent = pool.submit(bus.flush)
-        assert gone.sending.wait(LONGEST_WAIT_S)
-        received = pool.submit(bus.receive, 0.01)
-        wait_until(lambda: len(said) == 1)
-        gone.let_go.set()
-        assert (sent.result(LONGEST_WAIT_S), received.result(LONGEST_WAIT_S)) == ((0, 1), None)
-    wait_until(lambda: bus.receive(0.01) is None and bus.is_open)
-    bus.close()
-    assert (len(said), counters.reopened) == (2, 1)
-
-
-class StubbornBus(BrokenBus):
-    """A bus that is gone, and cannot be closed either."""
-
-    def shutdown(self) -> None:
-        super().shutdown()
-        raise can.CanOperationError("No such device")
-
-
-def test_a_bus_that_cannot_be_closed_is_opened_again_and_an_error_frame_that_waits_there_is_counted(
-    request: pytest.FixtureRequest,
-) -> None:
-    channel, counters = request.node.name, Counters()
-    noisy = VirtualBus(channel)
-    noisy.queue.put(can.Message(arbitration_id=0x40, is_error_frame=True))
-    buses = iter([StubbornBus(channel), StubbornBus(channel), noisy])
-    bus = SteadyBus(lambda: next(buses), counters)
-    wait_until(lambda: bus.receive(0.01) is None and counters.reopened == 1)
-    bus.close()
-    assert (counters.bus_errors, counters.bus_off) == (1, 1)
-
-
-def test_a_bus_that_the_other_thread_has_just_closed_is_no_surprise(request: pytest.FixtureRequest) -> None:
-    bus = SteadyBus(lambda: ClosedBus(request.node.name), Counters())
-    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
-    assert bus.flush() == (0, 1)
-    bus.close()
-
-
-class ClosedBus(VirtualBus):
-    """A SocketCAN bus that is closed answers like this."""
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        raise ValueError("file descriptor cannot be a negative integer (-1)")
 
 
 def test_the_kernel_is_asked_for_the_branches_only(

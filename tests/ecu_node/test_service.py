@@ -10,11 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.run import ParameterFile, _Tick
 from ecu_node.bus.service import Log, Requests, ServiceManager
-from ecu_node.bus.wiring import Mode, key_of, wire
-from ecu_node.database import VehicleDatabase
-from tests.ecu_node.vehicles import Frame, answers, protected
 
 WATCHDOG_S = 4.0
 
@@ -76,93 +72,6 @@ def test_the_watchdog_is_fed_at_half_its_time(managed: Manager) -> None:
     assert fed_s == pytest.approx([1000.0, 1002.0, 1004.0, 1006.0, 1008.0], abs=0.11)
 
 
-@pytest.mark.parametrize(
-    ("variable", "value"), [("WATCHDOG_PID", "1"), ("WATCHDOG_USEC", None), ("WATCHDOG_USEC", "soon")]
-)
-def test_a_watchdog_that_is_none_or_another_process_s_is_not_fed(
-    managed: Manager, monkeypatch: pytest.MonkeyPatch, variable: str, value: str | None
-) -> None:
-    if value is None:
-        monkeypatch.delenv(variable)
-    else:
-        monkeypatch.setenv(variable, value)
-    ServiceManager().alive(1.0)
-    assert managed.told() == []
-
-
-def test_a_node_that_does_not_do_its_work_does_not_feed_the_watchdog(
-    managed: Manager, database: VehicleDatabase, requests: Requests, tmp_path: Path
-) -> None:
-    said = list[str]()
-    file = ParameterFile(tmp_path / "none.json", database, None, mode=Mode.GATEWAY, say=said.append)
-    corrector = wire(database, file.in_force, 0.0, mode=Mode.GATEWAY)
-    tick = _Tick(
-        corrector=corrector,
-        buses=[],
-        source=file,
-        looks=[],
-        requests=requests,
-        manager=ServiceManager(),
-        say=said.append,
-    )
-    found = []
-    for works in (False, True):
-        tick(1000.0, works)
-        found.append("WATCHDOG=1" in managed.told())
-    assert found == [False, True]
-
-
-def test_what_changes_is_said_in_the_log_and_to_the_manager(
-    managed: Manager, database: VehicleDatabase, requests: Requests, tmp_path: Path
-) -> None:
-    said = list[str]()
-    file = ParameterFile(tmp_path / "none.json", database, None, mode=Mode.OVERLAY, say=said.append)
-    corrector = wire(database, file.in_force, 0.0, mode=Mode.OVERLAY)
-    tick = _Tick(
-        corrector=corrector,
-        buses=[],
-        source=file,
-        looks=[],
-        requests=requests,
-        manager=ServiceManager(),
-        say=said.append,
-    )
-    found = []
-    for look in range(20):
-        if look < 10:
-            for name in ("Battery", "Motor"):
-                data = protected(database, f"HV_{name}", look, **{f"{name}Current": 20.0})
-                answers(corrector, Frame(key_of(database.message(f"HV_{name}")), data), 0.1 * look)
-        corrector.look(0.1 * look)
-        tick(0.1 * look, works=False)
-        found += managed.told()
-    assert said == ["the bus sleeps"]
-    assert found == ["STATUS=the bus sleeps"]
-
-
-def test_an_abstract_address_is_understood(monkeypatch: pytest.MonkeyPatch) -> None:
-    name = f"ecu-node-test-{os.getpid()}"
-    manager = Manager(f"\0{name}")
-    monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
-    ServiceManager().ready("x")
-    assert manager.told() == ["READY=1\nSTATUS=x"]
-    manager.socket.close()
-
-
-@pytest.mark.parametrize("address", [None, "", "missing"])
-def test_without_a_manager_nothing_happens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str | None
-) -> None:
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    if address is not None:
-        monkeypatch.setenv("NOTIFY_SOCKET", address and str(tmp_path / address))
-    monkeypatch.setenv("WATCHDOG_USEC", "1000000")
-    service = ServiceManager()
-    service.ready("x")
-    service.alive(1.0)
-    service.stopping()
-
-
 def test_a_manager_that_does_not_read_does_not_hold_the_node_up(managed: Manager) -> None:
     service = ServiceManager()
     start_s = time.monotonic()
@@ -196,19 +105,6 @@ def test_the_same_line_comes_once_in_ten_seconds(
         *2 * ["ecu-node: bus gone"],
         "ecu-node: bus gone (and 97 times before)",
     ]
-
-
-def test_of_more_lines_than_it_remembers_each_is_said(
-    clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Else a log of ever other lines would take ever more memory."""
-    clock(0.0)
-    log = Log()
-    for text in (*5 * ["a"], *map(str, range(100)), "a"):
-        log.say(text)
-    assert len(log._said) <= 100
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [f"ecu-node: {text}" for text in (*3 * ["a"], *map(str, range(100)), "a")]
 
 
 def test_a_log_that_is_gone_does_not_end_the_node(monkeypatch: pytest.MonkeyPatch) -> None:

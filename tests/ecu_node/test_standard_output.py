@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node import __version__
-from ecu_node.errors import UserError
-from ecu_node.program import write_output
 from tests.ecu_node.vehicles import LAYOUT
 
 FULL = "import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
@@ -48,31 +45,3 @@ def test_a_result_that_cannot_be_written_is_one_line_and_1(
 ) -> None:
     done = written_nowhere(tmp_path, "ecu_node", *arguments, unbuffered=unbuffered)
     assert (done.returncode, done.stderr) == (1, f"ecu-node{LINE}")
-
-
-@pytest.mark.parametrize("arguments", [["--version"], ["simulate", "--help"]])
-def test_the_calibrator_says_it_the_same_way(tmp_path: Path, arguments: list[str]) -> None:
-    done = written_nowhere(tmp_path, "calibrator", *arguments)
-    assert (done.returncode, done.stderr) == (1, f"calibrator{LINE}")
-
-
-@pytest.mark.parametrize("command", ["ecu_node --version", "ecu_node schema", "calibrator --version"])
-def test_where_standard_output_is_closed_nothing_is_said(command: str) -> None:
-    done = subprocess.run(
-        ["/bin/sh", "-c", f'"$0" -m {command} >&-', sys.executable],
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert (done.returncode, done.stderr.removeprefix(f"ecu-node {__version__}\n")) == (0, "")
-
-
-def test_a_full_disk_that_shows_when_the_output_is_written_out_is_told_and_leaves_nothing_behind(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    with Path("/dev/full").open("w") as full:
-        monkeypatch.setattr(sys, "stdout", full)
-        with pytest.raises(UserError, match=r"^standard output: cannot write the result: No space left on device;"):
-            write_output("x")
-        write_output("what follows is dropped")

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import resource
 import runpy
 import socket
 import subprocess
@@ -19,8 +18,6 @@ from typing import Any
 import can
 import pytest
 
-from ecu_node.bus import service
-from ecu_node.bus.node import GatewayNode, OverlayNode
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Telemetry
 from ecu_node.bus.wiring import InForce, wire
@@ -29,8 +26,8 @@ from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters, Latency
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
-from tests.ecu_node.test_node import FullBus, at_work, wait_until
-from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers, parameters_for, protected
+from tests.ecu_node.test_node import FullBus, wait_until
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers, parameters_for
 
 ROOT = Path(__file__).parents[2]
 VSS = "Vehicle.Powertrain.TractionBattery.CurrentCurrent"
@@ -47,12 +44,7 @@ class Outlet:
         self.bus = SteadyBus(lambda: can.Bus("telemetry", "virtual"), self.corrector.counters)
         self.said: list[str] = []
         self.telemetry = Telemetry(
-            target,
-            self.corrector,
-            layout=database.layout,
-            latency=Latency(),
-            buses=[self.bus],
-            say=self.said.append,
+            target, self.corrector, layout=database.layout, latency=Latency(), buses=[self.bus], say=self.said.append
         )
 
     def second(self) -> None:
@@ -103,15 +95,6 @@ def test_line_has_currents_by_vss_name_sums_state_and_counters(make_outlet: Any,
     assert abs((datetime.now(UTC) - datetime.fromisoformat(line["time"])).total_seconds()) < 60.0
 
 
-def test_one_line_per_second_whatever_the_looks(make_outlet: Any, tmp_path: Path) -> None:
-    outlet = make_outlet(tmp_path / "node.jsonl")
-    start_s = time.monotonic()
-    for k in range(500):
-        outlet.telemetry.look(start_s + 0.02 * k)
-        time.sleep(0.001)
-    assert len(lines_of(tmp_path / "node.jsonl", 10)) == 10
-
-
 def test_lines_come_by_udp(make_outlet: Any) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
@@ -133,20 +116,6 @@ def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tm
     lines_of(path, 1)
     wait_until(lambda: len(outlet.said) == 2)
     assert outlet.said[1] == "--telemetry: lines are written again"
-
-
-def test_half_a_line_is_taken_back(make_outlet: Any, tmp_path: Path) -> None:
-    """Where the disk takes only a part: a limit of the file's size is like one, and needs a process of its own."""
-    code = (
-        "import resource, signal, sys; from pathlib import Path; from ecu_node.bus.telemetry import _append; "
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (150, 150)); "
-        "path = Path(sys.argv[1]); _append(path, b'a' * 99 + b'\\n'); _append(path, b'b' * 99 + b'\\n')"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "f")], capture_output=True, text=True, check=False, cwd=ROOT
-    )
-    assert "No space left on device" in done.stderr
-    assert (tmp_path / "f").read_bytes() == b"a" * 99 + b"\n"
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe without reader", "host without address"])
@@ -220,28 +189,6 @@ def test_latency_is_counted_by_bits_of_microseconds(monkeypatch: pytest.MonkeyPa
     assert sum(latency.counts) == 1000
 
 
-@pytest.mark.parametrize("kind", ["overlay", "gateway"])
-def test_every_answer_is_in_the_histogram(kind: str, database: VehicleDatabase, request: pytest.FixtureRequest) -> None:
-    def opened(which: str) -> SteadyBus:
-        return SteadyBus(lambda: can.Bus(f"{request.node.name}{which}", "virtual"), Counters())
-
-    corrector, latency = wire(database, InForce(parameters=parameters_for(database)), 0.0), Latency()
-    near, far = opened("near"), opened("far")
-    node: OverlayNode | GatewayNode = OverlayNode(near, corrector, period_s=0.1, latency=latency)
-    if kind == "gateway":
-        node = GatewayNode(near, far, corrector, period_s=0.1, latency=latency)
-    with can.Bus(f"{request.node.name}near", "virtual") as peer, at_work(node):
-        for k in range(50):
-            data = protected(database, "HV_Battery", k % 15)
-            peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
-            peer.send(can.Message(arbitration_id=0x7, is_extended_id=False, data=data))
-        wait_until(lambda: sum(latency.counts) >= 50)
-    assert sum(latency.counts) == 50
-    assert 0.0 < latency.at_most_s(0.5) <= latency.largest_s < 1.0
-    near.close()
-    far.close()
-
-
 def test_full_send_queue_is_a_state_until_it_opens(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
@@ -282,13 +229,6 @@ def test_nothing_leaks_and_no_garbage_is_collected_in_100000_frames(tmp_path: Pa
     lines = [json.loads(line) for line in (tmp_path / "telemetry.jsonl").read_text().splitlines()]
     assert 0 < lines[1]["latency_us"]["p50"] <= lines[-1]["latency_us"]["p99.9"] <= lines[-1]["latency_us"]["max"]
     assert lines[0]["counters"]["frames_in"] < lines[-1]["counters"]["frames_in"] <= FRAMES + 5_000
-
-
-def test_memory_that_cannot_be_locked_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resource, "setrlimit", lambda *_: None)
-    monkeypatch.setattr(service, "_MCL_CURRENT", 64)  # no flag of mlockall
-    with pytest.raises(OSError, match="Invalid argument"):
-        service._lock_memory()
 
 
 def test_real_time_says_what_was_not_allowed_and_goes_on() -> None:

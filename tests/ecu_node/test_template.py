@@ -11,9 +11,7 @@ from ecu_node.bus.wiring import InForce, key_of, wire
 from ecu_node.cli import main, template_text
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import LayoutError
 from ecu_node.parameters import check_fit, decode_parameters
-from ecu_node.update.trial import ParameterTrial
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
@@ -32,19 +30,6 @@ def test_the_template_of_a_layout_fits_it_at_once_and_corrects_nothing(
     report = json.loads(capsys.readouterr().out)
     assert (report["vehicle"], report["warnings"]) == ("my car", [])
     assert [branch["applied"] for branch in report["branches"].values()] == [False] * len(report["branches"])
-
-
-def test_what_is_filled_in_is_applied(
-    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    document = json.loads(template_text(database, "my car", NOW))
-    document["branches"]["motor"] = {"drift": 0.04, "offset_a": -1.5, "apply": True}
-    (tmp_path / "V.json").write_text(json.dumps(document))
-    assert main(check(tmp_path / "V.json")) == 0
-    found = json.loads(capsys.readouterr().out)["branches"]
-    assert {name: (branch["drift"], branch["offset_a"]) for name, branch in found.items() if branch["applied"]} == {
-        "motor": (0.04, -1.5)
-    }
 
 
 @pytest.mark.parametrize(
@@ -72,26 +57,6 @@ def test_the_sum_is_judged_about_the_load_that_the_layout_declares(
         answers(corrector, Frame(key_of(pair), data), 0.05 * step)
         corrector.look(0.05 * step)
     assert corrector.state() == state
-
-
-def test_a_declared_load_beyond_the_limits_is_told_before_a_file_is_filled_in_that_cannot_fit(
-    make_database: Callable[..., VehicleDatabase],
-) -> None:
-    database = make_database(f"{SMALL_LAYOUT}[unmeasured_load]\nmean_a = 161\nsd_a = 1\n")
-    with pytest.raises(
-        LayoutError, match=r"mean_a = 161 is beyond the layout's limit of 160 A \(\[limits\] offset_a\)"
-    ):
-        template_text(database, "v1", NOW)
-
-
-def test_all_branches_stand_in_it_with_names_and_digests(make_database: Callable[..., VehicleDatabase]) -> None:
-    database = make_database()
-    parameters = decode_parameters(template_text(database, "v1", NOW).encode(), "t")
-    check_fit(parameters, database, "v1")
-    assert tuple(parameters.branches) == database.layout.branch_names
-    assert (parameters.layout.name, parameters.dbc.name) == ("small.toml", "small.dbc")
-    assert (parameters.provenance.method, parameters.provenance.created) == ("by hand", "2026-06-01T12:00:00Z")
-    assert ParameterTrial(parameters, database, []) is not None
 
 
 @pytest.mark.parametrize("vehicle", ["", " ", "v" * 65, "a\nb", "\udcff"])

@@ -2,7 +2,6 @@
 
 import os
 import re
-import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,12 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.core.status import Reason, UnfitError
-from ecu_node.database import MAX_DBC_BYTES, read_database
 from ecu_node.documents import UnsuitableFileError, read_user_file
-from ecu_node.errors import DatabaseError
-from ecu_node.layout import MAX_LAYOUT_BYTES, read_layout
-from ecu_node.parameters import MAX_FILE_BYTES, read_parameters
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
 
 
@@ -63,35 +57,6 @@ def test_a_parameter_file_that_is_none_is_malformed(tmp_path: Path, make: Callab
     assert (done.returncode, done.stderr) == (1, "")
 
 
-def test_the_calibrator_refuses_such_a_layout_too(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "other.toml")
-    command = ["import", "--layout", str(tmp_path / "other.toml"), "--out", str(tmp_path / "store"), "log.blf"]
-    done = subprocess.run(
-        [sys.executable, "-m", "calibrator", *command], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 1
-    assert "other.toml: cannot read the layout: it is a pipe; a file is expected; " in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
-def test_files_of_the_largest_size_are_read(tmp_path: Path) -> None:
-    filled = SMALL_LAYOUT + "#" * (MAX_LAYOUT_BYTES - len(SMALL_LAYOUT))
-    (tmp_path / "small.toml").write_text(filled)
-    layout = read_layout(tmp_path / "small.toml")
-    (tmp_path / "small.dbc").write_bytes(b"\n" * MAX_DBC_BYTES)
-    with pytest.raises(DatabaseError, match="the DBC has no message"):
-        read_database(layout)
-    (tmp_path / "p.json").write_bytes(b" " * MAX_FILE_BYTES)
-    with pytest.raises(UnfitError, match="it is empty"):
-        read_parameters(tmp_path / "p.json")
-
-
-def test_a_file_that_grows_while_it_is_read_is_not_followed(tmp_path: Path) -> None:
-    """The kernel's own files tell no size before they are read."""
-    with pytest.raises(UnsuitableFileError, match="larger than 10 bytes"):
-        read_user_file(Path("/proc/self/status"), largest_bytes=10)
-
-
 def test_a_pipe_that_takes_the_place_of_a_file_keeps_nobody_waiting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,12 +72,3 @@ def test_a_pipe_that_takes_the_place_of_a_file_keeps_nobody_waiting(
     monkeypatch.setattr(os, "open", swap_and_open)
     with pytest.raises(UnsuitableFileError, match="it is a pipe"):
         read_user_file(path, largest_bytes=10)
-
-
-def test_a_socket_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)  # names of sockets are short
-    with socket.socket(socket.AF_UNIX) as bound:
-        bound.bind("p.json")
-        with pytest.raises(UnfitError, match="it is a socket") as caught:
-            read_parameters(Path("p.json"))
-    assert caught.value.reason is Reason.MALFORMED_PARAMETERS

@@ -6,11 +6,13 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, generate_private_key
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+from msgspec.structs import replace
 
-from ecu_node.parameters import VehicleParameters
-from ecu_node.update.signers import PASSPHRASE_VARIABLE
+from ecu_node.parameters import VehicleParameters, write_parameters
+from ecu_node.update.signers import PASSPHRASE_VARIABLE, public_key_of
 from tests.disk import full_disk
-from tests.update.repo import ALL, Repo
+from tests.ecu_node.vehicles import LAYOUT
+from tests.update.repo import ALL, Repo, expired
 
 
 def failed(repo: Repo, words: str, *command: object, code: int = 1) -> None:
@@ -20,6 +22,10 @@ def failed(repo: Repo, words: str, *command: object, code: int = 1) -> None:
     assert words in err
 
 
+def keyid(repo: Repo, name: str) -> str:
+    return public_key_of(repo.folder / "keys" / f"{name}.pub").keyid[:8]
+
+
 def keys(repo: Repo, *names: str) -> list[object]:
     return [word for name in names for word in ("--key", repo.key(name))]
 
@@ -27,18 +33,58 @@ def keys(repo: Repo, *names: str) -> list[object]:
 def test_signers_sign_one_after_the_other(repo: Repo, new: Path, other: VehicleParameters) -> None:
     repo.updated(new)
     repo.add(other)
-    failed(repo, "signatures of bins-", "publish", repo.path, *keys(repo, "t1"))
+    lacking = f"not published: {repo.bin} has 1 of 2 signatures, not of {keyid(repo, 't2')}; snapshot has 0 of 1"
+    failed(repo, lacking, "publish", repo.path, *keys(repo, "t1"))
     assert repo.updated(new).startswith("nothing new: "), "vehicles see nothing of it yet"
-    failed(repo, "signatures of snapshot and 1 more are missing", "publish", repo.path, *keys(repo, "t2"))
+    failed(repo, "not published: snapshot has 0 of 1 signatures", "publish", repo.path, *keys(repo, "t2"))
     repo.publish("snapshot", "timestamp")
     assert repo.updated(new).startswith("on trial: parameter set 301")
 
 
 def test_change_after_a_signature_needs_all_signatures_anew(repo: Repo, other: VehicleParameters) -> None:
     repo.add(other)
-    failed(repo, "signatures of bins-", "publish", repo.path, *keys(repo, "t1"))
+    failed(repo, "has 1 of 2 signatures", "publish", repo.path, *keys(repo, "t1"))
     repo.done("revoke", repo.path, "v1")
-    failed(repo, "signatures of bins-", "publish", repo.path, *keys(repo, "t2", "snapshot", "timestamp"))
+    out = repo.done("publish", repo.path, *keys(repo, "t2", "snapshot", "timestamp"))
+    assert f"what is staged is not published: {repo.bin} has 1 of 2 signatures" in out
+
+
+def test_what_waits_for_a_signer_does_not_keep_the_timestamp_from_being_renewed(
+    repo: Repo, state: Path, other: VehicleParameters
+) -> None:
+    """Else a signer who is away for 30 days would end the updates of the whole fleet."""
+    repo.updated(state)
+    repo.add(other)
+    repo.done("rotate", repo.path, "timestamp", "--public", repo.folder / "keys" / "new.pub")
+    assert "the timestamp is new" in repo.done("publish", repo.path, *keys(repo, "snapshot", "timestamp"))
+    assert repo.updated(state).startswith("nothing new: ")
+    assert "timestamp 2, snapshot 2" in repo.node("inspect", "--state", state)[1]
+    assert "2 roles staged: " in repo.done("status", repo.path)
+    assert "2 staged roles dropped; 0 roles staged" in repo.done("status", repo.path, "--unstage")
+    repo.publish()
+    assert repo.updated(state).startswith("nothing new: ")
+    assert "root 1, timestamp 3" in repo.node("inspect", "--state", state)[1]
+
+
+def test_rotation_keeps_the_threshold(repo: Repo) -> None:
+    public = [word for name in ("t1", "t2", "new") for word in ("--public", repo.folder / "keys" / f"{name}.pub")]
+    assert "targets 2 of 3; " in repo.done("rotate", repo.path, "targets", *public)
+    failed(repo, "targets: 2 signatures of 1 keys", "rotate", repo.path, "targets", *public[:2], code=2)
+    failed(repo, "the same key is given twice", "rotate", repo.path, "targets", *public[:2], *public[:2], code=2)
+    assert "1 of 1 (was 2)" in repo.done("rotate", repo.path, "targets", *public[:2], "--threshold", 1)
+
+
+def test_files_that_no_vehicle_would_take_are_not_added(repo: Repo, parameters: VehicleParameters) -> None:
+    battery = replace(parameters.branches["battery"], drift=0.9)
+    wild = replace(parameters, branches={**parameters.branches, "battery": battery})
+    write_parameters(wild, repo.folder / "wild.json")
+    command = ("add", repo.path, repo.folder / "wild.json", "--layout", LAYOUT)
+    failed(repo, "wild.json: no vehicle will take it: branch battery: drift +0.9 is beyond", *command)
+
+
+def test_bundle_of_expired_metadata_is_refused(repo: Repo) -> None:
+    repo.forge("timestamp", expired, "timestamp")
+    failed(repo, "when its timestamp expired; publish first", "bundle", repo.path, "v1", "--out", repo.folder / "b")
 
 
 def test_publication_that_was_cut_goes_on(
@@ -102,7 +148,7 @@ def test_encrypted_key_signs_with_its_passphrase_alone(
     assert private.stat().st_mode & 0o777 == 0o600
     read = ["openssl", "pkey", "-in", str(private), "-passin", "pass:a long passphrase", "-pubout"]
     assert subprocess.run(read, capture_output=True, check=True).stdout == (tmp_path / "dora.pub").read_bytes()
-    failed(repo, "signatures of", "publish", repo.path, "--key", private)
+    failed(repo, "belongs to no role here", "publish", repo.path, "--key", private)
     monkeypatch.setenv(PASSPHRASE_VARIABLE, "another passphrase")
     failed(repo, "is not its passphrase", "publish", repo.path, "--key", private)
     monkeypatch.delenv(PASSPHRASE_VARIABLE)
@@ -113,7 +159,8 @@ def test_encrypted_key_signs_with_its_passphrase_alone(
 def test_key_is_never_replaced(repo: Repo) -> None:
     before = repo.key("t1").read_bytes()
     failed(repo, "there is a key already", "key", "t1", "--no-passphrase", "--out", repo.folder / "keys")
-    failed(repo, "a name for a file is expected", "key", "a/b", "--no-passphrase", "--out", repo.folder, code=2)
+    for name in ("a/b", ""):
+        failed(repo, "a name for a file is expected", "key", name, "--no-passphrase", "--out", repo.folder, code=2)
     assert repo.key("t1").read_bytes() == before
 
 
@@ -132,6 +179,7 @@ def test_mistakes_are_one_line_and_change_nothing(repo: Repo, other: VehiclePara
     failed(repo, "bad.json: ", "add", repo.path, repo.folder / "v1.json", tmp_path / "bad.json")
     failed(repo, "a second file for vehicle v1", "add", repo.path, repo.folder / "v1.json", repo.folder / "v1.json")
     failed(repo, "no parameters of vehicle 'v9' here", "revoke", repo.path, "v1", "v9")
+    failed(repo, "vehicle 'v1' never had a file 00000000...", "revoke", repo.path, "v1", "--sha256", 64 * "0")
     failed(repo, "64 digits", "revoke", repo.path, "v1", "--sha256", "12", code=2)
     failed(repo, "no parameters of vehicle 'v9' are published here", "bundle", repo.path, "v9", "--out", tmp_path / "b")
     assert files() == before

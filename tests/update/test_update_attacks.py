@@ -145,7 +145,8 @@ def test_mix_and_match_is_refused(repo: Repo, new: Path, other: VehicleParameter
 
 
 def test_bundle_of_another_vehicle_is_refused(repo: Repo, new: Path) -> None:
-    repo.refused(new, "is it complete, and for vehicle 'v1', which this is?", repo.bundle("v2"))
+    words = "is not in the bundle, which has v2.json; is it complete, and for vehicle 'v1', which this is?"
+    repo.refused(new, words, repo.bundle("v2"))
 
 
 def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, new: Path) -> None:
@@ -275,7 +276,8 @@ def test_web_server(repo: Repo, new: Path, server: Any) -> None:
 
 
 def test_web_server_that_is_not_there_is_one_line(repo: Repo, new: Path) -> None:
-    repo.refused(new, "127.0.0.1", "http://127.0.0.1:1/x")
+    repo.refused(new, "Connection refused; check address and connection", "http://127.0.0.1:1/x")
+    repo.refused(new, "only http:// and https:// are known", "ftp://127.0.0.1/x")
 
 
 def test_bundle_with_more_files_changes_nothing_more(repo: Repo, new: Path, parameters: VehicleParameters) -> None:

@@ -158,6 +158,7 @@ def test_many_revocations_push_none_out(repo: Repo, state: Path) -> None:
     """Version 1.0 forgot the first of 65."""
     repo.done("revoke", repo.path, "v1")
     for number in range(100):
+        (repo.path / "targets" / f"{number:064x}.v1.json").touch()
         repo.done("revoke", repo.path, "v1", "--sha256", f"{number:064x}")
     repo.publish()
     assert "nothing is in force now" in repo.updated(state)
@@ -174,11 +175,29 @@ def test_former_set_that_is_published_again_ends_the_trial_of_its_successor(
     assert numbers(state)[1] != 301
 
 
+def test_same_file_with_a_later_expiry_needs_no_trial(repo: Repo, state: Path, parameters: VehicleParameters) -> None:
+    repo.offer(parameters, "--days", 800)
+    assert repo.updated(state).startswith("extended: parameter set 300")
+    assert numbers(state) == (300, None)
+    found = read_state(state).in_force
+    assert found is not None
+    assert found.expires > datetime.now(UTC) + timedelta(days=799)
+
+
+def test_set_on_trial_that_has_expired_is_refused(
+    repo: Repo, new: Path, database: VehicleDatabase, other: VehicleParameters
+) -> None:
+    repo.offer(other, "--days", 1)
+    repo.updated(new)
+    with pytest.raises(TrustError, match="expired at"):
+        update(new, str(repo.path), database, datetime.now(UTC) + timedelta(days=2))
+
+
 def test_dry_run_says_the_same_and_writes_nothing(repo: Repo, new: Path) -> None:
     before = {path.name: path.read_bytes() for path in new.iterdir()}
     code, out, _ = repo.update(new, None, "--dry-run")
     assert code == 0
-    assert out.startswith("would be taken: on trial: parameter set 300")
+    assert out.startswith("dry run, nothing is changed: on trial: parameter set 300")
     assert {path.name: path.read_bytes() for path in new.iterdir()} == before
 
 

@@ -56,6 +56,8 @@ def run(place: Repo, lines: list[str]) -> None:
     assert lines
     for line in lines:
         program, *words = shlex.split(line)
+        if program == "export":  # the passphrase; the fixture has set one
+            continue
         code, _, err = (place.calibrator if program == "calibrator" else place.node)(*words)
         assert code == 0, f"{line}: {err}"
 

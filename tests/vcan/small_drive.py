@@ -11,16 +11,11 @@ from fractions import Fraction
 from pathlib import Path
 
 from e2e.p01 import e2e_p01_check, e2e_p01_protect
+from msgspec.structs import replace
 
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import (
-    BranchParameters,
-    FileReference,
-    HardwareFault,
-    JunctionResidual,
-    Provenance,
-    VehicleParameters,
-)
+from ecu_node.parameters import JunctionResidual, VehicleParameters
+from tests.ecu_node.vehicles import parameters_for
 
 PERIOD_S = 0.02
 VEHICLE = "v0007"
@@ -68,23 +63,9 @@ def true_currents(t: float) -> dict[str, float]:
 
 def true_parameters(database: VehicleDatabase) -> VehicleParameters:
     """A parameter file that states the true faults."""
-    layout = database.layout
-    return VehicleParameters(
-        vehicle=VEHICLE,
-        number=7,
-        layout=FileReference(name=layout.path.name, sha256=layout.digest),
-        dbc=FileReference(name=layout.dbc_path.name, sha256=database.digest),
-        verdict="corrected",
-        branches={
-            name: BranchParameters(drift=float(branch.drift), offset_a=float(branch.offset_a), apply=True)
-            for name, branch in BRANCHES.items()
-        },
-        hardware_fault=HardwareFault(suspected=False),
-        junction_residual=JunctionResidual(measured_a=0.0, corrected_a=0.0),
-        provenance=Provenance(
-            tool="test", method="truth", created="2026-01-01", fleet="f", fleet_size=1, drives=[], duration_s=1.0
-        ),
-    )
+    faults = {name: (float(branch.drift), float(branch.offset_a)) for name, branch in BRANCHES.items()}
+    residual = JunctionResidual(measured_a=0.0, corrected_a=0.0)
+    return replace(parameters_for(database, **faults), vehicle=VEHICLE, number=7, junction_residual=residual)
 
 
 def protected(database: VehicleDatabase, message: str, counter: int, **codes: int) -> bytes:

@@ -163,11 +163,7 @@ def test_sighup_reads_the_parameters_again(
 
 @pytest.mark.parametrize("options", [(), GATEWAY], ids=["overlay", "gateway"])
 def test_a_second_node_refuses_and_the_first_one_goes_on(
-    params: Path,
-    start_node: StartNode,
-    recording: Recording,
-    other_recording: Recording,
-    options: tuple[str, ...],
+    params: Path, start_node: StartNode, recording: Recording, other_recording: Recording, options: tuple[str, ...]
 ) -> None:
     bus = other_recording if options else recording
     with start_node(params, *options) as first:

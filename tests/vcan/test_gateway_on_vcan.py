@@ -12,7 +12,6 @@ from tests.vcan.processes import (
     Recording,
     frames_of,
     generate,
-    play,
     playing,
     wait_until,
 )
@@ -108,32 +107,3 @@ def test_frames_of_the_vehicle_arrive_at_the_sensors_once(
     sent = [item for item in other_recording.frames if item.identifier != STATUS]
     assert len(sent) == 160, "nothing comes back"
     assert recording.frames == sent, "and the status stays where it belongs"
-
-
-def test_in_shadow_mode_a_gateway_changes_nothing(
-    database: VehicleDatabase,
-    params: Path,
-    tmp_path: Path,
-    start_node: StartNode,
-    recording: Recording,
-    other_recording: Recording,
-) -> None:
-    drive = tmp_path / "drive.log"
-    write_drive(drive, database, 45)
-    with start_node(params, "--gateway", OTHER_CHANNEL, "--shadow") as node:
-        other_recording.wait_for(int(STATUS, 16), 1)
-        play(drive)
-        sent = recording.wait_for_frames(len(frames_of(drive)))
-        intact = [item for item in sent if rewritten(database, [item])]
-        wait_until(lambda: len(drive_of(other_recording.frames)) >= len(intact), "all frames on the other bus")
-        assert node.stop() == 0
-    assert by_carrier(drive_of(other_recording.frames)) == by_carrier(intact)
-
-
-def test_a_gateway_that_cannot_see_can_fd_says_so(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
-    with start_node(params, "--vehicle", VEHICLE, "--gateway", OTHER_CHANNEL) as node:
-        other_recording.wait_for(int(STATUS, 16), 1)
-    text = f"{CHANNEL} and {OTHER_CHANNEL}: set up for CAN FD, of which nothing is passed on without --fd"
-    assert text in node.messages

@@ -18,7 +18,6 @@ import pytest
 from ecu_node.bus.kernel_routes import KernelRoutes
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import BusError
 from tests.vcan.conftest import StartNode
 from tests.vcan.processes import (
     CHANNEL,
@@ -203,13 +202,6 @@ def test_rules_that_nobody_here_may_change_are_told(
     with pytest.raises(AssertionError, match=words), start_node(params, *GATEWAY, by=WITHOUT_RIGHTS):
         pass  # it never says that it runs
     assert len(rules()) == RULES, "others are still carried"
-
-
-def test_a_rule_that_the_kernel_refuses_leaves_none() -> None:
-    with KernelRoutes((CHANNEL, "lo"), {(BATTERY, False)}, fd=False, say=print) as routes:
-        with pytest.raises(BusError, match=r"vcan0 and lo: the kernel refuses a rule of can-gw: .*No such device"):
-            routes.set()
-        assert rules() == []
 
 
 def test_a_fault_of_the_program_leaves_the_rules_as_a_kill_does() -> None:

@@ -162,7 +162,7 @@ def build(checked: Checked, folder: Path, *, compiler: str = "gcc", flags: tuple
         objects.append(folder / f"{source.stem}.o")
         strict = () if source == driver else FLAGS
         subprocess.run([compiler, *strict, *flags, "-g", f"-I{CORE}", "-c", source, "-o", objects[-1]], check=True)
-    subprocess.run([compiler, *flags, *objects, "-o", folder / "driver"], check=True)
+    subprocess.run([compiler, *flags, "-no-pie", *objects, "-o", folder / "driver"], check=True)
     return folder / "driver"
 
 

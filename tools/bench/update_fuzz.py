@@ -74,7 +74,8 @@ class Vehicle:
                 path = folder / f"{name}.json"
                 path.write_bytes(encode_parameters(replace(parameters, vehicle=name), "fuzz"))
                 found.add([path], days=365, allow_large_step=False)
-            list(found.publish(list(signers.values())))
+            list(found.sign(list(signers.values())))
+            found.publish(list(signers.values()))
             found = Repository(folder / "repository")
             self.bundles.append(found.bundle("bench"))
             if drift == 0.05:

@@ -62,8 +62,8 @@ def test_contradictions_of_the_command_line_are_refused(params: Path, tmp_path: 
     cases = [
         ((params, params, "--format", "dcm"), "2 parameter files: dcm holds one vehicle; .* --format csv"),
         ((params, params, "--format", "csv"), r"v1\.json: says the same as v1\.json, .* give each parameter set once"),
-        ((params, "--format", "hex"), "--elf PROGRAM belongs to --format hex and a2l, which need it"),
-        ((params, "--format", "csv", "--elf", params), "--elf PROGRAM belongs to --format hex and a2l"),
+        ((params, "--format", "hex"), "--format hex needs --elf PROGRAM"),
+        ((params, "--format", "csv", "--elf", params), "--format csv takes no --elf PROGRAM"),
     ]
     for words, message in cases:
         with pytest.raises(ContradictionError, match=message):

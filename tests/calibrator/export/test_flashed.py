@@ -145,7 +145,17 @@ def test_program_without_the_calibration_is_refused(vehicles: tuple[Path, Checke
     for elf, message in cases:
         with pytest.raises(ExportError, match=message):
             raise refused(params, "--format", "hex", "--elf", elf, "--output", tmp_path / "x", layout=layout)
-    assert find_image(program).order == "little"
+    assert find_image(program, checked.database).order == "little"
+
+
+def test_program_of_another_layout_or_without_addresses_is_refused(
+    vehicles: tuple[Path, Checked], make_database: MakeDatabase, tmp_path: Path
+) -> None:
+    program, checked = vehicles
+    with pytest.raises(ExportError, match=r"driver: was compiled with layout [0-9A-F]{16}, and the one given is"):
+        find_image(program, make_database())
+    with pytest.raises(ExportError, match=r"hv_calibration\.o: has no fixed addresses \(ET_REL"):
+        find_image(program.with_name("hv_calibration.o"), checked.database)
 
 
 def test_numbers_that_tools_cannot_hold_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:

@@ -90,13 +90,6 @@ def test_figures_are_those_of_their_definition(tmp_path: Path) -> None:
     assert total["rmse_percent"] == pytest.approx(total["rmse_a"] / 2.0)
 
 
-def test_doubling_all_currents_doubles_all_figures(tmp_path: Path) -> None:
-    one = figures(*table(tmp_path, battery=1.1 * MOTOR_A + 3.0, motor=-MOTOR_A))["before"]
-    two = figures(*table(tmp_path, battery=2.2 * MOTOR_A + 6.0, motor=-2.0 * MOTOR_A))["before"]
-    for name, item in one.items():
-        assert two[name] == pytest.approx({key: 2.0 * value for key, value in item.items()}, abs=0.01)
-
-
 def test_rows_without_a_number_are_counted_and_not_used(tmp_path: Path) -> None:
     battery = MOTOR_A + 12.0
     battery[100:110] = np.nan
@@ -146,32 +139,6 @@ def test_sum_of_a_gain_error_is_told_from_a_constant_and_a_delay(tmp_path: Path)
             assert battery["gain_share"] > 0.99
     said = run(*table(tmp_path, battery=late + noise, motor=-MOTOR_A)).stdout
     assert "battery: its frames are 80 +- " in said
-
-
-def test_noise_of_a_small_branch_is_not_taken_for_its_gain(tmp_path: Path) -> None:
-    heater = -3.0 - 2.0 * np.sign(np.sin(0.4 * TABLE_S)) + 0.3 * np.random.default_rng(5).normal(size=1200)
-    true = -3.0 - 2.0 * np.sign(np.sin(0.4 * TABLE_S))
-    alone = figures(*table(tmp_path, battery=MOTOR_A - true, motor=-MOTOR_A, heater=heater))["residual"]["before"][
-        "alone"
-    ]
-    assert abs(alone["heater"]["gain_error"]) < 0.01
-    assert alone["heater"]["gain_share"] < 0.02
-
-
-def test_rows_seconds_apart_give_the_gain_error_of_least_squares(tmp_path: Path) -> None:
-    rng, time_s = np.random.default_rng(5), np.arange(0.0, 600.0, 2.0)
-    motor, heater = 60.0 * np.sin(0.7 * time_s) + 25.0 * np.sin(2.3 * time_s + 1.0), 6.0 * np.sign(np.sin(0.1 * time_s))
-    noise = 0.15 * rng.normal(size=(3, 300))
-    battery, motor, heater = noise + np.array([-motor - heater, 1.04 * motor - 1.5, 0.97 * heater])
-    pd.DataFrame({"t": time_s, "b": battery, "m": motor, "h": heater}).round(3).to_csv(tmp_path / "t.csv", index=False)
-    total, columns = battery + motor + heater, np.column_stack([motor, heater, np.ones(300)])
-    straight = total - columns @ np.linalg.lstsq(columns, total, rcond=None)[0]
-    found = figures(tmp_path / "t.csv", "--branches", "battery=b,motor=m,heater=h")
-    assert found["residual"]["before"]["alone"]["motor"]["gain_error"] == pytest.approx(
-        1.0 / (1.0 - np.polyfit(motor, total, 1)[0]) - 1.0, abs=0.0003
-    )
-    assert found["residual"]["before"]["rest_a"] == pytest.approx(straight.std(), rel=0.05)
-    assert found["expected"]["sd_a"] == pytest.approx(straight.std(), rel=0.15)
 
 
 def test_empty_cell_widens_the_band_there_alone(tmp_path: Path) -> None:
@@ -234,14 +201,6 @@ def test_parameters_correct_as_the_node_would(log: Path, tmp_path: Path) -> None
     assert passing["uncorrected"] == ["battery", "motor"]
 
 
-def test_parameters_of_another_junction_are_refused(log: Path, tmp_path: Path) -> None:
-    text = parameters(tmp_path, offset_a=12.0, apply=True).read_text().replace('"battery"', '"pack"')
-    (tmp_path / "V1.json").write_text(text)
-    done = run(log, "--layout", LAYOUT, "--parameters", tmp_path / "V1.json")
-    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
-    assert "parameters for branch 'pack', which" in done.stderr
-
-
 def test_parameters_of_another_layout_are_refused(log: Path, tmp_path: Path) -> None:
     file = parameters(tmp_path, offset_a=12.0, apply=True)
     (tmp_path / "other.toml").write_text(LAYOUT.read_text() + "# other\n")
@@ -254,15 +213,6 @@ def test_parameters_of_another_layout_are_refused(log: Path, tmp_path: Path) -> 
     assert "--parameters belong to a layout; give --layout, not --branches" in done.stderr
 
 
-def test_help_has_a_short_form_and_an_example() -> None:
-    short, long = run("-h"), run("--help")
-    assert short.returncode == long.returncode == 0
-    assert short.stdout == long.stdout
-    assert "Usage: calibrator kirchhoff [OPTIONS] [LOG]" in short.stdout
-    words = " ".join(short.stdout.replace("\\\n", "").split())
-    assert "calibrator kirchhoff table.csv --branches battery=Ibat,-motor=Imot --plot sum.html" in words
-
-
 # ---- text, pictures and tables
 
 
@@ -272,16 +222,6 @@ def test_text_has_80_columns_and_ends_with_the_sum(log: Path) -> None:
     assert "\x1b" not in "".join(lines)
     assert "no usable frames of auxiliary, dcdc, motor_rear: left out of the sum" in lines
     assert lines[-1].startswith("RMSE of the sum: 12.00 A before, 0.0")
-
-
-def test_next_command_is_said(log: Path, tmp_path: Path) -> None:
-    path, *rest = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
-    branches = "--branches battery=battery,motor=motor"
-    assert run(path, *rest).stderr == f"next: calibrator layout init {path} {branches} --out my_car.toml\n"
-    (tmp_path / "layout.toml").write_text(LAYOUT_OF_TABLE)
-    said = f"next: calibrator calibrate {path} --layout {tmp_path}/layout.toml --trusted BRANCH --out result\n"
-    assert run(path, "--layout", tmp_path / "layout.toml").stderr == said
-    assert run(log, "--layout", LAYOUT).stderr == "", "it is corrected"
 
 
 @pytest.mark.parametrize(("name", "start"), [("out.png", b"\x89PNG"), ("out.PDF", b"%PDF"), ("out.svg", b"<?xml")])
@@ -321,120 +261,7 @@ def test_table_has_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> 
         np.testing.assert_allclose(frame["sum_a"].mean(), 12.0, atol=0.02)
 
 
-def test_column_that_stands_twice_is_one_line(tmp_path: Path) -> None:
-    (path, *_) = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
-    path = Path(str(path))
-    done = run(path, "--branches", "a=motor,b=motor")
-    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
-    assert "branches a and b: both read motor; each branch needs a signal of its own" in done.stderr
-    path.write_text(path.read_text().replace("battery,motor", "motor [A],motor [A]", 1))
-    done = run(path, "--branches", "a=motor,b=motor.2")
-    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
-    assert "'motor' stands for 'motor.1 [A]', 'motor.2 [A]'; write it in full" in done.stderr
-    assert run(path, "--branches", "a=motor.1,b=motor.2").returncode == 0
-
-
-@pytest.mark.parametrize("what", ["--plot", "--table"])
-def test_output_that_cannot_be_written_is_one_line(what: str, log: Path, tmp_path: Path) -> None:
-    suffix = {"--plot": "png", "--table": "csv"}[what]
-    done = run(log, "--layout", LAYOUT, what, tmp_path / "nowhere" / f"x.{suffix}")
-    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
-    assert f"x.{suffix}: cannot write the" in done.stderr
-    done = run(log, "--layout", LAYOUT, what, tmp_path / "x.what")
-    assert done.returncode == 2
-    assert f"x.what: expected a file name that ends with .{suffix}" in done.stderr
-
-
-def test_recording_is_not_overwritten(tmp_path: Path) -> None:
-    path, *rest = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
-    (tmp_path / "logs").mkdir()
-    inner = tmp_path / "logs" / "a.csv"
-    inner.write_text("a")
-    for arguments, out, kept in (
-        ((path, *rest), tmp_path / "logs" / ".." / "table.csv", path),
-        ((inner.parent, "--layout", LAYOUT), inner, inner),
-    ):
-        before = Path(str(kept)).read_bytes()
-        done = run(*arguments, "--table", out)
-        assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1)
-        assert f"{out}: is read here and would be overwritten; choose another name" in done.stderr
-        assert Path(str(kept)).read_bytes() == before
-
-
-# ---- mistakes
-
-
-def test_wrong_use_is_exit_code_2(log: Path) -> None:
-    for arguments in (
-        (log, "--layout", LAYOUT, "--interface", "virtual"),
-        (log,),
-        (log, "--layout", LAYOUT, "--branches", "a=b,c=d"),
-        (log, "--layout", LAYOUT, "--full-scale", 400),
-        (log, "--branches", "a=b,c=d"),
-        ("--interface", "virtual", "--branches", "a=b,c=d"),
-    ):
-        done = run(*arguments)
-        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), arguments
-
-
-def test_empty_log_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "empty.log").touch()
-    done = run(tmp_path / "empty.log", "--layout", LAYOUT)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.splitlines() == [
-        f"calibrator: {tmp_path / 'empty.log'}: the log is empty: no data frames (0 error frames, "
-        "0 remote frames, 0 damaged lines); record it again"
-    ]
-
-
-def test_missing_column_names_those_that_are_there(tmp_path: Path) -> None:
-    path, *_ = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
-    done = run(path, "--branches", "battery=Ibat,motor=motor")
-    assert done.returncode == 1
-    assert "there is no column 'Ibat'; the columns are 'battery', 'motor'" in done.stderr
-
-
-def test_one_branch_alone_has_no_sum(tmp_path: Path, database: VehicleDatabase) -> None:
-    channel = Channel(time_s=TIME_S, value=np.sin(TIME_S), good=np.ones(len(TIME_S), np.bool_))
-    drive = Drive(vehicle="V1", name="d", branches={"battery": channel}, inputs={})
-    write_candump(tmp_path / "one.log", drive_series(drive, database))
-    done = run(tmp_path / "one.log", "--layout", LAYOUT)
-    assert done.returncode == 1
-    assert "usable frames of battery only; a sum needs two branches" in done.stderr
-
-
-def test_branches_that_are_never_fresh_together_are_refused(tmp_path: Path) -> None:
-    motor = np.where(np.isin(np.arange(1200), (0, 500, 1000)), -MOTOR_A, np.nan)
-    battery = np.where(np.isin(np.arange(1200), (250, 750)), MOTOR_A, np.nan)
-    path, *_ = table(tmp_path, battery=battery, motor=motor)
-    (tmp_path / "layout.toml").write_text(LAYOUT_OF_TABLE)
-    done = run(path, "--layout", tmp_path / "layout.toml")
-    assert done.returncode == 1
-    assert "no instant at which all of battery, motor are fresh; check timeout_s" in done.stderr
-
-
-def test_missing_dbc_is_the_options_and_not_the_layouts(log: Path) -> None:
-    done = run(log, "--layout", LAYOUT, "--dbc", "missing.dbc")
-    assert (done.returncode, done.stderr) == (1, "calibrator: missing.dbc: no such DBC; check --dbc\n")
-
-
 # ---- a live bus
-
-
-@pytest.mark.parametrize("duration", ["nan", "inf", "0", "long"])
-def test_duration_that_is_none_is_named_with_what_is_expected(duration: str) -> None:
-    done = run("--interface", "virtual", "--channel", "x", "--duration", duration, "--layout", LAYOUT)
-    assert done.returncode == 2
-    assert f"'--duration': {duration}: expected a number from 0.1 to 86400" in done.stderr
-
-
-def test_silent_bus_and_unknown_interface_are_named() -> None:
-    silent = run("--interface", "virtual", "--channel", "x", "--duration", 0.2, "--layout", LAYOUT)
-    assert (silent.returncode, silent.stdout) == (1, "")
-    assert "virtual:x: no frame in 0.2 s" in silent.stderr
-    unknown = run("--interface", "nonsense", "--channel", "x", "--layout", LAYOUT)
-    assert (unknown.returncode, len(unknown.stderr.splitlines())) == (1, 1)
-    assert "cannot open the bus" in unknown.stderr
 
 
 @pytest.mark.parametrize("interrupted", [False, True])

@@ -83,17 +83,13 @@ def test_own_power_train_is_found_whole(tmp_path: Path) -> None:
 
 BATTERIES = {
     "Amps": ('SG_ Battery_Current : 0|16@1+ (0.1,-819.2) [0|819] "Amps"', "BMS"),
-    "Ampere": ('SG_ HVBattCurr : 0|16@1- (0.1,0) [0|0] "Ampere"', "BMS"),
     "A_DC": ('SG_ IBat : 0|16@1- (0.1,0) [-500|500] "A_DC"', "BMS"),
-    "prefixed unit": ('SG_ AccuCurrent : 0|16@1- (0.1,0) [-500|500] "Unit_Amper"', "BMS"),
     "quantity in the unit": ('SG_ PackCurrent : 0|16@1- (0.1,0) [-500|500] "current:A"', "BMS"),
     "milliampere of 32 bits": ('SG_ PackCurrent : 0|32@1- (1,0) [0|0] "mA"', "BMS"),
     "no unit": ('SG_ Current : 0|12@1+ (0.25,-500) [0|0] ""', "Battery"),
     "German": ('SG_ BAT_StromIst : 0|16@1- (0.1,0) [-500|500] "A"', "BMS"),
     "French": ('SG_ CourantBatterie : 0|16@1- (0.1,0) [-500|500] "A"', "EMS"),
-    "Spanish": ('SG_ CorrienteBateria : 0|16@1- (0.1,0) [-500|500] "A"', "EMS"),
     "abbreviated": ('SG_ RdHVltBatPckCrnt : 0|13@1- (0.15,0) [-614.4|614.25] "A"', "EMS"),
-    "unsigned": ('SG_ PackCurrent : 0|16@1+ (0.1,0) [0|0] "A"', "BMS"),
     "8 bits": ('SG_ Pack_Current : 0|8@1- (0.1,-0.1) [0|0] "A"', "BMS"),
 }
 
@@ -145,21 +141,6 @@ def test_no_pack_current_is_said_with_the_reason(kind: str, tmp_path: Path) -> N
     assert last.startswith(f"calibrator: {path}: no pack current found")
 
 
-@pytest.mark.parametrize(
-    "signal",
-    [
-        'PhaseCurrent : 0|16@1- (0.1,0) [-900|900] "A"',
-        'DcCurrentRequest : 0|16@1- (0.1,0) [-900|900] "A"',
-        'INV_Iq : 0|16@1- (0.1,0) [-900|900] "A"',
-    ],
-)
-def test_what_is_no_branch_makes_no_layout_beside_the_battery(signal: str, tmp_path: Path) -> None:
-    run = calibrator("layout", "init", database_file(tmp_path, PACK, f"BO_ 2 Drive: 8 INV\n SG_ {signal} BMS\n"))
-    assert run.returncode == 1
-    assert run.stdout == ""
-    assert "the pack current is PackStatus.PackCurrent, but no current, power or torque of a motor" in run.stderr
-
-
 def test_charger_is_a_branch_only_without_a_motor(tmp_path: Path) -> None:
     charger = (
         'BO_ 5 Chg: 8 OBC\n SG_ CHG_Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS\n'
@@ -169,12 +150,6 @@ def test_charger_is_a_branch_only_without_a_motor(tmp_path: Path) -> None:
     assert set(sources(found(database_file(tmp_path, PACK, charger, INVERTER)))) == {"battery", "motor"}
 
 
-def test_watts_per_bit_are_powers(tmp_path: Path) -> None:
-    heater = 'BO_ 3 x54F: 8 CLIMA\n SG_ HeaterPowerConsumption : 0|6@1+ (1,0) [0|0] "300W/bit?" BMS\n'
-    layout = found(database_file(tmp_path, PACK, INVERTER, heater))
-    assert layout.find_branch("heater").power == "x54F.HeaterPowerConsumption"
-
-
 def test_motor_without_a_current_is_computed_of_torque_and_speed(tmp_path: Path) -> None:
     motor = (
         'BO_ 2 x1DA: 8 INV\n SG_ MG_EffectiveTorque : 0|11@1- (0.5,0) [-274|274] "Nm" BMS\n'
@@ -182,17 +157,6 @@ def test_motor_without_a_current_is_computed_of_torque_and_speed(tmp_path: Path)
     )
     branch = found(database_file(tmp_path, PACK, motor)).find_branch("motor")
     assert (branch.formula, branch.uncertainty) == ("torque * motor_speed * 0.10472 / voltage", 0.1)
-
-
-def test_order_of_a_database_does_not_matter(tmp_path: Path) -> None:
-    one = found(database_file(tmp_path, PACK, INVERTER, HEATER))
-    other = found(database_file(tmp_path, HEATER, INVERTER, PACK))
-    assert (one.branch, one.input) == (other.branch, other.input)
-
-
-def test_comments_cannot_break_the_file(tmp_path: Path) -> None:
-    comment = f'CM_ SG_ 1 PackCurrent "first\nsecond # sign = 1 \\ and {"long " * 40}";\n'
-    assert sources(found(database_file(tmp_path, PACK, INVERTER, comment)))["battery"] == "PackStatus.PackCurrent"
 
 
 @pytest.mark.parametrize(
@@ -211,15 +175,6 @@ def test_other_databases_do_as_well(kind: str, tmp_path: Path) -> None:
         "battery": "PackStatus.PackCurrent",
         "motor": "InverterStatus.DcPower",
     }
-
-
-def test_slips_of_public_databases_are_put_right(tmp_path: Path) -> None:
-    """Identifiers of 29 bits without the mark, and names for values of a signal that is not there."""
-    far = 'BO_ 316494068 Climate: 8 CLIMA\n SG_ HeaterCurrent : 0|16@1+ (0.1,0) [0|50] "A" BMS\n'
-    names = 'VAL_ 1 NoSuchSignal 0 "off" 1 "on" ;\nCM_ SG_ 316494068 HeaterCurrent "of the cabin";\n'
-    layout = found(database_file(tmp_path, PACK, INVERTER, far, names))
-    assert sources(layout)["heater"] == "Climate.HeaterCurrent"
-    assert read_database(layout).message("Climate").is_extended_frame
 
 
 # ---- with a log
@@ -285,37 +240,12 @@ def test_with_a_log_signs_are_told_against_convention(tmp_path: Path) -> None:
     assert layout.full_scale_a == 250.0
 
 
-def test_heater_that_reads_0_is_left_out(tmp_path: Path) -> None:
-    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
-    log = log_file(dbc, {**DRIVING, "HeaterCurrent": lambda _: 0.0})
-    run = calibrator("layout", "init", dbc, "--log", log)
-    assert run.returncode == 0
-    assert 'name = "heater"' not in run.stdout
-    assert "     reads 0 A throughout the recording" in run.stderr.splitlines()
-
-
-def test_charge_port_that_reads_0_makes_no_layout(tmp_path: Path) -> None:
-    charger = 'BO_ 5 Chg: 8 OBC\n SG_ CHG_Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS\n'
-    dbc = database_file(tmp_path, PACK, charger)
-    run = calibrator("layout", "init", dbc, "--log", log_file(dbc, DRIVING))
-    assert run.returncode == 1
-    assert "the pack current is PackStatus.PackCurrent, but no current" in run.stderr
-
-
 def test_motor_that_does_not_follow_the_battery_is_none(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER)
     log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 15.0 * math.sin(5.3 * t)})
     run = calibrator("layout", "init", dbc, "--log", log)
     assert run.returncode == 1
     assert "of the greatest of them: a branch is missing or wrong" in run.stderr
-
-
-def test_sum_that_does_not_close_makes_no_layout(tmp_path: Path) -> None:
-    dbc = database_file(tmp_path, PACK, INVERTER)
-    log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 0.2e-3 * motor_a(t) * volts(t)})
-    run = calibrator("layout", "init", dbc, "--log", log)
-    assert run.returncode == 1
-    assert re.search("the sum of battery, motor still varies by 8.% of the greatest of them", run.stderr)
 
 
 def test_wrong_range_is_judged_by_the_log(tmp_path: Path) -> None:
@@ -326,13 +256,6 @@ def test_wrong_range_is_judged_by_the_log(tmp_path: Path) -> None:
     assert layout.wrong_ranges == ["PackStatus.PackCurrent"]
     run = calibrator("kirchhoff", log, "--layout", layout.path, "--json")
     assert json.loads(run.stdout)["before"]["sum"]["rmse_a"] < 20.0  # negative currents count: else 60 A
-
-
-def test_code_for_not_available_makes_no_range_wrong(tmp_path: Path) -> None:
-    pack = PACK.replace("16@1- (0.1,0) [-1000|1000]", "16@1+ (0.1,-819.2) [-819.2|819]")
-    dbc = database_file(tmp_path, pack, INVERTER)
-    log = log_file(dbc, {**DRIVING, "PackCurrent": lambda t: battery_a(t) if t > 5.0 else 5734.3})
-    assert found(dbc, "--log", log).wrong_ranges == []
 
 
 def test_unsigned_signal_that_is_signed_is_said(tmp_path: Path) -> None:
@@ -356,30 +279,6 @@ def test_multiplexed_battery_current_is_found(tmp_path: Path) -> None:
         "heater": "ClimaStatus.HeaterCurrent",
     }
     assert layout.find_branch("battery").timeout_s == 0.5  # every 100 ms: every other frame
-
-
-def test_multiplexer_whose_name_is_cut_to_32_characters(tmp_path: Path) -> None:
-    """As in the DBC of the Tesla: the long name stands in an attribute, and only the page's own signals go by it."""
-    short = "PackStatus_loggingAndVitals_Page"
-    pack = f"""BO_ 1 PackStatus: 8 BMS
- SG_ {short} M : 0|8@1+ (1,0) [0|1] "" INV
- SG_ PackCurrent m1 : 8|16@1- (0.1,0) [-1000|1000] "A" INV
- SG_ PackVoltage m0 : 8|16@1+ (0.1,0) [0|1000] "V" INV
-"""
-    long = (
-        f'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_ "SystemSignalLongSymbol" SG_ 1 {short} "{short}Index";\n'
-    )
-    dbc = database_file(tmp_path, pack, INVERTER, HEATER, long)
-    layout = found(dbc, "--log", log_file(database_file(tmp_path, pack, INVERTER, HEATER, name="short.dbc"), DRIVING))
-    assert sources(layout)["battery"] == "PackStatus.PackCurrent"
-    assert layout.full_scale_a == 250.0  # voltages on the other page would be currents of 390 A
-
-
-def test_stray_frames_of_another_bus_do_not_count(tmp_path: Path) -> None:
-    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
-    stray = [f"({1e9 + 3.0 * k:.6f}) can1 001#FF7FFF7F00000000" for k in range(5)]
-    layout = found(dbc, "--log", log_file(dbc, DRIVING, lines=stray))
-    assert layout.full_scale_a == 250.0
 
 
 def test_artificial_vehicle_passes_the_doctor(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -455,12 +354,6 @@ def columns(path: Path, *names: str, delay_s: float = 0.0) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["Iheat", "I_heat_A", "Heizstrom [A]"])
-def test_current_of_a_heater_is_a_branch_of_a_table(name: str, tmp_path: Path) -> None:
-    layout = found(columns(tmp_path / "x.csv", "Ibat", "Imot", name))
-    assert {b.name: (b.source, b.sign) for b in layout.branch}["heater"] == (name, -1)
-
-
 def test_current_that_closes_the_sum_is_a_branch_whatever_its_name(tmp_path: Path) -> None:
     assert sources(found(columns(tmp_path / "x.csv", "Ibat", "Imot", "I_x")))["auxiliary"] == "I_x"
     late = columns(tmp_path / "late.csv", "Ibat", "Imot", "I_x", delay_s=5.0)
@@ -501,30 +394,6 @@ def test_named_branches_are_written_without_a_guess(table: Path) -> None:
     ]
 
 
-def test_named_signals_of_a_database(tmp_path: Path) -> None:
-    dbc = database_file(tmp_path, PACK, INVERTER)
-    layout = found(dbc, "--branches", "battery=PackCurrent,-motor=InverterStatus.PhaseCurrent")
-    assert sources(layout) == {"battery": "PackStatus.PackCurrent", "motor": "InverterStatus.PhaseCurrent"}
-
-
-MISTAKES: dict[str, tuple[list[str], str]] = {
-    "no such signal": (["--branches", "battery=Nix,-motor=Motorstrom"], "'Nix' is no current or power there"),
-    "no equals sign": (["--branches", "battery"], "two or more are expected, such as battery=Ibat,-motor=Imot"),
-    "one branch": (["--branches", "battery=Batteriestrom"], "two or more are expected"),
-    "a log beside a table": (["--log", "x.log"], "a table, which needs no --log"),
-}
-
-
-@pytest.mark.parametrize("kind", MISTAKES)
-def test_mistake_with_a_table_is_one_line(kind: str, table: Path) -> None:
-    arguments, said = MISTAKES[kind]
-    run = calibrator("layout", "init", table, *arguments)
-    assert run.returncode == 1
-    assert run.stdout == ""
-    (line,) = run.stderr.splitlines()
-    assert said in line
-
-
 def test_mistake_with_a_database_is_one_line(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER)
     two = database_file(tmp_path, PACK, PACK.replace("1 PackStatus", "9 Twin"), name="two.dbc")
@@ -561,18 +430,6 @@ def test_json_has_every_candidate(tmp_path: Path) -> None:
     run = calibrator("layout", "init", database_file(tmp_path, INVERTER), "--json")
     assert run.returncode == 1
     assert json.loads(run.stdout)["problem"].startswith("no pack current found")
-
-
-def test_tool_makes_the_table_of_a_folder(tmp_path: Path) -> None:
-    database_file(tmp_path, PACK, INVERTER, name="one.dbc")
-    database_file(tmp_path, PACK, INVERTER, name="other.dbc")
-    database_file(tmp_path, INVERTER, name="inverter.dbc")
-    (tmp_path / "broken.dbc").write_text("BO_ 1")
-    (tmp_path / "right").write_text("database,battery\none,PackStatus.PackCurrent\nother,PackStatus.Nix\n")
-    tool = [DBC.parent / "tools" / "tried_databases.py", tmp_path, "--right", tmp_path / "right"]
-    run = subprocess.run([sys.executable, *map(str, tool)], capture_output=True, text=True, check=True)
-    assert "| one | right | `PackStatus.PackCurrent` | motor `InverterStatus.DcPower` |" in run.stdout.splitlines()
-    assert run.stdout.endswith("\nnone 1, refused 1, right 1, wrong 1\n")
 
 
 # ---- the dialogue
@@ -634,24 +491,6 @@ def test_dialogue_takes_and_leaves(tmp_path: Path) -> None:
     assert {b.name: b.sign for b in read_layout(tmp_path / "car.toml").branch} == {"battery": 1, "motor": -1}
 
 
-def test_candidate_that_is_left_stands_beside_the_one_that_is_taken(tmp_path: Path) -> None:
-    pack = PACK.replace(
-        " SG_ PackVoltage", ' SG_ PackCurrentRaw : 32|16@1- (0.1,0) [-1000|1000] "A" INV\n SG_ PackVoltage'
-    )
-    screen = Screen(database_file(tmp_path, pack, INVERTER), "--out", tmp_path / "car.toml")
-    lines = screen.until("q quit")
-    down = next(k for k, line in enumerate(lines) if "PackCurrentRaw" in line) - next(
-        k for k, line in enumerate(lines) if line.startswith(">")
-    )
-    screen.press(DOWN * down + " ")
-    screen.until("PackCurrentRaw: A")
-    screen.press("\r")
-    assert screen.ended()[0] == 0
-    text = (tmp_path / "car.toml").read_text()
-    assert sources(read_layout(tmp_path / "car.toml"))["battery"] == "PackStatus.PackCurrentRaw"
-    assert '# or: "PackStatus.PackCurrent" (A)' in text
-
-
 def test_dialogue_writes_what_does_not_close_only_when_asked_again(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 0.2e-3 * motor_a(t) * volts(t)})
@@ -663,21 +502,3 @@ def test_dialogue_writes_what_does_not_close_only_when_asked_again(tmp_path: Pat
     screen.press("\r")
     assert screen.ended()[0] == 0
     assert (tmp_path / "car.toml").exists()
-
-
-def test_dialogue_wants_two_branches_and_quits(tmp_path: Path) -> None:
-    screen = Screen(database_file(tmp_path, PACK, INVERTER), "--out", tmp_path / "car.toml")
-    screen.until("q quit")
-    screen.press(" \r")
-    screen.until("has at least two branches")
-    screen.press("q")
-    code, text = screen.ended()
-    assert code == 1
-    assert text.rstrip().endswith("calibrator: nothing was written")
-    assert not (tmp_path / "car.toml").exists()
-
-
-def test_yes_asks_nothing_at_a_terminal(tmp_path: Path) -> None:
-    code, text = Screen(database_file(tmp_path, PACK, INVERTER), "--yes", "--out", tmp_path / "car.toml").ended()
-    assert code == 0
-    assert "\x1b[?1049h" not in text

@@ -18,14 +18,6 @@ def test_names_are_split_into_words(text: str, words: str) -> None:
     assert " ".join(words_of(text)) == words
 
 
-def test_words_are_not_joined_across_texts() -> None:
-    assert words_of("PWR_LeistDC", "DC-Leistung Pulswechselrichter") == (
-        *("pwr", "leist", "dc", "dc"),
-        *("leistung", "pulswechselrichter"),
-    )
-    assert words_of("DC_DC", None, "AirCon") == ("dcdc", "aircon")
-
-
 def test_places_are_known_by_the_words_of_several_houses() -> None:
     assert places_of(words_of("BMS_PackCurrent")) == {"battery"}
     assert places_of(words_of("INV_DcPower")) == {"motor"}

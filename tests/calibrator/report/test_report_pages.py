@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
@@ -18,13 +17,11 @@ from calibrator.errors import FleetError
 from calibrator.report import page as page_module
 from calibrator.report.page import fleet_report, vehicle_report
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import HardwareFault, SensorFinding
+from ecu_node.parameters import SensorFinding
 from tests.calibrator.report.results_at_hand import (
     EVIL,
     sensor,
-    six_vehicle_result,
     six_vehicles,
-    vehicle,
     write_result,
 )
 
@@ -94,33 +91,6 @@ def test_other_explanations_of_an_undecided_sensor_are_drawn(result: Path) -> No
     assert battery["what it may be instead"]["text"] == ["V4, 40%"]
 
 
-def test_columns_of_vehicles_are_those_of_the_result(result: Path) -> None:
-    stored = pq.read_table(result / "results.parquet").to_pylist()
-    page = fleet_report(result)[0]
-    found = columns_of(page)
-    names = found["vehicle"].tolist()
-    assert set(names) == {"V1", "V2", "V3", "V4", "V5", "V10"}
-    for row in stored:
-        if row["branch"] is not None:
-            j = names.index(row["vehicle"])
-            i = 2 * j + ("battery", "motor").index(row["branch"])
-            assert found["drift"][i] == pytest.approx(row["drift"], abs=5.1e-6)
-            assert found["offset_sd_a"][i] == pytest.approx(row["offset_sd_a"], abs=5.1e-3)
-            assert found["applied"][i] == row["applied"]
-            assert found["junction_rms_measured_a"][j] == pytest.approx(row["junction_rms_measured_a"], abs=5.1e-3)
-
-
-def test_values_that_are_not_known_stay_so(tmp_path: Path, database: VehicleDatabase) -> None:
-    still = replace(sensor(), identifiable=False, fault_probability=None)
-    lost = replace(sensor(), drift_sd=None, offset_sd_a=None)
-    open_ones = replace(sensor(), offset_sd_a=200.0)
-    items = [vehicle(database, "V1", sensor(), still), vehicle(database, "V2", lost, open_ones)]
-    found = columns_of(fleet_report(write_result(tmp_path / "r", items))[0])
-    assert found["unknown"].tolist() == [0.0, 1.0, 3.0, 2.0]
-    assert np.isnan(found["fault_probability"][1])
-    assert np.isnan(found["drift_sd"][2])
-
-
 def test_names_and_reasons_are_text_and_never_code(result: Path) -> None:
     page, _ = fleet_report(result)
     assert EVIL not in page
@@ -141,35 +111,12 @@ def test_the_page_has_its_numbers_without_its_script(result: Path) -> None:
     assert "1 because it is beyond the limits of the layout" in text
 
 
-def test_the_same_result_gives_the_same_pages(result: Path) -> None:
-    assert fleet_report(result)[0] == fleet_report(result)[0]
-    assert vehicle_report(result, "V1")[0] == vehicle_report(result, "V1")[0]
-
-
-def test_large_page_holds_the_evidence_of_the_first_vehicles(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert len(json.loads(packed(fleet_report(result)[0], "details"))) == 6
-    monkeypatch.setattr(page_module, "MOST_DETAILED", 4)
-    assert len(json.loads(packed(fleet_report(result)[0], "details"))) == 4
-
-
 def test_of_a_very_large_fleet_those_with_a_fault_are_listed(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_module, "MOST_SENSORS", 11)
     page, report = fleet_report(result)
     assert len(columns_of(page)["vehicle"]) == 5
     assert report["overview"]["vehicles"] == 6
     assert "5 of 6 vehicles are listed" in visible(page)
-
-
-def test_a_battery_that_there_is_not_is_refused(result: Path) -> None:
-    with pytest.raises(FleetError, match="--battery rear: no such branch; expected one of battery, motor"):
-        fleet_report(result, battery="rear")
-
-
-def test_a_result_of_a_method_without_evidence_has_a_page(tmp_path: Path, database: VehicleDatabase) -> None:
-    result = write_result(tmp_path / "published", six_vehicles(database), method="published", evidence=False)
-    page, report = fleet_report(result)
-    assert facts_of(page)["evidence"] == []
-    assert report["overview"]["reference"] == {}
 
 
 def test_the_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None:
@@ -196,29 +143,6 @@ def test_the_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None
     }
 
 
-def test_a_result_of_one_vehicle_has_no_fleet(tmp_path: Path, database: VehicleDatabase) -> None:
-    """As one junction calibrated by itself gives it: no reference, no evidence, no hardware probability."""
-    item = replace(
-        vehicle(database, "car", sensor(0.1, 4.0, apply=True), replace(sensor(), identifiable=False)),
-        hardware_fault=HardwareFault(suspected=False),
-    )
-    page, report = fleet_report(write_result(tmp_path / "r", [item], evidence=False))
-    text = visible(page)
-    assert "Vehicle car" in text
-    assert "not known hardware fault: only a comparison with a fleet shows one" in text
-    assert "of the fleet" not in text
-    assert "45.2 A margin as measured" in text
-    assert report["protection"] is not None
-    assert facts_of(page)["figures"] == {}
-    assert columns_of(page)["unknown"].tolist() == [0.0, 1.0]
-
-
-def test_a_result_without_a_vehicle_is_refused(tmp_path: Path) -> None:
-    result = write_result(tmp_path / "r", [], left_out={"V1": "its drive is too short"})
-    with pytest.raises(FleetError, match="no vehicle in it has parameters; V1: its drive is too short"):
-        fleet_report(result)
-
-
 def test_findings_are_in_the_workshop_list_and_with_the_vehicle(tmp_path: Path, database: VehicleDatabase) -> None:
     vehicles = six_vehicles(database)
     findings = [
@@ -240,30 +164,8 @@ def test_findings_are_in_the_workshop_list_and_with_the_vehicle(tmp_path: Path, 
     assert "Workshop list" not in visible(vehicle_report(result, "V1")[0])
 
 
-def test_without_deviations_no_margin_is_given(tmp_path: Path, database: VehicleDatabase) -> None:
-    unsure = replace(sensor(0.1, 4.0, apply=True), drift_sd=None, offset_sd_a=None)
-    page, report = fleet_report(write_result(tmp_path / "r", [vehicle(database, "V1", unsure, sensor())]))
-    assert report["protection"] is None
-    assert "How wrong the battery sensor can be is not known" in visible(page)
-
-
-def test_a_result_of_an_older_version_is_told_to_be_one(result: Path) -> None:
-    text = (result / "run.json").read_text()
-    (result / "run.json").write_text(text.replace('"full_scale_a": 400.0', '"full_scale_a": 0.0'))
-    with pytest.raises(FleetError, match="no full_scale_a, it is of an older version; calibrate again"):
-        fleet_report(result)
-
-
 def test_a_vehicle_that_was_left_out_is_told_why(result: Path) -> None:
     with pytest.raises(FleetError, match="it was left out: cannot be read"):
         vehicle_report(result, f"log of {EVIL}")
     with pytest.raises(FleetError, match="no vehicle 'V99' in it"):
         vehicle_report(result, "V99")
-
-
-def test_a_result_without_parameters_is_named(tmp_path: Path, database: VehicleDatabase) -> None:
-    result = six_vehicle_result(tmp_path / "r", database)
-    for path in (result / "parameters").iterdir():
-        path.unlink()
-    with pytest.raises(FleetError, match=r"no parameters of vehicle V\d+ there; give the whole folder"):
-        fleet_report(result)

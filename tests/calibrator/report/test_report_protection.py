@@ -53,19 +53,6 @@ def test_sensor_needs_its_error_at_the_limit_and_corrected_its_doubt_alone(margi
     assert half["common_gain_a"] == pytest.approx(24.0)
 
 
-def test_doubt_of_a_trusted_sensor_counts(margin: Margin) -> None:
-    """A gain that is trusted to 0.2 % is wrong by up to 0.8 A and more."""
-    found = margin.known(sensor(sd=0.002))
-    assert found["common_before_a"] == found["common_after_a"] == pytest.approx(2.0 * DOUBT_A)
-    assert f"{2.0 * DOUBT_A:.1f} A margin as measured" in margin.text
-
-
-def test_doubt_gives_nothing_back(margin: Margin) -> None:
-    found = margin.known(sensor(0.1, 4.0, sd=0.02), sensor(0.01, 1.0, sd=0.02, apply=True))
-    assert found["common_gain_a"] == 0.0
-    assert found["own_gain_a"] == pytest.approx(5.0)
-
-
 def test_one_margin_for_all_falls_no_lower_than_the_worst_that_is_not_corrected(margin: Margin) -> None:
     found = margin.known(sensor(0.1, 4.0, apply=True), sensor(0.02, -1.0), sensor())
     assert found["common_after_a"] == pytest.approx(9.0 + DOUBT_A)

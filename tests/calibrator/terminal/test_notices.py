@@ -21,28 +21,12 @@ def test_where_a_notice_holds_is_said_exactly() -> None:
     assert merged_notices(three) == ["in 3 drives of 2 vehicles: temperature: 4 of 6 frames not usable"]
 
 
-def test_different_notices_stay_apart() -> None:
-    other = Notice(text="no frames of dcdc")
-    lines = merged_notices({("V1", "a"): [other, spoilt(1, 2)], ("V2", "a"): [other]})
-    assert lines == ["in 2 vehicles: no frames of dcdc", "V1/a: temperature: 1 of 2 frames not usable"]
-
-
-def test_no_notice_is_no_line() -> None:
-    assert merged_notices({("V1", "a"): []}) == []
-
-
 def test_one_reason_of_many_vehicles_is_one_line() -> None:
     names = [f"V{k:03}" for k in range(1, 45)]
     line = "V001, V002, V003, V004, V005, V006 and 38 more: too short"
     assert told_once((name, "too short") for name in names) == [line]
     assert left_out_text(dict.fromkeys(names, "too short")) == f"left out:\n  {line}"
     assert reasons_text("cannot tell", dict.fromkeys(names, "too short")) == f"cannot tell:\n  {line}"
-
-
-def test_many_reasons_for_which_nothing_can_be_told_are_cut_short() -> None:
-    lines = reasons_text("cannot tell", {f"V{k:03}": f"reason {k}" for k in range(12)}).splitlines()
-    assert lines[1:3] == ["  V000: reason 0", "  V001: reason 1"]
-    assert lines[-1] == "  and 2 other lines, see the parameter files"
 
 
 def test_nothing_to_tell_is_no_text() -> None:

@@ -39,16 +39,6 @@ def test_passes_are_numbered_and_a_later_command_is_not(
     assert starts == ["1/2 learn the fleet", "2/2 calibrate: 2 of 2 vehicles", "import: 1 of 1 logs"]
 
 
-def test_what_was_done_before_does_not_shorten_the_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clock = iter([0.0, 10.0])
-    monkeypatch.setattr("calibrator.terminal.progress.time.monotonic", lambda: next(clock))
-    with progress_bar("calibrate", 1000, "vehicles", begun=900) as done:
-        done(950)
-    assert capsys.readouterr().err == "calibrate: 950 of 1000 vehicles, 10 s, 10 s left\n"
-
-
 IN_TERMINAL = """
 from calibrator.terminal import progress
 from calibrator.terminal.progress import progress_bar
@@ -96,18 +86,6 @@ def test_a_terminal_gets_a_bar_with_colour() -> None:
     assert "read drives" in text.decode()
     assert "4/4 vehicles" in text.decode()
     assert re.search(rb"\x1b\[[0-9;]*3[0-9;]*m", text)
-
-
-def test_no_color_is_respected() -> None:
-    text = in_terminal(NO_COLOR="1")
-    assert "4/4 vehicles" in text.decode()
-    assert re.search(rb"\x1b\[[0-9;]*3[0-9]m", text) is None
-
-
-def test_a_dumb_terminal_gets_lines() -> None:
-    text = in_terminal(TERM="dumb").decode()
-    assert text.replace("\r\n", "\n").startswith("read drives: 4 of 4 vehicles, ")
-    assert "\x1b" not in text
 
 
 def test_ctrl_c_leaves_the_cursor_and_a_new_line() -> None:

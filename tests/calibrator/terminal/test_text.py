@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from calibrator.terminal.text import counted, few, few_reasons, figure
+from calibrator.terminal.text import few_reasons, figure
 
 
 @pytest.mark.parametrize(
@@ -23,11 +23,6 @@ def test_figures_are_written_as_people_do(value: float, digits: int, text: str) 
     assert figure(value, digits) == text
 
 
-def test_of_many_names_the_first_are_told() -> None:
-    assert few(["a", "b"]) == "a, b"
-    assert few([f"V{j}" for j in range(9)]) == "V0, V1, V2, V3, V4, V5 and 3 more"
-
-
 def test_of_many_reasons_five_are_told_and_how_many_more_there_are() -> None:
     reasons = {f"V{j}": "cut" for j in range(7)}
     five = "; V0: cut; V1: cut; V2: cut; V3: cut; V4: cut"
@@ -36,7 +31,3 @@ def test_of_many_reasons_five_are_told_and_how_many_more_there_are() -> None:
     assert few_reasons(dict(list(reasons.items())[:5])) == five
     assert few_reasons(reasons) == f"{five}; and 2 more"
     assert few_reasons(reasons, count=1000) == f"{five}; and 995 more"
-
-
-def test_one_thing_is_told_as_one() -> None:
-    assert [counted(number, "drive") for number in (0, 1, 2)] == ["0 drives", "1 drive", "2 drives"]

@@ -33,11 +33,6 @@ def hello() -> None:
     write_output("hello")
 
 
-def test_a_command_that_is_done(capfd: pytest.CaptureFixture[str]) -> None:
-    assert run_app(app, "prog", ["hello"]) == 0
-    assert capfd.readouterr() == ("hello\n", "")
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
@@ -95,18 +90,6 @@ def test_help_has_an_example_and_words_that_people_use(
     assert max(map(len, text.splitlines())) <= 80
     assert f"Example:\n    {' '.join(['calibrator', *command])} " in text
     assert re.search(r"list\[|<[a-zA-Z]+>|[{}]|e\+[0-9]", text) is None
-
-
-def test_help_says_what_may_be_repeated_and_no_bound_that_nobody_reaches(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(calibrator_app, "calibrator", ["repository", "publish", "--help"]) == 0
-    words = " ".join(capsys.readouterr().out.split())
-    assert "calibrator repository publish [OPTIONS] REPOSITORY" in words
-    assert "PUBLIC.pem=URI. May be repeated." in words
-
-
-def test_nothing_but_the_name_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(app, "prog", []) == 2
-    assert "Usage: prog" in capsys.readouterr().err
 
 
 def test_ctrl_c_ends_a_tool_with_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

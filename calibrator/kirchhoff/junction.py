@@ -1,0 +1,265 @@
+"""What recordings of one vehicle tell of the sum of its currents: signs, units, delays, whether anything moves.
+
+Signs and units come first (:mod:`calibrator.kirchhoff.signs`); with these put right the delays as the calibrator
+estimates them, and without the delays signs and units once more.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from calibrator.drive import Array, Drive
+from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
+from calibrator.errors import DriveError
+from calibrator.kirchhoff.signs import WELL_CORRELATED, Bands, bands_of, likely_multipliers, sag
+from calibrator.kirchhoff.sums import VOLTAGE, Comparison, compare_kirchhoff, step_of
+from calibrator.words import is_battery
+from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Layout
+
+__all__ = ["Junction", "look_at_junction"]
+
+CHANGE_PRICE, UNIT_PRICE = 0.7, 0.3
+"""Each branch that is changed must halve V / N: its variation must then be above that of the sum's rest. The second is
+what a slip of a unit costs beyond a wrong sign: where both explain the same, the sign is wrong. [1]"""
+PLAUSIBLE_PRICE = 2.0
+"""For each branch whose current would be beyond what the layout calls full scale, or almost nothing of it. [1]"""
+ORIENTATION_PRICE = 1.5
+"""For energy that would flow into a battery while its voltage falls: more than for one more change. [1]"""
+LARGEST_SHARE, LEAST_SHARE = 1.2, 0.002
+"""Of full scale: beyond it, and almost nothing of it for the greatest current. [1]"""
+PEAK_QUANTILE = 0.999
+"""Of the magnitudes: a few wild samples are no peak. [1]"""
+SMALL_SHARE = 0.05
+"""Of the greatest branch's variation; a smaller branch's gain is drawn to 0 by its noise. [1]"""
+AVERAGED_S, FEWEST_AVERAGES = 2.0, 3
+"""Noise is averaged out over this long, to see whether currents move; fewer averages do not tell. [s], [1]"""
+SHORT_S = 20.0
+"""Shorter recordings tell no signs. [s]"""
+STILL_A, STILL_SHARE, STILL_STEPS = 0.5, 0.01, 0.5
+"""Currents that move by less than this [A], this share of full scale, or this many of their steps stand still. [1]"""
+STILL_SPEED = 0.5
+"""Below this speed, in whatever unit, a car stands."""
+COARSEST = 0.01
+"""Share of full scale; a coarser step is a slip of a unit. [1]"""
+_SPEEDS, _SPEED_UNITS = ("speed", "velocity", "geschwindigkeit"), {"km/h", "kph", "kmh", "mph", "m/s", ""}
+"""Of the vehicle; columns of a table have no unit here, and a motor's speed never quite stands."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Junction:
+    """The K branches with usable values, over recordings of one vehicle.
+
+    Attributes
+    ----------
+    database : VehicleDatabase
+        With the voltages, see :func:`.with_voltages`.
+    branches : tuple of str
+        The K branches.
+    drives : tuple of Drive
+        Those with all of these branches.
+    comparisons : tuple of Comparison
+        Their currents, each on one time base; none with fewer than two branches.
+    steps_a : ndarray of shape (K,)
+        Step of the signal of each branch, at most :data:`COARSEST`. [A]
+    bands : Bands
+        Comparable currents as the layout has them, but for the delays; of no instant where too little was recorded.
+    multipliers : ndarray of shape (K,)
+        +-10^n with which the sum varies least; 1 where nothing is wrong. [1]
+    delays : BranchDelays or None
+        With these signs and units; None where too little was recorded.
+    """
+
+    database: VehicleDatabase
+    branches: tuple[str, ...]
+    drives: tuple[Drive, ...]
+    comparisons: tuple[Comparison, ...]
+    steps_a: Array
+    bands: Bands
+    multipliers: Array
+    delays: BranchDelays | None
+
+    @property
+    def rms_a(self) -> Array:
+        """How much each branch varies, as the layout has it, shape (K,). [A]"""
+        return np.asarray(np.sqrt(np.mean(self.bands.current_a**2, axis=0)))
+
+    @property
+    def changed(self) -> list[int]:
+        """Numbers of the branches that are not as the layout has them."""
+        return [int(k) for k in np.flatnonzero(self.multipliers != 1.0)]
+
+    def is_small(self, name: str) -> bool:
+        """Whether a branch varies too little beside the greatest for the sum to tell much of it."""
+        right_a = self.rms_a * np.abs(self.multipliers)
+        return bool(right_a[self.branches.index(name)] < SMALL_SHARE * np.max(right_a))
+
+    @cached_property
+    def currents_a(self) -> list[Array]:
+        """Branches and their sum at the valid instants, shape (T, K + 1) for each drive. [A]"""
+        return [comparison.stages["before"].dropna().to_numpy() for comparison in self.comparisons]
+
+    @property
+    def sum_a(self) -> Array:
+        """Sum of the branches at all valid instants. [A]"""
+        return np.concatenate([np.zeros(0), *(part[:, -1] for part in self.currents_a)])
+
+    @property
+    def valid_s(self) -> float:
+        """How long the branches have values together. [s]"""
+        return self.database.layout.period_s * len(self.sum_a)
+
+    @property
+    def is_short(self) -> bool:
+        """Whether too little was recorded for signs, units and gains."""
+        return self.valid_s < SHORT_S
+
+    @cached_property
+    def moves_a(self) -> Array:
+        """Standard deviation of each branch, noise averaged out; empty where too little was recorded to tell. [A]"""
+        length = max(round(AVERAGED_S / self.database.layout.period_s), 1)
+        whole = [part[: len(part) // length * length, :-1] for part in self.currents_a]
+        means = [part.reshape(-1, length, part.shape[1]).mean(axis=1) for part in whole]
+        return np.concatenate(means).std(axis=0) if sum(map(len, means)) >= FEWEST_AVERAGES else np.zeros(0)
+
+    @property
+    def mean_a(self) -> float:
+        """Greatest magnitude of the mean of a branch. [A]"""
+        return float(max((np.abs(part[:, :-1].mean(axis=0)).max() for part in self.currents_a), default=0.0))
+
+    @cached_property
+    def speed(self) -> float | None:
+        """Greatest speed [in its unit], 0 for none; None where it is not recorded."""
+        inputs = [
+            item.name
+            for item in self.database.layout.input
+            if (self.database.signal(item.signal)[1].unit or "") in _SPEED_UNITS
+            and any(word in f"{item.name} {item.signal}".lower() for word in _SPEEDS)
+        ]
+        channels = [drive.inputs[name] for drive in self.drives for name in inputs if name in drive.inputs]
+        seen = [float(np.abs(each.value[each.good]).max()) for each in channels if each.good.any()]
+        return None if not seen else max(seen) if max(seen) > STILL_SPEED else 0.0
+
+    @cached_property
+    def stands_still(self) -> bool:
+        """Whether no current moves by more than its sensor can show; a speed that moves says otherwise."""
+        if self.speed or not len(self.moves_a):
+            return False
+        least_a = min(STILL_A, STILL_SHARE * self.database.layout.full_scale_a)
+        return bool(np.all(self.moves_a <= np.maximum(least_a, STILL_STEPS * self.steps_a)))
+
+    @property
+    def moves(self) -> bool:
+        """Whether currents move, and long enough, to tell signs, units, delays and gains."""
+        return len(self.bands.block) > 0 and not self.stands_still
+
+
+def look_at_junction(
+    drives: Sequence[Drive], database: VehicleDatabase, *, full_scale_a: float | None = None
+) -> Junction:
+    """Look at the sum of the branches that have usable values in some drives of one vehicle.
+
+    Parameters
+    ----------
+    drives : sequence of Drive
+        Of one vehicle; those that lack a branch that others have do not count.
+    database : VehicleDatabase
+        With the voltages, see :func:`.with_voltages`.
+    full_scale_a : float, optional
+        What currents are plausible up to, if it is not that of the layout. [A]
+    """
+    layout = database.layout
+    usable = {name for drive in drives for name, channel in drive.branches.items() if channel.good.any()}
+    names = tuple(name for name in layout.branch_names if name in usable)
+    whole = [drive for drive in drives if all(n in drive.branches and drive.branches[n].good.any() for n in names)]
+    comparisons, delays = list[Comparison](), None
+    bands = bands_of([])
+    best: Array = np.ones(len(names))
+    if len(names) > 1:
+        for drive in whole:
+            with suppress(DriveError):  # no instant at which all are fresh: there is no sum to look at
+                comparisons.append(compare_kirchhoff(drive, database))
+        bands = bands_of([[drive.branches[name] for name in names] for drive in whole])
+    steps_a = np.array([max((step_of(database, name, drive) for drive in whole), default=0.0) for name in names])
+    steps_a = np.minimum(steps_a, COARSEST * layout.full_scale_a)
+    if len(bands.block):
+        price = _price(drives, names, layout, full_scale_a or layout.full_scale_a)
+        least_a = float(np.linalg.norm(steps_a))
+        best = _multipliers(bands, price, least_a)
+        order = np.argsort(-np.sum((bands.current_a * best) ** 2, axis=0), kind="stable")
+        right = [_multiplied(drive, dict(zip(names, best.tolist(), strict=True))) for drive in whole]
+        with suppress(DriveError):
+            delays = estimate_delays(right, [names[k] for k in order])
+            on_time = [without_delays(drive, delays.by_branch()) for drive in whole]
+            bands = bands_of([[drive.branches[name] for name in names] for drive in on_time])
+            best = _multipliers(bands, price, least_a)
+    return Junction(
+        database=database,
+        branches=names,
+        drives=tuple(whole),
+        comparisons=tuple(comparisons),
+        steps_a=steps_a,
+        bands=bands,
+        multipliers=best,
+        delays=delays,
+    )
+
+
+def _multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
+    """A drive with its branch currents multiplied by a number."""
+    branches = {
+        name: replace(drive.branches[name], value=m * drive.branches[name].value) for name, m in multipliers.items()
+    }
+    return replace(drive, branches=branches)
+
+
+def _values(drives: Sequence[Drive], branch: str) -> Array:
+    """Good values of a branch over all drives. [A]"""
+    channels = [drive.branches[branch] for drive in drives if branch in drive.branches]
+    return np.concatenate([channel.value[channel.good] for channel in channels])
+
+
+def _multipliers(bands: Bands, price: Callable[[Array], float], least_a: float) -> Array:
+    """Likely multipliers of the branches; a sum that varies by no more than quantisation leaves is right."""
+    ones = np.ones(bands.current_a.shape[1])
+    return ones if bands.rms_a(ones) <= least_a else likely_multipliers(bands, price)
+
+
+def _price(
+    drives: Sequence[Drive], names: Sequence[str], layout: Layout, full_scale_a: float
+) -> Callable[[Array], float]:
+    """What is held against multipliers of the branches beside the sum."""
+    peak_share = np.array([np.quantile(np.abs(_values(drives, name)), PEAK_QUANTILE) for name in names]) / full_scale_a
+    battery = next((k for k, n in enumerate(names) if is_battery(n, layout.find_branch(n).source)), None)
+    orientation = 0.0 if battery is None else _orientation(drives, names[battery])
+
+    def price(multipliers: Array) -> float:
+        share = np.abs(multipliers) * peak_share
+        turned = 0.0 if battery is None else float(np.sign(multipliers[battery]))
+        changes = min(np.sum(multipliers != 1.0), 1 + np.sum(multipliers != -1.0))  # all signs turned are one change
+        return float(
+            CHANGE_PRICE * changes
+            + UNIT_PRICE * np.sum(np.abs(multipliers) != 1.0)
+            + PLAUSIBLE_PRICE * (np.sum(share > LARGEST_SHARE) + (share.max() < LEAST_SHARE))
+            + ORIENTATION_PRICE * max(-turned * orientation, 0.0)
+        )
+
+    return price
+
+
+def _orientation(drives: Sequence[Drive], battery: str) -> float:
+    """Tell from the battery's voltage whether its current is positive into the junction.
+
+    Near 1 if the voltage falls when the current rises, near -1 if it rises; without a voltage that follows the current,
+    a third of that by the sign of the mean current, since driving takes energy out of a battery; 0 if nothing tells.
+    """
+    both = [drive for drive in drives if battery in drive.branches and VOLTAGE in drive.inputs]
+    correlation = sag([(drive.branches[battery], drive.inputs[VOLTAGE]) for drive in both])
+    if abs(correlation) > WELL_CORRELATED:
+        return -correlation
+    value = _values(drives, battery)
+    spread = float(np.sqrt(np.mean(value**2)))
+    return float(np.mean(value)) / spread / 3.0 if spread > 0.0 else 0.0
