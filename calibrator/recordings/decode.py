@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from cantools.database.can import Message, Signal
+from fastcrc import crc8
 from numpy.typing import NDArray
 
 from calibrator.compiled import compiled
@@ -246,18 +247,9 @@ def _is_one_of(signal: Signal, raw: Raw, codes: frozenset[int]) -> Mask:
 
 # ---- end-to-end protection
 
-_POLYNOMIAL = 0x1D
 _NO_COUNTER = 15
-
-
-def _crc_table() -> NDArray[np.uint8]:
-    crc = np.arange(256)
-    for _ in range(8):
-        crc = ((crc << 1) ^ np.where(crc & 0x80, _POLYNOMIAL, 0)) & 0xFF
-    return crc.astype(np.uint8)
-
-
-_CRC = _crc_table()
+_CRC = np.array([crc8.gsm_a(bytes([byte])) for byte in range(256)], np.uint8)
+"""CRC of each byte, of polynomial 0x1D, start and final value 0."""
 
 
 def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: int) -> Mask:
