@@ -46,14 +46,29 @@ class Faults:
     def __len__(self) -> int:
         return len(self.hardware_drift)
 
+    @classmethod
+    def of_parameters(cls, x: Array, full_scale_a: float) -> "Faults":
+        """Faults of the 3K free parameters of N vehicles, of footnote 1 of [1]_.
+
+        Parameters
+        ----------
+        x : ndarray of shape (N, 3K)
+            (d_h, o_h,1 .. o_h,K-1, D_m, o_m), offsets in fractions of full scale; o_h,K is minus the sum of the others.
+        full_scale_a : float
+            Full scale of the junction. [A]
+        """
+        K = x.shape[1] // 3
+        free = x[:, 1:K] * full_scale_a
+        return cls(
+            hardware_drift=x[:, 0],
+            hardware_offset_a=np.column_stack([free, -free.sum(axis=1)]),
+            drift=x[:, K : 2 * K],
+            offset_a=x[:, 2 * K :] * full_scale_a,
+        )
+
     def take(self, index: Index) -> "Faults":
         """Return the same faults for some of the vehicles; an integer gives arrays without the leading N."""
-        return Faults(
-            hardware_drift=self.hardware_drift[index],
-            hardware_offset_a=self.hardware_offset_a[index],
-            drift=self.drift[index],
-            offset_a=self.offset_a[index],
-        )
+        return Faults(**{name: values[index] for name, values in vars(self).items()})
 
     @property
     def has_hardware_fault(self) -> Mask:

@@ -22,7 +22,6 @@ class Purpose(IntEnum):
     TRAINING_FAULTS = 6
     TRAINING_ERROR = 7
     COMMON_DRIVE = 8
-    HYPERPARAMETERS = 9
 
 
 def random_stream(purpose: Purpose, *numbers: int) -> np.random.Generator:

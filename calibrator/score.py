@@ -15,7 +15,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults
 
-__all__ = ["TOLERANCE", "correction_error_rms", "f2_score", "harmed", "recovered", "recovery_rate"]
+__all__ = ["TOLERANCE", "correction_error_rms", "f2_score", "harmed", "recovered"]
 
 TOLERANCE = 0.10
 """Relative error below which a vehicle counts as recovered, section IV-D. [1]"""
@@ -45,14 +45,6 @@ def recovered(
     drift = _close(estimate.drift, truth.drift, smallest_fault, tolerance)
     offset = _close(estimate.offset_a / full_scale_a, truth.offset_a / full_scale_a, smallest_fault, tolerance)
     return drift & offset
-
-
-def recovery_rate(
-    estimate: Faults, truth: Faults, *, full_scale_a: float, smallest_fault: float, tolerance: float = TOLERANCE
-) -> float:
-    """Share of the vehicles that are :func:`recovered`, with the same parameters; NaN without vehicles."""
-    found = recovered(estimate, truth, full_scale_a=full_scale_a, smallest_fault=smallest_fault, tolerance=tolerance)
-    return float(found.mean()) if found.size else float("nan")
 
 
 def f2_score(predicted: Mask, actual: Mask) -> float:

@@ -51,6 +51,9 @@ class _HeardMessage:
         self.frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
         """Times [s] and payloads of the last intact ones."""
         self.faults = dict.fromkeys(_FAULTS.values(), 0)
+        self.answered_by: list[_HeardMessage] = []
+        self.unanswered: deque[tuple[float, _HeardMessage]] = deque(maxlen=REMEMBERED_FRAMES)
+        """Frames that this message has not answered yet."""
 
     def take(self, payload: bytearray, time_s: float) -> bool:
         """Take a frame; like the node, use it only if it is intact, new, and not after a jump of its counter."""
@@ -99,10 +102,6 @@ class BusMonitor:
             key: _HeardMessage(protection_of(database, message), start_s) for key, message in messages.items()
         }
         self._branches = [_BranchOnBus(database, branch, self._heard) for branch in database.layout.branch]
-        self._unanswered: dict[int, deque[tuple[float, _HeardMessage]]] = {
-            id(branch.answering): deque(maxlen=REMEMBERED_FRAMES) for branch in self._branches if branch.answering
-        }
-        """Frames that were not answered yet, by the message that answers them."""
         self._database, self._latency = database, Latency()
 
     def take(self, key: tuple[int, bool], payload: bytearray, time_s: float) -> None:
@@ -120,12 +119,9 @@ class BusMonitor:
         message = self._heard.get(key)
         if message is None or not message.take(payload, time_s):
             return
-        for answer in {id(branch.answering) for branch in self._branches if branch.asking is message}:
-            if answer in self._unanswered:
-                self._unanswered[answer].append((time_s, message))
-        waiting = self._unanswered.get(id(message))
-        if waiting is None:
-            return
+        for answering in message.answered_by:
+            answering.unanswered.append((time_s, message))
+        waiting = message.unanswered
         while waiting and time_s - waiting[0][0] > _LONGEST_LATENCY_S:
             waiting.popleft()
         asked_s, asking = waiting.popleft() if waiting else (time_s, None)
@@ -183,6 +179,8 @@ class _BranchOnBus:
         self.measured.follow(placed_signal(message, signal), self.asking.frames)
         message, signal = database.signal(corrected or branch.source)
         self.answering = heard[key_of(message)] if corrected is not None else None
+        if self.answering is not None and self.answering not in self.asking.answered_by:
+            self.asking.answered_by.append(self.answering)
         self.answers: Frames = deque(maxlen=REMEMBERED_FRAMES)
         """Intact corrected frames, at the times of those that they answer."""
         self.corrected.follow(placed_signal(message, signal), self.answers)

@@ -10,10 +10,10 @@ import numpy as np
 from rich.console import Console
 
 from calibrator.experiments.experiments import EXPERIMENTS, fleet_for
-from calibrator.experiments.methods import PERFECT, POSTERIOR, Estimate
+from calibrator.experiments.methods import PERFECT, POSTERIOR
 from calibrator.experiments.pages import result_table
 from calibrator.experiments.runner import run_experiment
-from calibrator.experiments.trial import Trial
+from calibrator.experiments.trial import Estimate, Trial
 from calibrator.faults import Faults
 
 

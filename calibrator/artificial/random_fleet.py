@@ -90,16 +90,12 @@ def draw_faults(
         values = np.where(rng.random(values.shape) < 2.0 * sign_bias, np.abs(values), values)
     if balanced:
         values[rng.permutation(n) < n // 2, :branches] = 0.0
-    hardware_drift, hardware_offset, drift, offset = np.split(values, [1, branches, 2 * branches], axis=1)
-    hardware_offset = np.concatenate([hardware_offset, -hardware_offset.sum(axis=1, keepdims=True)], axis=1)
-    faults = Faults(
-        hardware_drift=hardware_drift[:, 0],
-        hardware_offset_a=hardware_offset * full_scale_a,
-        drift=drift,
-        offset_a=offset * full_scale_a,
-    )
-    if symmetric:
-        faults = _symmetric_group(faults)
+    faults = Faults.of_parameters(values, full_scale_a)
+    if symmetric:  # each vehicle with three others, so that the mean of (21) is the ideal current
+        signs = {"hardware_drift": (1, -1, 1, -1), "hardware_offset_a": (1, -1, 1, -1),
+                 "drift": (1, -1, -1, 1), "offset_a": (1, -1, 1, -1)}  # fmt: skip
+        group = {name: np.concatenate([s * getattr(faults, name) for s in own]) for name, own in signs.items()}
+        faults = Faults(**group)
     return faults.take(rng.permutation(vehicles))
 
 
@@ -110,14 +106,3 @@ def _sparse_values(
     rank = np.argsort(np.argsort(rng.random((vehicles, parameters)), axis=1), axis=1)
     sign = rng.choice([-1.0, 1.0], size=(vehicles, parameters))
     return np.where(rank < nonzero, sign * rng.uniform(*magnitude, size=(vehicles, parameters)), 0.0)
-
-
-def _symmetric_group(faults: Faults) -> Faults:
-    """Each vehicle with the three others whose mean of (21) is the ideal current, section IV-B of [1]_."""
-    signs = ((1, 1, 1, 1), (-1, -1, -1, -1), (1, 1, -1, 1), (-1, -1, 1, -1))
-    return Faults(
-        hardware_drift=np.concatenate([s[0] * faults.hardware_drift for s in signs]),
-        hardware_offset_a=np.concatenate([s[1] * faults.hardware_offset_a for s in signs]),
-        drift=np.concatenate([s[2] * faults.drift for s in signs]),
-        offset_a=np.concatenate([s[3] * faults.offset_a for s in signs]),
-    )

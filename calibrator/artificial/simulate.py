@@ -6,7 +6,7 @@ delay and noise, sampled by its own message at its own instants, quantised by th
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from calibrator.artificial.trips import (
     balance_branch,
     choose_branches,
     with_branches,
-)
+)  # fmt: skip
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.fleet_id import write_fleet_ids
 from calibrator.errors import FleetError
@@ -36,16 +36,9 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch, Layout, split_signal
 
 __all__ = [
-    "FleetPlan",
-    "Vehicle",
-    "draw_vehicles",
-    "simulate_fleet",
-    "trip_of",
-    "vehicle_currents",
-    "vehicle_drive",
-    "vehicle_frames",
-    "write_vehicle",
-]
+    "FleetPlan", "Vehicle", "draw_vehicles", "simulate_fleet", "trip_of", "vehicle_currents", "vehicle_drive",
+    "vehicle_frames", "write_vehicle",
+]  # fmt: skip
 
 WRITTEN_DOWN = ("seed", "sparsity", "magnitude", "balanced", "symmetric", "common_drive", "noise")
 """Fields of the plan that stand in the truth, too."""
@@ -105,8 +98,8 @@ def vehicle_frames(
         One series per message of the DBC that carries a branch of the vehicle or an input.
     """
     return [
-        encode_message(database, sent.message, sent.time_s, sent.values)
-        for sent in _sent_messages(rng, database, vehicle, trip)
+        encode_message(database, message, time_s, {signal: value for signal, _, value, _ in sent})
+        for message, time_s, sent in _sent_messages(rng, database, vehicle, trip)
     ]
 
 
@@ -123,51 +116,43 @@ def vehicle_drive(rng: np.random.Generator, database: VehicleDatabase, vehicle: 
     Drive
         Channels at the instants of their frames, in steps of their signals; named after vehicle and trip.
     """
-    branches: dict[str, Channel] = {}
-    inputs: dict[str, Channel] = {}
-    for sent in _sent_messages(rng, database, vehicle, trip):
-        for signal_name, (kind, name) in sent.signals.items():
-            _, signal = database.signal(f"{sent.message}.{signal_name}")
-            unit = _signed_unit(database, name) if kind == "branch" else 1.0
-            value = sent_values(signal, sent.values[signal_name]) * unit
-            channel = Channel(time_s=sent.time_s, value=value, good=np.isfinite(value))
-            (branches if kind == "branch" else inputs)[name] = channel
-    return Drive(
-        vehicle=vehicle.name,
-        name=trip.name,
-        branches={name: branches[name] for name in vehicle.branches},
-        inputs=inputs,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Sent:
-    """What a vehicle puts into one message on one trip: values by signal, and what each signal is."""
-
-    message: str
-    signals: Mapping[str, tuple[str, str]]
-    time_s: Array
-    values: Mapping[str, Array]
+    channels = {}
+    for message, time_s, sent in _sent_messages(rng, database, vehicle, trip):
+        for signal, name, value, unit in sent:
+            seen = unit * sent_values(database.signal(f"{message}.{signal}")[1], value)
+            channels[name] = Channel(time_s=time_s, value=seen, good=np.isfinite(seen))
+    branches = {name: channels.pop(name) for name in vehicle.branches}
+    return Drive(vehicle=vehicle.name, name=trip.name, branches=branches, inputs=channels)
 
 
 def _sent_messages(
     rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth
-) -> Iterator[_Sent]:
-    """Values of each message before they are encoded."""
-    i = vehicle_currents(vehicle, trip)
-    for message_name, signals in _signals_by_message(database, vehicle.branches, trip).items():
-        time_s = _frame_times(rng, database, message_name, trip)
-        values: dict[str, Array] = {}
-        for signal_name, (kind, name) in signals.items():
-            if kind == "branch":
-                k = vehicle.branches.index(name)
+) -> Iterator[tuple[str, Array, list[tuple[str, str, Array, float]]]]:
+    """What a vehicle puts into each message on one trip, before it is encoded.
+
+    Yields the message's name, its instants [s], and of each signal its name, that of the branch or input, its values in
+    the unit of the DBC, and the factor from there to ampere into the junction.
+    """
+    i, layout = vehicle_currents(vehicle, trip), database.layout
+    messages: dict[str, list[tuple[str, str]]] = {}
+    names = [(_current_signal(layout.find_branch(name)), name) for name in vehicle.branches]
+    names += [(item.signal, item.name) for item in layout.input if item.name in trip.inputs]
+    for place, name in names:
+        messages.setdefault(split_signal(place)[0], []).append((split_signal(place)[1], name))
+    for message, own in messages.items():
+        time_s = _frame_times(rng, database, message, trip)
+        sent: list[tuple[str, str, Array, float]] = []
+        for signal, name in own:
+            if name in vehicle.branches:
+                k, definition = vehicle.branches.index(name), database.signal(f"{message}.{signal}")[1]
+                unit = layout.find_branch(name).sign * unit_factor(definition, AMPERE, f"branch {name}")
                 seen = np.interp(time_s - vehicle.delay_s[k], trip.time_s, i[:, k])
-                measured = measured_currents(seen[:, None], vehicle.faults)[:, k]
-                measured += rng.normal(0.0, vehicle.noise_a, size=len(time_s))
-                values[signal_name] = measured / _signed_unit(database, name)
+                value = measured_currents(seen[:, None], vehicle.faults)[:, k]
+                value = (value + rng.normal(0.0, vehicle.noise_a, size=len(time_s))) / unit
             else:
-                values[signal_name] = np.interp(time_s, trip.time_s, trip.inputs[name])
-        yield _Sent(message=message_name, signals=signals, time_s=time_s, values=values)
+                value, unit = np.interp(time_s, trip.time_s, trip.inputs[name]), 1.0
+            sent.append((signal, name, value, unit))
+        yield message, time_s, sent
 
 
 def write_vehicle(
@@ -204,21 +189,19 @@ def write_vehicle(
         target = folder / kind / vehicle.name
         target.mkdir(parents=True, exist_ok=True)
         write_candump(target / LOG_NAME, vehicle_frames(rng, database, vehicle, trip))
-    i = vehicle_currents(vehicle, unseen)
-    faults = vehicle.faults
-
-    def by_branch(values: Array) -> dict[str, float]:
-        return dict(zip(vehicle.branches, values.tolist(), strict=True))
-
+    i, faults = vehicle_currents(vehicle, unseen), vehicle.faults
+    by_branch = {
+        "hardware_offset_a": faults.hardware_offset_a,
+        "drift": faults.drift,
+        "offset_a": faults.offset_a,
+        "delay_s": vehicle.delay_s,
+        "unseen_mean_a": np.mean(i, axis=0),
+        "unseen_mean_square_a2": np.mean(i**2, axis=0),
+    }
     return VehicleTruth(
         hardware_drift=float(faults.hardware_drift),
-        hardware_offset_a=by_branch(faults.hardware_offset_a),
-        drift=by_branch(faults.drift),
-        offset_a=by_branch(faults.offset_a),
-        delay_s=by_branch(vehicle.delay_s),
         unmeasured_a=vehicle.unmeasured_a,
-        unseen_mean_a=by_branch(np.mean(i, axis=0)),
-        unseen_mean_square_a2=by_branch(np.mean(i**2, axis=0)),
+        **{key: dict(zip(vehicle.branches, values.tolist(), strict=True)) for key, values in by_branch.items()},
     )
 
 
@@ -237,34 +220,12 @@ def _frame_times(rng: np.random.Generator, database: VehicleDatabase, message_na
     return np.maximum(nominal + jitter, 0.0)
 
 
-def _signals_by_message(
-    database: VehicleDatabase, branches: Sequence[str], trip: GroundTruth
-) -> Mapping[str, dict[str, tuple[str, str]]]:
-    """Signals to fill, by message: ('branch' or 'input', name in the layout)."""
-    found: dict[str, dict[str, tuple[str, str]]] = {}
-    for name in branches:
-        message, signal = split_signal(_current_signal(database.layout.find_branch(name)))
-        found.setdefault(message, {})[signal] = ("branch", name)
-    for item in database.layout.input:
-        if item.name in trip.inputs:
-            message, signal = split_signal(item.signal)
-            found.setdefault(message, {})[signal] = ("input", item.name)
-    return found
-
-
 def _current_signal(branch: Branch) -> str:
     if branch.signal is None:
         raise FleetError(
             f"branch {branch.name} is a power divided by a voltage; fleets are made from current signals only"
         )
     return branch.signal
-
-
-def _signed_unit(database: VehicleDatabase, name: str) -> float:
-    """Factor from the DBC's value to ampere into the junction."""
-    branch = database.layout.find_branch(name)
-    _, signal = database.signal(_current_signal(branch))
-    return branch.sign * unit_factor(signal, AMPERE, f"branch {name}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -348,21 +309,19 @@ def simulate_fleet(
     with whole_folder(out) as folder:
         write = partial(_write, folder=folder, database=database, trips=trips, seed=plan.seed)
         written = run_many(write, enumerate(vehicles), Workers(processes=workers))
-        truths: dict[str, VehicleTruth] = {}
+        truths = dict[str, VehicleTruth]()
         for vehicle, truth in zip(vehicles, written, strict=True):
             truths[vehicle.name] = truth
             progress(len(truths))
-        put_in = {field: getattr(plan, field) for field in WRITTEN_DOWN}
-        fleet = with_fleet_id(
-            FleetTruth(
-                fleet_id="",
-                layout=layout.name,
-                branches=list(branches),
-                full_scale_a=layout.full_scale_a,
-                vehicles=truths,
-                **put_in,
-            )
+        fleet = FleetTruth(
+            fleet_id="",
+            layout=layout.name,
+            branches=list(branches),
+            full_scale_a=layout.full_scale_a,
+            vehicles=truths,
+            **{field: getattr(plan, field) for field in WRITTEN_DOWN},
         )
+        fleet = with_fleet_id(fleet)
         write_truth(folder / TRUTH_FILE, fleet)
         for kind in ("logs", "unseen"):
             write_fleet_ids(folder / kind, {fleet.fleet_id})

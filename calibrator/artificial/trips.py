@@ -6,7 +6,6 @@ said about that branch afterwards is therefore not independent of the other sens
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -101,15 +100,12 @@ def ground_truth_from_drive(drive: Drive, period_s: float) -> GroundTruth | None
     channels = {**drive.branches, **drive.inputs}
     if not drive.branches or any(not channel.good.any() for channel in channels.values()):
         return None
-    start = max(float(channel.time_s[channel.good][0]) for channel in channels.values())
-    stop = min(float(channel.time_s[channel.good][-1]) for channel in channels.values())
+    known = {name: (channel.time_s[channel.good], channel.value[channel.good]) for name, channel in channels.items()}
+    start, stop = max(float(t[0]) for t, _ in known.values()), min(float(t[-1]) for t, _ in known.values())
     time_s = np.arange(start, stop, period_s)
     if not time_s.size:
         return None
-    values = {
-        name: np.interp(time_s, channel.time_s[channel.good], channel.value[channel.good])
-        for name, channel in channels.items()
-    }
+    values = {name: np.interp(time_s, *pair) for name, pair in known.items()}
     return GroundTruth(
         name=drive.name,
         period_s=period_s,
@@ -161,107 +157,116 @@ def _pieces(trip: GroundTruth) -> list[GroundTruth]:
 
 TripPurpose = Literal["calibration", "unseen"]
 """A trip to learn from, or one to test on."""
-
 _STREAM: dict[TripPurpose, Purpose] = {"calibration": Purpose.CALIBRATION_TRIP, "unseen": Purpose.UNSEEN_TRIP}
-
-
 LEARNT_SHARE = 0.75
 """Share of a single recording that trips to learn from are made of; the rest is for unseen ones. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TripSource(ABC):
-    """Gives every vehicle its trips; the same number and purpose give the same trip.
+class BuiltinTrips:
+    """A different trip of the built-in vehicle for every vehicle and purpose; the same arguments give the same trip.
 
     Attributes
     ----------
     seed : int
         Seed of the trips.
-    unseen_s : float
-        Length of each trip to test on. [s]
+    duration_s, unseen_s : float
+        Length of each trip to learn from, and of each trip to test on. [s]
     notices : tuple of str
         What a user should know about the trips.
-    common : bool
-        Every vehicle drives the trips of vehicle 0, as in the experiments of the paper.
     """
 
     seed: int
+    duration_s: float
     unseen_s: float
     notices: tuple[str, ...] = ()
-    common: bool = False
-
-    @property
-    @abstractmethod
-    def branches(self) -> tuple[str, ...]:
-        """Branches that the trips have."""
-
-    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
-        """Trip of vehicle ``number``."""
-        if self.common:
-            return replace(self.make(0, purpose), name=f"common-{purpose}")
-        return self.make(number, purpose)
-
-    @abstractmethod
-    def make(self, number: int, purpose: TripPurpose) -> GroundTruth:
-        """Make a trip for vehicle ``number``, whether or not trips are common."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BuiltinTrips(TripSource):
-    """A different trip of the built-in vehicle for every vehicle and purpose; duration_s of those to learn from."""
-
-    duration_s: float
 
     @property
     def branches(self) -> tuple[str, ...]:
         """Branches of the built-in vehicle."""
         return BUILTIN_BRANCHES
 
-    def make(self, number: int, purpose: TripPurpose) -> GroundTruth:
-        """Drive a trip."""
+    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
+        """Drive a trip for vehicle ``number``."""
         rng = random_stream(_STREAM[purpose], self.seed, number)
         duration_s = self.duration_s if purpose == "calibration" else self.unseen_s
         return builtin_trip(rng, duration_s=duration_s, name=f"builtin-{number}-{purpose}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedTrips(TripSource):
+class RecordedTrips:
     """Recorded trips: one each while they last, then pieces of them joined anew; unseen trips are joined anew.
 
     No piece of a recording is in both trips of a vehicle; a single recording is cut in time.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of the trips.
+    recorded : sequence of GroundTruth
+        The recordings.
+    vehicles : int
+        How many vehicles need trips.
+    unseen_s : float
+        Length of each trip to test on. [s]
+    notices : tuple of str
+        What a user should know about the trips.
     """
 
+    seed: int
     recorded: Sequence[GroundTruth]
     vehicles: int
+    unseen_s: float
+    notices: tuple[str, ...] = ()
 
     @property
     def branches(self) -> tuple[str, ...]:
         """Branches that all recordings have."""
         return tuple(b for b in self.recorded[0].currents_a if all(b in trip.currents_a for trip in self.recorded))
 
-    def make(self, number: int, purpose: TripPurpose) -> GroundTruth:
-        """Take or join a trip."""
-        one_each = self.vehicles <= len(self.recorded)
-        if purpose == "calibration" and one_each and len(self.recorded) > 1:
+    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
+        """Take or join a trip for vehicle ``number``."""
+        count, learnt, half = len(self.recorded), purpose == "calibration", len(self.recorded) // 2
+        if learnt and count > 1 and self.vehicles <= count:
             return self.recorded[number]
-        pool = self._pool(number, purpose)
-        duration_s = self.unseen_s
-        if purpose == "calibration":
-            duration_s = float(np.median([len(trip) * trip.period_s for trip in pool]))
+        if count == 1:
+            (only,) = self.recorded
+            cut = int(LEARNT_SHARE * len(only))
+            pool = [only.part(0, cut) if learnt else only.part(cut, len(only))]
+        elif self.vehicles <= count:
+            pool = [trip for k, trip in enumerate(self.recorded) if k != number]
+        else:
+            pool = list(self.recorded[:-half] if learnt else self.recorded[-half:])
+        median_s = float(np.median([len(trip) * trip.period_s for trip in pool]))
+        duration_s = median_s if learnt else self.unseen_s
         rng = random_stream(_STREAM[purpose], self.seed, number)
         joined = cut_and_rejoin(rng, pool, duration_s=duration_s, name=f"recorded-{number}-{purpose}")
         return joined.part(0, int(duration_s / joined.period_s))
 
-    def _pool(self, number: int, purpose: TripPurpose) -> list[GroundTruth]:
-        """Recordings that a trip may be made of; none serves both purposes of one vehicle."""
-        if len(self.recorded) == 1:
-            (only,) = self.recorded
-            cut = int(LEARNT_SHARE * len(only))
-            return [only.part(0, cut) if purpose == "calibration" else only.part(cut, len(only))]
-        if self.vehicles <= len(self.recorded):
-            return [trip for k, trip in enumerate(self.recorded) if k != number]
-        half = len(self.recorded) // 2
-        return list(self.recorded[:-half] if purpose == "calibration" else self.recorded[-half:])
+
+@dataclass(frozen=True, kw_only=True)
+class CommonTrips:
+    """Every vehicle drives the trips of vehicle 0 of some source, as in the experiments of the paper."""
+
+    of: BuiltinTrips | RecordedTrips
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """Branches that the trips have."""
+        return self.of.branches
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What a user should know about the trips."""
+        return self.of.notices
+
+    def trip(self, _: int, purpose: TripPurpose) -> GroundTruth:
+        """Trip of any vehicle."""
+        return replace(self.of.trip(0, purpose), name=f"common-{purpose}")
+
+
+TripSource = BuiltinTrips | RecordedTrips | CommonTrips
+"""Gives every vehicle its trips."""
 
 
 def read_recorded_trips(store: Path, layout: Layout) -> tuple[list[GroundTruth], list[str]]:
@@ -286,17 +291,14 @@ def read_recorded_trips(store: Path, layout: Layout) -> tuple[list[GroundTruth],
     FleetError
         If no drive is usable.
     """
-    trips: list[GroundTruth] = []
-    unusable: list[str] = []
-    for drive in iterate_drives(store, layout):
-        trip = ground_truth_from_drive(drive, layout.period_s)
-        if trip is None:
-            unusable.append(f"{drive.vehicle}/{drive.name}")
-        else:
-            trips.append(trip)
+    made = [
+        (f"{drive.vehicle}/{drive.name}", ground_truth_from_drive(drive, layout.period_s))
+        for drive in iterate_drives(store, layout)
+    ]
+    trips = [trip for _, trip in made if trip is not None]
     if not trips:
         raise FleetError(f"{store}: no drive with usable samples; import drives with 'calibrator import'")
-    return trips, unusable
+    return trips, [name for name, trip in made if trip is None]
 
 
 def choose_trips(
@@ -329,20 +331,16 @@ def choose_trips(
     FleetError
         If no drive of the store is usable, or the built-in vehicle has not what the layout names.
     """
+    found: BuiltinTrips | RecordedTrips
     if drives == "builtin":
-        return BuiltinTrips(
-            seed=seed, duration_s=duration_s, unseen_s=unseen_s, notices=_builtin_notices(layout), common=common
-        )
-    recorded, unusable = read_recorded_trips(Path(drives), layout)
-    notice = f"{len(unusable)} drives lack good samples of some channel and are left out: {', '.join(unusable)}"
-    return RecordedTrips(
-        seed=seed,
-        recorded=recorded,
-        vehicles=1 if common else vehicles,
-        unseen_s=unseen_s,
-        notices=(notice,) if unusable else (),
-        common=common,
-    )
+        notices = _builtin_notices(layout)
+        found = BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s, notices=notices)
+    else:
+        recorded, unusable = read_recorded_trips(Path(drives), layout)
+        text = f"{len(unusable)} drives lack good samples of some channel and are left out: {', '.join(unusable)}"
+        count, notices = 1 if common else vehicles, (text,) if unusable else ()
+        found = RecordedTrips(seed=seed, recorded=recorded, vehicles=count, unseen_s=unseen_s, notices=notices)
+    return CommonTrips(of=found) if common else found
 
 
 def _builtin_notices(layout: Layout) -> tuple[str, ...]:

@@ -45,6 +45,8 @@ FEWEST = 30
 """Samples beyond a bend, for it to be looked for. [1]"""
 CLIPPED = 0.55
 """Share of the gain that is lost beyond a bend, from which on the sensor counts as clipped. [1]"""
+OVERSHOOT = 1.3
+"""Times the bend: less is read by a clipped sensor, more by another one. [1]"""
 CHANCE = 0.3
 """Correlation by chance between the fleet model and its errors in one vehicle. [1]"""
 GAIN_SD, DEAD_SD = 0.3, 0.04
@@ -375,6 +377,10 @@ def _junction_residual(fleet: FleetMoments, fast: Array) -> _Residual:
     # Neighbouring samples repeat each other where blocks' sums of r scatter more than white noise's would.
     scatter = blocks.total(scores[:, -1] ** 2 / own) / blocks.count
     repeated = max(float(np.median(scatter / np.maximum(squares / samples, TINY))), 1.0)
+    # A block in which a current stands still has no noise of it.
+    varies = np.diagonal(fleet.moments, axis1=1, axis2=2)[:, z] - fleet.moments[:, z, -1] ** 2 / own[:, None]
+    noisy = np.clip(varies, 0.0, own[:, None] * noise[blocks.vehicle])
+    noisy *= (samples[:, None] * noise / np.maximum(blocks.total(noisy), TINY))[blocks.vehicle]
     return _Residual(
         fleet=fleet,
         total=total,
@@ -383,7 +389,7 @@ def _junction_residual(fleet: FleetMoments, fast: Array) -> _Residual:
         law=law,
         weights=weights,
         noise=np.insert((noise * law)[:, :-1], y - M, 0.0, axis=1),
-        with_z=scores[:, z - M] + own[:, None] * (noise * law)[blocks.vehicle],
+        with_z=scores[:, z - M] + noisy * law[blocks.vehicle],
         square_a2=np.maximum(squares, TINY),
         n_eff=samples / repeated,
     )
@@ -444,6 +450,9 @@ def _by_level(
         "bend": (np.concatenate([above, -below, above - below], axis=2), bent_there),
     }
     moving = fleet.variance_a2[:, :, None] > (MOVING * full_scale_a) ** 2
+    reach_a = np.max(np.abs(x) * (count >= FEWEST), axis=2)
+    least_a = np.min(reach_a, axis=1, where=moving[..., 0], initial=np.inf)[:, None, None]
+    greatest_a = np.max(reach_a, axis=1)[:, None, None]
     gram, found, own = residual.gram[:, None, None], [], residual.y - fleet.inputs
     for cause, (h, slope) in shapes.items():  # (N, K, S, L), constant within a level
         with_all = np.einsum("nksl,nkli->nksi", h, levels[..., :-1])
@@ -455,6 +464,11 @@ def _by_level(
         beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
         usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)
         size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)
+        if (
+            cause == "bend" and not has_fleet
+        ):  # a clipped sensor reads no more than that, others do; else a ramp's delay
+            beyond_a = OVERSHOOT * np.tile(BENDS_A, 3)
+            size = np.where((abs(size) < CLIPPED) | ((least_a <= beyond_a) & (beyond_a <= greatest_a)), size, 0.0)
         explained_a2 = size * with_r
         stretch = np.zeros((N, K, h.shape[2]))
         if not has_fleet:

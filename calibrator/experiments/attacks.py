@@ -36,8 +36,6 @@ class Scene:
         Of what it does; signed for the faults of sensors.
     full_scale_a, peak_a : float
         Full scale of the junction, and the sensor's largest current on the drive to learn from. [A]
-    unseen : bool
-        Whether this is the drive on which corrections are judged.
     progress, temperature_c : ndarray of shape (T,)
         Time since the start over the drive's length [1], 1 on the unseen drive; temperature of the sensors [degC].
     rng : numpy.random.Generator
@@ -47,7 +45,6 @@ class Scene:
     size: float
     full_scale_a: float
     peak_a: float
-    unseen: bool
     progress: Array
     temperature_c: Array
     rng: np.random.Generator
@@ -68,13 +65,15 @@ class World:
     magnitude : tuple of float or None
         Of the faults of all vehicles, where the world is about them.
     truth : callable or None
-        New drift, offset [A] of the affected sensor, from the old ones, the size and full scale; sensors stay linear.
+        New drift, offset [A] of the affected sensor, from the old ones and the size; sensors stay linear.
     hardware : callable or None
         New hardware drift from the old one and the size.
-    true : callable or None
+    load : callable or None
         What it adds to the first branch (the source), shape (T,), from the true currents (T, K). [A]
-    measured : callable or None
+    sensor : callable or None
         New measured current of the affected sensor, shape (T,). [A]
+    disturbance : callable or None
+        What it adds to the affected sensor in a recording alone, shape (T,). [A]
     battery : bool
         Whether the sensor is always the battery's.
     """
@@ -83,10 +82,11 @@ class World:
     size: tuple[float, float] = (0.0, 0.0)
     causes: tuple[str, ...] = ()
     magnitude: tuple[float, float] | None = None
-    truth: Callable[[Array, Array, Array, float], tuple[Array, Array]] | None = None
+    truth: Callable[[Array, Array, Array], tuple[Array, Array]] | None = None
     hardware: Callable[[Array, Array], Array] | None = None
-    true: Callable[[Array, Scene], Array] | None = None
-    measured: Callable[[Array, Scene], Array] | None = None
+    load: Callable[[Array, Scene], Array] | None = None
+    sensor: Callable[[Array, Scene], Array] | None = None
+    disturbance: Callable[[Scene, int], Array] | None = None
     battery: bool = False
 
 
@@ -123,26 +123,26 @@ class Attack:
         j = np.flatnonzero(self.has)
         at = (j, self.branch[j])
         if self.world.truth is not None:
-            drift[at], offset_a[at] = self.world.truth(drift[at], offset_a[at], self.size[j], self.full_scale_a)
+            drift[at], offset_a[at] = self.world.truth(drift[at], offset_a[at], self.size[j])
         if self.world.hardware is not None:
             hardware = np.where(self.has, self.world.hardware(hardware, self.size), hardware)
         return replace(faults, drift=drift, offset_a=offset_a, hardware_drift=hardware)
 
     def true_a(self, vehicle: int, i: Array, *, unseen: bool) -> Array:
         """True currents of a vehicle in this world, shape (T, K), from those without it. [A]"""
-        if not self.has[vehicle] or self.world.true is None:
+        if not self.has[vehicle] or self.world.load is None:
             return i
-        load_a = self.world.true(i, self._scene(vehicle, len(i), unseen=unseen))
+        load_a = self.world.load(i, self._scene(vehicle, len(i), unseen=unseen))
         return np.column_stack([i[:, 0] + load_a, i[:, 1:]])
 
     def measured_a(self, vehicle: int, i_m: Array, *, unseen: bool, peak_a: Array) -> Array:
         """Measured currents of a vehicle in this world, shape (T, K), from those of linear sensors. [A]"""
-        if not self.has[vehicle] or self.world.measured is None:
-            return i_m
-        k = int(self.branch[vehicle])
+        k, changed = int(self.branch[vehicle]), i_m.copy()
         scene = self._scene(vehicle, len(i_m), unseen=unseen, peak_a=float(peak_a[k]))
-        changed = i_m.copy()
-        changed[:, k] = self.world.measured(i_m[:, k], scene)
+        if self.has[vehicle] and self.world.sensor is not None:
+            changed[:, k] = self.world.sensor(i_m[:, k], scene)
+        if self.has[vehicle] and self.world.disturbance is not None and not unseen:
+            changed[:, k] += self.world.disturbance(scene, len(i_m))
         return changed
 
     def _scene(self, vehicle: int, samples: int, *, unseen: bool, peak_a: float = 0.0) -> Scene:
@@ -152,7 +152,6 @@ class Attack:
             size=float(self.size[vehicle]),
             full_scale_a=self.full_scale_a,
             peak_a=peak_a,
-            unseen=unseen,
             progress=np.ones(samples) if unseen else np.linspace(0.0, 1.0, samples),
             temperature_c=rng.uniform(5.0, 25.0) + rng.uniform(20.0, 30.0) * warm / warm[-1],
             rng=rng,
@@ -179,7 +178,8 @@ def draw_attack(name: str, vehicles: int, *, full_scale_a: float, seed: int) -> 
         Of the N vehicles.
     """
     world, rng = WORLDS[name], np.random.default_rng([seed, vehicles, *name.encode()])
-    sign = rng.choice([-1.0, 1.0], vehicles) if world.measured is not None else 1.0
+    signed = world.sensor is not None or world.disturbance is not None
+    sign = rng.choice([-1.0, 1.0], vehicles) if signed else 1.0
     return Attack(
         world=world,
         has=rng.random(vehicles) < world.share,
@@ -198,36 +198,12 @@ def _on_off(scene: Scene, samples: int, seconds: tuple[float, float], duty: floa
     return np.repeat(state.astype(float), (lengths_s * HZ).astype(int))[:samples]
 
 
-def _batch(share: float, offset_a: float) -> World:
-    """A batch of battery sensors with one more offset."""
-    size = (offset_a, offset_a)
-    return World(share=share, size=size, causes=("batch",), battery=True, truth=lambda d, o, s, _: (d, o + s))
-
-
-def _load(
-    share: float, low: float, high: float, causes: tuple[str, ...], true: Callable[[Array, Scene], Array]
-) -> World:
-    """A load without a sensor, which the source carries."""
-    return World(share=share, size=(low, high), causes=causes, battery=True, true=true)
-
-
-def _sensor(cause: str, size: tuple[float, float], measured: Callable[[Array, Scene], Array], **more: Any) -> World:
-    """A sensor that is not linear."""
-    also = more.pop("also", ())
-    return World(size=size, causes=(cause, *also), measured=measured, **more)
-
-
-def _disturbance(cause: str, size: tuple[float, float], added: Callable[[Scene, int], Array], **more: Any) -> World:
-    """Something added to the samples of a recording alone."""
-    return _sensor(cause, size, lambda x, s: x if s.unseen else x + added(s, len(x)), **more)
-
-
 def _spikes(scene: Scene, samples: int, share: float, signs: tuple[float, ...]) -> Array:
     height_a = scene.full_scale_a * scene.rng.uniform(0.1, 1.0, samples) * scene.rng.choice(signs, samples)
     return np.where(scene.rng.random(samples) < share, height_a, 0.0)
 
 
-def _later_gain(d: Array, o: Array, size: Array, _: float) -> tuple[Array, Array]:
+def _later_gain(d: Array, o: Array, size: Array) -> tuple[Array, Array]:
     """What a gain that has stepped or drifted away is at the end."""
     return (1.0 + d) * (1.0 + size) - 1.0, o * (1.0 + size)
 
@@ -237,45 +213,63 @@ def _earlier(x: Array, scene: Scene, part: Array) -> Array:
     return x * (1.0 + scene.size * part) / (1.0 + scene.size)
 
 
-LOAD = ("load",)
+Change = Callable[[Array, Scene], Array]
+
+
+def _load(share: float, size: tuple[float, float], load: Change, *causes: str) -> World:
+    """A load without a sensor, which the source carries."""
+    return World(share=share, size=size, causes=("load", *causes), battery=True, load=load)
+
+
+def _sensor(size: tuple[float, float], sensor: Change, *causes: str, **more: Any) -> World:
+    """A sensor that is not linear."""
+    return World(size=size, causes=causes, sensor=sensor, **more)
+
+
+def _disturbed(size: tuple[float, float], added: Callable[[Scene, int], Array], *causes: str) -> World:
+    """Something added to the samples of a recording alone."""
+    return World(size=size, causes=causes, disturbance=added)
+
+
+def _batch(share: float, offset_a: float) -> World:
+    """A batch of battery sensors with one more offset."""
+    size = (offset_a, offset_a)
+    return World(share=share, size=size, causes=("batch",), battery=True, truth=lambda d, o, s: (d, o + s))
+
+
+STEP, BENT, SPIKE = (0.15, 0.15), (0.05, 0.2), (1.0, 1.0)
 WORLDS = {
     "faults 30-60 %": World(share=0.0, magnitude=(0.3, 0.6)),
     **{f"battery {a:+g} A in {share:.0%}": _batch(share, a) for share in (1.0, 0.6) for a in (5.0, 12.0, 20.0, -12.0)},
-    "load 5 A in 30%": _load(0.3, 5.0, 5.0, LOAD, lambda i, s: np.full(len(i), s.size)),
-    "load 10 A in 15%": _load(0.15, 10.0, 10.0, LOAD, lambda i, s: np.full(len(i), s.size)),
-    "load 0-10 % of |motor| in 30%": _load(0.3, 0.0, 0.1, (*LOAD, "sign"), lambda i, s: s.size * np.abs(i[:, 1])),
+    "load 5 A in 30%": _load(0.3, (5.0, 5.0), lambda i, s: np.full(len(i), s.size)),
+    "load 10 A in 15%": _load(0.15, (10.0, 10.0), lambda i, s: np.full(len(i), s.size)),
+    "load 0-10 % of |motor| in 30%": _load(0.3, (0.0, 0.1), lambda i, s: s.size * np.abs(i[:, 1]), "sign"),
     "load 15 A switching in 15%": _load(
-        0.15, 15.0, 15.0, (*LOAD, "switching"), lambda i, s: s.size * _on_off(s, len(i), (20.0, 120.0))
+        0.15, (15.0, 15.0), lambda i, s: s.size * _on_off(s, len(i), (20.0, 120.0)), "switching"
     ),
-    "inverted in 10%": World(share=0.1, causes=("inverted",), truth=lambda d, o, *_: (-2.0 - d, -o)),
-    "dead in 10%": World(share=0.1, causes=("dead",), truth=lambda d, o, *_: (0.0 * d - 1.0, 0.0 * o)),
+    "inverted in 10%": World(share=0.1, causes=("inverted",), truth=lambda d, o, _: (-2.0 - d, -o)),
+    "dead in 10%": World(share=0.1, causes=("dead",), truth=lambda d, o, _: (0.0 * d - 1.0, 0.0 * o)),
     "clipped at 40-70 %": _sensor(
-        "clipped", (0.4, 0.7), lambda x, s: np.clip(x, -abs(s.size) * s.peak_a, abs(s.size) * s.peak_a),
-        also=("saturating",),
+        (0.4, 0.7), lambda x, s: np.clip(x, -abs(s.size) * s.peak_a, abs(s.size) * s.peak_a), "clipped", "saturating"
     ),
-    "quadratic 5-20 %": _sensor("quadratic", (0.05, 0.2), lambda x, s: x + s.size * x**2 / s.full_scale_a),
-    "cubic 5-20 %": _sensor(
-        "cubic", (0.05, 0.2), lambda x, s: x + s.size * x**3 / s.full_scale_a**2, also=("saturating",)
-    ),
+    "quadratic 5-20 %": _sensor(BENT, lambda x, s: x + s.size * x**2 / s.full_scale_a, "quadratic"),
+    "cubic 5-20 %": _sensor(BENT, lambda x, s: x + s.size * x**3 / s.full_scale_a**2, "cubic", "saturating"),
     "gain step of 15 % midway": _sensor(
-        "step", (0.15, 0.15), lambda x, s: _earlier(x, s, np.ceil(s.progress - 0.5)), truth=_later_gain
+        STEP, lambda x, s: _earlier(x, s, np.ceil(s.progress - 0.5)), "step", truth=_later_gain
     ),
     "gain ramp to 15 %": _sensor(
-        "ramp", (0.15, 0.15), lambda x, s: _earlier(x, s, s.progress), truth=_later_gain, also=("temperature",)
+        STEP, lambda x, s: _earlier(x, s, s.progress), "ramp", "temperature", truth=_later_gain
     ),
     "0.1-0.3 % per K": _sensor(
-        "temperature", (0.001, 0.003), lambda x, s: x * (1.0 + s.size * (s.temperature_c - REFERENCE_C)),
-        also=("ramp",),
+        (0.001, 0.003), lambda x, s: x * (1.0 + s.size * (s.temperature_c - REFERENCE_C)), "temperature", "ramp"
     ),
-    "spikes in 0.5 %": _disturbance("spikes", (1.0, 1.0), lambda s, n: _spikes(s, n, 0.005, (1.0,))),
-    "outliers in 0.2 %": _disturbance(
-        "outliers", (1.0, 1.0), lambda s, n: _spikes(s, n, 0.002, (-1.0, 1.0)), also=("spikes",)
-    ),
-    "EMI bursts of 5-10 A": _disturbance(
-        "noise", (5.0, 10.0), lambda s, n: s.size * _on_off(s, n, (1.0, 5.0), 0.1) * s.rng.standard_normal(n)
+    "spikes in 0.5 %": _disturbed(SPIKE, lambda s, n: _spikes(s, n, 0.005, (1.0,)), "spikes"),
+    "outliers in 0.2 %": _disturbed(SPIKE, lambda s, n: _spikes(s, n, 0.002, (-1.0, 1.0)), "outliers", "spikes"),
+    "EMI bursts of 5-10 A": _disturbed(
+        (5.0, 10.0), lambda s, n: s.size * _on_off(s, n, (1.0, 5.0), 0.1) * s.rng.standard_normal(n), "noise"
     ),
     "second variant x1.10 in 50%": World(
         share=0.5, size=(0.1, 0.1), causes=("variant",), hardware=lambda d_h, size: (1.0 + d_h) * (1.0 + size) - 1.0
     ),
-}  # fmt: skip
+}
 """By the names that the table shows; shares of vehicles where they are not 30 %."""

@@ -11,8 +11,6 @@ alone. Whatever they find is corrected.
 
 import itertools
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +29,10 @@ from calibrator.estimator.evidence import (
     stack_summaries,
 )
 from calibrator.estimator.posterior import evidence_of, row_residuals
-from calibrator.experiments.methods import Estimate
 from calibrator.experiments.trial import CommonEvidence, Trial
 from calibrator.faults import Faults
 
-__all__ = ["BASELINES", "Baseline"]
+__all__ = ["BASELINES"]
 
 PENALTY = float(np.log(10_000.0))
 """Of a parameter in the Bayesian information criterion: log of the samples of a quarter of an hour at 10 Hz."""
@@ -51,42 +48,16 @@ LEAST_WEIGHT = 0.2
 """Weight of a branch in the junction law below which total least squares says nothing of its gain. [1]"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Baseline:
-    """A method that corrects whatever it finds.
-
-    Attributes
-    ----------
-    name : str
-        For tables.
-    solve : callable
-        Faults of the vehicles of a trial.
-    """
-
-    name: str
-    solve: Callable[[Trial], Faults]
-
-    def estimate(self, trial: Trial) -> Estimate:
-        """Solve, and correct every sensor whose parameters are not zero."""
-        faults = self.solve(trial)
-        corrected = (faults.drift != 0.0) | (faults.offset_a != 0.0)
-        return Estimate(
-            faults=faults, hardware=faults.has_hardware_fault, corrected=corrected, confidence=None, failed=0
-        )
-
-
-def _best_subset(trial: Trial) -> Faults:
+def best_subset(trial: Trial) -> Faults:
     """The support with the least Bayesian information criterion, of all."""
     linear = _Linear(trial)
-    P = linear.design.shape[1]
+    N, P = len(linear.rows), linear.design.shape[1]
     supports = np.array([bits for bits in itertools.product((False, True), repeat=P) if sum(bits) < P], bool)
-    fits = [linear.fit(np.tile(support, (len(linear.rows), 1))) for support in supports]
-    bic = np.stack([chi2 + PENALTY * support.sum() for support, (_, chi2) in zip(supports, fits, strict=True)])
-    best = supports[np.argmin(bic, axis=0)]
-    return linear.faults(linear.fit(best)[0])
+    chi2 = np.stack([linear.fit(np.tile(support, (N, 1)))[1] for support in supports])
+    return linear.faults(supports[np.argmin(chi2 + PENALTY * supports.sum(axis=1)[:, None], axis=0)])
 
 
-def _lasso(trial: Trial) -> Faults:
+def lasso(trial: Trial) -> Faults:
     """Support of the LASSO path with the least criterion, fitted anew without shrinkage."""
     linear = _Linear(trial)
     y = linear.values(np.zeros((len(linear.rows), linear.design.shape[1])))
@@ -96,23 +67,23 @@ def _lasso(trial: Trial) -> Faults:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # gains are open by a common factor
             support[j] = path.fit(whiten @ linear.design, whiten @ y[j]).coef_ != 0.0
-    return linear.faults(linear.fit(support)[0])
+    return linear.faults(support)
 
 
-def _median_regression(trial: Trial) -> Faults:
+def fleet_median(trial: Trial) -> Faults:
     """Slopes and intercepts that differ from the fleet's median; all of it is the sensor's."""
     rows, order = _evidence_rows(trial)
-    at = rows.places
 
     def apart(values: Array) -> Array:
         deviation = values - np.median(values, axis=0)
-        return np.where(np.abs(deviation) > BEYOND * median_abs_deviation(values, scale="normal"), deviation, 0.0)
+        known = np.abs(deviation) > BEYOND * median_abs_deviation(values, scale="normal")
+        return np.where(known, deviation, 0.0)[:, np.argsort(order)]
 
-    drift, offset = apart(np.exp(rows.values[:, at.slopes])), apart(rows.values[:, at.intercepts])
-    return _sensors_alone(drift[:, np.argsort(order)], offset[:, np.argsort(order)] * trial.full_scale_a)
+    drift, offset = apart(np.exp(rows.values[:, rows.places.slopes])), apart(rows.values[:, rows.places.intercepts])
+    return _sensors_alone(drift, offset * trial.full_scale_a)
 
 
-def _total_least_squares(trial: Trial) -> Faults:
+def total_least_squares(trial: Trial) -> Faults:
     """Direction in which a vehicle's currents vary least: weights 1 / (1 + d) of the junction law, median 1."""
     mean_a, covariance_a2 = _measured_moments(trial)
     w = np.linalg.eigh(covariance_a2)[1][:, :, 0]
@@ -123,7 +94,7 @@ def _total_least_squares(trial: Trial) -> Faults:
     return _sensors_alone(1.0 / w - 1.0, offset_a)
 
 
-def _reconciliation(trial: Trial) -> Faults:
+def reconciliation(trial: Trial) -> Faults:
     """Measured over reconciled currents: those nearest to the measured ones that sum to zero, all as accurate."""
     mean_a, covariance_a2 = _measured_moments(trial)
     K = mean_a.shape[1]
@@ -137,11 +108,20 @@ def _reconciliation(trial: Trial) -> Faults:
     return _sensors_alone((slope - 1.0) * wrong[:, None], offset_a * wrong[:, None])
 
 
+BASELINES = {
+    "best subset": (best_subset, "best subset with BIC on the default's evidence"),
+    "LASSO": (lasso, "LASSO with refit on the same"),
+    "fleet median": (fleet_median, "regression on the fleet's median"),
+    "total least squares": (total_least_squares, "total least squares on the junction law"),
+    "VDI 2048": (reconciliation, "reconciliation by VDI 2048"),
+}
+"""By name: what finds the faults of the vehicles of a trial, and what it is."""
+
+
 def _sensors_alone(drift: Array, offset_a: Array) -> Faults:
     """Faults without any of the hardware."""
-    return Faults(
-        hardware_drift=np.zeros(len(drift)), hardware_offset_a=np.zeros_like(drift), drift=drift, offset_a=offset_a
-    )
+    nothing = np.zeros_like(drift)
+    return Faults(hardware_drift=nothing[:, 0], hardware_offset_a=nothing, drift=drift, offset_a=offset_a)
 
 
 def _measured_moments(trial: Trial) -> tuple[Array, Array]:
@@ -203,9 +183,9 @@ class _Linear:
         y = np.einsum("nij,nj->ni", self.whiten, self.values(theta))
         return theta, np.sum((y - np.einsum("nip,np->ni", design, theta)) ** 2, axis=1)
 
-    def faults(self, theta: Array) -> Faults:
-        """Faults of parameters (N, 3K), branches in the vehicles' own order."""
-        at, own = ParameterPlaces(self.rows.branches), np.argsort(self.order)
+    def faults(self, support: Mask) -> Faults:
+        """Faults of a support (N, 3K), branches in the vehicles' own order."""
+        at, own, theta = ParameterPlaces(self.rows.branches), np.argsort(self.order), self.fit(support)[0]
         gain, hardware = np.exp(theta[:, at.gains]), theta[:, at.hardware_offsets]
         hardware = np.column_stack([hardware, -hardware.sum(axis=1)])
         return Faults(
@@ -214,12 +194,3 @@ class _Linear:
             drift=gain[:, own] - 1.0,
             offset_a=(theta[:, at.offsets] * gain)[:, own] * self.full_scale_a,
         )
-
-
-BASELINES = (
-    Baseline(name="best subset", solve=_best_subset),
-    Baseline(name="LASSO", solve=_lasso),
-    Baseline(name="fleet median", solve=_median_regression),
-    Baseline(name="total least squares", solve=_total_least_squares),
-    Baseline(name="VDI 2048", solve=_reconciliation),
-)

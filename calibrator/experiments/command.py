@@ -11,7 +11,7 @@ from calibrator.files.folders import require_possible_folder
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, SeedOption, WorkersOption, given_options, whole_option
 from calibrator.terminal.progress import one_pass
-from calibrator.terminal.text import print_report
+from calibrator.terminal.text import dumps, table
 from ecu_node.program import write_output
 
 __all__ = ["experiment", "score"]
@@ -69,22 +69,17 @@ def experiment(
         raise typer.BadParameter(f"{name}: expected one of {', '.join(EXPERIMENTS)} or all", param_hint="NAME")
     rows = list(EXPERIMENTS.values()) if name == "all" else [EXPERIMENTS[name]]
     recorded = [row for row in rows if row.recorded]
-    unheeded: tuple[str, ...] = ()
-    reason = ""
+    others = ", ".join(row.name for row in EXPERIMENTS.values() if row.recorded)
+    unheeded, reason = ["drives", "layout"], f"{name} takes the built-in vehicle; this is only for {others}"
     if rows == [CALIBRATION]:
-        unheeded = ("drives", "layout", "quick", "repetitions", "seed", "workers")
+        unheeded += ["quick", "repetitions", "seed", "workers"]
         reason = "calibration runs nothing, it pools what is recorded in --out"
-    elif not recorded:
-        unheeded = ("drives", "layout")
-        others = ", ".join(row.name for row in EXPERIMENTS.values() if row.recorded)
-        reason = f"{name} takes the built-in vehicle; this is only for {others}"
-    if given := given_options(context, unheeded):
+    if not recorded and (given := given_options(context, unheeded)):
         raise typer.BadParameter(reason, param_hint=given[0])
+    first = "first run 'calibrator experiment all --out {}', or some experiments by their names"
     if rows == [CALIBRATION] and out is None:
         raise typer.BadParameter(
-            "calibration pools what is recorded there; first run 'calibrator experiment all --out FOLDER', or some "
-            "experiments by their names",
-            param_hint="--out",
+            f"calibration pools what is recorded there; {first.format('FOLDER')}", param_hint="--out"
         )
     if out is not None:
         require_possible_folder(out)
@@ -96,14 +91,12 @@ def experiment(
     for number, row in enumerate(rows, start=1):
         with one_pass(number, len(rows)):
             if row is CALIBRATION:
-                before = [] if out is None else read_records(out, EXPERIMENTS)
-                pooled = {result.experiment.name: result for result in before} | done
-                if not pooled:
+                before = {each.experiment.name: each for each in read_records(out, EXPERIMENTS)} if out else {}
+                if not before | done:
                     raise FleetError(
-                        f"{out}: no experiment is recorded that calibration could pool; first run 'calibrator "
-                        f"experiment all --out {out}', or some experiments by their names"
+                        f"{out}: no experiment is recorded that calibration could pool; {first.format(out)}"
                     )
-                result = pool_confidences(list(pooled.values()))
+                result = pool_confidences([*(before | done).values()])
             else:
                 fleet = trips if row.recorded and trips is not None else fleet_for(row, quick=quick)
                 small = row.small() if quick else row
@@ -125,6 +118,11 @@ def score(
 ) -> None:
     """Compare a result with the truth of its artificial fleet."""
     with importing():
-        from calibrator.experiments.result_score import score_result
+        from calibrator.experiments.result_score import WORDS, score_result
 
-    print_report(score_result(result, truth), json=json)
+    found = score_result(result, truth)
+    if json:
+        write_output(dumps(found))
+    else:
+        rows = [(WORDS[key], f"{x:.3f}" if isinstance(x, float) else f"{x}") for key, x in found.items()]
+        write_output(table(("share of vehicles", ""), rows))

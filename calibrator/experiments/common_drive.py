@@ -14,7 +14,6 @@ branch, (.)_r the others and M the covariance of the measured currents, g = M_rr
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -127,19 +126,16 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
     """
     trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, seed), duration_s=duration_s, name=f"builtin-{seed}")
     unseen = builtin_trip(random_stream(Purpose.UNSEEN_TRIP, seed), duration_s=duration_s, name="unseen")
-    x, voltage = trip.inputs, trip.inputs["voltage"]
-    power = x["torque"] * x["speed"]
-    inputs = (
-        np.maximum(power, 0.0) / voltage,
-        np.minimum(power, 0.0) / voltage,
-        x["torque"] ** 2 / voltage,
-        x["heater_demand"] / voltage,
-        x["aircon_demand"] / voltage,
-        x["low_voltage_demand"] / voltage,
-    )
+    x = trip.inputs
+    power, demands = x["torque"] * x["speed"], [x[f"{name}_demand"] for name in ("heater", "aircon", "low_voltage")]
+    inputs = [np.maximum(power, 0.0), np.minimum(power, 0.0), x["torque"] ** 2, *demands]
     currents, other = (with_branches(t, BUILTIN_BRANCHES[:branches], BALANCE).matrix_a() for t in (trip, unseen))
     return CommonDrive(
-        name=trip.name, i_s=currents, inputs=np.stack(inputs, axis=1), full_scale_a=FULL_SCALE_A, unseen=other
+        name=trip.name,
+        i_s=currents,
+        inputs=np.stack(inputs, axis=1) / x["voltage"][:, None],
+        full_scale_a=FULL_SCALE_A,
+        unseen=other,
     )
 
 
@@ -202,8 +198,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
     truth = case.draw(drive, case.vehicles, Purpose.FAULTS, seed)
     simulate = _simulation(drive, truth, case, Purpose.SIMULATION_ERROR, seed)
     if case.state_space:
-        simulated = list(_state_space_simulations(drive, truth))
-        simulate = lambda: simulated  # noqa: E731
+        simulate = list(_state_space_simulations(drive, truth)).copy
     reference = fleet_mean(simulate())
     evidence = collect_evidence(simulate(), reference, _junction_a2(drive, truth))
 
@@ -212,6 +207,12 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         rows = common_rows(evidence, reference.mean(axis=0), mean_a, covariance_a2, full_scale_a=drive.full_scale_a)
         return CommonEvidence(rows=rows, mean_a=mean_a, covariance_a2=covariance_a2)
 
+    def training() -> tuple[FleetEvidence, Faults]:
+        """Evidence and truth of another fleet, for the trees."""
+        other = case.draw(drive, case.training_vehicles, Purpose.TRAINING_FAULTS, seed)
+        simulate_other = _simulation(drive, other, case, Purpose.TRAINING_ERROR, seed)
+        return collect_evidence(simulate_other(), fleet_mean(simulate_other()), _junction_a2(drive, other)), other
+
     return Trial(
         smallest_fault=case.magnitude[0],
         full_scale_a=drive.full_scale_a,
@@ -219,15 +220,8 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         unseen=UnseenDrive.of_linear_sensors(drive.unseen, truth),
         record=record,
         collect=lambda: evidence,
-        training=partial(_training, drive, case, seed),
+        training=training,
     )
-
-
-def _training(drive: CommonDrive, case: CommonCase, seed: int) -> tuple[FleetEvidence, Faults]:
-    """Evidence and truth of another fleet, for the trees."""
-    truth = case.draw(drive, case.training_vehicles, Purpose.TRAINING_FAULTS, seed)
-    simulate = _simulation(drive, truth, case, Purpose.TRAINING_ERROR, seed)
-    return collect_evidence(simulate(), fleet_mean(simulate()), _junction_a2(drive, truth)), truth
 
 
 def _simulation(
@@ -294,14 +288,13 @@ def common_rows(
     gain = np.linalg.solve(covariance_a2[:, 1:, 1:], covariance_a2[:, 1:, :1])[:, :, 0]
     constant_a = mean_a[:, :1] - np.sum(gain * mean_a[:, 1:], axis=1, keepdims=True)
     nothing = np.zeros((N, K))
-    covariance = np.tile(np.diag(np.full(5 * K, UNKNOWN_VARIANCE)), (N, 1, 1))
+    variance = np.full(5 * K, UNKNOWN_VARIANCE)
+    variance[K : 2 * K - 1], variance[4 * K - 1] = GAIN_VARIANCE, CONSTANT_VARIANCE
+    covariance = np.tile(np.diag(variance), (N, 1, 1))
     for k in range(K):
         unit = np.array([np.ones(N), np.full(N, 1.0 / full_scale_a)]).T / slope[:, k, None]
         place = np.array([k, 3 * K - 1 + k])
         covariance[:, place[:, None], place] = of_line[:, k] * unit[:, :, None] * unit[:, None, :]
-    for row in range(K, 2 * K - 1):
-        covariance[:, row, row] = GAIN_VARIANCE
-    covariance[:, 4 * K - 1, 4 * K - 1] = CONSTANT_VARIANCE
     return EvidenceRows(
         relative=np.concatenate([np.log(slope), np.log(-gain), nothing], axis=1),
         constant=np.concatenate([intercept_a / full_scale_a, constant_a / full_scale_a, nothing], axis=1),

@@ -9,21 +9,21 @@ table), the methods that are compared on them, and how it is shown. A new one is
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS
-from calibrator.experiments.baselines import BASELINES
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, builtin_common_drive
 from calibrator.experiments.methods import (
+    BASELINES,
     CEILING,
     LEFT_IN,
     PERFECT,
     POSTERIOR,
     THRESHOLD,
     TREE,
-    ComparedMethod,
 )
 from calibrator.experiments.recorded_trips import (
     RecordedCase,
@@ -31,6 +31,7 @@ from calibrator.experiments.recorded_trips import (
     builtin_fleet,
     read_fleet,
 )
+from calibrator.experiments.trial import ComparedMethod
 from calibrator.files.layout_files import vehicle_database
 
 __all__ = ["CALIBRATION", "COVERAGE", "EXPERIMENTS", "REAL", "Experiment", "Setting", "fleet_for"]
@@ -114,23 +115,25 @@ class Experiment:
 
     def with_vehicles(self, vehicles: int, training_vehicles: int | None = None) -> "Experiment":
         """The same with smaller fleets on the common drive, and a smaller one to train trees on."""
-        small = []
-        for setting in self.settings:
-            case = setting.case
-            if isinstance(case, CommonCase):
-                training = case.training_vehicles if training_vehicles is None else training_vehicles
-                case = replace(case, vehicles=min(case.vehicles, vehicles), training_vehicles=training)
-            small.append(replace(setting, case=case))
-        return replace(self, settings=tuple(small))
+
+        def smaller(case: CommonCase | RecordedCase) -> CommonCase | RecordedCase:
+            if isinstance(case, RecordedCase):
+                return case
+            training = case.training_vehicles if training_vehicles is None else training_vehicles
+            return replace(case, vehicles=min(case.vehicles, vehicles), training_vehicles=training)
+
+        return replace(self, settings=tuple(replace(each, case=smaller(each.case)) for each in self.settings))
 
     def small(self) -> "Experiment":
         """The same with small fleets and few settings: shows that it runs, not the figures."""
-        kept = [s for s in self.settings if not self.quick or s.x in self.quick.get(s.series, ())]
-        return replace(self, settings=tuple(kept)).with_vehicles(QUICK_VEHICLES, QUICK_TRAINING_VEHICLES)
+        kept = tuple(s for s in self.settings if not self.quick or s.x in self.quick.get(s.series, ()))
+        return replace(self, settings=kept).with_vehicles(QUICK_VEHICLES, QUICK_TRAINING_VEHICLES)
 
 
 READINGS = (("", 60.0), ("3 of 6", 50.0))
 """S = 60 with two branches: 2 of 6 parameters that are not zero, or 3 of 6, which is S = 50 in our count."""
+LEVELS = ((20.0, "", 20.0), (40.0, "", 40.0), *((60.0, *reading) for reading in READINGS), (80.0, "", 80.0))
+"""Levels of sparsity, with both readings of the one at which the paper is quoted."""
 TWO_READINGS = (
     "S = 60 can be read as 2 or 3 of 6 parameters that are not zero: 3 of 6 where the table says so, else 2. The "
     "paper's share of hardware faults fits 3, its recovery fits 2; its figure stands beside both."
@@ -140,10 +143,9 @@ BALANCED = "Half of the vehicles have no hardware fault; where 'any vehicle' is 
 QUICK_LEVELS = {"": (60.0, 80.0), "3 of 6": (60.0,)}
 
 
-def _levels(case: CommonCase) -> tuple[Setting, ...]:
-    """Levels of sparsity, with both readings of the one at which the paper is quoted."""
-    levels = ((20.0, "", 20.0), (40.0, "", 40.0), *((60.0, *reading) for reading in READINGS), (80.0, "", 80.0))
-    return tuple(Setting(x=x, series=series, case=replace(case, sparsity=S)) for x, series, S in levels)
+def _paper(method: ComparedMethod, names: str, *rows: tuple[float, ...]) -> dict[tuple[float, str], dict[str, float]]:
+    """Figures of the paper: rows of the value of x and of what is named."""
+    return {(x, method.name): dict(zip(names.split(), values, strict=True)) for x, *values in rows}
 
 
 def _sizes(magnitude: tuple[float, float]) -> str:
@@ -162,17 +164,15 @@ MAIN = tuple(RecordedCase(branches=K, sparsity=S) for K in (2, 3) for S in (80.0
 LOAD_A = (3.0, 1.0)
 """Control units and the like take 1 to 4 A that no branch measures. [A]"""
 REAL = tuple(
-    _named(case)
-    for case in (
-        *MAIN,
-        *(replace(case, balanced=False) for case in MAIN),
-        RecordedCase(magnitude=(0.02, 0.10)),
-        RecordedCase(magnitude=(0.01, 0.05)),
-        RecordedCase(magnitude=(0.005, 0.02)),
-        RecordedCase(magnitude=(0.3, 0.6)),
-        RecordedCase(magnitude=(0.3, 0.6), branches=3),
-        RecordedCase(sparsity=80.0, unmeasured_a=LOAD_A),
-        RecordedCase(sparsity=60.0, unmeasured_a=LOAD_A),
+    map(
+        _named,
+        (
+            *MAIN,
+            *(replace(case, balanced=False) for case in MAIN),
+            *(RecordedCase(magnitude=size) for size in ((0.02, 0.10), (0.01, 0.05), (0.005, 0.02), (0.3, 0.6))),
+            RecordedCase(magnitude=(0.3, 0.6), branches=3),
+            *(RecordedCase(sparsity=S, unmeasured_a=LOAD_A) for S in (80.0, 60.0)),
+        ),
     )
 )
 """The four main settings, balanced and with hardware faults possible in any vehicle; sizes of faults; loads."""
@@ -186,11 +186,9 @@ TABLE = (
         series_label=READING,
         methods=(THRESHOLD, TREE, PERFECT, POSTERIOR),
         settings=tuple(Setting(x=60.0, series=series, case=CommonCase(sparsity=S)) for series, S in READINGS),
-        paper={
-            (60.0, THRESHOLD.name): {"f2": 0.68, "recovery_rate": 0.84, "complexity": 0.93},
-            (60.0, TREE.name): {"f2": 0.84, "recovery_rate": 0.86, "complexity": 0.41},
-            (60.0, PERFECT.name): {"f2": 1.00, "recovery_rate": 0.91, "complexity": 0.40},
-        },
+        paper=_paper(THRESHOLD, "f2 recovery_rate complexity", (60.0, 0.68, 0.84, 0.93))
+        | _paper(TREE, "f2 recovery_rate complexity", (60.0, 0.84, 0.86, 0.41))
+        | _paper(PERFECT, "f2 recovery_rate complexity", (60.0, 1.00, 0.91, 0.40)),
         note=TWO_READINGS,
         picture="dots",
     ),
@@ -204,7 +202,7 @@ TABLE = (
             for x in (-20.0, -10.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
         ),
         quick={"": (0.0, 20.0)},
-        paper={(15.0, PERFECT.name): {"recovery_rate": 0.80}, (20.0, PERFECT.name): {"recovery_rate": 0.91}},
+        paper=_paper(PERFECT, "recovery_rate", (15.0, 0.80), (20.0, 0.91)),
     ),
     Experiment(
         name="sparsity",
@@ -212,12 +210,9 @@ TABLE = (
         x_label=SPARSITY,
         series_label=READING,
         methods=(TREE, PERFECT, POSTERIOR),
-        settings=_levels(CommonCase()),
+        settings=tuple(Setting(x=x, series=series, case=CommonCase(sparsity=S)) for x, series, S in LEVELS),
         quick=QUICK_LEVELS,
-        paper={
-            (S, TREE.name): {"recovery_rate": rate}
-            for S, rate in ((20.0, 0.47), (40.0, 0.49), (60.0, 0.86), (80.0, 0.96))
-        },
+        paper=_paper(TREE, "recovery_rate", (20.0, 0.47), (40.0, 0.49), (60.0, 0.86), (80.0, 0.96)),
         note=TWO_READINGS,
     ),
     Experiment(
@@ -226,15 +221,20 @@ TABLE = (
         x_label=SPARSITY,
         series_label=READING,
         methods=(TREE, POSTERIOR),
-        settings=_levels(CommonCase(vehicles=500, state_space=True)),
+        settings=tuple(
+            Setting(x=x, series=series, case=CommonCase(vehicles=500, state_space=True, sparsity=S))
+            for x, series, S in LEVELS
+        ),
         quick=QUICK_LEVELS,
         drive_s=1200.0,  # the models are exact there: a longer drive shows the same and takes three times as long
-        paper={
-            (20.0, TREE.name): {"f2": 0.76, "recovery_rate": 0.45, "recovery_rate_25": 0.63},
-            (40.0, TREE.name): {"f2": 0.75, "recovery_rate": 0.49, "recovery_rate_25": 0.71},
-            (60.0, TREE.name): {"f2": 0.91, "recovery_rate": 0.75, "recovery_rate_25": 0.85},
-            (80.0, TREE.name): {"f2": 0.91, "recovery_rate": 0.96, "recovery_rate_25": 0.98},
-        },
+        paper=_paper(
+            TREE,
+            "f2 recovery_rate recovery_rate_25",
+            (20.0, 0.76, 0.45, 0.63),
+            (40.0, 0.75, 0.49, 0.71),
+            (60.0, 0.91, 0.75, 0.85),
+            (80.0, 0.91, 0.96, 0.98),
+        ),
         note=TWO_READINGS,
     ),
     Experiment(
@@ -377,9 +377,8 @@ def fleet_for(
             "need a layout, also for built-in ones: name it with --layout"
         )
     database = vehicle_database(layout or DEFAULT_LAYOUT)
-    if drives is not None:
-        fleet = read_fleet(drives, database)
-        return fleet.take(QUICK_TRIPS, duration_s=QUICK_DURATION_S) if quick else fleet
-    if quick:
-        return builtin_fleet(database, trips=QUICK_TRIPS, duration_s=QUICK_DURATION_S)
-    return builtin_fleet(database)
+    if drives is None:
+        made = partial(builtin_fleet, trips=QUICK_TRIPS, duration_s=QUICK_DURATION_S) if quick else builtin_fleet
+        return made(database)
+    fleet = read_fleet(drives, database)
+    return fleet.take(QUICK_TRIPS, duration_s=QUICK_DURATION_S) if quick else fleet

@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 from scipy.stats import beta, norm
 
 from calibrator.drive import Array
-from calibrator.experiments.methods import Estimate
-from calibrator.experiments.trial import Trial
+from calibrator.experiments.trial import Estimate, Trial
 from calibrator.score import f2_score, recovered
 
 __all__ = [
-    "FIGURES", "TENTH_COLUMNS", "calibration_errors", "figure_rows", "judge", "pool_figures", "pool_tenths",
+    "ALL", "FIGURES", "TENTH_COLUMNS", "calibration_errors", "figure_rows", "judge", "pool_figures", "pool_tenths",
     "tenths_of",
 ]  # fmt: skip
 
+ALL = "all together"
+"""Series of what several experiments have found."""
 SURE = 0.95
 """Confidence from which on a vehicle counts as sure. [1]"""
 LEAST_GAIN = 1e-9
@@ -48,12 +49,8 @@ class FigureKind(NamedTuple):
     rare: bool = False
 
 
-def _calibration_error(pairs: Array) -> float:
-    return calibration_errors(tenths_of({"ece": pairs}))[0]
-
-
-def _error_by_chance(pairs: Array) -> float:
-    return calibration_errors(tenths_of({"ece": pairs}))[1]
+def _error(which: int) -> Callable[[Array], float]:
+    return lambda pairs: calibration_errors(tenths_of({"ece": pairs}))[which]
 
 
 FIGURES = {
@@ -68,8 +65,8 @@ FIGURES = {
     "sure_wrong": FigureKind(
         "> 0.95, wrong", "of the vehicles above 0.95 those not recovered, and how many they expect", rare=True
     ),
-    "ece": FigureKind("ECE", "expected calibration error, by tenths of the confidence", _calibration_error),
-    "ece_by_chance": FigureKind("by chance", "what it is by chance if the confidence is exact", _error_by_chance),
+    "ece": FigureKind("ECE", "expected calibration error, by tenths of the confidence", _error(0)),
+    "ece_by_chance": FigureKind("by chance", "what it is by chance if the confidence is exact", _error(1)),
     "corrected": FigureKind("corrected", "share of the vehicles that is corrected in some branch"),
     "deployed": FigureKind("deployed", "share of the vehicles with faulty sensors that is corrected in some branch"),
     "harmed": FigureKind(
@@ -111,13 +108,9 @@ def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
         (held to be, is) faulty of ``f2``, and (confidence, recovered) of ``ece``. ``pit`` holds the probability
         integral transforms of the deployed parameters. Figures that have no meaning here are left out.
     """
-    truth, count = trial.truth, len(trial.truth)
-    within, within_25 = (
-        recovered(
-            estimate.faults, truth, full_scale_a=trial.full_scale_a, smallest_fault=trial.smallest_fault, tolerance=t
-        )
-        for t in (0.10, 0.25)
-    )
+    truth, faults, N = trial.truth, estimate.faults, len(trial.truth)
+    scales = {"full_scale_a": trial.full_scale_a, "smallest_fault": trial.smallest_fault}
+    within, within_25 = (recovered(faults, truth, tolerance=t, **scales) for t in (0.10, 0.25))
     corrected, worsening_a = np.any(estimate.corrected, axis=1), _worsening_a(estimate, trial)
     values: dict[str, NDArray[Any]] = {
         "recovery_rate": within,
@@ -128,34 +121,28 @@ def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
         "deployed": corrected[truth.has_sensor_fault],
         "harmed": np.any(worsening_a > 0.0, axis=1)[corrected],
         "worst_a": worsening_a.max(axis=1, initial=0.0),
-        "failed": np.full(count, estimate.failed / count),
+        "failed": np.full(N, estimate.failed / N),
     }
     if estimate.confidence is not None:
         confidence, sure = estimate.confidence, estimate.confidence > SURE
-        values |= {
-            "confidence": confidence,
-            "sure": sure,
-            "sure_confidence": confidence[sure],
-            "sure_recovered": within[sure],
-            "sure_wrong": ~within[sure],
-            "ece": np.column_stack([confidence, within]),
-            "ece_by_chance": np.column_stack([confidence, within]),
-        }
+        pairs = np.column_stack([confidence, within])
+        values |= {"confidence": confidence, "sure": sure, "ece": pairs, "ece_by_chance": pairs}
+        values |= {"sure_confidence": confidence[sure], "sure_recovered": within[sure], "sure_wrong": ~within[sure]}
     if trial.attacked is not None and trial.causes:
-        causes = [set(found) for found in estimate.findings] or [set[str]()] * count
+        causes = [set(found) for found in estimate.findings] or [set[str]()] * N
         values["named"] = np.array([not found.isdisjoint(trial.causes) for found in causes])[trial.attacked]
         values["misnamed"] = np.array([bool(found) for found in causes])[~trial.attacked]
     if trial.delay_error_s is not None:
         values["delay_rmse_ms"] = 1e3 * trial.delay_error_s.ravel()
     if estimate.drift_sd is not None and estimate.offset_sd_a is not None:
-        pits = [] if estimate.pit is None else estimate.pit(truth)
-        own, found = (truth.drift, truth.offset_a), (estimate.faults.drift, estimate.faults.offset_a)
+        true, found = (truth.drift, truth.offset_a), (faults.drift, faults.offset_a)
+        sds, pits = (estimate.drift_sd, estimate.offset_sd_a), estimate.pit(truth) if estimate.pit else None
         transforms = []
-        for k, (name, sd) in enumerate((("gain", estimate.drift_sd), ("offset", estimate.offset_sd_a))):
+        for k, name in enumerate(("gain", "offset")):
             deployed = estimate.corrected & (found[k] != 0.0)
-            z = (own[k][deployed] - found[k][deployed]) / sd[deployed]
+            z = ((true[k] - found[k]) / np.where(deployed, sds[k], 1.0))[deployed]
             values[f"{name}_within_1"], values[f"{name}_beyond_3"] = np.abs(z) <= 1.0, np.abs(z) > 3.0
-            transforms.append(pits[k][deployed] if pits else norm.cdf(z))
+            transforms.append(norm.cdf(z) if pits is None else pits[k][deployed])
         values["pit"] = np.concatenate(transforms)
     return values
 
@@ -163,8 +150,7 @@ def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
 def _worsening_a(estimate: Estimate, trial: Trial) -> Array:
     """By how much the corrected branches (N, K) get worse; full scale where the gain is 0, which has no inverse. [A]"""
     drift, offset_a = (np.where(estimate.corrected, x, 0.0) for x in (estimate.faults.drift, estimate.faults.offset_a))
-    impossible = np.abs(1.0 + drift) < LEAST_GAIN
-    zero = np.zeros_like(drift)
+    impossible, zero = np.abs(1.0 + drift) < LEAST_GAIN, np.zeros_like(drift)
     worsening = trial.unseen.rms_a(np.where(impossible, 0.0, drift), offset_a) - trial.unseen.rms_a(zero, zero)
     return np.where(impossible, trial.full_scale_a, np.where(estimate.corrected, worsening, 0.0))
 
@@ -185,15 +171,13 @@ def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
     tenths : DataFrame
         From :func:`tenths_of`.
     """
-    together = {
-        name: np.concatenate([trial[name] for trial in trials if name in trial])
-        for name in dict.fromkeys(name for trial in trials for name in trial)
-    }
+    names = dict.fromkeys(name for trial in trials for name in trial)
+    parts = {name: [trial[name] for trial in trials if len(trial.get(name, ()))] for name in names}
+    together = {name: np.concatenate(own) for name, own in parts.items() if own}
     rows = []
     for name, kind in FIGURES.items():
-        if name in together and len(together[name]):
-            values = together[name]
-            singly = [kind.merged(trial[name]) for trial in trials if name in trial and len(trial[name])]
+        if name in together:
+            singly, values = [kind.merged(own) for own in parts[name]], together[name]
             sd = np.std(singly, ddof=1) if len(singly) > 1 else 0.0
             share = values.ndim == 1 and values.dtype == bool
             rows.append((name, float(kind.merged(values)), float(sd), len(values), share))
@@ -203,11 +187,10 @@ def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 def _with_intervals(figures: pd.DataFrame) -> pd.DataFrame:
     """Figures with the 95 % intervals of those that are shares."""
-    hits = np.rint(figures["value"] * figures["of"])
+    hits, share = np.rint(figures["value"] * figures["of"]), figures["share"].astype(bool)
     misses = figures["of"] - hits
     low = np.nan_to_num(beta.ppf(TAIL, hits, misses + 1), nan=0.0)  # no distribution has 0 hits, nor 0 misses
     high = np.nan_to_num(beta.ppf(1.0 - TAIL, hits + 1, misses), nan=1.0)
-    share = figures["share"].astype(bool)
     return figures.assign(low=np.where(share, low, np.nan), high=np.where(share, high, np.nan)).drop(columns="share")
 
 
@@ -229,11 +212,12 @@ def tenths_of(values: Values) -> pd.DataFrame:
 
 def pool_tenths(tenths: pd.DataFrame) -> pd.DataFrame:
     """Tenths of several settings together, without those that hold no vehicle."""
-    weighed = tenths[["low", "vehicles", "confidence", "recovered"]].astype(float)
-    weighed[["confidence", "recovered"]] = weighed[["confidence", "recovered"]].mul(weighed["vehicles"], axis=0)
+    means = ["confidence", "recovered"]
+    weighed = tenths[["low", "vehicles", *means]].astype(float)
+    weighed[means] = weighed[means].mul(weighed["vehicles"], axis=0)
     summed = weighed.groupby("low", as_index=False).sum().query("vehicles > 0")
-    means = summed[["confidence", "recovered"]].div(summed["vehicles"], axis=0)
-    return summed.assign(confidence=means["confidence"], recovered=means["recovered"])
+    summed[means] = summed[means].div(summed["vehicles"], axis=0)
+    return summed
 
 
 def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
@@ -249,8 +233,6 @@ def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
 def pool_figures(figures: pd.DataFrame) -> pd.DataFrame:
     """Figures that are means, each over the values of several settings together; without standard deviations."""
     means = figures[[FIGURES[name].merged is np.mean for name in figures["figure"]]]
-    grouped = means.assign(total=means["value"] * means["of"]).groupby("figure", sort=False)
-    pooled = grouped.agg(total=("total", "sum"), of=("of", "sum"), low=("low", "max")).reset_index()
-    return _with_intervals(
-        pooled.assign(value=pooled["total"] / pooled["of"], sd=0.0, share=pooled["low"].notna())
-    ).drop(columns="total")
+    weighed = means.assign(value=means["value"] * means["of"], share=means["low"].notna())
+    pooled = weighed.groupby("figure", sort=False)[["value", "of", "share"]].sum().reset_index()
+    return _with_intervals(pooled.assign(value=pooled["value"] / pooled["of"], sd=0.0))

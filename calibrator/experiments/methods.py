@@ -1,37 +1,28 @@
-"""Methods that experiments compare: a trial in, estimated faults out.
+"""Methods that experiments compare: the default, the published one with its classifiers, and what is simpler.
 
-A method of your own is any object with a ``name`` and a function ``estimate(trial)`` that returns an :class:`Estimate`.
+A method is a row: a name, and a function from a trial to an estimate.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
-from calibrator.drive import Array, Mask
+from calibrator.drive import Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.decision import RowsEstimate, estimate_rows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_vehicles, learn_fleet
 from calibrator.estimator.learning import learn_fault_models
 from calibrator.estimator.prior import Prior, known_prior
-from calibrator.experiments.trial import CommonEvidence, FaultDistribution, Trial
+from calibrator.experiments.baselines import BASELINES as SOLVERS
+from calibrator.experiments.trial import CommonEvidence, Estimate, FaultDistribution, Trial
 from calibrator.faults import Faults
 from calibrator.published.classify import Classification, FaultTrees, classify_by_threshold, classify_by_truth
 from calibrator.published.recovery import recover_fleet
 
 __all__ = [
-    "CEILING",
-    "LEFT_IN",
-    "PERFECT",
-    "POSTERIOR",
-    "THRESHOLD",
-    "TREE",
-    "ComparedMethod",
-    "Estimate",
-    "Posterior",
-    "Published",
+    "BASELINES", "CEILING", "LEFT_IN", "MEANINGS", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Method",
     "require_estimate",
 ]  # fmt: skip
 
@@ -39,112 +30,36 @@ ROUNDING = 1e-9
 """By which a probability may leave 0 to 1. [1]"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """What a method says of N vehicles with K branches.
-
-    Attributes
-    ----------
-    faults : Faults
-        Estimate.
-    hardware : ndarray of bool of shape (N,)
-        Vehicles held to have a hardware fault.
-    corrected : ndarray of bool of shape (N, K)
-        Branches that would be corrected in the vehicle; the others pass through.
-    confidence : ndarray of shape (N,) or None
-        Probability of being recovered; None: the method does not say.
-    failed : int
-        Vehicles whose optimisation failed.
-    drift_sd, offset_sd_a : ndarray of shape (N, K) or None
-        Standard deviations of the sensors' parameters, if the method states them. [1], [A]
-    pit : callable or None
-        Probability integral transform of true faults under the posterior, (drift, offset) each of shape (N, K); None:
-        that of a normal distribution with these standard deviations.
-    findings : sequence of N sequences of str
-        Causes that the method names of each vehicle, besides faults; empty if it names none.
-    redraw : callable or None
-        Draws the faults of so many vehicles from the prior that the method has learnt.
-    """
-
-    faults: Faults
-    hardware: Mask
-    corrected: Mask
-    confidence: Array | None
-    failed: int
-    drift_sd: Array | None = None
-    offset_sd_a: Array | None = None
-    pit: Callable[[Faults], tuple[Array, Array]] | None = None
-    findings: Sequence[Sequence[str]] = ()
-    redraw: Callable[[np.random.Generator, int], Faults] | None = None
-
-
-class ComparedMethod(Protocol):
-    """Anything that recovers a fleet."""
-
-    @property
-    def name(self) -> str:
-        """Short name for tables."""
-
-    def estimate(self, trial: Trial) -> Estimate:
-        """Estimate the faults of all vehicles of a trial."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Published:
-    """The published method with one of its classifiers; whatever it finds is corrected.
+@dataclass(frozen=True)
+class Method:
+    """A row of the methods.
 
     Attributes
     ----------
     name : str
-        Name of the classifier.
-    classify : callable
-        The classifier.
+        Short name for tables.
+    estimate : callable
+        Estimates the faults of all vehicles of a trial.
     """
 
     name: str
-    classify: Callable[[Trial], Classification]
-
-    def estimate(self, trial: Trial) -> Estimate:
-        """Classify, then recover by the four cases."""
-        recovery = recover_fleet(trial.evidence, self.classify(trial), full_scale_a=trial.full_scale_a)
-        return Estimate(
-            faults=recovery.faults,
-            hardware=recovery.classification.hardware,
-            corrected=(recovery.faults.drift != 0.0) | (recovery.faults.offset_a != 0.0),
-            confidence=None,
-            failed=len(recovery.failed),
-        )
+    estimate: Callable[[Trial], Estimate]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Posterior:
-    """The default method.
-
-    Attributes
-    ----------
-    name : str
-        As on the command line.
-    knows_distribution : bool
-        Whether it is told how the faults were drawn, to show the ceiling; the default is told nothing.
-    """
-
-    name: str = "posterior"
-    knows_distribution: bool = False
-
-    def estimate(self, trial: Trial) -> Estimate:
-        """Estimate, and correct the branches that are hardly ever made worse."""
-        known = trial.drawn_from if self.knows_distribution else None
-        prior = None if known is None else known_prior(known.counts, known.gain)
-        if isinstance(trial.recorded, CommonEvidence):
-            return _of_rows(trial.recorded, prior, trial.full_scale_a)
-        names = [f"{k + 1}" for k in range(trial.truth.drift.shape[1])]
-        reference = learn_fleet(trial.recorded, full_scale_a=trial.full_scale_a, branches=names, known=prior)
-        found = estimate_vehicles(trial.recorded, reference)
-        return replace(
-            _estimated(found, found.corrected, reference.models[0].prior),
-            pit=lambda truth: found.pit(truth.drift, truth.offset_a),
-            findings=[[finding.cause for finding in findings] for findings in found.findings],
-        )
+def _posterior(trial: Trial, *, known: bool = False) -> Estimate:
+    """The default, which corrects the branches that are hardly ever made worse; told how faults were drawn, or not."""
+    drawn = trial.drawn_from if known else None
+    prior = None if drawn is None else known_prior(drawn.counts, drawn.gain)
+    if isinstance(trial.recorded, CommonEvidence):
+        return _of_rows(trial.recorded, prior, trial.full_scale_a)
+    names = [f"{k + 1}" for k in range(trial.truth.drift.shape[1])]
+    reference = learn_fleet(trial.recorded, full_scale_a=trial.full_scale_a, branches=names, known=prior)
+    found = estimate_vehicles(trial.recorded, reference)
+    return replace(
+        _estimated(found, found.corrected, reference.models[0].prior),
+        pit=lambda truth: found.pit(truth.drift, truth.offset_a),
+        findings=[[finding.cause for finding in findings] for findings in found.findings],
+    )
 
 
 def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float) -> Estimate:
@@ -161,9 +76,6 @@ def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float)
 
 
 def _estimated(found: RowsEstimate, corrected: Mask, prior: Prior) -> Estimate:
-    learnt = FaultDistribution(
-        counts=prior.counts, gain=(prior.gain.low, prior.gain.high), offset=(prior.offset.low, prior.offset.high)
-    )
     return Estimate(
         faults=Faults(
             hardware_drift=found.hardware_drift,
@@ -177,8 +89,22 @@ def _estimated(found: RowsEstimate, corrected: Mask, prior: Prior) -> Estimate:
         failed=0,
         drift_sd=found.drift_sd,
         offset_sd_a=found.offset_sd_a,
-        redraw=partial(learnt.draw, full_scale_a=found.full_scale_a),
+        learnt=FaultDistribution(
+            counts=prior.counts, gain=(prior.gain.low, prior.gain.high), offset=(prior.offset.low, prior.offset.high)
+        ),
     )
+
+
+def _all_corrected(faults: Faults, hardware: Mask, failed: int = 0) -> Estimate:
+    """Estimate of a method that corrects whatever it finds, and does not say how sure it is."""
+    corrected = (faults.drift != 0.0) | (faults.offset_a != 0.0)
+    return Estimate(faults=faults, hardware=hardware, corrected=corrected, confidence=None, failed=failed)
+
+
+def _published(trial: Trial, *, classify: Callable[[Trial], Classification]) -> Estimate:
+    """The published method: classify, then recover by the four cases."""
+    recovery = recover_fleet(trial.evidence, classify(trial), full_scale_a=trial.full_scale_a)
+    return _all_corrected(recovery.faults, recovery.classification.hardware, len(recovery.failed))
 
 
 def _by_threshold(trial: Trial) -> Classification:
@@ -196,12 +122,25 @@ def _by_tree(trial: Trial) -> Classification:
     return FaultTrees(evidence.features, faults).classify(trial.evidence.features)
 
 
-THRESHOLD = Published(name="published/threshold", classify=_by_threshold)
-TREE = Published(name="published/tree", classify=_by_tree)
-PERFECT = Published(name="published/perfect", classify=_by_truth)
-POSTERIOR = Posterior()
-CEILING = Posterior(name="posterior/law known", knows_distribution=True)
-LEFT_IN = Posterior(name="posterior, delays left in")
+def _baseline(trial: Trial, *, solve: Callable[[Trial], Faults]) -> Estimate:
+    faults = solve(trial)
+    return _all_corrected(faults, faults.has_hardware_fault)
+
+
+THRESHOLD = Method("published/threshold", partial(_published, classify=_by_threshold))
+TREE = Method("published/tree", partial(_published, classify=_by_tree))
+PERFECT = Method("published/perfect", partial(_published, classify=_by_truth))
+POSTERIOR = Method("posterior", _posterior)
+CEILING = Method("posterior/law known", partial(_posterior, known=True))
+LEFT_IN = Method("posterior, delays left in", _posterior)
+BASELINES = tuple(Method(name, partial(_baseline, solve=solve)) for name, (solve, _) in SOLVERS.items())
+MEANINGS = {
+    **{name: meaning for name, (_, meaning) in SOLVERS.items()},
+    POSTERIOR.name: "the default",
+    LEFT_IN.name: "the default with the delays left in",
+    CEILING.name: "the default if it is told how the faults were drawn: the most that this evidence gives",
+}
+"""What the names of methods mean, where they do not say it."""
 
 
 def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
@@ -218,22 +157,23 @@ def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
         kind = "None" if given is None else f"an object of type {type(given).__name__}"
         if isinstance(given, np.ndarray):
             kind = f"an array of {given.dtype} of shape {given.shape}"
-        return FleetError(f"method '{method}': {what} {kind}, expected {expected}; see Estimate of {__name__}")
+        return FleetError(
+            f"method '{method}': {what} {kind}, expected {expected}; see Estimate of {Estimate.__module__}"
+        )
 
     if not isinstance(estimate, Estimate):
         raise wrong("estimate() returned", estimate, "an Estimate")
     if not isinstance(estimate.faults, Faults):
         raise wrong("faults are", estimate.faults, "Faults of calibrator.faults")
-    arrays: dict[str, tuple[object, tuple[int, ...], str]] = {
-        f"faults.{name}": (value, (N, K), "numbers") for name, value in vars(estimate.faults).items()
-    }
-    arrays["faults.hardware_drift"] = (estimate.faults.hardware_drift, (N,), "numbers")
-    arrays |= {"hardware": (estimate.hardware, (N,), "bool"), "corrected": (estimate.corrected, (N, K), "bool")}
-    if estimate.confidence is not None:
-        arrays["confidence"] = (estimate.confidence, (N,), "numbers")
-    for what, (given, shape, elements) in arrays.items():
-        kinds, axes = "b" if elements == "bool" else "fiu", "vehicles and branches" if shape[1:] else "vehicles"
+    arrays = {f"faults.{name}": value for name, value in vars(estimate.faults).items()}
+    arrays |= {name: getattr(estimate, name) for name in ("hardware", "corrected", "confidence")}
+    if estimate.confidence is None:
+        del arrays["confidence"]
+    for what, given in arrays.items():
+        shape = (N,) if what in {"faults.hardware_drift", "hardware", "confidence"} else (N, K)
+        kinds, elements = ("b", "bool") if what in {"hardware", "corrected"} else ("fiu", "numbers")
         if not (isinstance(given, np.ndarray) and given.shape == shape and given.dtype.kind in kinds):
+            axes = "vehicles and branches" if shape[1:] else "vehicles"
             raise wrong(f"{what} is", given, f"an array of {elements} of shape {shape}: {axes}")
         bad, expected = ~np.isfinite(given), "finite ones, 0 where no fault is found"
         if what == "confidence":
@@ -241,6 +181,4 @@ def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
             expected = "probabilities from 0 to 1"
         if bad.any():
             raise wrong(f"{what} has {np.sum(bad)} wrong values in", given, expected)
-    if not isinstance(estimate.failed, int | np.integer):
-        raise wrong("failed is", estimate.failed, "a number of vehicles")
     return estimate

@@ -1,6 +1,7 @@
 """Results of experiments as tables on the console, and as pages with their pictures in a folder."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,28 +11,16 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from calibrator.experiments.baselines import BASELINES
 from calibrator.experiments.experiments import COVERAGE, EXPERIMENTS, Experiment
-from calibrator.experiments.figures import FIGURES, calibration_errors, pool_figures, pool_tenths
-from calibrator.experiments.methods import CEILING, LEFT_IN, POSTERIOR
+from calibrator.experiments.figures import ALL, FIGURES, calibration_errors, pool_figures, pool_tenths
+from calibrator.experiments.methods import BASELINES, CEILING, MEANINGS, POSTERIOR
 from calibrator.experiments.picture import write_picture
-from calibrator.experiments.runner import ALL, KEYS, ExperimentResult, read_records
+from calibrator.experiments.runner import KEYS, ExperimentResult, read_records
 from calibrator.terminal.text import counted
 from ecu_node.documents import write_atomically
 
 __all__ = ["headline", "result_markdown", "result_table", "write_page"]
 
-METHODS = {
-    "best subset": "best subset with BIC on the default's evidence",
-    "LASSO": "LASSO with refit on the same",
-    "fleet median": "regression on the fleet's median",
-    "total least squares": "total least squares on the junction law",
-    "VDI 2048": "reconciliation by VDI 2048",
-    POSTERIOR.name: "the default",
-    LEFT_IN.name: "the default with the delays left in",
-    CEILING.name: "the default if it is told how the faults were drawn: the most that this evidence gives",
-}
-"""What the names of methods mean, where they do not say it."""
 SHORT = ("confidence", "ece", "delay_rmse_ms", "worst_a", *COVERAGE)
 """Figures for which a console of 80 columns has room."""
 PAGES_ALONE = (CEILING.name, *(method.name for method in BASELINES[1:]))
@@ -55,30 +44,26 @@ def headline(result: ExperimentResult, *, short: bool = False) -> pd.DataFrame:
         A row per setting. Figures besides the recovery are of the default, or where it was not run of the first method
         with a confidence.
     """
-    experiment, texts = result.experiment, _texts(result.figures, short=short)
-    settings = texts[["series", "x"]].drop_duplicates().set_index(["series", "x"])
-    best = _paper_rates(experiment)
-    if best:
-        settings["paper"] = [f"{best[x]:.2f}" if x in best else NOTHING for _, x in settings.index]
-    columns = [(method, "recovery_rate", method) for method in result.methods]
-    columns += [(FIGURES[name].heading, name, _owner(result)) for name in _shown(result, short=short)]
-    for heading, figure, method in columns:
-        own = texts[(texts["figure"] == figure) & (texts["method"] == method)].set_index(["series", "x"])["text"]
-        settings[heading] = own.reindex(settings.index).astype(object).fillna(NOTHING)
-    return _labelled(settings.reset_index(), experiment)
+    experiment = result.experiment
+    cells = _texts(result.figures, short=short).pivot_table(
+        index=["series", "x"], columns=["method", "figure"], values="text", sort=False, aggfunc="first", dropna=False
+    )
+    cells = cells.reindex(list(dict.fromkeys(zip(result.figures["series"], result.figures["x"], strict=True))))
+    columns = {method: cells.get((method, "recovery_rate")) for method in result.methods}
+    columns |= {FIGURES[name].heading: cells.get((_owner(result), name)) for name in _shown(result, short=short)}
+    table = pd.DataFrame(columns, index=cells.index, dtype=object)
+    if experiment.paper:  # its best figure, whatever methods were run
+        best = dict(sorted((x, figures["recovery_rate"]) for (x, _), figures in experiment.paper.items()))
+        table.insert(0, "paper", [f"{best[x]:.2f}" if x in best else NOTHING for _, x in table.index])
+    return _labelled(table, experiment)
 
 
 def _labelled(table: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
-    """Table with the labels of what is varied; without series, if there are none."""
-    table = table.assign(x=["" if np.isnan(x) else f"{x:g}" for x in table["x"]])
+    """Table whose index, what is varied, has become columns with labels; without series, if there are none."""
+    table = table.fillna(NOTHING).reset_index()
+    table["x"] = ["" if np.isnan(x) else f"{x:g}" for x in table["x"]]
     table = table if experiment.series_label else table.drop(columns="series")
     return table.rename(columns={"series": experiment.series_label, "x": experiment.x_label})
-
-
-def _paper_rates(experiment: Experiment) -> dict[float, float]:
-    """Best recovery rate that the paper prints, by x, whatever methods were run."""
-    rates = sorted((x, figures["recovery_rate"]) for (x, _), figures in experiment.paper.items())
-    return dict(rates)
 
 
 def _owner(result: ExperimentResult) -> str:
@@ -91,8 +76,8 @@ def _shown(result: ExperimentResult, *, short: bool = False) -> list[str]:
     """Figures of the owner in the headline."""
     there = set(result.figures.loc[result.figures["method"] == _owner(result), "figure"])
     wanted = result.experiment.shown
-    short_names = (*SHORT, "harmed") if wanted != Experiment.shown else SHORT
-    return [name for name in wanted if name in there and (not short or name in short_names)]
+    fits = {*SHORT, "harmed"} if wanted != Experiment.shown else {*SHORT}
+    return [name for name in wanted if name in there and (not short or name in fits)]
 
 
 def _texts(figures: pd.DataFrame, *, short: bool = False) -> pd.DataFrame:
@@ -100,46 +85,44 @@ def _texts(figures: pd.DataFrame, *, short: bool = False) -> pd.DataFrame:
     sure = figures[figures["figure"] == "sure_confidence"].set_index(KEYS)["value"].to_dict()
     texts = []
     for row in figures.itertuples():
-        kind, share = FIGURES[row.figure], not np.isnan(row.low)
+        rare, share = FIGURES[row.figure].rare, not np.isnan(row.low)
         text = f"{row.value:.1f}" if row.figure == "worst_a" else f"{row.value:.3f}"
-        counts = f"{round(row.value * row.of)} of {row.of:.0f}" if kind.rare and share else ""
-        if short or not share:
-            texts.append(counts or text)
-            continue
-        beside = f"; {counts}" if counts else ""
-        if row.figure == "sure_wrong":
-            beside += f", {(1.0 - sure[row.series, row.x, row.method]) * row.of:.1f} expected"
-        texts.append(f"{text} ({row.low:.3f} to {row.high:.3f}{beside})")
+        counts = f"{round(row.value * row.of)} of {row.of:.0f}" if rare and share else ""
+        if row.figure == "sure_wrong" and not short:
+            counts += f", {(1.0 - sure[row.series, row.x, row.method]) * row.of:.1f} expected"
+        whole = "; ".join(filter(None, (f"{row.low:.3f} to {row.high:.3f}", counts)))
+        texts.append((counts or text) if short or not share else f"{text} ({whole})")
     return figures.assign(text=texts)
 
 
 def _caption(results: Sequence[ExperimentResult], *, short: bool = False) -> str:
     """Explain the columns of the headlines of results; a column that none of them has is not mentioned."""
     methods = dict.fromkeys(method for result in results for method in result.methods)
-    named = {name: METHODS.get(name, "a method of one's own") for name in methods if not name.startswith("published/")}
+    named = {name: MEANINGS.get(name, "a method of one's own") for name in methods if not name.startswith("published/")}
     means = ["paper (its best printed figure)"] if any(result.experiment.paper for result in results) else []
     means += ["published/classifier (the published method)"] if len(named) < len(methods) else []
     means += [f"{name} ({meaning})" for name, meaning in named.items()]
-    text = f"Share of vehicles recovered within 10 %: {', '.join(means)}."
-    shown = {name for result in results for name in _shown(result, short=short)}
-    if shown:
-        owners = dict.fromkeys(_called(_owner(result)) for result in results if _shown(result, short=short))
-        text += f" Of {' and '.join(owners)}: {_explained([name for name in FIGURES if name in shown])}."
-    notes = dict.fromkeys(result.experiment.note for result in results if result.experiment.note)
+    texts = [f"Share of vehicles recovered within 10 %: {', '.join(means)}."]
+    by_result = [(_owner(result), _shown(result, short=short)) for result in results]
+    if any(shown for _, shown in by_result):
+        owners = dict.fromkeys(_called(owner) for owner, shown in by_result if shown)
+        names = [name for name in FIGURES if any(name in shown for _, shown in by_result)]
+        texts.append(f"Of {' and '.join(owners)}: {_explained(names)}.")
     if not short:
-        text += " In brackets: 95 % intervals (Clopper and Pearson), for which vehicles are independent."
-    for branch in dict.fromkeys(result.settings.get("balance_branch") for result in results):
-        if branch is not None:
-            notes[
-                f"In every trip the current of {branch} is minus the sum of the other branches: it is not independent "
-                "of their sensors, and true currents sum to 0 A but for a load that is put in."
-            ] = None
+        texts.append("In brackets: 95 % intervals (Clopper and Pearson), for which vehicles are independent.")
+    texts += dict.fromkeys(result.experiment.note for result in results if result.experiment.note)
+    texts += [
+        f"In every trip the current of {branch} is minus the sum of the other branches: it is not independent "
+        "of their sensors, and true currents sum to 0 A but for a load that is put in."
+        for branch in dict.fromkeys(result.settings.get("balance_branch") for result in results)
+        if branch is not None
+    ]
     if any((result.figures["series"] == ALL).any() for result in results):
-        notes[f"Settings that several experiments share are the same trials and count once in '{ALL}'."] = None
-    return " ".join([text, *notes])
+        texts.append(f"Settings that several experiments share are the same trials and count once in '{ALL}'.")
+    return " ".join(texts)
 
 
-def _explained(names: Sequence[str]) -> str:
+def _explained(names: Iterable[str]) -> str:
     return ", ".join(f"{FIGURES[name].heading} ({FIGURES[name].meaning})" for name in names)
 
 
@@ -149,19 +132,15 @@ def _called(method: str) -> str:
 
 
 def _effort(result: ExperimentResult) -> str:
-    count = result.settings["repetitions"]
-    times = counted(1, "repetition") if str(count) == "1" else f"{count} repetitions"
+    count = str(result.settings["repetitions"])
+    times = counted(int(count), "repetition") if count.isdecimal() else f"{count} repetitions"
     return f"{times}, seed {result.settings['seed']}, drive {result.settings['drive']}"
 
 
 def result_table(result: ExperimentResult) -> Group:
     """Headline of a result for the console: title, table and caption, which is as wide as the console."""
-    figures = result.figures[~result.figures["method"].isin(PAGES_ALONE)]
-    shown = ExperimentResult(
-        experiment=result.experiment, settings=result.settings, figures=figures, tenths=result.tenths
-    )
-    table = Table(box=None, pad_edge=False, collapse_padding=True)
-    cells = headline(shown, short=True)
+    shown = replace(result, figures=result.figures[~result.figures["method"].isin(PAGES_ALONE)])
+    table, cells = Table(box=None, pad_edge=False, collapse_padding=True), headline(shown, short=True)
     for number, heading in enumerate(cells.columns):
         first = number == 0 and bool(result.experiment.series_label)
         text = escape(heading).replace("/", "/\n").replace(", ", ",\n")
@@ -170,13 +149,13 @@ def result_table(result: ExperimentResult) -> Group:
         table.add_row(*row)
     vehicles = f"{result.settings['vehicles']} vehicles, " if isinstance(result.settings.get("vehicles"), int) else ""
     more = "--out writes all figures" if result.made else "result_markdown shows all figures"
-    text = f"{_caption([shown], short=True)} {more}. {vehicles}{_effort(result)}.{_failures(figures)}"
-    return Group(Text(result.experiment.title, style="bold"), table, Text(text, style="dim"), Text())
+    caption = f"{_caption([shown], short=True)} {more}. {vehicles}{_effort(result)}.{_failures(result)}"
+    return Group(Text(result.experiment.title, style="bold"), table, Text(caption, style="dim"), Text())
 
 
-def _failures(figures: pd.DataFrame) -> str:
+def _failures(result: ExperimentResult) -> str:
     """Say where an optimisation failed; empty if none did."""
-    failed = figures[(figures["figure"] == "failed") & (figures["value"] > 0.0)]
+    failed = result.figures[(result.figures["figure"] == "failed") & (result.figures["value"] > 0.0)]
     named = [f"{row.series} {row.x:g} {row.method} {row.value:.3f}".strip() for row in failed.itertuples()]
     return f" Optimisation failed for a share of: {', '.join(named)}." if named else ""
 
@@ -191,11 +170,11 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
     picture : str
         File of its picture, as the page is to link it; empty: there is none.
     """
-    experiment, figures = result.experiment, result.figures
+    experiment, figures, owner = result.experiment, result.figures, _owner(result)
     hidden = ("failed",) if experiment.name == "coverage" else ("failed", *COVERAGE)
     names = [name for name in FIGURES if name not in hidden and (figures["figure"] == name).any()]
     written = f"Written by `calibrator experiment {experiment.name} --out FOLDER`. " if result.made else ""
-    more = _explained([name for name in names if name not in _shown(result)])
+    more = _explained(name for name in names if name not in _shown(result))
     about = f"All figures{f'; besides those above {more}' if more else ''}."
     about += " After a stroke: the paper." if experiment.paper else ""
     if "harmed" in names and any(name.startswith("published/") for name in result.methods):
@@ -203,23 +182,19 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
             " The published method corrects every branch that it regresses, a sound one by what noise leaves there: "
             "such a vehicle counts as harmed although it is recovered."
         )
-    sections = [
-        f"# {experiment.title}",
-        f"{written}{_caption([result])}{_failures(figures)}",
-        _markdown(headline(result)),
-        _together(result),
-        f"![{experiment.title}]({picture})" if picture else "",
-        about,
-        _details(result, names),
-    ]
-    tenths = result.tenths[result.tenths["method"] == _owner(result)]
+    sections = [f"# {experiment.title}", f"{written}{_caption([result])}{_failures(result)}"]
+    sections += [_markdown(headline(result)), _together(result), f"![{experiment.title}]({picture})" if picture else ""]
+    sections += [about, _details(result, names)]
+    tenths = result.tenths[result.tenths["method"] == owner]
     whole = pool_tenths(tenths[tenths["series"] == ALL] if (tenths["series"] == ALL).any() else tenths)
     if len(whole):
         ece, chance = calibration_errors(whole)
+        formats = {"low": "{:.1f}", "vehicles": "{:.0f}", "confidence": "{:.3f}", "recovered": "{:.3f}"}
+        cells = pd.DataFrame({name: whole[name].map(text.format) for name, text in formats.items()})
         sections += [
-            f"All settings together, by tenths of the confidence of {_called(_owner(result))} (ECE {ece:.3f}, by "
+            f"All settings together, by tenths of the confidence of {_called(owner)} (ECE {ece:.3f}, by "
             f"chance {chance:.3f}):",
-            _reliability(whole),
+            _markdown(cells.rename(columns={"low": "from", "confidence": "mean confidence"})),
         ]
     if experiment.name == "coverage" and len(tenths):
         pit = tenths.pivot_table(index=["series", "x"], columns="low", values="pit", sort=False, aggfunc="sum")
@@ -227,12 +202,13 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
         sections += [
             "Deployed parameters by tenths of their probability integral transform, which are equal if the posterior "
             "is right (of the simulation-based calibration these are its ranks):",
-            _markdown(_labelled(pit.astype(int).reset_index(), experiment)),
+            _markdown(_labelled(pit.astype(int), experiment)),
         ]
-    settings = ", ".join(
-        f"{name} {str(value).lower() if isinstance(value, bool) else value}" for name, value in result.settings.items()
+    pairs = (
+        (name, str(value).lower() if isinstance(value, bool) else value) for name, value in result.settings.items()
     )
-    sections.append(f"Settings: {settings}.{f' Made by {result.made}.' if result.made else ''}")
+    made = f" Made by {result.made}." if result.made else ""
+    sections.append(f"Settings: {', '.join(f'{name} {value}' for name, value in pairs)}.{made}")
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
@@ -244,38 +220,32 @@ def _markdown(table: pd.DataFrame) -> str:
 
 def _together(result: ExperimentResult) -> str:
     """All settings together: what is rare in one may be told by many; empty for a single setting."""
-    rows = []
-    for method in result.methods:
-        own = result.figures[(result.figures["method"] == method) & (result.figures["series"] != ALL)]
-        counted_shares = own["figure"].isin(["harmed", "sure_wrong"]) & own["low"].notna()
-        if own[["series", "x"]].drop_duplicates().shape[0] > 1 and counted_shares.any():
-            rows.append(_texts(pool_figures(own).assign(series="", x=0.0, method=method)))
-    if not rows:
+    own = result.figures[(result.figures["series"] != ALL) & result.figures["low"].notna()]
+    own = own[own["figure"].isin(["harmed", "sure_wrong"])].method.unique()
+    if result.figures[["series", "x"]].drop_duplicates().shape[0] < 2 or not len(own):
         return ""
-    texts = pd.concat(rows).pivot_table(index="method", columns="figure", values="text", sort=False, aggfunc="first")
-    texts = texts.reindex(columns=["harmed", "sure_wrong"]).astype(object).fillna(NOTHING)
-    texts.columns = [FIGURES[name].heading for name in texts.columns]
-    return _markdown(texts.rename_axis("all settings together").reset_index())
+    pooled = [pool_figures(result.figures[(result.figures["method"] == name) & (result.figures["series"] != ALL)])
+              .assign(series="", x=0.0, method=name) for name in own]  # fmt: skip
+    table = _figure_table(pd.concat(pooled), ["harmed", "sure_wrong"], ["method"]).fillna(NOTHING)
+    return _markdown(table.rename_axis("all settings together").reset_index())
 
 
 def _details(result: ExperimentResult, names: Sequence[str]) -> str:
     """All figures of all methods, the paper's after a stroke."""
-    texts, paper = _texts(result.figures), result.experiment.paper
+    return _markdown(_labelled(_figure_table(result.figures, names, KEYS, result.experiment), result.experiment))
+
+
+def _figure_table(
+    figures: pd.DataFrame, names: Sequence[str], index: list[str], experiment: Experiment | None = None
+) -> pd.DataFrame:
+    """A column of texts per figure."""
+    texts, paper = _texts(figures), {} if experiment is None else experiment.paper
     texts["text"] += [
         f" / {paper[key][figure]:.2f}" if figure in paper.get(key := (x, method), {}) else ""
         for x, method, figure in zip(texts["x"], texts["method"], texts["figure"], strict=True)
     ]
-    table = texts.pivot_table(index=KEYS, columns="figure", values="text", sort=False, aggfunc="first")
-    table = table.reindex(columns=names).astype(object).fillna(NOTHING)
-    table.columns = [FIGURES[name].heading for name in names]
-    return _markdown(_labelled(table.reset_index(), result.experiment))
-
-
-def _reliability(whole: pd.DataFrame) -> str:
-    """Confidence beside what became of it, by tenths."""
-    formats = {"low": "{:.1f}", "vehicles": "{:.0f}", "confidence": "{:.3f}", "recovered": "{:.3f}"}
-    cells = pd.DataFrame({name: whole[name].map(text.format) for name, text in formats.items()})
-    return _markdown(cells.rename(columns={"low": "from", "confidence": "mean confidence"}))
+    table = texts.pivot_table(index=index, columns="figure", values="text", sort=False, aggfunc="first")
+    return table.reindex(columns=names).astype(object).set_axis([FIGURES[name].heading for name in names], axis=1)
 
 
 def write_page(folder: Path, result: ExperimentResult) -> None:

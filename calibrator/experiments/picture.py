@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -13,9 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import ScaledTranslation
 
 from calibrator.drive import Array
-from calibrator.experiments.baselines import BASELINES
-from calibrator.experiments.methods import CEILING, LEFT_IN, PERFECT, POSTERIOR, THRESHOLD, TREE
-from calibrator.experiments.runner import ALL, ExperimentResult
+from calibrator.experiments.figures import ALL
+from calibrator.experiments.methods import BASELINES, CEILING, LEFT_IN, PERFECT, POSTERIOR, THRESHOLD, TREE
+
+if TYPE_CHECKING:
+    from calibrator.experiments.runner import ExperimentResult
 
 __all__ = ["draw_result", "write_picture"]
 
@@ -43,25 +45,22 @@ COLOURS = (
 )  # fmt: skip
 """The first are those of Okabe and Ito, for all eyes."""
 MARKERS, LINES = "os^DvPp<h>Xd", ("-", "--", "-.", ":")
-METHODS = tuple(method.name for method in (POSTERIOR, PERFECT, CEILING, TREE, THRESHOLD, LEFT_IN, *BASELINES))
+METHODS = [method.name for method in (POSTERIOR, PERFECT, CEILING, TREE, THRESHOLD, LEFT_IN, *BASELINES)]
 """Each has its style in all pictures."""
 
 
-def _style(number: int) -> dict[str, Any]:
-    """How a curve is told from others, also without colours."""
+def _style(of: int | str) -> dict[str, Any]:
+    """How a curve, by its number, or a method is told from others, also without colours."""
+    number = of if isinstance(of, int) else METHODS.index(of) if of in METHODS else len(METHODS)
     return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 
-def _style_of(method: str) -> dict[str, Any]:
-    return _style(METHODS.index(method) if method in METHODS else len(METHODS))
-
-
-def write_picture(result: ExperimentResult, path: Path) -> None:
+def write_picture(result: "ExperimentResult", path: Path) -> None:
     """Draw a result into a PNG file."""
     draw_result(result).savefig(path, dpi=110)
 
 
-def draw_result(result: ExperimentResult) -> Figure:
+def draw_result(result: "ExperimentResult") -> Figure:
     """Draw a result of an experiment as its row in the table says, with one legend beside the data."""
     kinds = {"lines": _draw_lines, "dots": _draw_dots, "map": _draw_map, "reliability": _draw_reliability}
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
@@ -77,21 +76,17 @@ def _bars(rows: pd.DataFrame) -> Array:
     return np.asarray(np.maximum(np.nan_to_num(lengths), 0.0))
 
 
-def _paper(result: ExperimentResult, rows: pd.DataFrame) -> list[float | None]:
-    """The paper's figures for these rows, where it prints any."""
-    paper = result.experiment.paper
-    keys = zip(rows["x"], rows["method"], rows["figure"], strict=True)
-    return [paper.get((x, method), {}).get(figure) for x, method, figure in keys]
-
-
 def _rings(
-    axes: Axes, points: Iterable[tuple[float | None, float | None]], label: str, colour: str, **more: Any
-) -> None:
-    """Figures of the paper: rings that hide nothing."""
-    known = [(x, y) for x, y in points if x is not None and y is not None]
+    axes: Axes, result: "ExperimentResult", rows: pd.DataFrame, places: Iterable[float], *, label: str, colour: str,
+    across: bool = False, **more: Any,
+) -> None:  # fmt: skip
+    """Figures of the paper for these rows, where it prints any: rings that hide nothing."""
+    paper, keys = result.experiment.paper, zip(rows["x"], rows["method"], rows["figure"], strict=True)
+    found = [paper.get((x, method), {}).get(figure) for x, method, figure in keys]
+    known = [(place, value) for place, value in zip(places, found, strict=True) if value is not None]
     if known:
+        x, y = zip(*(pair[::-1] if across else pair for pair in known), strict=True)
         look: dict[str, Any] = {"s": 110.0, "facecolors": "none", "edgecolors": colour, "linewidths": 1.5, "zorder": 4}
-        x, y = ([*values] for values in zip(*known, strict=True))
         axes.scatter(x, y, label=f"paper, {label}", **look, **more)
 
 
@@ -99,63 +94,59 @@ def _legend(figure: Figure, *, title: str | None = None) -> None:
     """One legend below all axes, each label once."""
     found: dict[str, Artist] = {}
     for axes in figure.axes:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+        found = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True)) | found
     labels = sorted(found, key=lambda label: label.startswith("paper"))
-    columns = min(len(labels), 6)
-    figure.legend(
-        [found[label] for label in labels], labels, loc="outside lower center", ncols=columns, fontsize="small",
-        title=title,
-    )  # fmt: skip
+    handles, columns = [found[label] for label in labels], min(len(labels), 6)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize="small", title=title)
 
 
-def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
+def _draw_dots(figure: Figure, result: "ExperimentResult") -> None:
     """A line of dots per setting and a panel per figure, where settings are no numbers."""
-    table, panels = result.figures, result.experiment.panels
+    table, panels, x_label = result.figures, result.experiment.panels, result.experiment.x_label
     keys = list(dict.fromkeys(zip(table["series"], table["x"], strict=True)))
     figure.set_size_inches(11.0, 2.0 + max(3.0, 0.3 * len(keys)))
     all_axes = figure.subplots(1, len(panels), sharey=True)
     for axes, name in zip(all_axes, panels, strict=True):
         for number, method in enumerate(result.methods):
-            rows = table[(table["method"] == method) & (table["figure"] == name)]
-            if rows.empty:
-                continue
+            rows, style = table[(table["method"] == method) & (table["figure"] == name)], _style(method)
             aside = 0.6 * ((number + 0.5) / len(result.methods) - 0.5)
             place = [keys.index(key) + aside for key in zip(rows["series"], rows["x"], strict=True)]
-            style = _style_of(method)
-            axes.errorbar(rows["value"], place, xerr=_bars(rows), label=method, linestyle="", markersize=5.0, **style)
-            _rings(axes, zip(_paper(result, rows), place, strict=True), method, style["color"])
+            if place:
+                bars = {"xerr": _bars(rows), "label": method, "linestyle": "", "markersize": 5.0}
+                axes.errorbar(rows["value"], place, **bars, **style)
+            _rings(axes, result, rows, place, label=method, colour=style["color"], across=True)
         axes.set(title=TITLES[name], xlim=SHARES)
         axes.grid(visible=True, alpha=0.3)
-    ticks = [f"{series}, {result.experiment.x_label.split()[0]} {x:g}".removeprefix(", ") for series, x in keys]
+    ticks = [f"{series}, {x_label.split()[0]} {x:g}".removeprefix(", ") for series, x in keys]
     all_axes[0].set_yticks(range(len(keys)), ticks, fontsize="small")
     all_axes[0].invert_yaxis()
     _legend(figure)
 
 
-def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
+def _draw_lines(figure: Figure, result: "ExperimentResult") -> None:
     """Figures over what is varied: a curve per method; with several series a panel per method, a curve per series."""
-    table, x_label = result.figures, result.experiment.x_label
-    several = table["series"].nunique() > 1
+    table, several = result.figures, result.figures["series"].nunique() > 1
     groups = [[method] for method in result.methods] if several else [list(result.methods)]
-    wanted = [(name, group) for name in result.experiment.panels for group in groups]
-    drawn = [(*one, table[(table["figure"] == one[0]) & table["method"].isin(one[1])]) for one in wanted]
-    drawn = [panel for panel in drawn if len(panel[2])]
-    all_axes = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
-    values = sorted(set(table["x"]))
+    drawn = [
+        (name, group, panel)
+        for name in result.experiment.panels
+        for group in groups
+        if len(panel := table[(table["figure"] == name) & table["method"].isin(group)])
+    ]
+    all_axes, values = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0], sorted(set(table["x"]))
     for axes, (name, group, panel) in zip(all_axes, drawn, strict=True):
         curves = list(panel.groupby(["method", "series"], sort=False))
         for number, ((method, one), rows) in enumerate(curves):
-            label = (one or "as S says") if several else method
-            style = _style(number) if several else _style_of(method)
+            label, style = ((one or "as S says"), _style(number)) if several else (method, _style(method))
             aside_pt = DODGE_PT * (number - (len(curves) - 1) / 2.0)
             transform = axes.transData + ScaledTranslation(aside_pt / 72.0, 0.0, figure.dpi_scale_trans)
             axes.errorbar(
                 rows["x"], rows["value"], yerr=_bars(rows), label=label, transform=transform,
                 linestyle=LINES[number % len(LINES)], markersize=5.5, capsize=2.5, elinewidth=1.0, **style,
             )  # fmt: skip
-            _rings(axes, zip(rows["x"], _paper(result, rows), strict=True), label, style["color"], transform=transform)
-        axes.set(title=f"{TITLES[name]}, {group[0]}" if several else TITLES[name], xlabel=x_label, ylim=SHARES)
+            _rings(axes, result, rows, rows["x"], label=label, colour=style["color"], transform=transform)
+        axes.set(title=f"{TITLES[name]}, {group[0]}" if several else TITLES[name], ylim=SHARES)
+        axes.set_xlabel(result.experiment.x_label)
         axes.tick_params(labelleft=True)
         axes.grid(visible=True, alpha=0.3)
         margin = MARGIN * (values[-1] - values[0]) or 1.0
@@ -169,7 +160,7 @@ def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
     _legend(figure, title=result.experiment.series_label if several else None)
 
 
-def _draw_map(figure: Figure, result: ExperimentResult) -> None:
+def _draw_map(figure: Figure, result: "ExperimentResult") -> None:
     """A map of the recovery rate per method."""
     table, experiment = result.figures, result.experiment
     all_axes = np.atleast_1d(figure.subplots(1, len(result.methods)))
@@ -184,7 +175,7 @@ def _draw_map(figure: Figure, result: ExperimentResult) -> None:
         axes.set(title=f"recovery rate, {method}", xlabel=experiment.x_label, ylabel=experiment.series_label)
 
 
-def _draw_reliability(figure: Figure, result: ExperimentResult) -> None:
+def _draw_reliability(figure: Figure, result: "ExperimentResult") -> None:
     """Share recovered over confidence, experiment by experiment and all together, with the numbers of vehicles."""
     reliability, counts = figure.subplots(1, 2)
     reliability.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=1.0)

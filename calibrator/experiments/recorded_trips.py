@@ -30,7 +30,6 @@ from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise_samples
 from calibrator.terminal.progress import shown
 from ecu_node.database import VehicleDatabase
-from ecu_node.layout import Layout
 
 __all__ = [
     "NOISE", "RecordedCase", "RecordedFleet", "VehicleSamples", "builtin_fleet", "read_fleet", "record_vehicles",
@@ -83,11 +82,6 @@ class RecordedFleet:
         return self.trips[0].period_s
 
     @property
-    def balance_branch(self) -> str:
-        """The branch whose current is minus the sum of the others."""
-        return balance_branch(self.database.layout, tuple(self.trips[0].currents_a))
-
-    @property
     def record(self) -> dict[str, int | float | str]:
         """What is needed to make the trips again."""
         return {
@@ -96,7 +90,7 @@ class RecordedFleet:
             "driving_minutes": round(sum(map(len, self.trips)) * self.period_s / 60.0, 1),
             "full_scale_a": self.full_scale_a,
             "noise_a": NOISE * self.full_scale_a,
-            "balance_branch": self.balance_branch,
+            "balance_branch": balance_branch(self.database.layout, tuple(self.trips[0].currents_a)),
         }
 
     def take(self, trips: int, *, duration_s: float) -> "RecordedFleet":
@@ -116,24 +110,19 @@ class RecordedFleet:
         names = choose_branches(self.database.layout, tuple(self.trips[0].currents_a), count)
         return tuple(with_branches(trip, names, balance_branch(self.database.layout, names)) for trip in self.trips)
 
-    def resolution_a(self, branches: tuple[str, ...]) -> Array:
-        """Steps of the signals of some branches, shape (K,); 0 where a branch has none. [A]"""
-        return np.array([self.database.current_step_a(name) for name in branches])
+    def input_names(self, available: Mapping[str, object]) -> tuple[str, ...]:
+        """Those of the inputs of the vehicles' and of the fleet's model that a trip with these inputs has."""
+        layout = self.database.layout
+        names = tuple(dict.fromkeys([*layout.model_inputs, *layout.fleet_inputs]))
+        return choose_inputs(layout, tuple(available), names=names)[0]
 
     def inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
-        """Inputs of the vehicles' and of the fleet's model that a trip has, by name, each of shape (T,)."""
-        layout = self.database.layout
-        names, _ = choose_inputs(layout, tuple(trip.inputs), names=_all_inputs(layout))
-        values = dict(trip.inputs)
+        """The same with their values, each of shape (T,)."""
+        layout, values = self.database.layout, dict(trip.inputs)
         for item in layout.derived:
             if base_inputs(layout, [item.name]) <= values.keys():
                 values[item.name] = evaluate_formula(item.formula, values)
-        return {name: values[name] for name in names}
-
-
-def _all_inputs(layout: Layout) -> tuple[str, ...]:
-    """Inputs of the vehicles' and of the fleet's model, each once."""
-    return tuple(dict.fromkeys([*layout.model_inputs, *layout.fleet_inputs]))
+        return {name: values[name] for name in self.input_names(trip.inputs)}
 
 
 def read_fleet(store: Path, database: VehicleDatabase) -> RecordedFleet:
@@ -261,22 +250,18 @@ class VehicleSamples:
         following : ndarray of shape (T, K) or None
             Ideal currents of the trip on which corrections are judged; None: its own trip is wanted. [A]
         """
-        i, i_m = self._linear(vehicle, own, unseen=False)
-        peak_a = np.abs(i_m).max(axis=0)
-        if following is not None:
-            i, i_m = self._linear(vehicle, following, unseen=True)
+        faults, pairs = self.truth.take(vehicle), []
+        for i_s, unseen in ((own, False), (following, True)):
+            if i_s is not None:
+                i = true_currents(i_s, faults)
+                i[:, 0] += self.unmeasured_a[vehicle]
+                i = i if self.attack is None else self.attack.true_a(vehicle, i, unseen=unseen)
+                pairs.append((i, measured_currents(i, faults)))
+        i, i_m = pairs[-1]
         if self.attack is None:
             return i, i_m
+        peak_a = np.abs(pairs[0][1]).max(axis=0)
         return i, self.attack.measured_a(vehicle, i_m, unseen=following is not None, peak_a=peak_a)
-
-    def _linear(self, vehicle: int, i_s: Array, *, unseen: bool) -> tuple[Array, Array]:
-        """True currents, and those that linear sensors measure."""
-        faults = self.truth.take(vehicle)
-        i = true_currents(i_s, faults)
-        i[:, 0] += self.unmeasured_a[vehicle]
-        if self.attack is not None:
-            i = self.attack.true_a(vehicle, i, unseen=unseen)
-        return i, measured_currents(i, faults)
 
 
 def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial:
@@ -285,12 +270,12 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
     Corrections are judged on the trip of the next vehicle.
     """
     if case.minutes is not None:
-        fleet = replace(fleet, trips=_runs(fleet, case, seed))
+        fleet = replace(fleet, trips=_runs(fleet, case.minutes, case.vehicles or len(fleet.trips), seed))
     trips, truth, N = fleet.with_branches(case.branches), None, len(fleet.trips)
     if case.own_prior:
-        redraw = POSTERIOR.estimate(recorded_trial(fleet, replace(case, own_prior=False), seed)).redraw
-        assert redraw is not None
-        truth = redraw(random_stream(Purpose.TRAINING_FAULTS, seed), N)
+        learnt = POSTERIOR.estimate(recorded_trial(fleet, replace(case, own_prior=False), seed)).learnt
+        assert learnt is not None
+        truth = learnt.draw(random_stream(Purpose.TRAINING_FAULTS, seed), N, fleet.full_scale_a)
     vehicles = record_vehicles(fleet, case, trips, seed, truth=truth)
     attack, ideal = vehicles.attack, [trip.matrix_a() for trip in trips]
     return Trial(
@@ -307,11 +292,10 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
     )
 
 
-def _runs(fleet: RecordedFleet, case: RecordedCase, seed: int) -> tuple[GroundTruth, ...]:
+def _runs(fleet: RecordedFleet, minutes: float, vehicles: int, seed: int) -> tuple[GroundTruth, ...]:
     """Drives of so many minutes, each from a random start on; vehicles may share trips, but hardly ever a start."""
-    assert case.minutes is not None
-    trips, samples, runs = fleet.trips, int(60.0 * case.minutes / fleet.period_s), []
-    for number in range(len(trips) if case.vehicles is None else case.vehicles):
+    trips, samples, runs = fleet.trips, int(60.0 * minutes / fleet.period_s), []
+    for number in range(vehicles):
         rng = random_stream(Purpose.CALIBRATION_TRIP, seed, number)
         k = int(rng.integers(len(trips)))
         parts = [trips[k].part(int(rng.integers(len(trips[k]))), len(trips[k]))]
@@ -340,9 +324,9 @@ def record_vehicles(
     truth : Faults or None
         Faults of the vehicles; None: drawn as the case says.
     """
-    N, full_scale_a = len(trips), fleet.full_scale_a
-    drawn = draw_faults(
-        random_stream(Purpose.FAULTS, seed),
+    N, full_scale_a, rng = len(trips), fleet.full_scale_a, random_stream(Purpose.FAULTS, seed)
+    faults = truth or draw_faults(
+        rng,
         vehicles=N,
         branches=case.branches,
         sparsity=case.sparsity,
@@ -350,7 +334,6 @@ def record_vehicles(
         full_scale_a=full_scale_a,
         balanced=case.balanced,
     )
-    faults = drawn if truth is None else truth
     attack = draw_attack(case.world, N, full_scale_a=full_scale_a, seed=seed) if case.world else None
     vehicles = VehicleSamples(
         truth=faults if attack is None else attack.truth(faults),
@@ -361,24 +344,23 @@ def record_vehicles(
         pairs = [_through_frames(fleet, case, vehicles, trip, (seed, j)) for j, trip in enumerate(trips)]
         errors_s = None if case.delays_left_in else np.stack([error_s for _, error_s in pairs])
         return replace(vehicles, samples=[samples for samples, _ in pairs], delay_error_s=errors_s)
-    steps_a = fleet.resolution_a(tuple(trips[0].currents_a))
-    samples = []
-    for j, trip in enumerate(trips):
-        _, i_m = vehicles.currents_a(j, trip.matrix_a())
-        seen = i_m + NOISE * full_scale_a * random_stream(Purpose.FRAMES, seed, j).standard_normal(i_m.shape)
-        safe = np.where(steps_a > 0.0, steps_a, 1.0)
-        inputs = fleet.inputs(trip)
-        samples.append(
-            Samples(
-                branch_names=tuple(trip.currents_a),
-                input_names=tuple(inputs),
-                time_s=trip.time_s,
-                currents_a=np.where(steps_a > 0.0, np.rint(seen / safe) * safe, seen),
-                inputs=np.column_stack(list(inputs.values())),
-                valid=np.ones(len(trip), dtype=bool),
-            )
-        )
-    return replace(vehicles, samples=samples)
+    return replace(vehicles, samples=[_sampled(fleet, vehicles, trip, (seed, j)) for j, trip in enumerate(trips)])
+
+
+def _sampled(fleet: RecordedFleet, vehicles: VehicleSamples, trip: GroundTruth, seed: tuple[int, int]) -> Samples:
+    """What a vehicle records at the instants of its trip, with noise, in the steps of its signals."""
+    _, i_m = vehicles.currents_a(seed[1], trip.matrix_a())
+    seen = i_m + NOISE * fleet.full_scale_a * random_stream(Purpose.FRAMES, *seed).standard_normal(i_m.shape)
+    steps_a = np.array([fleet.database.current_step_a(name) for name in trip.currents_a])  # 0: it has none
+    safe, inputs = np.where(steps_a > 0.0, steps_a, 1.0), fleet.inputs(trip)
+    return Samples(
+        branch_names=tuple(trip.currents_a),
+        input_names=tuple(inputs),
+        time_s=trip.time_s,
+        currents_a=np.where(steps_a > 0.0, np.rint(seen / safe) * safe, seen),
+        inputs=np.column_stack(list(inputs.values())),
+        valid=np.ones(len(trip), dtype=bool),
+    )
 
 
 def _through_frames(
@@ -400,11 +382,9 @@ def _through_frames(
     found_s: Array = np.zeros(len(delay_s))
     if not case.delays_left_in:
         delays = estimate_delays([drive], vehicle.branches)
-        drive = without_delays(drive, delays.by_branch())
-        found_s = delays.delay_s
-    layout = fleet.database.layout
-    inputs, _ = choose_inputs(layout, tuple(drive.inputs), names=_all_inputs(layout))
-    return align(drive, layout, vehicle.branches, inputs=inputs), (found_s - delay_s + delay_s[0])[1:]
+        drive, found_s = without_delays(drive, delays.by_branch()), delays.delay_s
+    samples = align(drive, fleet.database.layout, vehicle.branches, inputs=fleet.input_names(drive.inputs))
+    return samples, (found_s - delay_s + delay_s[0])[1:]
 
 
 def _summaries(samples: Sequence[Samples], fleet: RecordedFleet) -> list[DriveSummary]:
@@ -414,10 +394,14 @@ def _summaries(samples: Sequence[Samples], fleet: RecordedFleet) -> list[DriveSu
 
 def _published_evidence(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetEvidence:
     """A model per vehicle, simulated on the longest held-out drive (2)."""
-    drives = [drive.with_inputs(fleet.database.layout.model_inputs) for drive in samples]
     vehicles = [
-        identify_vehicle([drive], period_s=fleet.period_s, vehicle=str(j), names=(str(j),))
-        for j, drive in enumerate(drives)
+        identify_vehicle(
+            [drive.with_inputs(fleet.database.layout.model_inputs)],
+            period_s=fleet.period_s,
+            vehicle=str(j),
+            names=(str(j),),
+        )
+        for j, drive in enumerate(samples)
     ]
     unity = max(vehicles, key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in)
     simulated = [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles]

@@ -6,7 +6,7 @@ Every setting is run with the same seeds; all methods of a setting see the same 
 import json
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from calibrator.errors import FleetError
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, common_trial
 from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, Experiment, Setting
 from calibrator.experiments.figures import (
+    ALL,
     TENTH_COLUMNS,
     calibration_errors,
     figure_rows,
@@ -26,8 +27,9 @@ from calibrator.experiments.figures import (
     pool_figures,
     pool_tenths,
 )
-from calibrator.experiments.methods import POSTERIOR, ComparedMethod, require_estimate
+from calibrator.experiments.methods import POSTERIOR, require_estimate
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, recorded_trial
+from calibrator.experiments.trial import ComparedMethod
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.progress import shown
 from calibrator.time_of_run import time_of_run
@@ -35,10 +37,14 @@ from ecu_node import __version__
 
 __all__ = ["ALL", "ExperimentResult", "made_now", "pool_confidences", "read_records", "run_experiment"]
 
-ALL = "all together"
 NOT_POOLED = (CALIBRATION.name, "attacks")
 """Attacks are worlds that the estimator does not expect; what becomes of confidences there is in their own table."""
 KEYS = ["series", "x", "method"]
+TRIALS: dict[tuple[type, type], Callable[..., Any]] = {
+    (CommonCase, CommonDrive): common_trial,
+    (RecordedCase, RecordedFleet): recorded_trial,
+}
+"""What makes a trial, by case and fleet."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,19 +129,18 @@ def run_experiment(
         raise FleetError(f"an experiment needs at least 1 repetition, not {repetitions}")
     usual = tuple(experiment.methods if methods is None else methods)
     names = [method.name for method in usual]
-    for called in names:
-        if names.count(called) > 1:
-            raise FleetError(f"{names.count(called)} methods are called '{called}'; give each method a name of its own")
-    seeds = range(seed, seed + repetitions)
-    tasks = ((setting.case, setting.methods or usual, each) for setting in experiment.settings for each in seeds)
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise FleetError(f"{len(twice)} methods are called '{twice[0]}'; give each method a name of its own")
+    rows = [(setting, setting.methods or usual) for setting in experiment.settings]
+    tasks = [(setting.case, own, seed + number) for setting, own in rows for number in range(repetitions)]
     judged = run_many(partial(_run_trial, fleet), tasks, Workers(processes=workers))
-    trials = list(shown(judged, experiment.name, len(experiment.settings) * repetitions, "trials"))
-    tables = []
-    for number, setting in enumerate(experiment.settings):
-        own = trials[number * repetitions : (number + 1) * repetitions]
-        for k, method in enumerate(setting.methods or usual):
-            tables.append(_keyed(figure_rows([trial[k] for trial in own]), setting.series, setting.x, method.name))
-    figures, tenths = (pd.concat(rows, ignore_index=True) for rows in zip(*tables, strict=True))
+    trials = list(shown(judged, experiment.name, len(tasks), "trials"))
+    tables = [
+        _keyed(figure_rows([trial[k] for trial in trials[first : first + repetitions]]), s.series, s.x, method.name)
+        for first, (s, own) in zip(range(0, len(trials), repetitions), rows, strict=True)
+        for k, method in enumerate(own)
+    ]
+    figures, tenths = (pd.concat(some, ignore_index=True) for some in zip(*tables, strict=True))
     return ExperimentResult(
         experiment=experiment,
         settings={"seed": seed, "repetitions": repetitions, **_common(experiment.settings), **fleet.record},
@@ -148,12 +153,10 @@ def _run_trial(
     fleet: CommonDrive | RecordedFleet, task: tuple[CommonCase | RecordedCase, Sequence[ComparedMethod], int]
 ) -> list[dict[str, Any]]:
     case, methods, seed = task
-    if isinstance(fleet, CommonDrive) and isinstance(case, CommonCase):
-        trial = common_trial(fleet, case, seed)
-    elif isinstance(fleet, RecordedFleet) and isinstance(case, RecordedCase):
-        trial = recorded_trial(fleet, case, seed)
-    else:
+    make = TRIALS.get((type(case), type(fleet)))
+    if make is None:
         raise FleetError(f"{type(case).__name__} cannot be run on a {type(fleet).__name__}; see fleet_for()")
+    trial = make(fleet, case, seed)
     return [judge(require_estimate(method.name, method.estimate(trial), trial.truth), trial) for method in methods]
 
 
@@ -175,7 +178,7 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
     """Pool the confidences of the default method over experiments: is a confidence of 0.9 right in 0.9 of the cases?
 
     Experiments share settings, such as the paper's with S = 60, and with the same seed these are the same trials. "All
-    together" counts them once: trials are taken for the same if drive, seed, repetitions, tenths and figures are.
+    together" counts them once: trials are taken for the same if drive, seed, repetitions and tenths are.
 
     Parameters
     ----------
@@ -192,49 +195,44 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
     FleetError
         If no experiment has a confidence.
     """
-    used, together, tables = [], dict[Any, Any](), []
+    parts, used = [], []
     for result in results:
-        figures, tenths = (t[t["method"] == POSTERIOR.name] for t in (result.figures, result.tenths))
-        if result.experiment.name in NOT_POOLED or not tenths["vehicles"].sum():
-            continue
-        used.append(result)
-        drawn = tuple(result.settings.get(name) for name in ("drive", "seed", "repetitions"))
-        settings = list(tenths.groupby(KEYS, sort=False))
-        for (series, x, _), found in settings:
-            own = figures[(figures["series"] == series) & (figures["x"] == x)]
-            same = (drawn, *(table.drop(columns=KEYS).to_json(double_precision=12) for table in (found, own)))
-            together[same] = own, found
-        tables.append(_pooled(result.experiment.name, figures, tenths))
+        own = [table[table["method"] == POSTERIOR.name] for table in (result.figures, result.tenths)]
+        if result.experiment.name not in NOT_POOLED and own[1]["vehicles"].sum():
+            used.append(result)
+            drawn = " ".join(str(result.settings.get(name)) for name in ("drive", "seed", "repetitions"))
+            parts.append([table.assign(experiment=result.experiment.name, drawn=drawn) for table in own])
     if not used:
         raise FleetError("no experiment has a confidence to check; run 'calibrator experiment all --out FOLDER' first")
-    tables.append(_pooled(ALL, *(pd.concat(rows) for rows in zip(*together.values(), strict=True))))
-    figures, tenths = (pd.concat(rows, ignore_index=True) for rows in zip(*tables, strict=True))
-
-    def settings_of(name: str) -> str:
-        return " or ".join(sorted({str(result.settings.get(name, "?")) for result in used}))
-
-    return ExperimentResult(
-        experiment=CALIBRATION,
-        settings={
-            "experiments": ", ".join(result.experiment.name for result in used),
-            "repetitions": settings_of("repetitions"),
-            "seed": settings_of("seed"),
-            "drive": "those of the experiments",
-        },
-        figures=figures,
-        tenths=tenths,
+    figures, tenths = (pd.concat(some, ignore_index=True) for some in zip(*parts, strict=True))
+    keys = ["experiment", "series", "x"]
+    by_setting = tenths.pivot_table(
+        index=[*keys, "drawn"], columns="low", values=["vehicles", "confidence"], sort=False
     )
+    once = by_setting.round(12).reset_index(level="drawn").drop_duplicates().index
+    groups = {name: [table[table["experiment"] == name] for table in (figures, tenths)]
+              for name in dict.fromkeys(figures["experiment"])}  # fmt: skip
+    groups[ALL] = [table[table.set_index(keys).index.isin(once)] for table in (figures, tenths)]
+    pooled = [_pooled(name, *tables) for name, tables in groups.items()]
+    figures, tenths = (pd.concat(some, ignore_index=True) for some in zip(*pooled, strict=True))
+    told = {name: " or ".join(sorted({str(result.settings.get(name, "?")) for result in used}))
+            for name in ("repetitions", "seed")}  # fmt: skip
+    settings = {
+        "experiments": ", ".join(result.experiment.name for result in used),
+        **told,
+        "drive": "those of the experiments",
+    }
+    return ExperimentResult(experiment=CALIBRATION, settings=settings, figures=figures, tenths=tenths)
 
 
 def _pooled(series: str, figures: pd.DataFrame, tenths: pd.DataFrame) -> list[pd.DataFrame]:
     """Row of an experiment: what tells whether its confidences are right."""
-    pooled = pool_tenths(tenths)
-    means = pool_figures(figures)
+    pooled, means = pool_tenths(tenths), pool_figures(figures)
     kept = means[means["figure"].isin(["recovery_rate", "confidence"]) | means["figure"].str.startswith("sure")]
-    errors = zip(("ece", "ece_by_chance"), calibration_errors(pooled), strict=True)
     vehicles = pooled["vehicles"].sum()
-    rows = [{"figure": name, "value": value, "sd": 0.0, "of": vehicles} for name, value in errors]
-    return _keyed((pd.concat([kept, pd.DataFrame(rows)]), pooled), series, vehicles, POSTERIOR.name)
+    errors = pd.DataFrame({"figure": ["ece", "ece_by_chance"], "value": calibration_errors(pooled), "sd": 0.0,
+                           "of": vehicles})  # fmt: skip
+    return _keyed((pd.concat([kept, errors]), pooled), series, vehicles, POSTERIOR.name)
 
 
 class _Record(msgspec.Struct):
@@ -263,10 +261,7 @@ def read_records(folder: Path, names: Iterable[str]) -> list[ExperimentResult]:
         If one is no record of an experiment.
     """
     found = []
-    for name in names:
-        path = folder / f"{name}.json"
-        if not path.is_file():
-            continue
+    for path in (path for name in names if (path := folder / f"{name}.json").is_file()):
         try:
             record = msgspec.json.decode(path.read_bytes(), type=_Record)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
@@ -275,7 +270,7 @@ def read_records(folder: Path, names: Iterable[str]) -> list[ExperimentResult]:
                 "remove it, or run the experiment again"
             ) from None
         result = ExperimentResult(
-            experiment=EXPERIMENTS[name],
+            experiment=EXPERIMENTS[path.stem],
             settings=record.settings,
             figures=pd.DataFrame(record.figures).astype({"value": float, "low": float, "high": float}),
             tenths=pd.DataFrame(record.tenths, columns=[*KEYS, *TENTH_COLUMNS]),

@@ -1,9 +1,13 @@
-"""One trial: a fleet with known faults, what a method is given of it, and the truth that it is judged by."""
+"""One trial: a fleet with known faults, what a method is given of it, and the truth that it is judged by.
+
+A method of your own is any object with a ``name`` and a function ``estimate(trial)`` that returns an :class:`Estimate`.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
+from typing import Protocol
 
 import numpy as np
 
@@ -14,7 +18,9 @@ from calibrator.faults import Faults
 from calibrator.published.evidence import FleetEvidence
 from calibrator.summaries.moments import DriveSummary
 
-__all__ = ["CommonEvidence", "FaultDistribution", "Trial", "UnseenDrive", "drawn_distribution"]
+__all__ = [
+    "CommonEvidence", "ComparedMethod", "Estimate", "FaultDistribution", "Trial", "UnseenDrive", "drawn_distribution",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,13 +51,7 @@ class FaultDistribution:
         relative = np.isin(np.arange(3 * K), [0, *range(K, 2 * K)])
         low, high = (np.where(relative, *pair) for pair in zip(self.gain, self.offset, strict=True))
         values = active * rng.choice([-1.0, 1.0], size=active.shape) * rng.uniform(low, high, size=active.shape)
-        hardware_offset = np.column_stack([values[:, 1:K], -values[:, 1:K].sum(axis=1)])
-        return Faults(
-            hardware_drift=values[:, 0],
-            hardware_offset_a=hardware_offset * full_scale_a,
-            drift=values[:, K : 2 * K],
-            offset_a=values[:, 2 * K :] * full_scale_a,
-        )
+        return Faults.of_parameters(values, full_scale_a)
 
 
 def drawn_distribution(
@@ -99,7 +99,7 @@ class CommonEvidence:
     covariance_a2: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class UnseenDrive:
     """Moments of the true currents i and of the sensors' errors e = i_m - i on a drive that no method has seen.
 
@@ -120,30 +120,18 @@ class UnseenDrive:
     @classmethod
     def of_samples(cls, drives: Sequence[tuple[Array, Array]]) -> "UnseenDrive":
         """Moments of the true and the measured currents, both of shape (T, K), of N vehicles. [A]"""
-        pairs = [(i, i_m - i) for i, i_m in drives]
-        return cls(
-            mean_a=np.stack([i.mean(axis=0) for i, _ in pairs]),
-            mean_square_a2=np.stack([np.mean(i**2, axis=0) for i, _ in pairs]),
-            error_mean_a=np.stack([e.mean(axis=0) for _, e in pairs]),
-            error_mean_square_a2=np.stack([np.mean(e**2, axis=0) for _, e in pairs]),
-            error_product_a2=np.stack([np.mean(e * i, axis=0) for i, e in pairs]),
-        )
+        moments = [(i, i**2, i_m - i, (i_m - i) ** 2, (i_m - i) * i) for i, i_m in drives]
+        return cls(*np.array([[values.mean(axis=0) for values in own] for own in moments]).swapaxes(0, 1))
 
     @classmethod
     def of_linear_sensors(cls, ideal_a: Array, truth: Faults) -> "UnseenDrive":
         """Moments of N vehicles with linear sensors that all make one drive of ideal currents (T, K), (11) and (13)."""
         gain, constant = 1.0 + truth.hardware_drift[:, None], truth.hardware_offset_a
         mean_a, mean_square_a2 = ideal_a.mean(axis=0), np.mean(ideal_a**2, axis=0)
-        mean = gain * mean_a + constant
-        square = gain**2 * mean_square_a2 + 2.0 * gain * constant * mean_a + constant**2
+        i = gain * mean_a + constant
+        i2 = gain**2 * mean_square_a2 + 2.0 * gain * constant * mean_a + constant**2
         d, o = truth.drift, truth.offset_a
-        return cls(
-            mean_a=mean,
-            mean_square_a2=square,
-            error_mean_a=d * mean + o,
-            error_mean_square_a2=d**2 * square + 2.0 * d * o * mean + o**2,
-            error_product_a2=d * square + o * mean,
-        )
+        return cls(i, i2, d * i + o, d**2 * i2 + 2.0 * d * o * i + o**2, d * i2 + o * i)
 
     def rms_a(self, drift: Array, offset_a: Array) -> Array:
         """Root mean square error of the currents corrected with these parameters (25), shape (N, K). [A]
@@ -211,3 +199,54 @@ class Trial:
     def evidence(self) -> FleetEvidence:
         """Evidence of the published method, made once."""
         return self.collect()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What a method says of N vehicles with K branches.
+
+    Attributes
+    ----------
+    faults : Faults
+        Estimate.
+    hardware : ndarray of bool of shape (N,)
+        Vehicles held to have a hardware fault.
+    corrected : ndarray of bool of shape (N, K)
+        Branches that would be corrected in the vehicle; the others pass through.
+    confidence : ndarray of shape (N,) or None
+        Probability of being recovered; None: the method does not say.
+    failed : int
+        Vehicles whose optimisation failed.
+    drift_sd, offset_sd_a : ndarray of shape (N, K) or None
+        Standard deviations of the sensors' parameters, if the method states them. [1], [A]
+    pit : callable or None
+        Probability integral transform of true faults under the posterior, (drift, offset) each of shape (N, K); None:
+        that of a normal distribution with these standard deviations.
+    findings : sequence of N sequences of str
+        Causes that the method names of each vehicle, besides faults; empty if it names none.
+    learnt : FaultDistribution or None
+        Prior that the method has learnt.
+    """
+
+    faults: Faults
+    hardware: Mask
+    corrected: Mask
+    confidence: Array | None
+    failed: int
+    drift_sd: Array | None = None
+    offset_sd_a: Array | None = None
+    pit: Callable[[Faults], tuple[Array, Array]] | None = None
+    findings: Sequence[Sequence[str]] = ()
+    learnt: FaultDistribution | None = None
+
+
+class ComparedMethod(Protocol):
+    """Anything that recovers a fleet."""
+
+    @property
+    def name(self) -> str:
+        """Short name for tables."""
+
+    @property
+    def estimate(self) -> Callable[[Trial], Estimate]:
+        """Estimates the faults of all vehicles of a trial."""

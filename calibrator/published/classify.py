@@ -49,11 +49,6 @@ class Classification:
     hardware: Mask
     sensor: Mask
 
-    @property
-    def case(self) -> Array:
-        """The paper's cases 1 (no fault), 2 (hardware), 3 (sensors), 4 (both), shape (N,)."""
-        return 1.0 + self.hardware + 2.0 * self.sensor
-
 
 def decision_criterion(features: Array) -> Array:
     """Evaluate eta of (7): estimated mean square of what hardware faults add to the currents.

@@ -22,7 +22,6 @@ import cvxpy
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.errors import FleetError
 from calibrator.faults import Faults
 from calibrator.options import Classifier
 from calibrator.published.classify import (
@@ -36,7 +35,7 @@ from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet
 
 __all__ = [
     "BasisPursuit", "BasisPursuitError", "Recovery", "calibrate_published", "quadratic_forms", "recover_fleet",
-    "refit_support", "support_of",
+    "refit_support",
 ]  # fmt: skip
 
 cp: Any = cvxpy  # its type hints leave out the atoms
@@ -138,22 +137,13 @@ class BasisPursuit:
         return np.asarray(self._X.value[:-1, -1], np.float64)
 
 
-def support_of(x: Array) -> Mask:
-    """Parameters of shape (3K,) that are not zero: at most the 2K largest, as there are 2K equations."""
-    equations = 2 * len(x) // 3
-    order = np.argsort(-np.abs(x), kind="stable")
-    support = np.zeros(len(x), bool)
-    support[order[:equations]] = True
-    return support & (np.abs(x) > SMALLEST_PARAMETER)
-
-
 def refit_support(x: Array, slopes: Array, intercepts: Array, deviations: Array) -> Array:
     """Fit the nonzero parameters of one vehicle to its slopes and intercepts by Gauss-Newton.
 
     Parameters
     ----------
     x : ndarray of shape (3K,)
-        Start; its support stays.
+        Start; its support, at most the 2K largest, stays.
     slopes, intercepts : ndarray of shape (K,)
         a [1], and b in fractions of full scale [1].
     deviations : ndarray of shape (2K,)
@@ -164,7 +154,8 @@ def refit_support(x: Array, slopes: Array, intercepts: Array, deviations: Array)
     ndarray of shape (3K,)
         Refitted parameters; the start with its small entries set to zero if the refit leaves the model's range.
     """
-    support = support_of(x)
+    largest = np.argsort(np.argsort(-np.abs(x), kind="stable")) < len(deviations)  # there are 2K equations
+    support = largest & (np.abs(x) > SMALLEST_PARAMETER)
     start = np.where(support, x, 0.0)
     target = np.concatenate([slopes, intercepts])
     fitted = start.copy()
@@ -287,31 +278,20 @@ def recover_fleet(evidence: FleetEvidence, classification: Classification, *, fu
     -------
     Recovery
         Estimates; a failed optimisation is named in it, the other vehicles go on.
-
-    Raises
-    ------
-    FleetError
-        If evidence and classification are of different fleets, or the full scale is not positive.
     """
-    if not len(evidence) == len(classification.hardware) == len(classification.sensor):
-        raise FleetError(f"{len(evidence)} vehicles, but {len(classification.hardware)} were classified")
-    if not full_scale_a > 0.0:
-        raise FleetError(f"full scale must be positive, not {full_scale_a:g} A")
     N, K = evidence.slopes.shape
     x = np.zeros((N, 3 * K))
     regressed = classification.sensor & ~classification.hardware
     x[regressed, K : 2 * K] = evidence.slopes[regressed] - 1.0
     x[regressed, 2 * K :] = evidence.intercepts_a[regressed] / full_scale_a
     failed: dict[int, str] = {}
-    both = np.flatnonzero(classification.sensor & classification.hardware)
-    pursuit = BasisPursuit(K) if both.size else None
-    for j in both.tolist():
-        assert pursuit is not None
+    both, pursuit = classification.sensor & classification.hardware, BasisPursuit(K)
+    for j in np.flatnonzero(both).tolist():
         try:
             x[j] = _pursue(pursuit, evidence.take(j), full_scale_a)
         except BasisPursuitError as error:
             failed[j] = str(error)
-    return Recovery(faults=_faults(x, full_scale_a), classification=classification, failed=failed)
+    return Recovery(faults=Faults.of_parameters(x, full_scale_a), classification=classification, failed=failed)
 
 
 def _pursue(pursuit: BasisPursuit, vehicle: FleetEvidence, full_scale_a: float) -> Array:
@@ -320,15 +300,3 @@ def _pursue(pursuit: BasisPursuit, vehicle: FleetEvidence, full_scale_a: float) 
     variances = np.concatenate([vehicle.slope_variances, vehicle.intercept_variances_a2 / full_scale_a**2])
     x = pursuit.solve(slopes, intercepts, epsilon=EPSILON_SHARE * float(variances.sum()))
     return refit_support(x, slopes, intercepts, np.maximum(np.sqrt(variances), LEAST_DEVIATION))
-
-
-def _faults(x: Array, full_scale_a: float) -> Faults:
-    """Parameters (N, 3K), offsets in fractions of full scale, as fault parameters."""
-    K = x.shape[1] // 3
-    free = x[:, 1:K] * full_scale_a
-    return Faults(
-        hardware_drift=x[:, 0],
-        hardware_offset_a=np.column_stack([free, -free.sum(axis=1)]),
-        drift=x[:, K : 2 * K],
-        offset_a=x[:, 2 * K :] * full_scale_a,
-    )

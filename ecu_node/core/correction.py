@@ -138,7 +138,8 @@ def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
     Returns
     -------
     IntegerPlan
-        For every valid code its error is at most half a code + 2^-10.
+        For every valid code its error is at most half a code + 2^-10: it is never below the exact line, and above it by
+        less than :data:`LARGEST_ERROR`. Beyond that its shift is as large as 64-bit words allow.
 
     Raises
     ------
@@ -150,38 +151,10 @@ def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
     offset_a = signals.sign * as_written(fault.offset_a)
     # a current is a power at 1 V, which needs no code
     volts_per_code, volts_at_0 = (Fraction(0), Fraction(1)) if voltage is None else (voltage.scale, voltage.offset)
-    return integer_plan(
-        signals,
-        slope=source.scale * per_unit,
-        voltage_slope=-offset_a * volts_per_code * per_unit,
-        constant=(source.offset - offset_a * volts_at_0) * per_unit - target.offset / target.scale,
-    )
-
-
-def integer_plan(signals: Signals, *, slope: Fraction, voltage_slope: Fraction, constant: Fraction) -> IntegerPlan:
-    """Integers that come closest to code_out = slope * code_in + voltage_slope * voltage_code + constant. [code]
-
-    Parameters
-    ----------
-    signals : Signals
-        Whose codes it is for.
-    slope, voltage_slope, constant : Fraction
-        G, H and B.
-
-    Returns
-    -------
-    IntegerPlan
-        Never below the line, and above it by less than :data:`LARGEST_ERROR` for every valid code. Beyond that its
-        shift is as large as 64-bit words allow.
-
-    Raises
-    ------
-    DatabaseError
-        If the target's value table leaves no values around 0.
-    """
-    terms = [(slope, signals.source)]
-    if signals.voltage is not None and voltage_slope:
-        terms.append((voltage_slope, signals.voltage))
+    terms = [(source.scale * per_unit, source)]
+    if voltage is not None and offset_a:
+        terms.append((-offset_a * volts_per_code * per_unit, voltage))
+    constant = (source.offset - offset_a * volts_at_0) * per_unit - target.offset / target.scale
     span = sum(codes.highest - codes.lowest for _, codes in terms)
     needed = _ERROR_BITS + (span // 2 + 1).bit_length()
     largest = abs(constant) + 1

@@ -41,7 +41,7 @@ def _signal_by_signal(
     def rewrite(payload: bytearray, before: bytearray, now_s: float) -> bytearray:
         made = bytearray(before)
         for branch, written in branches.items():
-            code = branch.signal.code(payload) if branch in inside and branch.signal is not None else None
+            code = branch.signal.code(payload) if branch in inside else None
             if code is not None:
                 written.put(made, *branch.convert(code, now_s, counters))
             elif written.not_available is not None:
@@ -62,15 +62,14 @@ def _in_one_word(
 
     Numbers are unsigned: sign bits of two's complements are turned over, in the payload and in the outgoing one.
     """
-    places = [branch.signal.place for branch in branches if branch.signal is not None and not branch.signal.above]
-    orders = {(place.order, written.place.order) for place, written in zip(places, branches.values(), strict=False)}
-    if len(orders) != 1 or len(places) < len(branches) or not branches.keys() <= {*inside}:
+    orders = {(branch.signal.place.order, written.place.order) for branch, written in branches.items()}
+    if len(orders) != 1 or any(branch.signal.above or branch not in inside for branch in branches):
         return otherwise
     ((order, to),) = orders
     cells = []
     signs, taken, ready = bytearray(length), bytearray(made_length), bytearray(made_length)
-    for place, (branch, written) in zip(places, branches.items(), strict=True):
-        plan, (first, last) = branch.plan, branch.ordinary_codes()
+    for branch, written in branches.items():
+        place, plan, (first, last) = branch.signal.place, branch.plan, branch.ordinary_codes()
         if first > last:
             return otherwise
         bias = plan.bias + (1 << (plan.shift - 1)) + place.lowest * plan.gain - (written.place.lowest << plan.shift)
@@ -279,8 +278,7 @@ class Source:
 
     def _find(self, length: int) -> _Ways:
         """Find out what is done with payloads of some length. [byte]"""
-        inside = {branch: Written(branch.signal.place) for branch in self.branches
-                  if branch.signal is not None and branch.signal.end <= length}  # fmt: skip
+        inside = {item: Written(item.signal.place) for item in self.branches if item.signal.end <= length}
 
         def way(branches: Mapping[LiveBranch, Written], made_length: int) -> _Rewrite:
             plain = _signal_by_signal(branches, inside, self._counters)

@@ -44,7 +44,7 @@ class HeardSignal:
 
     def __init__(self, codes: Codes, timeout_s: float) -> None:
         self.codes, self.timeout_s = codes, timeout_s
-        self.signal: PlacedSignal | None = None
+        self.signal = PlacedSignal(place=codes.place)
         self._frames: Frames = deque()
         self._read: tuple[float, bytearray] | None = None
         """The last frame that was read."""
@@ -56,7 +56,7 @@ class HeardSignal:
 
     def newest_first(self) -> Iterator[tuple[float, int]]:
         """Times and codes, back from the last frame that has the signal; each frame is read once. [s]"""
-        if self.signal is not None and self._frames and self._frames[-1] is not self._read:
+        if self._frames and self._frames[-1] is not self._read:
             new = list(takewhile(lambda frame: frame is not self._read, reversed(self._frames)))
             self._read = new[0]
             for time_s, payload in reversed(new):

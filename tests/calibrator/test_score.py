@@ -3,7 +3,7 @@ import pytest
 
 from calibrator.drive import Array
 from calibrator.faults import Faults, corrected_currents, measured_currents
-from calibrator.score import correction_error_rms, f2_score, harmed, recovered, recovery_rate
+from calibrator.score import correction_error_rms, f2_score, harmed, recovered
 
 FULL_SCALE_A = 400.0
 
@@ -35,11 +35,6 @@ def test_a_vanishing_truth_counts_as_the_smallest_fault() -> None:
 def test_an_estimate_that_is_not_a_number_is_not_recovered() -> None:
     truth = sensor_faults([[0.1, 0.0]], [[0.0, 0.0]])
     assert found(sensor_faults([[np.nan, 0.0]], [[0.0, 0.0]]), truth) == [False]
-
-
-def test_rate_of_no_vehicles_is_not_a_number() -> None:
-    none = sensor_faults([[0.0, 0.0]], [[0.0, 0.0]]).take(slice(0, 0))
-    assert np.isnan(recovery_rate(none, none, full_scale_a=FULL_SCALE_A, smallest_fault=0.05))
 
 
 def test_f2_follows_its_definition() -> None:

@@ -18,10 +18,8 @@ from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "own_estimator.py"
-NOTEBOOK = ROOT / "examples" / "fleet_to_node.ipynb"
 PAGE = (ROOT / "docs" / "experiments.md").read_text()
 RECORDED = re.findall(r"(?ms)^```python\n(.+?)^```", PAGE)
-MODULE = re.compile(r"(?m)^[ \"]*from ((?:calibrator|ecu_node)[\w.]*) import")
 
 
 @pytest.fixture
@@ -66,12 +64,3 @@ def test_it_stands_beside_the_published_method_and_the_default_also_on_recorded_
     assert "6 vehicles, 2 repetitions, seed 0, drive 6 drives of i3" in " ".join(shown.split())
     for name in ("perfect", "posterior", "own"):
         assert name in shown
-
-
-@pytest.mark.parametrize(
-    "source", [EXAMPLE.read_text(), NOTEBOOK.read_text(), *RECORDED], ids=["own", "notebook", "page"]
-)
-def test_what_it_imports_is_in_the_reference_of_the_python_interface(source: str) -> None:
-    listed = re.findall(r"(?m)^   ([\w.]+)$", (ROOT / "docs" / "reference" / "api.md").read_text())
-    assert len(MODULE.findall(source)) > 3
-    assert sorted(set(MODULE.findall(source)) - set(listed)) == []

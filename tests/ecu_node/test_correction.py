@@ -1,9 +1,7 @@
 """Integer plan against exact fractions."""
 
 import math
-from collections.abc import Iterable
 from fractions import Fraction
-from typing import NamedTuple
 
 import pytest
 from cantools.database.can import Signal
@@ -12,19 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecu_node.core.correction import LARGEST_ERROR, IntegerPlan, SensorFault, Signals, correction_plan
-from ecu_node.core.correction import integer_plan as plan_of_line
 from ecu_node.core.signals import AMPERE, Codes, not_available_code, read_codes, require_reach, writable_range
 from ecu_node.errors import DatabaseError
 
 HALF = Fraction(1, 2)
-
-
-class Line(NamedTuple):
-    """Exact correction. [code]"""
-
-    slope: Fraction
-    voltage_slope: Fraction
-    constant: Fraction
 
 
 def current(
@@ -115,35 +104,6 @@ def test_signals_of_any_width_keep_the_error_bound(
     wanted = exact(source, source, code, sign=1, drift=repr(drift), offset_a=repr(offset))
     clamped = min(max(wanted, Fraction(source.lowest)), Fraction(source.highest))
     assert abs(got - clamped) <= HALF + LARGEST_ERROR
-
-
-def excess(plan: IntegerPlan, line: Line, codes: Iterable[int], volts: Iterable[int]) -> list[Fraction]:
-    """How far the integers lie above a line, before anything is rounded; largest and least at the ends of the codes."""
-    return [
-        Fraction(code * plan.gain + volt * plan.voltage_gain + plan.bias, 1 << plan.shift)
-        - (line.slope * code + line.voltage_slope * volt + line.constant)
-        for code in codes
-        for volt in volts
-    ]
-
-
-@settings(deadline=None)
-@given(
-    length=st.integers(2, 64),
-    volts=st.integers(2, 64),
-    signed=st.booleans(),
-    slope=st.fractions(-3, 3),
-    voltage_slope=st.fractions(-3, 3),
-    constant=st.fractions(-70000, 70000),
-)
-def test_the_integers_are_never_below_the_line_and_above_it_by_less_than_the_largest_error(
-    length: int, volts: int, signed: bool, slope: Fraction, voltage_slope: Fraction, constant: Fraction
-) -> None:
-    source, voltage = current(length=length, signed=signed), current(length=volts, signed=not signed)
-    line = Line(slope=slope, voltage_slope=voltage_slope, constant=constant)
-    plan = plan_of_line(Signals(source=source, target=source, sign=1, voltage=voltage), **line._asdict())
-    ends = (source.lowest, source.highest), (voltage.lowest, voltage.highest)
-    assert all(0 <= error < LARGEST_ERROR for error in excess(plan, line, *ends))
 
 
 def test_passing_through_changes_no_code() -> None:

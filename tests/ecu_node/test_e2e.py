@@ -195,16 +195,6 @@ def test_repeated_frames_gaps_and_jumps(kind: str, protect: Callable[[str], Prot
     assert found == [ok, Check.REPEATED, ok, Check.LOST, ok, jump, ok, ok]
 
 
-@pytest.mark.parametrize("last", [-1, 0])
-def test_gaps_and_jumps_count_on_past_the_last_code(kind: str, protect: Callable[[str], Protection], last: int) -> None:
-    protection = protect(ENTRIES[kind] + "\nmax_delta_counter = 3")
-    last += protection.modulus
-    frames = stream(protection, 9, first=last)
-    for step, found in ((0, Check.REPEATED), (1, Check.OK), (3, Check.LOST), (4, Check.JUMPED), (8, Check.JUMPED)):
-        check = Receiver(protection).check
-        assert [check(frames[0]), check(frames[step])] == [Check.OK, found]
-
-
 @pytest.mark.parametrize(
     ("kind", "counter"), [("P04", 0x0100), ("P04", 0x0101), ("P07", 0x0101), ("P07", 0x010001), ("P07", 0x01000000)]
 )

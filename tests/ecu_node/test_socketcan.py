@@ -118,19 +118,6 @@ def test_frames_are_dated_by_the_kernel_and_none_with_the_time_of_another(ends: 
     assert undated.timestamp == 0.0
 
 
-def test_what_came_after_the_bus_was_asked_is_found_when_it_is_asked_again(ends: Ends) -> None:
-    link, far = ends
-    frame = build_can_frame(can.Message(arbitration_id=7))
-    far.send(frame)
-    assert link.receive(0.0) is not None
-    asked_s = link.asked_s
-    far.send(frame)
-    assert link.receive(0.0) is None
-    assert link.asked_s == asked_s, "the bus was not asked, so this is still the time up to which it was heard"
-    assert link.receive(0.0) is not None
-    assert link.asked_s > asked_s
-
-
 def test_a_bus_that_takes_no_more_says_how_many_it_took(ends: Ends) -> None:
     link, far = ends
     frames = [can.Message(arbitration_id=number) for number in range(1000)]

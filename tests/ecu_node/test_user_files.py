@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.documents import UnsuitableFileError, read_user_file
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
 
 
@@ -55,20 +54,3 @@ def test_a_parameter_file_that_is_none_is_malformed(tmp_path: Path, make: Callab
     done = checked(tmp_path / "p.json", LAYOUT)
     assert re.match(rf"NOT FIT \(MALFORMED_PARAMETERS\): .*p\.json: not a parameter file: {words}", done.stdout)
     assert (done.returncode, done.stderr) == (1, "")
-
-
-def test_a_pipe_that_takes_the_place_of_a_file_keeps_nobody_waiting(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As the owner of the folder can do it, between a look at the file and its opening."""
-    path, opened = tmp_path / "p.json", os.open
-    path.write_bytes(b"{}")
-
-    def swap_and_open(name: str, flags: int) -> int:
-        path.unlink()
-        os.mkfifo(path)
-        return opened(name, flags)
-
-    monkeypatch.setattr(os, "open", swap_and_open)
-    with pytest.raises(UnsuitableFileError, match="it is a pipe"):
-        read_user_file(path, largest_bytes=10)

@@ -1,7 +1,5 @@
 """Programs of clean environments that run beside a test."""
 
-import os
-import pty
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -11,7 +9,7 @@ from typing import TypeVar
 
 from tests.package.clean_venv import CleanVenv
 
-__all__ = ["on_terminal", "started", "until"]
+__all__ = ["started", "until"]
 
 PATIENCE_S = 60.0
 _Found = TypeVar("_Found")
@@ -39,33 +37,3 @@ def until(look: Callable[[], _Found | None], what: str) -> _Found:
             return found
         time.sleep(0.05)
     raise AssertionError(f"{what}: not in {PATIENCE_S:g} s")
-
-
-def on_terminal(
-    venv: CleanVenv, name: str, *arguments: object, folder: Path, wanted: bytes
-) -> tuple[int | None, bytes]:
-    """Run a program on a terminal of its own until it has shown something, or has ended.
-
-    Returns
-    -------
-    code : int or None
-        Exit code; None if it was still running, and was interrupted.
-    shown : bytes
-        All that it showed.
-    """
-    ours, theirs = pty.openpty()
-    environment = {**venv.environment, "TERM": "xterm", "COLUMNS": "160"}
-    command = [venv.program(name), *map(str, arguments)]
-    process = subprocess.Popen(command, cwd=folder, env=environment, stdin=theirs, stdout=theirs, stderr=theirs)
-    os.close(theirs)
-    shown = b""
-    try:
-        while wanted not in shown:
-            shown += os.read(ours, 65536)
-        return None, shown
-    except OSError:  # EIO: it has ended
-        return process.wait(timeout=PATIENCE_S), shown
-    finally:
-        process.kill()
-        process.wait()
-        os.close(ours)

@@ -31,21 +31,6 @@ def test_the_wheel_has_every_file_of_the_packages_and_no_other(in_wheel: set[str
     assert own == {name for package in PACKAGES for name in files(ROOT / package)}
 
 
-def test_the_wheel_has_types_assets_and_the_schema(in_wheel: set[str]) -> None:
-    assets = {f"calibrator/report/assets/{name}" for name in ("page.css", "page.html", "page.js")}
-    needed = {"calibrator/py.typed", "ecu_node/py.typed", "ecu_node/parameters.schema.json", *assets}
-    assert needed <= in_wheel
-
-
-def test_the_wheel_names_its_licence_and_its_programs(wheel: Path, in_wheel: set[str]) -> None:
-    (licence,) = (name for name in in_wheel if name.endswith(".dist-info/licenses/LICENSE"))
-    with zipfile.ZipFile(wheel) as archive:
-        assert archive.read(licence) == (ROOT / "LICENSE").read_bytes()
-        (programs,) = (archive.read(name).decode() for name in in_wheel if name.endswith("entry_points.txt"))
-    assert "calibrator = calibrator.__main__:main" in programs
-    assert "ecu-node = ecu_node.cli:main" in programs
-
-
 def test_the_source_has_every_file_that_is_kept(unpacked: Path) -> None:
     folders = ("calibrator", "dbc", "deploy", "docs", "ecu_node", "examples", "tests", "tools", ".ci")
     kept = set().union(*(files(ROOT / folder) for folder in folders))

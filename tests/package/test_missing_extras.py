@@ -83,11 +83,3 @@ def test_doing_what_a_command_without_its_extra_says_makes_it_work(
         assert "pip install" not in said
         assert code != 70
         assert "Traceback" not in said
-
-
-def test_every_command_of_the_calibrator_says_the_same_without_it(wheel: Path, tmp_path: Path) -> None:
-    venv = new_venv(tmp_path / "node", wheel)
-    for arguments in (["report", "result"], ["calibrate", "fleet"], ["--help"], []):
-        done = venv.run("calibrator", *arguments, folder=tmp_path)
-        assert (done.returncode, done.stdout) == (1, "")
-        assert done.stderr == "calibrator: typer is not installed; pip install 'hv-current-correction[calibrator]'\n"

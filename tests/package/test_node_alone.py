@@ -9,10 +9,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from ecu_node import __version__
 from tests.package.clean_venv import ROOT, CleanVenv
 from tests.package.conftest import VEHICLE, Installed
-from tests.package.processes import on_terminal
 
 PLAYER = Path(__file__).with_name("virtual_drive.py")
 LAYOUT = ("--layout", "my_car.toml")
@@ -33,22 +31,11 @@ def test_only_what_the_node_needs_is_installed(node: CleanVenv) -> None:
     assert node.run("python", "-m", "pip", "check", folder=node.folder).returncode == 0
 
 
-def test_the_version_is_told(node: CleanVenv, car: Path) -> None:
-    assert node.run("ecu-node", "--version", folder=car).stdout == f"ecu-node {__version__}\n"
-
-
 def test_parameters_are_checked(node: CleanVenv, car: Path) -> None:
     arguments = ("--params", "V001.json", *LAYOUT, "--vehicle", VEHICLE, "--json")
     done = node.run("ecu-node", "check", *arguments, folder=car)
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["branches"]["battery"]["applied"] is True
-
-
-def test_schema_and_template_are_printed(node: CleanVenv, car: Path) -> None:
-    schema = node.run("ecu-node", "schema", folder=car)
-    assert schema.stdout == (ROOT / "ecu_node" / "parameters.schema.json").read_text()
-    template = node.run("ecu-node", "template", *LAYOUT, "--vehicle", VEHICLE, folder=car)
-    assert json.loads(template.stdout)["vehicle"] == VEHICLE
 
 
 def test_currents_are_corrected_on_a_virtual_bus(node: CleanVenv, car: Path, drive: Path) -> None:
@@ -66,13 +53,6 @@ def test_a_bus_is_watched(node: CleanVenv, car: Path) -> None:
     assert done.returncode == 1
     assert "no branch of my_car.toml was seen" in done.stderr
     assert json.loads(done.stdout)["node"] is None
-
-
-def test_the_monitor_draws_a_table(node: CleanVenv, car: Path) -> None:
-    options = (*LAYOUT, "--interface", "virtual", "--channel", "monitor")
-    code, shown = on_terminal(node, "ecu-node", "monitor", *options, folder=car, wanted=b"motor_rear")
-    assert code is None, shown
-    assert b"\x1b[?1049h" in shown  # a screen of its own
 
 
 def test_updates_without_their_extra_are_refused_in_one_line(node: CleanVenv, car: Path) -> None:

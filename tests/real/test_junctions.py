@@ -68,6 +68,7 @@ def test_stations_differ_by_their_gains(i3: Path) -> None:
     assert ratio["circontrol"] == pytest.approx(0.988, abs=0.003)
     assert ratio["efacec"] == pytest.approx(1.012, abs=0.003)
     assert (rows.gain_error_sd < 0.0035).all()
+    assert not any(each.parameters.findings for each in found.vehicles_.values()), "a ramp is no fault of a sensor"
 
 
 def test_battery_against_both_stations_is_a_contradiction(i3: Path, tmp_path: Path) -> None:
@@ -107,6 +108,7 @@ def test_rear_inverter_reads_two_percent_less_than_the_battery(tesla: Path) -> N
     assert rows.gain_error_sd["motor_front"] > 0.05
     assert not rows.corrected.any()
     assert "the gain of motor_front needs a drive in which that current varies more" in found.summary()
+    assert not any(each.parameters.findings for each in found.vehicles_.values())
 
 
 def test_sum_at_zero_current_is_the_load_of_the_tesla(tesla: Path) -> None:

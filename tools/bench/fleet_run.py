@@ -28,7 +28,7 @@ from bench.row import LAYOUT, MEBIBYTE, Row
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.simulate import FleetPlan, draw_vehicles, simulate_fleet, trip_of, vehicle_drive
 from calibrator.artificial.trips import BuiltinTrips
-from calibrator.drive import Array
+from calibrator.drive import Array, Drive
 from calibrator.drives.delays import BranchDelays
 from calibrator.drives.store import write_drive
 from calibrator.experiments.recorded_trips import RecordedCase, builtin_fleet, record_vehicles
@@ -47,7 +47,7 @@ from calibrator.terminal.progress import shown
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
-__all__ = ["make_store", "resident_bytes", "rows"]
+__all__ = ["calibrate", "make_store", "resident_bytes", "rows", "watched"]
 
 FLEETS, QUICK_FLEETS = (1_000, 10_000, 100_000), (500, 1_000)
 KILLED_FLEET, KILLS = 2_000, 20
@@ -77,20 +77,20 @@ def rows(*, quick: bool) -> list[Row]:
         Per fleet size the time and the peak memory of a run, against those of the smallest fleet; and how many of the
         killed runs gave the same result.
     """
-    found, first = list[Row](), None
+    found, first = list[Row](), 0.0
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name)
         for vehicles in QUICK_FLEETS if quick else FLEETS:
             make_store(folder / "store", vehicles=vehicles)
-            seconds, peak = watched(_command(folder / "store", folder / "result"))
+            seconds, peak = watched(calibrate(folder / "store", folder / "result"))
             for made in ("store", "result"):
                 shutil.rmtree(folder / made)
             peer, ratio = ("the smallest fleet", first / peak) if first else (None, None)
             first, label = first or peak, f"{vehicles} vehicles from summaries"
-            memory = {"value": peak / MEBIBYTE, "unit": "MiB", "peer": peer, "ratio": ratio}
+            what = f"{label}, peak memory of all processes"
             found += [
                 Row(name=f"{label}, whole run", value=seconds, unit="s"),
-                Row(name=f"{label}, peak memory of all processes", **memory),
+                Row(name=what, value=peak / MEBIBYTE, unit="MiB", peer=peer, ratio=ratio),
             ]
         vehicles, kills = (QUICK_KILLED_FLEET, QUICK_KILLS) if quick else (KILLED_FLEET, KILLS)
         same = killed_runs(folder, vehicles, kills)
@@ -100,7 +100,8 @@ def rows(*, quick: bool) -> list[Row]:
     ]
 
 
-def _command(given: Path, out: Path, command: str = "calibrate") -> list[str]:
+def calibrate(given: Path, out: Path, command: str = "calibrate") -> list[str]:
+    """Command line of a calibration, or of what comes before it."""
     options = ("--layout", str(LAYOUT), "--out", str(out), "--workers", str(WORKERS))
     return [sys.executable, "-m", "calibrator", command, str(given), *options]
 
@@ -160,7 +161,7 @@ def killed_runs(folder: Path, vehicles: int, kills: int, command: str = "calibra
     def run(out: Path, limit_s: float | None = None) -> float:
         """Run to the end, or for so long, and return the time. [s]"""
         start_s, quiet = time.monotonic(), subprocess.DEVNULL
-        words = _command(given, out, command)
+        words = calibrate(given, out, command)
         with subprocess.Popen(words, stdout=quiet, stderr=quiet, env=environment, process_group=0) as process:
             try:
                 if process.wait(limit_s):
@@ -184,9 +185,9 @@ def _contents(result: Path) -> dict[str, bytes]:
     return {str(path.relative_to(result)): path.read_bytes() for path in result.rglob("*") if path.is_file()}
 
 
-def make_store(folder: Path, *, vehicles: int) -> None:
+def make_store(folder: Path, *, vehicles: int, branches: int = 2) -> None:
     """Write a store of summaries of so many vehicles with known kinds of faults."""
-    database, K = read_database(read_layout(LAYOUT)), len(BRANCHES)
+    database, K = read_database(read_layout(LAYOUT)), branches
     fleet = builtin_fleet(database, trips=TRIPS, duration_s=60.0 * MINUTES)
     case = RecordedCase(branches=K, sparsity=100.0, magnitude=MAGNITUDE)
     inputs = database.layout.fleet_inputs or database.layout.model_inputs
@@ -194,7 +195,10 @@ def make_store(folder: Path, *, vehicles: int) -> None:
     trips = [summarise_samples([item.with_inputs(inputs)], period_s=fleet.period_s) for item in recorded]
     fleet_inputs = recorded[0].with_inputs(inputs).input_names
     equipment = Equipment(
-        branches=BRANCHES, inputs=tuple(database.layout.model_inputs), fleet_inputs=fleet_inputs, notices=()
+        branches=recorded[0].branch_names,
+        inputs=tuple(database.layout.model_inputs),
+        fleet_inputs=fleet_inputs,
+        notices=(),
     )
     identity = store_identity(equipment, database, vehicles=vehicles, fleet="synthetic", fleet_ids=frozenset())
     store = SummaryStore(storage=open_storage(folder), identity=identity)
@@ -208,9 +212,17 @@ def make_store(folder: Path, *, vehicles: int) -> None:
 def _write(
     bucket: tuple[int, Sequence[str]], *, store: SummaryStore, trips: Sequence[DriveSummary], full_scale_a: float
 ) -> None:
-    (number, names), K = bucket, len(BRANCHES)
-    rng, kind = np.random.default_rng(number), {"sparsity": SPARSITY, "magnitude": MAGNITUDE, "balanced": True}
-    faults = draw_faults(rng, vehicles=len(names), branches=K, full_scale_a=full_scale_a, **kind)
+    (number, names), branches = bucket, store.identity.branches
+    K = len(branches)
+    faults = draw_faults(
+        np.random.default_rng(number),
+        vehicles=len(names),
+        branches=K,
+        sparsity=SPARSITY,
+        magnitude=MAGNITUDE,
+        full_scale_a=full_scale_a,
+        balanced=True,
+    )
     zero, unknown = np.zeros(K), np.full(K, np.nan)
     records = {}
     for j, name in enumerate(names):
@@ -218,7 +230,7 @@ def _write(
             vehicle=name,
             drives=("trip",),
             summary=_measured(trips[int(name[1:]) % TRIPS], faults.take(j)),
-            delays=BranchDelays(branches=BRANCHES, delay_s=zero, sd_s=zero, known=np.ones(K, bool)),
+            delays=BranchDelays(branches=branches, delay_s=zero, sd_s=zero, known=np.ones(K, bool)),
             zero_current=ZeroCurrent(offset_a=unknown, sd_a=unknown),
         )
         records[name] = [Record(vehicle=name, drives=("trip",), sources=("",), found=found)]
@@ -236,9 +248,10 @@ def _measured(trip: DriveSummary, faults: Faults) -> DriveSummary:
 
 def write_drives(folder: Path, drives: int, *, per_vehicle: int = 10) -> float:
     """Write drives of ten minutes at 10 Hz into a store; how long they are together. [h]"""
-    database, rng, base, seconds = read_database(read_layout(LAYOUT)), np.random.default_rng(0), [], 0.0
+    database, rng, seconds = read_database(read_layout(LAYOUT)), np.random.default_rng(0), 0.0
     trips = BuiltinTrips(seed=0, duration_s=DRIVE_S, unseen_s=60.0)
     plan = FleetPlan(vehicles=-(-drives // per_vehicle), currents=len(BRANCHES), sparsity=SPARSITY, magnitude=MAGNITUDE)
+    base: list[Drive] = []
     for number, vehicle in enumerate(draw_vehicles(plan, database.layout, BRANCHES)):
         for trip in range(per_vehicle):
             if len(base) < DRIVES:
@@ -273,11 +286,11 @@ def main() -> None:
             return
         if arguments.drives:
             hours = write_drives(folder / "fleet", arguments.drives)
-            seconds, peak = watched(_command(folder / "fleet", store, "summarise"))
+            seconds, peak = watched(calibrate(folder / "fleet", store, "summarise"))
             print(f"{arguments.drives} drives, {hours:.0f} h, summarised: {seconds:.0f} s, {peak / MEBIBYTE:.0f} MiB")
         elif not store.exists():
             make_store(store, vehicles=arguments.vehicles)
-        seconds, peak = watched(_command(store, folder / "result"))
+        seconds, peak = watched(calibrate(store, folder / "result"))
     print(f"calibrated: {seconds:.0f} s, {peak / MEBIBYTE:.0f} MiB")
 
 

@@ -416,7 +416,7 @@ def _draw_protection(rng: Random, identifier: int, size: int) -> Protection | No
         "CRC8",
     ]  # P04, P07 fit few messages
     name, step = rng.choice(often), rng.randint(1, 4)
-    windows = (Window(1, 0, 1),) * 3  # each frame counts by itself
+    windows: tuple[Window, ...] = (Window(1, 0, 1),) * 3  # each frame counts by itself
     if rng.random() < 0.5:
         sizes = [rng.randint(1, 12) for _ in range(3)]
         windows = tuple(Window(n, rng.randint(0, (n + 1) // 2), rng.randint(0, n // 2)) for n in sizes)
@@ -427,7 +427,9 @@ def _draw_protection(rng: Random, identifier: int, size: int) -> Protection | No
         found = _autosar(rng, name, identifier, size) if name in fitting else None
     else:
         found = _counter_crc8(rng, identifier & 0xFFFF, size) if size >= 3 else None
-    return found and Protection(**{**found, "toml": toml + found["toml"]}, max_step=step, windows=windows)
+    if found is None:
+        return None
+    return Protection(**{**found, "toml": toml + found["toml"]}, max_step=step, windows=windows)
 
 
 def _autosar(rng: Random, name: str, identifier: int, size: int) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def rows(*, quick: bool) -> list[Row]:
         drive = read_recording(log, database, vehicle="V", name="d").drive
         seconds = _best(lambda: gzip.decompress(packed.read_bytes()), READINGS)[1]
         found.append(Row(name="candump.gz unpacked, nothing else", value=drive.duration_s / 3600 / seconds, unit="h/s"))
-        thin = {name: _thinned(channel) for name, channel in (drive.branches | drive.inputs).items()}
+        thin = {name: _thinned(channel) for name, channel in {**drive.branches, **drive.inputs}.items()}
         two = {name: thin[name] for name in ("battery", "motor")}
         inputs = {name: thin[name] for name in drive.inputs}
         write_drive(folder / "store", replace(drive, branches=two, inputs=inputs), database.layout)
@@ -103,7 +103,7 @@ def _log_row(name: str, path: Path, database: VehicleDatabase) -> Row:
     """Frames per second of a log file; refused if both ways give different results."""
     recording, seconds = _best(lambda: read_recording(path, database, vehicle="V", name="d"), READINGS)
     others, peer_seconds = _best(lambda: _message_by_message(path, database), 1)
-    for channel_name, channel in (recording.drive.branches | recording.drive.inputs).items():
+    for channel_name, channel in {**recording.drive.branches, **recording.drive.inputs}.items():
         time_s, value = others[channel_name]
         np.testing.assert_allclose(channel.time_s, time_s, atol=TIME_STAMP_S, rtol=0.0, err_msg=channel_name)
         np.testing.assert_allclose(channel.value, value, rtol=1e-12, err_msg=channel_name)
@@ -117,7 +117,7 @@ def _log_row(name: str, path: Path, database: VehicleDatabase) -> Row:
 def _message_by_message(path: Path, database: VehicleDatabase) -> dict[str, tuple[Any, Any]]:
     """Times [s] and values of the same channels as most programs make them."""
     layout = database.layout
-    signals = {branch.name: (branch.source, branch.sign) for branch in layout.branch}
+    signals: dict[str, tuple[str, int]] = {branch.name: (branch.source, branch.sign) for branch in layout.branch}
     signals |= {item.name: (item.signal, 1) for item in layout.input}
     wanted: dict[int, list[tuple[str, str, int]]] = {}
     for name, (source, sign) in signals.items():
@@ -161,7 +161,7 @@ def _processor_s() -> float:
     """Processor time of this process, of those that it waited for, and of those that still run. [s]"""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     living = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
-    return sum(each.ru_utime + each.ru_stime for each in used) + sum(each.user + each.system for each in living)
+    return sum(each.ru_utime + each.ru_stime for each in used) + sum(float(each.user + each.system) for each in living)
 
 
 if __name__ == "__main__":

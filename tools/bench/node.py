@@ -36,7 +36,7 @@ def rows(*, quick: bool) -> list[Row]:
     """Measure; figures of SocketCAN are left out where there is none, which is said on standard error."""
     found = core_rows(20 if quick else 100) + process_rows(100_000 if quick else 10_000_000)
     words = ("-m", "bench.node_socketcan", "--frames", "1000" if quick else "10000", "--json")
-    command = [ROOT / "tools" / "with_vcan", sys.executable, *words]
+    command: list[str | Path] = [ROOT / "tools" / "with_vcan", sys.executable, *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, env=ENVIRONMENT)
     if done.returncode == NO_KERNEL:
         print(f"bench: no rows of SocketCAN: {done.stderr.strip()}", file=sys.stderr, flush=True)
@@ -69,7 +69,7 @@ def core_rows(repeats: int) -> list[Row]:
         for _ in range(repeats):
             start_s = time.perf_counter()
             for payload in vehicle.frames:  # as the loop over a bus hands them to the core
-                source = sources.get((IDENTIFIER, False))  # type: ignore[call-overload]
+                source = sources.get((IDENTIFIER, False))
                 if source is not None:
                     if mode is Mode.OVERLAY:
                         source.answer(payload, 0.0)
@@ -89,7 +89,7 @@ def core_rows(repeats: int) -> list[Row]:
 def _require_equal(vehicle: BenchVehicle, mode: Mode) -> None:
     """Refuse to compare ways that give different results."""
     message = vehicle.database.message("Pair" if mode is Mode.GATEWAY else "PairOut")
-    others = [payload for payload in map(plain_job(vehicle, mode), vehicle.frames) if payload is not None]
+    others = [bytes(payload) for payload in map(plain_job(vehicle, mode), vehicle.frames) if payload is not None]
     for ours, other in zip(vehicle.corrected(mode), others, strict=True):
         a, b = message.decode_simple(ours), message.decode_simple(other)
         for name in a.keys() - {"Crc"}:  # which follows from the others

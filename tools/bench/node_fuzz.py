@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from random import Random
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from bench.c_core import frames as random_frames
 from bench.fuzz_vehicles import FuzzBranch, FuzzMessage, FuzzVehicle, draw_vehicle
@@ -192,10 +192,11 @@ class Oracle:
     def _codes(self, message: FuzzMessage, data: bytes) -> dict[str, int]:
         """Codes of the signals that are whole in a payload, by cantools."""
         definition, selector = self._database.message(message.name), message.selector
-        found = definition.decode(data.ljust(message.size, b"\0"), decode_choices=False, scaling=False)
+        whole = data.ljust(message.size, b"\0")
+        found: Any = definition.decode(whole, decode_choices=False, scaling=False)
         selected = selector is not None and selector.end <= len(data)
         return {
-            signal.name: found[signal.name]  # type: ignore[index,misc]
+            signal.name: found[signal.name]
             for signal in message.signals
             if signal.name in found and signal.end <= len(data) and (selected or signal.above is None)
         }
@@ -278,7 +279,7 @@ def fuzz(frames: int, seed: int = 0, frames_per_vehicle: int = FRAMES_PER_VEHICL
                 Oracle(vehicle, database, mode),
                 wire(database, InForce(parameters=parameters), 0.0, mode=mode),
             )
-            sources = {key.identifier | key.extended << 31: source for key, source in corrector.sources.items()}
+            sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}
             for number, (identifier, data) in enumerate(drawn):
                 if data is None:  # a silence, after which the node forgets
                     continue

@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from statistics import median, quantiles
 
@@ -69,13 +70,11 @@ def rows(frames: int) -> list[Row]:
     for name, figures in best.items():
         for what, value in figures.items():
             (label, _, unit), ours = what.rpartition(", "), best["ecu-node"][what]
-            peer, ratio = (
-                f"as the peer of ecu-node, {ours:.3g} {unit}",
-                value / ours if label == "rate" else ours / value,
-            )
-            if name == "ecu-node":
-                peer = ratio = None
-            found.append(Row(name=f"SocketCAN, {name}: {label}", value=value, unit=unit, peer=peer, ratio=ratio))
+            row = Row(name=f"SocketCAN, {name}: {label}", value=value, unit=unit)
+            if name != "ecu-node":
+                ratio = value / ours if label == "rate" else ours / value
+                row = replace(row, peer=f"as the peer of ecu-node, {ours:.3g} {unit}", ratio=ratio)
+            found.append(row)
     return found
 
 
@@ -164,7 +163,7 @@ class _Line:
 
 def _compiled_gateway(vehicle: BenchVehicle, folder: Path) -> Path:
     """The program in C, ``gateway CHANNEL_IN CHANNEL_OUT``: the C core with the vehicle's calibration."""
-    checked = Checked(name="params", digest="0" * 64, parameters=vehicle.in_force.parameters, database=vehicle.database)
+    checked = Checked(name="params", digest="0" * 64, parameters=vehicle.parameters, database=vehicle.database)
     (folder / "hv_calibration.c").write_text(c_text(checked))
     sources = [Path(__file__).with_name("node_gateway.c"), folder / "hv_calibration.c", CORE / "hv_correction.c"]
     subprocess.run([shutil.which("gcc") or "gcc", "-O2", f"-I{CORE}", *sources, "-o", folder / "gateway"], check=True)

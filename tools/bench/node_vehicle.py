@@ -19,7 +19,7 @@ from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
 from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-from ecu_node.parameters import BranchParameters, write_parameters
+from ecu_node.parameters import BranchParameters, VehicleParameters, write_parameters
 
 __all__ = ["IDENTIFIER", "BenchVehicle", "make_vehicle", "plain_job"]
 
@@ -73,19 +73,19 @@ class BenchVehicle:
     ----------
     database : VehicleDatabase
         Layout and DBC; the parameters stand beside the layout, in ``params.json``.
-    in_force : InForce
+    parameters : VehicleParameters
         The true faults.
     frames : list of bytearray
         One round of payloads; the last is followed by the first. The last two bytes are the frame's number.
     """
 
     database: VehicleDatabase
-    in_force: InForce
+    parameters: VehicleParameters
     frames: list[bytearray]
 
     def corrector(self, mode: Mode) -> Corrector:
         """A node's core that corrects this vehicle."""
-        return wire(self.database, self.in_force, 0.0, mode=mode)
+        return wire(self.database, InForce(parameters=self.parameters), 0.0, mode=mode)
 
     def corrected(self, mode: Mode) -> list[bytes]:
         """What the node makes of one round of frames."""
@@ -115,7 +115,7 @@ def make_vehicle(folder: Path) -> BenchVehicle:
     faults = {name: BranchParameters(drift=d, offset_a=o_a, apply=True) for name, (d, o_a) in FAULTS.items()}
     parameters = true_parameters(database, faults)
     write_parameters(parameters, folder / "params.json")
-    vehicle = BenchVehicle(database=database, in_force=InForce(parameters=parameters), frames=[])
+    vehicle = BenchVehicle(database=database, parameters=parameters, frames=[])
     protection = vehicle.protection("Pair")
     for number in range(NUMBERS):  # this current flows from the battery into the motor
         battery_a = _AMPLITUDE_A * math.sin(2.0 * math.pi * number / NUMBERS)

@@ -7,6 +7,7 @@ measured in seconds of processor time on one thread, the best of some runs.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from time import process_time
 
 import numpy as np
@@ -48,14 +49,13 @@ def rows(*, quick: bool) -> list[Row]:
             for sparsity in SPARSITIES:
                 fleet = _simulated(branches, QUICK_VEHICLES if quick else vehicles, sparsity)
                 models = learn_fault_models(fleet, feed=0)
-                seconds = _best_s(lambda fleet=fleet, models=models: _estimate(fleet, models)) / len(fleet)
-                row = {"name": f"posterior, K = {branches}, S = {sparsity:.0f} %", "value": 1e3 * seconds}
-                peer_s, peer = None, None
+                seconds = _best_s(partial(_estimate, fleet, models)) / len(fleet)
+                peer, ratio = None, None
                 if branches in WITH_PEER:
                     peer_s = _basis_pursuit_s(fleet, QUICK_SOLVED if quick else SOLVED)
-                    peer = f"basis pursuit, cvxpy (DPP) and Clarabel: {1e3 * peer_s:.2f} ms"
-                ratio = None if peer_s is None else peer_s / seconds
-                found.append(Row(**row, unit="ms per vehicle", peer=peer, ratio=ratio))
+                    peer, ratio = f"basis pursuit, cvxpy (DPP) and Clarabel: {1e3 * peer_s:.2f} ms", peer_s / seconds
+                name = f"posterior, K = {branches}, S = {sparsity:.0f} %"
+                found.append(Row(name=name, value=1e3 * seconds, unit="ms per vehicle", peer=peer, ratio=ratio))
         fleet = _simulated(2, QUICK_FLEET if quick else FLEET, SPARSITIES[0])
         seconds = _best_s(lambda: _estimate(fleet, learn_fault_models(fleet, feed=0)))
         name = f"fleet of {len(fleet)} vehicles, hyper-parameters too, K = 2, S = {SPARSITIES[0]:.0f} %"
@@ -75,7 +75,8 @@ def _best_s(measured: Callable[[], object]) -> float:
 def _basis_pursuit_s(fleet: EvidenceRows, vehicles: int) -> float:
     """Time per vehicle. [s]"""
     K = fleet.branches
-    pairs = list(zip(np.exp(fleet.relative[:, :K]), fleet.constant[:, :K], strict=True))[:vehicles]
+    slopes, intercepts = np.exp(fleet.values[:, fleet.places.slopes]), fleet.values[:, fleet.places.intercepts]
+    pairs = list(zip(slopes, intercepts, strict=True))[:vehicles]
     epsilon, problem = RESIDUAL * K * (SLOPE_SD**2 + INTERCEPT_SD**2), BasisPursuit(K)
     return _best_s(lambda: [problem.solve(a, b, epsilon=epsilon) for a, b in pairs]) / len(pairs)
 

@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 
 from calibrator.artificial.simulate import (
-    FleetPlan,
     Vehicle,
-    draw_vehicles,
     vehicle_drive,
     vehicle_frames,
     write_vehicle,
@@ -53,38 +51,11 @@ def frames(database: VehicleDatabase, v: Vehicle) -> list[FrameSeries]:
     return vehicle_frames(np.random.default_rng(3), database, v, trip())
 
 
-def test_healthy_vehicle_shows_the_ideal_currents_in_the_sign_of_its_sensors(database: VehicleDatabase) -> None:
-    series = frames(database, vehicle(faults()))
-    for message, signal in (("HV_Battery", "BatteryCurrent"), ("HV_Motor", "MotorCurrent")):
-        time_s, value = decoded(database, series, message, signal)
-        expected = np.interp(time_s, trip().time_s, trip().currents_a["battery"])
-        np.testing.assert_allclose(value, expected, atol=0.0101)
-
-
-def test_faulty_sensor_shows_drift_and_offset(database: VehicleDatabase) -> None:
-    time_s, value = decoded(database, frames(database, vehicle(faults(0.2, 10.0))), "HV_Motor", "MotorCurrent")
-    into_junction = -value
-    motor = np.interp(time_s, trip().time_s, trip().currents_a["motor"])
-    np.testing.assert_allclose(into_junction, 1.2 * motor + 10.0, atol=0.0101)
-
-
-def test_delayed_branch_shows_the_past(database: VehicleDatabase) -> None:
-    late = vehicle(faults(), delay_s=np.array([0.0, 0.3]))
-    time_s, value = decoded(database, frames(database, late), "HV_Motor", "MotorCurrent")
-    np.testing.assert_allclose(value, np.interp(time_s - 0.3, trip().time_s, trip().currents_a["battery"]), atol=0.0101)
-
-
 def test_unmeasured_load_is_carried_by_the_battery_alone(database: VehicleDatabase) -> None:
     for message, signal, extra in (("HV_Battery", "BatteryCurrent", 3.0), ("HV_Motor", "MotorCurrent", 0.0)):
         _, with_load = decoded(database, frames(database, vehicle(faults(), unmeasured_a=3.0)), message, signal)
         _, without = decoded(database, frames(database, vehicle(faults())), message, signal)
         np.testing.assert_allclose(with_load - without, extra, atol=0.0201)
-
-
-def test_noise_has_the_size_asked_for(database: VehicleDatabase) -> None:
-    _, with_noise = decoded(database, frames(database, vehicle(faults(), noise_a=0.4)), "HV_Motor", "MotorCurrent")
-    _, without = decoded(database, frames(database, vehicle(faults())), "HV_Motor", "MotorCurrent")
-    assert np.std(with_noise - without) == pytest.approx(0.4, rel=0.05)
 
 
 def test_messages_keep_their_cycle_time_and_their_own_instants(database: VehicleDatabase) -> None:
@@ -93,16 +64,6 @@ def test_messages_keep_their_cycle_time_and_their_own_instants(database: Vehicle
     assert np.mean(np.diff(series[288])) == pytest.approx(0.010, rel=0.01)
     assert not np.intersect1d(series[272], series[288]).size
     assert all(np.all(np.diff(time_s) > 0.0) for time_s in series.values())
-
-
-def test_delays_and_loads_stay_in_their_ranges(database: VehicleDatabase) -> None:
-    plan = FleetPlan(
-        vehicles=200, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.3, unmeasured_a=(3.0, 5.0)
-    )
-    drawn = draw_vehicles(plan, database.layout, ("battery", "motor", "auxiliary"))
-    delays = np.array([vehicle.delay_s for vehicle in drawn])
-    assert 0.0 <= delays.min() < 0.02 < 0.28 < delays.max() <= 0.3
-    assert min(vehicle.unmeasured_a for vehicle in drawn) == 0.0
 
 
 def test_truth_holds_the_moments_of_the_true_currents(database: VehicleDatabase, tmp_path: Path) -> None:

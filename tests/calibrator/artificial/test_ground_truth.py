@@ -3,13 +3,11 @@ import pytest
 
 from calibrator.artificial.trips import (
     GroundTruth,
-    choose_branches,
     cut_and_rejoin,
     ground_truth_from_drive,
     with_branches,
 )
 from calibrator.drive import Channel, Drive
-from ecu_node.database import VehicleDatabase
 
 
 def trip(samples: int = 100, name: str = "trip", level: float = 10.0) -> GroundTruth:
@@ -30,12 +28,6 @@ def test_balancing_branch_is_minus_the_sum_of_the_others() -> None:
     np.testing.assert_allclose(two.matrix_a().sum(axis=1), 0.0)
 
 
-def test_branches_are_chosen_in_the_order_of_the_layout(database: VehicleDatabase) -> None:
-    available = ("auxiliary", "motor", "battery")
-    assert choose_branches(database.layout, available, 2) == ("battery", "motor")
-    assert choose_branches(database.layout, available, 3) == ("battery", "motor", "auxiliary")
-
-
 def test_rejoined_trip_is_made_of_pieces_between_standstills() -> None:
     source = trip(200)
     joined = cut_and_rejoin(np.random.default_rng(0), [source], duration_s=10.0, name="new")
@@ -46,13 +38,6 @@ def test_rejoined_trip_is_made_of_pieces_between_standstills() -> None:
     assert np.all(joined.inputs["speed"][jumps] == 0.0)
     assert set(current) <= set(source.currents_a["battery"])
     np.testing.assert_allclose(joined.matrix_a().sum(axis=1), 0.0, atol=1e-12)
-
-
-def test_trip_without_standstill_stays_whole() -> None:
-    source = trip(50)
-    moving = GroundTruth(name="x", period_s=0.1, currents_a=source.currents_a, inputs={"speed": np.full(50, 30.0)})
-    joined = cut_and_rejoin(np.random.default_rng(0), [moving], duration_s=5.0, name="new")
-    np.testing.assert_array_equal(joined.currents_a["battery"], source.currents_a["battery"])
 
 
 def test_recorded_drive_becomes_a_trip_over_the_span_of_all_channels() -> None:

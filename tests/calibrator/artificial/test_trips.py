@@ -7,10 +7,10 @@ import pytest
 
 from calibrator.artificial.trips import (
     BuiltinTrips,
+    CommonTrips,
     GroundTruth,
     RecordedTrips,
     TripSource,
-    choose_branches,
     choose_trips,
 )
 from calibrator.drive import Channel, Drive
@@ -65,7 +65,7 @@ def test_single_recording_is_cut_in_time() -> None:
 
 
 def test_common_trips_are_the_same_for_all_and_differ_by_purpose() -> None:
-    trips = BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0, common=True)
+    trips = CommonTrips(of=BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0))
     first, second = trips.trip(0, "calibration"), trips.trip(5, "calibration")
     np.testing.assert_array_equal(first.currents_a["battery"], second.currents_a["battery"])
     unseen = trips.trip(0, "unseen")
@@ -106,25 +106,11 @@ def renamed(layout: Layout, *, branches: bool = False, inputs: Sequence[str] = (
     return msgspec.structs.replace(layout, branch=branch, derived=derived)
 
 
-def test_builtin_vehicle_has_all_that_its_own_layout_names(database: VehicleDatabase) -> None:
-    assert builtin(database.layout).notices == ()
-
-
 def test_layout_with_other_branches_is_told_those_of_the_builtin_vehicle(database: VehicleDatabase) -> None:
     with pytest.raises(FleetError, match=r"two or more branches named battery, motor, .* or give --drives a store"):
         builtin(renamed(database.layout, branches=True))
 
 
-def test_layout_with_other_inputs_is_told_those_of_the_builtin_vehicle(database: VehicleDatabase) -> None:
-    with pytest.raises(FleetError, match="model inputs made of voltage, torque, speed"):
-        builtin(renamed(database.layout, inputs=["voltage"]))
-
-
 def test_inputs_that_the_builtin_vehicle_has_not_are_named(database: VehicleDatabase) -> None:
     (notice,) = builtin(renamed(database.layout, inputs=["heater_demand"])).notices
     assert notice == "model inputs that the built-in vehicle has not: heater_current"
-
-
-def test_drives_with_other_branches_than_the_layout_are_refused_with_both(database: VehicleDatabase) -> None:
-    with pytest.raises(FleetError, match=r"has the branches battery, .*, these drives have pack, drive; at least two"):
-        choose_branches(database.layout, ("pack", "drive"), 2)

@@ -210,6 +210,15 @@ def test_contradicting_knowledge_corrects_nothing() -> None:
     assert not calibrator.parameters_.corrected.any()
 
 
+def test_branch_that_stands_still_for_a_while_is_no_finding() -> None:
+    """While it does it has no noise either; taken for noisy, it once made a step of 10^10 A."""
+    frame = recording(90)
+    steady = frame["heater"].where(frame.index > 150.0, -2.0)
+    frame["battery"] -= steady - frame["heater"]
+    frame["heater"] = steady
+    assert not JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION).vehicles_["vehicle"].parameters.findings
+
+
 @pytest.mark.parametrize(
     ("change", "cause"),
     [

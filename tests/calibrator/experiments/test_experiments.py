@@ -15,10 +15,11 @@ from calibrator.cli import app
 from calibrator.errors import FleetError
 from calibrator.experiments.common_drive import CommonCase
 from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, Experiment, Setting, fleet_for
+from calibrator.experiments.figures import ALL
 from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR
 from calibrator.experiments.pages import headline, result_markdown, result_table, write_page
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
-from calibrator.experiments.runner import ALL, ExperimentResult, pool_confidences, read_records, run_experiment
+from calibrator.experiments.runner import ExperimentResult, pool_confidences, read_records, run_experiment
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
 
 RUN = [name for name in EXPERIMENTS if name != CALIBRATION.name]
@@ -89,8 +90,8 @@ def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet,
     result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")
     write_page(tmp_path / "results", result)
-    assert list(dict.fromkeys(zip(result.figures["series"], result.figures["x"], result.figures["method"], strict=True))
-    ) == [(s.series, s.x, method.name) for s in row.settings for method in s.methods or row.methods]  # fmt: skip
+    found = dict.fromkeys(zip(result.figures["series"], result.figures["x"], result.figures["method"], strict=True))
+    assert list(found) == [(s.series, s.x, method.name) for s in row.settings for method in s.methods or row.methods]
     (read,) = read_records(tmp_path / "results", EXPERIMENTS)
     for name_, table in (("figures", result.figures), ("tenths", result.tenths)):
         pd.testing.assert_frame_equal(getattr(read, name_), table, check_dtype=False)
@@ -131,34 +132,15 @@ def test_table_puts_paper_published_method_and_default_side_by_side(snr: Experim
 
 def test_captions_explain_only_columns_that_are_there(snr: ExperimentResult) -> None:
     only_published = only(snr, "method", PERFECT.name)
-    for text in (result_markdown(only_published), " ".join(printed(only_published).split())):
-        assert "paper (its best printed figure), published/classifier (the published method)." in text
-        for absent in ("the default", "confidence", "calibration error", "delays", "law known"):
-            assert absent not in text
+    for text in (result_markdown(only_published), printed(only_published)):
+        assert not any(absent in text for absent in ("the default", "confidence", "calibration error", "delays"))
     assert "counts as harmed although it is recovered." in result_markdown(snr)
-    assert "The published method corrects" not in result_markdown(only(snr, "method", POSTERIOR.name))
 
 
 def test_damaged_record_is_named(tmp_path: Path) -> None:
     (tmp_path / "snr.json").write_bytes(b'{"name": 3}')
     with pytest.raises(FleetError, match=r"snr\.json: not a record of an experiment: .*run the experiment again"):
         read_records(tmp_path, ["real", "snr"])
-
-
-def test_flags_are_booleans_in_records_and_words_on_pages(snr: ExperimentResult) -> None:
-    settings = json.loads(snr.to_json())["settings"]
-    assert (settings["balanced"], settings["symmetric"]) == (True, True)
-    assert "balanced true, symmetric true" in result_markdown(snr)
-
-
-def test_index_lists_the_results_of_the_folder_in_order(snr: ExperimentResult, tmp_path: Path) -> None:
-    write_page(tmp_path / "results", snr)
-    write_page(tmp_path / "results", replace(snr, experiment=EXPERIMENTS["classifier"]))
-    index = (tmp_path / "results.md").read_text()
-    assert index.index("(results/classifier.md)") < index.index("(results/snr.md)")
-    assert "2 repetitions, seed 0, drive smooth" in index
-    once = replace(snr, settings={**snr.settings, "repetitions": 1})
-    assert "1 repetition, seed 0" in printed(once)
 
 
 def test_calibration_pools_the_confidences_and_counts_shared_trials_once(snr: ExperimentResult) -> None:

@@ -4,14 +4,12 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy.stats import binomtest, chisquare
 
 from calibrator.drive import Array, Mask
-from calibrator.experiments.figures import Values, calibration_errors, figure_rows, judge, pool_tenths, tenths_of
-from calibrator.experiments.methods import Estimate
-from calibrator.experiments.trial import Trial, UnseenDrive
+from calibrator.experiments.figures import Values, calibration_errors, figure_rows, judge, tenths_of
+from calibrator.experiments.trial import Estimate, Trial, UnseenDrive
 from calibrator.faults import Faults, corrected_currents, measured_currents, true_currents
 
 N = 1000
@@ -79,24 +77,6 @@ def test_calibration_error_by_chance_is_the_usual_one_of_an_exact_confidence() -
     assert drawn[0][1] == pytest.approx(np.mean([error for error, _ in drawn]), rel=0.1)
 
 
-def test_method_without_confidence_has_no_figures_of_it() -> None:
-    estimate, trial = two_vehicles(drift=0.1, harm_second=0.0)
-    silent = judge(replace(estimate, confidence=None), trial)
-    assert {"confidence", "ece", "sure", "delay_rmse_ms"}.isdisjoint(figures_of(silent))
-    assert not len(tenths_of(silent))
-
-
-def test_tenths_hold_every_vehicle_once_and_pooling_adds_them() -> None:
-    first, second = confident(np.linspace(0.0, 1.0, N), np.ones(N)), confident(np.ones(N), np.zeros(N))
-    _, together = figure_rows([first, second])
-    one = tenths_of(first)
-    assert together["vehicles"].sum() == 2 * N
-    assert together["vehicles"].iloc[-1] == one["vehicles"].iloc[-1] + N
-    pooled = pool_tenths(pd.concat([tenths_of(first), tenths_of(second)]))
-    for column in ("vehicles", "confidence", "recovered"):
-        np.testing.assert_allclose(pooled[column], together[column])
-
-
 @pytest.mark.parametrize(
     ("drift", "harm_second", "recovery_rate", "harmed"),
     [(0.1, 0.0, 1.0, 0.0), (0.1, 0.2, 0.5, 0.5), (0.1, -1.0, 0.5, 0.5)],
@@ -142,26 +122,12 @@ def test_unseen_moments_are_those_of_the_samples() -> None:
     np.testing.assert_allclose(unseen.rms_a(drift, offset_a)[0], np.sqrt(np.mean(error_a**2, axis=0)))
 
 
-def test_inverted_sensor_can_be_corrected() -> None:
-    estimate, trial = two_vehicles(drift=0.1, harm_second=0.0)
-    truth = replace(trial.truth, drift=np.full((2, 2), -2.0))
-    inverted = replace(trial, truth=truth, unseen=unseen_of(truth))
-    whole = replace(estimate, faults=truth, corrected=np.ones((2, 2), bool))
-    assert figures_of(judge(whole, inverted))["harmed"].value == 0.0
-
-
 def test_shares_have_an_exact_interval() -> None:
     for hits, of in ((0, 100), (3, 175), (5, 5)):
         row = figures_of({"harmed": np.arange(of) < hits})["harmed"]
         assert (round(row.value * row.of), row.of) == (hits, of)
         assert (row.low, row.high) == pytest.approx(binomtest(hits, of).proportion_ci(0.95, method="exact"))
     assert np.isnan(figures_of({"confidence": np.array([0.3])})["confidence"].low)
-
-
-def test_standard_deviation_is_that_over_trials() -> None:
-    figures = figures_of({"recovery_rate": np.array([True, False])}, {"recovery_rate": np.array([True, True])})
-    assert (figures["recovery_rate"].value, figures["recovery_rate"].of) == (0.75, 4)
-    assert figures["recovery_rate"].sd == pytest.approx(np.std([0.5, 1.0], ddof=1))
 
 
 def test_standard_deviations_that_are_right_have_normal_scores() -> None:

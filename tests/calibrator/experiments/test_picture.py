@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from calibrator.drive import Array
-from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS
+from calibrator.experiments.experiments import EXPERIMENTS
 from calibrator.experiments.figures import figure_rows
-from calibrator.experiments.methods import PERFECT, POSTERIOR, TREE
-from calibrator.experiments.picture import FEW, draw_result
+from calibrator.experiments.methods import PERFECT, POSTERIOR
+from calibrator.experiments.picture import draw_result
 from calibrator.experiments.runner import ExperimentResult, pool_confidences
 
 BIASES = ("0", "0.2", "0.4", "0.5")
@@ -81,6 +81,8 @@ def test_equal_curves_stand_side_by_side_inside_the_axes(equal: ExperimentResult
             assert np.all(np.abs(one[:, 0] - other[:, 0]) > 5.0)
             np.testing.assert_allclose(one[:, 1], other[:, 1])
         assert all(axes.get_window_extent().contains(*point) for place in places for point in place)
+        for looks in (Line2D.get_color, Line2D.get_marker, Line2D.get_linestyle):
+            assert len({looks(line) for line in curves_of(axes)}) == len(BIASES)
 
 
 def test_bars_are_the_95_percent_intervals(equal: ExperimentResult) -> None:
@@ -90,15 +92,6 @@ def test_bars_are_the_95_percent_intervals(equal: ExperimentResult) -> None:
         lines = [c for c in axes.collections if isinstance(c, LineCollection)]
         ends = np.concatenate([np.ravel([s[:, across] for s in line.get_segments()]) for line in lines])
         assert {0.0, 0.116, 0.884, 1.0} == {round(float(end), 3) for end in ends}, "of 0 and of 30 of 30 vehicles"
-
-
-def test_curves_of_a_panel_differ_in_colour_marker_and_line_style(equal: ExperimentResult) -> None:
-    methods = result_of(*((20, m.name, 0.5, "") for m in (TREE, PERFECT, POSTERIOR)), name="snr")
-    for result, number in ((equal, len(BIASES)), (methods, 3)):
-        lines = curves_of(drawn(result).axes[0])
-        assert len({line.get_color() for line in lines}) == number
-        assert len({line.get_marker() for line in lines}) == number
-        assert len({line.get_linestyle() for line in lines}) == number
 
 
 def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult) -> None:
@@ -112,32 +105,6 @@ def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult
     assert [text.get_text() for text in drawn(equal).legends[0].get_texts()] == list(BIASES)
 
 
-def test_panels_without_any_figure_are_left_out(equal: ExperimentResult) -> None:
-    published = replace(equal, figures=equal.figures[equal.figures["method"] == PERFECT.name])
-    assert len(drawn(published).axes) == 1
-    assert len(drawn(equal).axes) == 3
-
-
-@pytest.mark.parametrize("name", ["classifier", "sparsity"])
-def test_papers_figure_does_not_hide_ours(name: str) -> None:
-    figure = drawn(result_of((60, TREE.name, 0.9, ""), (60, POSTERIOR.name, 0.9, ""), name=name))
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert sum(label.startswith("paper, ") for label in labels) == 1
-    (paper,) = [c for c in figure.axes[0].collections if str(c.get_label()).startswith("paper, ")]
-    assert len(np.asarray(paper.get_facecolor())) == 0
-
-
 def test_map_shows_every_rate(equal: ExperimentResult) -> None:
     texts = [text.get_text() for text in drawn(shown_as(equal, "phase")).axes[0].texts]
     assert sorted(texts) == ["0.00"] * len(BIASES) + ["1.00"] * len(BIASES)
-
-
-def test_experiments_of_the_reliability_differ_and_few_vehicles_are_hollow() -> None:
-    names = [name for name in EXPERIMENTS if name not in {CALIBRATION.name, "attacks"}]
-    results = [replace(result_of((20, POSTERIOR.name, k / 30.0, "")), experiment=EXPERIMENTS[name])
-               for k, name in enumerate(names)]  # fmt: skip
-    figure = drawn(pool_confidences(results))
-    labelled = [line for line in figure.axes[0].lines if str(line.get_label()).startswith(tuple(names))]
-    assert len({line.get_color() for line in labelled}) == len({line.get_marker() for line in labelled}) == len(names)
-    faces = [line.get_markerfacecolor() for line in figure.axes[0].lines[1:] if len(np.asarray(line.get_xydata())) == 1]
-    assert set(faces[1:-1]) == {"white"}, f"less than {FEW} vehicles each"

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from calibrator.experiments.recorded_trips import (
     NOISE,
     RecordedCase,
     RecordedFleet,
-    builtin_fleet,
     read_fleet,
     record_vehicles,
     recorded_trial,
@@ -30,32 +28,6 @@ def fleet() -> RecordedFleet:
     return small_fleet()
 
 
-def test_trips_of_a_fleet_sum_to_zero_and_have_the_first_branches_of_the_layout(fleet: RecordedFleet) -> None:
-    for count in (2, 3):
-        trip = fleet.with_branches(count)[0]
-        assert tuple(trip.currents_a) == ("battery", "motor", "auxiliary")[:count]
-        np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
-
-
-def test_part_of_a_fleet_says_what_it_is_a_part_of(fleet: RecordedFleet) -> None:
-    part = fleet.take(4, duration_s=60.0)
-    assert part.name == f"the first 60 s of 4 of {fleet.name}"
-    assert [len(trip) for trip in part.trips] == [600] * 4
-
-
-def test_more_branches_than_the_trips_have_are_refused(fleet: RecordedFleet) -> None:
-    with pytest.raises(FleetError, match="4 currents asked for; these drives have 3"):
-        fleet.with_branches(4)
-
-
-def test_inputs_are_those_of_the_layout_that_the_trip_has(fleet: RecordedFleet) -> None:
-    trip = fleet.trips[0]
-    inputs = fleet.inputs(trip)
-    assert "low_voltage_current" not in inputs
-    power = trip.inputs["torque"] * trip.inputs["speed"] / trip.inputs["voltage"]
-    np.testing.assert_allclose(inputs["driving_current"], np.maximum(power, 0.0))
-
-
 def test_samples_obey_the_fault_model_within_noise_and_steps(fleet: RecordedFleet) -> None:
     case = RecordedCase(branches=3, sparsity=60.0, unmeasured_a=(3.0, 1.0))
     trips = fleet.with_branches(3)
@@ -66,7 +38,7 @@ def test_samples_obey_the_fault_model_within_noise_and_steps(fleet: RecordedFlee
         sums = true.sum(axis=1)
         assert sums.mean() == pytest.approx(vehicles.unmeasured_a[j], abs=0.1)
         assert sums.std() == pytest.approx(noise_a * np.sqrt(np.sum((1.0 + truth.drift[j]) ** -2)), rel=0.1)
-        steps = samples.currents_a / fleet.resolution_a(samples.branch_names)
+        steps = samples.currents_a / [fleet.database.current_step_a(name) for name in samples.branch_names]
         np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
     assert vehicles.unmeasured_a.std() > 0.3
 
@@ -113,16 +85,6 @@ def test_distribution_is_that_of_drawn_fleets_and_draws_such_fleets(
         sizes = np.abs(faults.drift[faults.drift != 0.0])
         assert (sizes.min(), sizes.mean(), sizes.max()) == pytest.approx((0.05, 0.15, 0.25), abs=0.002)
         np.testing.assert_allclose(faults.hardware_offset_a.sum(axis=1), 0.0, atol=1e-9)
-
-
-def test_any_vehicle_of_a_fleet_that_is_not_balanced_may_have_a_hardware_fault(fleet: RecordedFleet) -> None:
-    case = RecordedCase(branches=3, sparsity=60.0)
-    balanced, any_vehicle = (
-        recorded_trial(fleet, replace(case, balanced=balanced), 0).truth for balanced in (True, False)
-    )
-    assert np.count_nonzero(balanced.has_hardware_fault) <= len(fleet.trips) // 2
-    assert np.count_nonzero(any_vehicle.has_hardware_fault) > len(fleet.trips) // 2
-    np.testing.assert_array_equal(balanced.drift.shape, any_vehicle.drift.shape)
 
 
 @pytest.mark.long
@@ -174,14 +136,3 @@ def test_trips_of_a_store_are_read_and_those_without_good_samples_left_out(
     read = read_fleet(tmp_path / "store", read_database(layout))
     assert read.name == "4 drives of store (1 left out)"
     assert len(read.trips) == 4
-
-
-def test_builtin_trips_stand_in_for_recordings_and_say_so() -> None:
-    made = builtin_fleet(read_database(read_layout(LAYOUT)), trips=4, duration_s=60.0)
-    assert made.name == "4 built-in trips, no recordings"
-    assert not np.array_equal(made.trips[0].matrix_a()[:400], made.trips[1].matrix_a()[:400])
-
-
-def test_fleet_of_too_few_trips_is_refused(fleet: RecordedFleet) -> None:
-    with pytest.raises(FleetError, match="small: 3 usable trips, at least 4 are needed"):
-        replace(fleet, trips=fleet.trips[:3])

@@ -5,7 +5,6 @@ from calibrator.faults import Faults
 from calibrator.published.classify import (
     FaultTrees,
     classify_by_threshold,
-    classify_by_truth,
     decision_criterion,
 )
 
@@ -38,15 +37,6 @@ def test_threshold_is_a_third_of_the_fleets_spread() -> None:
     threshold = eta.std(ddof=1) / 3.0
     np.testing.assert_array_equal(found.hardware, eta > threshold)
     assert found.sensor.all()
-
-
-def test_fleet_of_one_is_compared_with_zero() -> None:
-    assert classify_by_threshold(np.array([[1.0, 1.0, 0.0]])).hardware.tolist() == [True]
-
-
-def test_the_four_cases_are_those_of_the_paper() -> None:
-    found = classify_by_truth(faults_of([0.0, 0.1, 0.0, 0.1], [0.0, 0.0, 0.2, 0.2]))
-    assert found.case.tolist() == [1, 2, 3, 4]
 
 
 def test_trees_learn_what_separates_the_classes() -> None:

@@ -3,9 +3,8 @@ import pytest
 
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
-from calibrator.errors import FleetError
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.published.evidence import collect_evidence, fleet_mean
+from calibrator.published.evidence import collect_evidence
 
 
 def ideal_currents(samples: int = 600) -> Array:
@@ -27,11 +26,6 @@ def simulations(i_s: Array, faults: Faults, noise_a: float) -> Array:
     return np.asarray(clean + noise_a * np.random.default_rng(1).normal(size=clean.shape))
 
 
-def test_mean_of_a_symmetric_fleet_is_the_ideal_current() -> None:
-    i_s = ideal_currents()
-    np.testing.assert_allclose(fleet_mean(simulations(i_s, symmetric_fleet(), 0.0)), i_s, atol=1e-10)
-
-
 def test_noise_free_slopes_and_intercepts_are_those_of_the_faults() -> None:
     i_s, faults = ideal_currents(), symmetric_fleet()
     evidence = collect_evidence(simulations(i_s, faults, 0.0), i_s, np.zeros(len(faults)))
@@ -48,30 +42,3 @@ def test_variances_are_those_of_white_noise() -> None:
     offset_score = (evidence.intercepts_a - b) / np.sqrt(evidence.intercept_variances_a2)
     assert slope_score.std() == pytest.approx(1.0, abs=0.06)
     assert offset_score.std() == pytest.approx(1.0, abs=0.06)
-
-
-def test_features_are_the_mean_squares_of_deviation_and_junction_sum() -> None:
-    i_s, faults = ideal_currents(), symmetric_fleet(4)
-    simulated = simulations(i_s, faults, 2.0)
-    junction_a2 = np.mean(simulated.sum(axis=2) ** 2, axis=1)
-    features = collect_evidence(simulated, i_s, junction_a2).features
-    np.testing.assert_allclose(features[:, :3], np.mean((simulated - i_s) ** 2, axis=1))
-    np.testing.assert_array_equal(features[:, 3], junction_a2)
-
-
-def test_empty_fleet_is_refused() -> None:
-    with pytest.raises(FleetError, match="no vehicle left"):
-        fleet_mean([])
-
-
-def test_constant_reference_is_refused() -> None:
-    reference = ideal_currents()
-    reference[:, 1] = 4.0
-    with pytest.raises(FleetError, match="branch 2 is constant"):
-        collect_evidence([reference], reference, np.zeros(1))
-
-
-def test_fleets_of_different_size_are_refused() -> None:
-    reference = ideal_currents()
-    with pytest.raises(FleetError, match="1 vehicles were simulated, but 2"):
-        collect_evidence([reference], reference, np.zeros(2))

@@ -3,29 +3,12 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
-from calibrator.estimator.published_fleet import SLOPE_SPREAD
-from calibrator.faults import slopes_and_intercepts
 from tests.calibrator.command_here import calibrator
 
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 FILES = ("--layout", LAYOUT, "--workers", 1)
-
-
-def test_spread_of_slopes_is_that_of_the_default_faults() -> None:
-    faults = draw_faults(
-        np.random.default_rng(0),
-        vehicles=20_000,
-        branches=2,
-        sparsity=80.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=400.0,
-    )
-    slopes, _ = slopes_and_intercepts(faults)
-    assert slopes.std() == pytest.approx(SLOPE_SPREAD, rel=0.02)
 
 
 @pytest.fixture(scope="module")

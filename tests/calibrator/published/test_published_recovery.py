@@ -3,16 +3,11 @@ import pytest
 
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
-from calibrator.errors import FleetError
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.classify import Classification, classify_by_truth
 from calibrator.published.evidence import FleetEvidence
 from calibrator.published.recovery import (
-    BasisPursuit,
-    BasisPursuitError,
-    quadratic_forms,
     recover_fleet,
-    refit_support,
 )
 from calibrator.score import recovered
 
@@ -44,15 +39,6 @@ def evidence_of(faults: Faults, *, slope_sd: float = 0.0, offset_sd: float = 0.0
     )
 
 
-@pytest.mark.parametrize("branches", [2, 3, 5])
-def test_quadratic_forms_are_the_slopes_and_intercepts(branches: int) -> None:
-    x = np.random.default_rng(0).normal(size=3 * branches)
-    a, b = slopes_and_intercepts(faults_from(x[None]))
-    lifted = np.append(x, 1.0)
-    values = np.einsum("i,kij,j->k", lifted, quadratic_forms(branches), lifted)
-    np.testing.assert_allclose(values, np.append(a[0], b[0] / FULL_SCALE_A), atol=1e-12)
-
-
 @pytest.mark.parametrize("branches", [2, 3, 4])
 def test_single_faults_are_recovered_exactly_without_noise(branches: int) -> None:
     x = 0.15 * np.eye(3 * branches)
@@ -73,14 +59,6 @@ def test_fleet_of_sparse_faults_is_recovered_through_noise() -> None:
     evidence = evidence_of(truth, slope_sd=0.001, offset_sd=0.0002)
     found = recover_fleet(evidence, classify_by_truth(truth), full_scale_a=FULL_SCALE_A)
     assert recovered(found.faults, truth, full_scale_a=FULL_SCALE_A, smallest_fault=0.05).mean() > 0.99
-
-
-def test_cases_one_and_two_get_no_sensor_parameters() -> None:
-    truth = faults_from(np.array([[0.1, 0.0, 0.0, 0.2, 0.1, 0.0]]).repeat(2, axis=0))
-    classes = Classification(hardware=np.array([False, True]), sensor=np.array([False, False]))
-    found = recover_fleet(evidence_of(truth), classes, full_scale_a=FULL_SCALE_A)
-    assert not found.faults.drift.any()
-    assert not found.faults.offset_a.any()
 
 
 def test_case_three_reads_the_parameters_from_the_regression() -> None:
@@ -117,20 +95,3 @@ def test_a_failed_optimisation_is_named_and_the_fleet_goes_on() -> None:
     assert "basis pursuit" in found.failed[0]
     assert not found.faults.offset_a[0].any()
     np.testing.assert_allclose(found.faults.offset_a[1], truth.offset_a[1], atol=1e-4)
-
-
-def test_solver_that_gives_up_is_named() -> None:
-    with pytest.raises(BasisPursuitError, match=r"basis pursuit (failed|ended)"):
-        BasisPursuit(2).solve(np.array([1e90, 1.0]), np.zeros(2), epsilon=1e-6)
-
-
-def test_refit_that_runs_away_keeps_the_start() -> None:
-    start = np.array([0.5, 0.0, 0.3, 0.0, 0.0, 0.0])
-    fitted = refit_support(start, np.array([9.0, -9.0]), np.zeros(2), np.full(4, 0.001))
-    np.testing.assert_array_equal(fitted, start)
-
-
-def test_classes_of_another_fleet_are_refused() -> None:
-    truth = faults_from(np.zeros((3, 6)))
-    with pytest.raises(FleetError, match="3 vehicles, but 2 were classified"):
-        recover_fleet(evidence_of(truth), classify_by_truth(truth.take(slice(0, 2))), full_scale_a=FULL_SCALE_A)
