@@ -4,14 +4,14 @@ A drive keeps the times of its frames; :mod:`calibrator.drives.align` puts them 
 in place and are labelled, so that what was left out can always be counted.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Channel", "Complex", "Drive", "DriveFile", "Equipment", "Mask"]
+__all__ = ["Array", "Channel", "Complex", "Drive", "DriveFile", "Equipment", "Mask", "Samples"]
 
 Array = NDArray[np.floating[Any]]
 """Real numbers; always double precision in practice."""
@@ -64,6 +64,38 @@ class Drive:
         if not channels:
             return 0.0
         return float(max(c.time_s[-1] for c in channels) - min(c.time_s[0] for c in channels))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Samples:
+    """Aligned samples of one drive.
+
+    Attributes
+    ----------
+    branch_names, input_names : tuple of str
+        Names of the K branches and M inputs, derived ones included.
+    time_s : ndarray of shape (T,)
+        Instants since the start of the drive, equally spaced. [s]
+    currents_a : ndarray of shape (T, K)
+        Measured branch currents, positive into the junction; NaN where not valid. [A]
+    inputs : ndarray of shape (T, M)
+        Inputs in the unit of the DBC; NaN where not valid.
+    valid : ndarray of bool, shape (T,)
+        Whether the instant may be used.
+    """
+
+    branch_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    time_s: Array
+    currents_a: Array
+    inputs: Array
+    valid: Mask
+
+    def with_inputs(self, names: Sequence[str]) -> "Samples":
+        """Return the same samples with those of the inputs that are among some names, in their order."""
+        kept = [self.input_names.index(name) for name in names if name in self.input_names]
+        chosen = tuple(self.input_names[i] for i in kept)
+        return replace(self, input_names=chosen, inputs=np.ascontiguousarray(self.inputs[:, kept]))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,6 +1,8 @@
 """Errors of the off-board side; see :mod:`ecu_node.errors` for what they have in common."""
 
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from ecu_node.errors import UserError
@@ -15,6 +17,7 @@ __all__ = [
     "ProposalError",
     "RepositoryStateError",
     "internal_error",
+    "naming",
 ]
 
 INTERNAL_ERROR = "internal error: "
@@ -25,6 +28,15 @@ def internal_error(error: Exception) -> str:
     """Reason of a vehicle that a fault of the program itself left out."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{INTERNAL_ERROR}{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno}); report it"
+
+
+@contextmanager
+def naming(shown: str, copy: Path) -> Iterator[None]:
+    """Within the block errors of the user that name a copy name what is shown in its place."""
+    try:
+        yield
+    except UserError as error:
+        raise type(error)(str(error).replace(str(copy), shown)) from None
 
 
 class LogError(UserError):

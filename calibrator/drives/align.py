@@ -9,14 +9,13 @@ are not valid stay in place with NaN in all columns.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.compiled import compiled, inner
-from calibrator.drive import Array, Channel, Drive, Mask
+from calibrator.drive import Array, Channel, Drive, Mask, Samples
 from calibrator.errors import DriveError
 from ecu_node.formulas import FUNCTIONS, base_inputs, formula_value, parse_formula
 from ecu_node.layout import Layout
@@ -36,38 +35,6 @@ MAX_SAMPLES = 20_000_000
 """23 days at 0.1 s; a drive that claims more has a wrong time."""
 
 _STALE, _NOT_GOOD = "stale", "not good"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Samples:
-    """Aligned samples of one drive.
-
-    Attributes
-    ----------
-    branch_names, input_names : tuple of str
-        Names of the K branches and M inputs, derived ones included.
-    time_s : ndarray of shape (T,)
-        Instants since the start of the drive, equally spaced. [s]
-    currents_a : ndarray of shape (T, K)
-        Measured branch currents, positive into the junction; NaN where not valid. [A]
-    inputs : ndarray of shape (T, M)
-        Inputs in the unit of the DBC; NaN where not valid.
-    valid : ndarray of bool, shape (T,)
-        Whether the instant may be used.
-    """
-
-    branch_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    time_s: Array
-    currents_a: Array
-    inputs: Array
-    valid: Mask
-
-    def with_inputs(self, names: Sequence[str]) -> "Samples":
-        """Return the same samples with those of the inputs that are among some names, in their order."""
-        kept = [self.input_names.index(name) for name in names if name in self.input_names]
-        chosen = tuple(self.input_names[i] for i in kept)
-        return replace(self, input_names=chosen, inputs=np.ascontiguousarray(self.inputs[:, kept]))
 
 
 def choose_inputs(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from calibrator.errors import naming
 from ecu_node.documents import write_atomically
 from ecu_node.errors import UserError
 
@@ -18,7 +19,6 @@ __all__ = [
     "Entry",
     "Storage",
     "StorageError",
-    "copied_file",
     "is_url",
     "local_copy",
     "open_storage",
@@ -266,20 +266,11 @@ def local_copy(url: str) -> Iterator[Path]:
     folder, _, name = url.rpartition("/")
     storage = Storage(url=folder)
     filesystem, root = storage._filesystem()
-    with copied_file(name, url) as copy:
+    with tempfile.TemporaryDirectory(prefix="copy-") as temporary:
+        copy = Path(temporary) / name
         try:
             filesystem.get_file(f"{root}/{name}", str(copy))
         except Exception as error:  # noqa: BLE001
             raise storage._failed(name, "read", error) from None
-        yield copy
-
-
-@contextmanager
-def copied_file(name: str, shown: str) -> Iterator[Path]:
-    """Where to put a copy that is gone after the block; errors of the user name what is shown in its place."""
-    with tempfile.TemporaryDirectory(prefix="copy-") as folder:
-        copy = Path(folder) / name
-        try:
+        with naming(url, copy):
             yield copy
-        except UserError as error:
-            raise type(error)(str(error).replace(str(copy), shown)) from None

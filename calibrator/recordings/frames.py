@@ -27,9 +27,12 @@ from calibrator.recordings.blf import read_blf
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, Frames, concatenate_frames, frames_of
 from calibrator.recordings.gvret import read_gvret
 from calibrator.recordings.log_files import (
+    TABLE_SUFFIXES,
     UNREADABLE,
     exists,
     files_in,
+    is_candump,
+    is_table,
     open_log,
     read_undamaged,
     readable,
@@ -38,8 +41,7 @@ from calibrator.recordings.log_files import (
     text_head,
 )
 from calibrator.recordings.mf4 import read_mf4
-from calibrator.recordings.tables import TABLE_SUFFIXES, is_table
-from calibrator.recordings.text_logs import is_candump, read_candump, read_plain_asc
+from calibrator.recordings.text_logs import read_candump, read_plain_asc
 
 __all__ = ["LOG_SUFFIXES", "is_log", "read_frames"]
 

@@ -1,4 +1,4 @@
-"""Files of recordings: alone, in folders, in ``.zip`` archives, gzipped.
+"""Files of recordings: alone, in folders, in ``.zip`` archives, gzipped; and what kind of recording one is.
 
 A file inside an archive has the path ``fleet.zip/V0001/monday.log``, as if the archive were a folder.
 """
@@ -6,7 +6,10 @@ A file inside an archive has the path ``fleet.zip/V0001/monday.log``, as if the 
 import codecs
 import gzip
 import io
+import mmap
+import re
 import shutil
+import tempfile
 import warnings
 import zipfile
 import zlib
@@ -17,14 +20,18 @@ from typing import Any, BinaryIO, TextIO, cast
 
 import pandas as pd
 
-from calibrator.errors import LogError
-from calibrator.files.storage import copied_file
+from calibrator.errors import LogError, naming
 
 __all__ = [
     "MAX_DAMAGED_SHARE",
+    "PRINTED_CANDUMP",
+    "TABLE_SUFFIXES",
     "UNREADABLE",
     "exists",
     "files_in",
+    "is_bus_log",
+    "is_candump",
+    "is_table",
     "open_log",
     "read_rows",
     "read_undamaged",
@@ -44,6 +51,19 @@ _BINARY = (".mf4", ".parquet", ".feather", ".arrow")
 MAX_DAMAGED_SHARE = 0.05
 """Of the lines of a text log. Recordings of a real car through a serial adapter had up to 3 % broken lines and decoded
 well. [1]"""
+PRINTED_CANDUMP = re.compile(
+    rb"^[ \t]*(?:\((?P<time>[-\d:. ]+)\)[ \t]+)?(?P<channel>[\w.-]+)[ \t]+(?:[RT]X [-B] [-E][ \t]+)?"
+    rb"(?P<id>[\dA-F]{8}|[\dA-F]{3})[ \t]+\[(?P<length>\d+)\](?:[ \t]+(?P<remote>remote request)|[ \t]+(?P<data>"
+    rb"(?:[\dA-F]{2} ?)*))[^\r\n]*",
+    re.MULTILINE | re.IGNORECASE,
+)
+"""A line as candump prints it without ``-L``."""
+_LOGGED = re.compile(rb"\(\d+\.\d+\) \S+ [\dA-Fa-f]{3,8}#")
+TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf4")
+FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
+"""Headers of identifiers, lower case: a text file that has one of them beside a time is a log of CAN frames."""
+_FRAME_CHANNEL = bytes(8) + b"CAN_DataFrame\0"
+"""A block of text begins with its count of links, which is 0, then comes the text."""
 _HEAD_BYTES = 1 << 16
 _READ_BYTES = 1 << 17
 """Asked for at a time: room for all of it is made for each piece that comes. [byte]"""
@@ -120,6 +140,45 @@ def reason_of(error: BaseException) -> str:
     return str(text).splitlines()[0]
 
 
+def is_candump(head: str, *, printed: bool = False) -> bool:
+    """Whether a text begins with lines of candump; with `printed`, as it prints them without ``-L``."""
+    lines = [line for line in head.splitlines() if line.strip()][:50]
+    forms = (PRINTED_CANDUMP,) if printed else (PRINTED_CANDUMP, _LOGGED)
+    return 2 * sum(any(form.match(line.encode()) for form in forms) for line in lines) > len(lines)
+
+
+def is_bus_log(path: Path) -> bool:
+    """Whether an MDF 4 file holds frames: ASAM's name of their channel is a text in it, which is never compressed."""
+    if not path.stat().st_size:
+        return True
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        return content.find(_FRAME_CHANNEL) >= 0
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file is a table: by its suffix, and where logs of frames have the same one, by what is in it."""
+    suffix = suffix_of(path)
+    if suffix == ".zip" or path.is_dir():
+        return any(is_table(file) for file in files_in(path)[:1])
+    if suffix not in TABLE_SUFFIXES or not exists(path):
+        return False
+    try:
+        with readable(path) as file:
+            if suffix == ".mf4":
+                return not is_bus_log(file)
+            if suffix in {".csv", ".tsv", ".txt"}:
+                head = text_head(file)[0]
+                return not is_candump(head) and not any(_is_frame_header(line) for line in head.splitlines()[:5])
+    except UNREADABLE:
+        return suffix != ".txt"
+    return True
+
+
+def _is_frame_header(line: str) -> bool:
+    cells = {cell.strip().lower() for cell in re.split(r"[,;\t]", line)}
+    return bool(cells.intersection(FRAME_COLUMNS)) and bool(cells & {"data", "databytes", "d1", "len", "dlc"})
+
+
 def exists(path: Path) -> bool:
     """Whether there is such a file, alone or in an archive."""
     archive = _archive(path)
@@ -158,7 +217,8 @@ def readable(path: Path) -> Iterator[Path]:
     if archive is None and not packed:
         yield path
         return
-    with copied_file(path.name[:-3] if packed else path.name, str(path)) as copy:
+    with tempfile.TemporaryDirectory(prefix="recording-") as folder:
+        copy = Path(folder) / (path.name[:-3] if packed else path.name)
         try:
             with ExitStack() as opened:
                 source: Any = path.open("rb") if archive is None else zipfile.ZipFile(archive)
@@ -170,7 +230,8 @@ def readable(path: Path) -> Iterator[Path]:
                 shutil.copyfileobj(source, opened.enter_context(copy.open("wb")))
         except _NO_ARCHIVE as error:
             raise LogError(f"{path}: cannot be unpacked: {str(error).strip(chr(39))}; copy the file again") from None
-        yield copy
+        with naming(str(path), copy):
+            yield copy
 
 
 def _archive(path: Path) -> Path | None:

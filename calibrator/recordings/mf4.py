@@ -7,7 +7,6 @@ Needs the extra ``mf4`` (asammdf).
 import atexit
 import importlib.util
 import json
-import mmap
 import os
 import signal
 import subprocess
@@ -39,23 +38,13 @@ from calibrator.recordings.frame_arrays import (
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["convert", "is_bus_log", "read_mf4", "read_mf4_table"]
+__all__ = ["convert", "read_mf4", "read_mf4_table"]
 
 START_S = 60.0
 """Time for the process to start on a slow machine; asammdf imports much. [s]"""
-_FRAME_CHANNEL = bytes(8) + b"CAN_DataFrame\0"
-"""A block of text begins with its count of links, which is 0, then comes the text."""
 BYTES_PER_S = 20_000.0
 """Slowest reading that is still waited for, a tenth of what a slow machine does."""
 _DONE = "done"
-
-
-def is_bus_log(path: Path) -> bool:
-    """Whether an MDF 4 file holds frames: ASAM's name of their channel is a text in it, which is never compressed."""
-    if not path.stat().st_size:
-        return True
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        return content.find(_FRAME_CHANNEL) >= 0
 
 
 def read_mf4(path: Path) -> Frames:

@@ -29,24 +29,21 @@ from calibrator.recordings.log_files import (
     UNREADABLE,
     exists,
     files_in,
+    is_table,
     open_log,
     read_rows,
     readable,
     suffix_of,
     text_head,
 )
-from calibrator.recordings.mf4 import is_bus_log, read_mf4_table
-from calibrator.recordings.text_logs import is_candump
+from calibrator.recordings.mf4 import read_mf4_table
 from ecu_node.core.signals import AMPERE, usual_unit
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError
 from ecu_node.layout import layout_of
 
-__all__ = ["TABLE_SUFFIXES", "Table", "bare_name", "is_table", "layout_from_branches", "read_table"]
+__all__ = ["Table", "bare_name", "is_table", "layout_from_branches", "read_table"]
 
-TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf4")
-FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
-"""Headers of identifiers, lower case: a text file that has one of them beside a time is a log of CAN frames."""
 MOST_SHARING = 1.5
 """Rows with the same time, on average, from which on the time is too coarse: loggers repeat a few instants. [1]"""
 _DELIMITERS = ("\t", ";", "|", ",", " ")
@@ -157,30 +154,6 @@ class Table:
         names = list(dict.fromkeys([*like, *self.columns]))
         more = f" and {len(names) - 12} more" if len(names) > 12 else ""
         return f"the columns are {', '.join(map(repr, names[:12]))}{more}"
-
-
-def is_table(path: Path) -> bool:
-    """Whether a file is a table: by its suffix, and where logs of frames have the same one, by what is in it."""
-    suffix = suffix_of(path)
-    if suffix == ".zip" or path.is_dir():
-        return any(is_table(file) for file in files_in(path)[:1])
-    if suffix not in TABLE_SUFFIXES or not exists(path):
-        return False
-    try:
-        with readable(path) as file:
-            if suffix == ".mf4":
-                return not is_bus_log(file)
-            if suffix in {".csv", ".tsv", ".txt"}:
-                head = text_head(file)[0]
-                return not is_candump(head) and not any(_is_frame_header(line) for line in head.splitlines()[:5])
-    except UNREADABLE:
-        return suffix != ".txt"
-    return True
-
-
-def _is_frame_header(line: str) -> bool:
-    cells = {cell.strip().lower() for cell in re.split(r"[,;\t]", line)}
-    return bool(cells.intersection(FRAME_COLUMNS)) and bool(cells & {"data", "databytes", "d1", "len", "dlc"})
 
 
 def bare_name(header: str) -> str:

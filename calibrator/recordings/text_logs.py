@@ -39,22 +39,17 @@ from calibrator.recordings.frame_arrays import (
 )
 from calibrator.recordings.log_files import (
     MAX_DAMAGED_SHARE,
+    PRINTED_CANDUMP,
     UNREADABLE,
+    is_candump,
     open_log,
     reason_of,
     text_blocks,
     text_head,
 )
 
-__all__ = ["is_candump", "parse_candump", "read_candump", "read_plain_asc"]
+__all__ = ["parse_candump", "read_candump", "read_plain_asc"]
 
-_PRINTED = re.compile(
-    rb"^[ \t]*(?:\((?P<time>[-\d:. ]+)\)[ \t]+)?(?P<channel>[\w.-]+)[ \t]+(?:[RT]X [-B] [-E][ \t]+)?"
-    rb"(?P<id>[\dA-F]{8}|[\dA-F]{3})[ \t]+\[(?P<length>\d+)\](?:[ \t]+(?P<remote>remote request)|[ \t]+(?P<data>"
-    rb"(?:[\dA-F]{2} ?)*))[^\r\n]*",
-    re.MULTILINE | re.IGNORECASE,
-)
-_LOGGED = re.compile(rb"\(\d+\.\d+\) \S+ [\dA-Fa-f]{3,8}#")
 _DECIMAL = re.compile(r"^base\s+dec", re.MULTILINE | re.IGNORECASE)
 _MOST_DISORDER = 0.1
 """Share of lines whose time is not after the one before: in a log nearly none, of distances about half. [1]"""
@@ -71,13 +66,6 @@ _NOT_HEX = 255
 HEX = np.array([int(c, 16) if c in "0123456789ABCDEFabcdef" else _NOT_HEX for c in map(chr, range(256))], np.uint8)
 """Value of each character as a hexadecimal digit."""
 _Text = NDArray[np.uint8]
-
-
-def is_candump(head: str, *, printed: bool = False) -> bool:
-    """Whether a text begins with lines of candump; with `printed`, as it prints them without ``-L``."""
-    lines = [line for line in head.splitlines() if line.strip()][:50]
-    forms = (_PRINTED,) if printed else (_PRINTED, _LOGGED)
-    return 2 * sum(any(form.match(line.encode()) for form in forms) for line in lines) > len(lines)
 
 
 def read_candump(path: Path) -> Frames:
@@ -130,7 +118,7 @@ def _log_lines(text: bytes, where: str) -> bytes:
     Times are absolute (``-ta``, ``-tA``), since the start (``-tz``) or since the line before (``-td``), which hardly
     ever increase.
     """
-    times = [match["time"] for match in _PRINTED.finditer(text)]
+    times = [match["time"] for match in PRINTED_CANDUMP.finditer(text)]
     if None in times:
         raise LogError(f"{where}: printed by candump without times; record it with 'candump -L' or 'candump -ta'")
     seconds = np.array([_seconds(time.decode()) for time in times])
@@ -146,7 +134,7 @@ def _log_lines(text: bytes, where: str) -> bytes:
         fd = b"##0" if len(match["length"]) > 1 else b"#"
         return b"(%.6f) %b %b%b%b" % (time_s, match["channel"], match["id"], fd, data)
 
-    return _PRINTED.sub(line, text)
+    return PRINTED_CANDUMP.sub(line, text)
 
 
 def _seconds(time: str) -> float:

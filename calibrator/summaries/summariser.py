@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from calibrator.compiled import compiled
-from calibrator.drive import Array, Mask
-from calibrator.drives.align import Samples
+from calibrator.drive import Array, Mask, Samples
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank, plain_bank
 from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, DriveSummary, FitSums

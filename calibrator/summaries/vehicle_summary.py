@@ -7,8 +7,8 @@ from operator import add
 
 import numpy as np
 
-from calibrator.drive import Array, Channel, Drive, Equipment
-from calibrator.drives.align import Samples, align
+from calibrator.drive import Array, Channel, Drive, Equipment, Samples
+from calibrator.drives.align import align
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank
