@@ -2,16 +2,16 @@
 
 Read in this order, with docs/method.md beside it:
 
-    moments, fleet_model             regressions on the junction law and on the fleet, and what most vehicles agree on
-    rows, readings                   their results as evidence rows, with what is known of single sensors
-    prior, explanations, posterior   which faults explain the rows of a vehicle, and how probable each is
-    learning                         what the fleet says of its faults, and of vehicles without any
-    decision, checks                 estimate, confidence, harm; whether the best explanation fits
-    fleet_estimate, vehicle_report   all of this for a fleet, then for each vehicle; what is said of it
-    junction                         one junction without a fleet: the same rows, by what is known of its sensors
-    fleet_task, run, results         the command: bucket by bucket, over processes, into a folder
-    fleet, frames                    the door for Python: data frames in, parameters out
+    evidence, readings              regressions on the junction law and on the fleet; what is known of single sensors
+    prior, posterior                which faults explain the rows of a vehicle, and how probable each is
+    learning                        what the fleet says of its faults, and of vehicles without any
+    decision, checks                estimate, confidence, harm; whether the best explanation fits
+    fleet_estimate, vehicle_report  all of this for a fleet, then for each vehicle; what is said of it
+    junction                        one junction without a fleet: the same rows, by what is known of its sensors
+    settings, fleet_task, run       the command: bucket by bucket, over processes
+    results                         the folder that it writes
+    fleet, frames                   the door for Python: data frames in, parameters out
 
-``published_fleet`` is the published method in the same frame; ``fleet_identification`` finds a
-filter bank where inputs alone do not tell the currents.
+``published_fleet`` is the published method in the same frame; ``fleet_identification`` finds a filter bank where inputs
+alone do not tell the currents.
 """

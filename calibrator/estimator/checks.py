@@ -9,7 +9,6 @@ Equations: (M22) to (M25) of docs/method.md, section "Does the best explanation 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -141,8 +140,7 @@ class _Causes(NamedTuple):
     square: Array
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Residual:
+class _Residual(NamedTuple):
     """Residual r = y - g^T z of the junction law of N vehicles: y the branch that moves most, z the others and 1.
 
     Attributes
@@ -185,7 +183,7 @@ class _Residual:
         """Moments of z with z, shape (N, K, K)."""
         return self.total[:, self.z[:, None], self.z]
 
-    @cached_property
+    @property
     def of_z(self) -> Array:
         """Moments of all columns with z in each block, shape (B, p, K)."""
         return self.fleet.moments[:, :, self.z]
@@ -213,8 +211,7 @@ class _Residual:
         return _Causes(explained_a2, fit, size, place, level_branch, pattern, square)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _OverModel:
+class _OverModel(NamedTuple):
     """Each measured current of N vehicles regressed on the fleet model's and 1.
 
     Attributes
@@ -260,8 +257,7 @@ class _OverModel:
         return np.asarray(-0.5 * (K - 1) / K * off)  # the shares of all branches add up to one
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Misfits:
+class _Misfits(NamedTuple):
     """What each cause explains of the junction law of N vehicles with K branches.
 
     Attributes
@@ -320,20 +316,20 @@ def _measure_misfits(summaries: Sequence[DriveSummary], read_out: Array, full_sc
     ]
     found = _Causes(*(np.stack(part, axis=1) for part in zip(*causes, strict=True)))
     unit = np.sqrt((weights**2).mean(axis=1))  # gain errors of the branches do not scale the residual
-    white = np.einsum("nk,nkl,nl->n", weights, fast, weights)
+    fast_sum = np.einsum("nkl,nl->nk", fast, weights)
+    white = np.einsum("nk,nk->n", weights, fast_sum)
     explained_a2 = np.column_stack([found.explained_a2, np.zeros(len(fleet))])
     left = np.maximum(residual.square_a2[:, None] - explained_a2, 0.0)
+    branch_fit = np.zeros((len(weights), len(CAUSES), len(read_out[0])))
     return _Misfits(
         causes=found,
         model=model,
         misfit_a=np.sqrt(found.explained_a2 / samples[:, None]) / unit[:, None],
-        branch_fit=model.whose(found.pattern, found.square, weights)
-        if len(read_out) > 1
-        else np.zeros((len(weights), len(CAUSES), len(read_out[0]))),
+        branch_fit=model.whose(found.pattern, found.square, weights) if len(read_out) > 1 else branch_fit,
         residual_a2=left / (samples * unit**2)[:, None],
         fast_a2=white / (WHITE_GAIN * samples * unit**2),
         mean_a=fleet.mean_a,
-        noise_share=weights * np.einsum("nkl,nl->nk", fast, weights) / np.maximum(white, TINY)[:, None],
+        noise_share=weights * fast_sum / np.maximum(white, TINY)[:, None],
         spikes=spikes / samples[:, None, None],
         samples=samples,
     )
@@ -381,18 +377,9 @@ def _junction_residual(fleet: FleetMoments, fast: Array) -> _Residual:
     varies = np.diagonal(fleet.moments, axis1=1, axis2=2)[:, z] - fleet.moments[:, z, -1] ** 2 / own[:, None]
     noisy = np.clip(varies, 0.0, own[:, None] * noise[blocks.vehicle])
     noisy *= (samples[:, None] * noise / np.maximum(blocks.total(noisy), TINY))[blocks.vehicle]
-    return _Residual(
-        fleet=fleet,
-        total=total,
-        y=y,
-        z=z,
-        law=law,
-        weights=weights,
-        noise=np.insert((noise * law)[:, :-1], y - M, 0.0, axis=1),
-        with_z=scores[:, z - M] + noisy * law[blocks.vehicle],
-        square_a2=np.maximum(squares, TINY),
-        n_eff=samples / repeated,
-    )
+    shared = np.insert((noise * law)[:, :-1], y - M, 0.0, axis=1)
+    with_z = scores[:, z - M] + noisy * law[blocks.vehicle]
+    return _Residual(fleet, total, y, z, law, weights, shared, with_z, np.maximum(squares, TINY), samples / repeated)
 
 
 def _over_fleet_model(residual: _Residual, read_out: Array) -> _OverModel:
@@ -413,17 +400,10 @@ def _over_fleet_model(residual: _Residual, read_out: Array) -> _OverModel:
     slope_sd = np.sqrt(blocks.total(_dot(scores, own[blocks.vehicle]) ** 2))
     repeated = np.maximum(np.median(slope_sd**2 / np.maximum(left * own[..., 0], TINY), axis=0), 1.0)
     determinant = gram[..., 0, 0] * gram[..., 1, 1] - gram[..., 0, 1] ** 2
+    moves_a = np.sqrt(np.maximum(determinant, 0.0)) / total[:, -1, -1:]
+    slope, zero_a = fitted[..., 0], fitted[..., 1]
     return _OverModel(
-        columns=columns,
-        basis=basis,
-        gram=gram,
-        right=right,
-        slope=fitted[..., 0],
-        slope_sd=slope_sd,
-        zero_a=fitted[..., 1],
-        variance_a2=repeated * left,
-        moves_a=np.sqrt(np.maximum(determinant, 0.0)) / total[:, -1, -1:],
-        error_a=np.sqrt(left),
+        columns, basis, gram, right, slope, slope_sd, zero_a, repeated * left, moves_a, error_a=np.sqrt(left)
     )
 
 
@@ -673,8 +653,7 @@ def _who(name: str | None) -> str:
     return f"sensor {name}" if name is not None else "one of the sensors, it is not known which"
 
 
-@dataclass(frozen=True)
-class _Vehicle:
+class _Vehicle(NamedTuple):
     """Vehicle j of some misfits; its methods word what is found in it."""
 
     misfits: _Misfits
@@ -687,42 +666,42 @@ class _Vehicle:
         """Sensors that are inverted or dead, by their slope over the fleet model."""
         found, slope, mean_a = [], self.misfits.model.slope[self.j], self.misfits.mean_a[self.j]
         for k, name in enumerate(self.branches):
-            if inverted[k] >= LEAST_PROBABILITY:
-                text = f"sensor {name} reads with the wrong sign, {slope[k]:+.2f} A per ampere of the fleet's; turn it "
-                found.append(_finding(name, "inverted", inverted[k], f"{text}round, or correct its signal's sign"))
-            if dead[k] >= LEAST_PROBABILITY:
-                text = f"sensor {name} does not follow the current, it stays near {mean_a[k]:.1f} A; "
-                found.append(_finding(name, "dead", dead[k], f"{text}check it, its plug and its supply"))
+            reversed_ = (
+                f"reads with the wrong sign, {slope[k]:+.2f} A per ampere of the fleet's; turn it round, or correct "
+            )
+            stays = f"does not follow the current, it stays near {mean_a[k]:.1f} A; check it, its plug and its supply"
+            for cause, probability, text in (
+                ("inverted", inverted[k], reversed_ + "its signal's sign"),
+                ("dead", dead[k], stays),
+            ):
+                if probability >= LEAST_PROBABILITY:
+                    found.append(_finding(name, cause, probability, f"sensor {name} {text}"))
         return found
 
     def of_law(self, shape: Array, unusual: Array) -> list[SensorFinding]:
         """The cause that explains most of the junction law's residual; noise and switched loads by what is left."""
         misfits, usual, j = self.misfits, self.usual, self.j
-        fit = misfits.causes.fit[j]
+        fit, level, left = misfits.causes.fit[j], misfits.causes.level_branch[j], misfits.residual_a2[j]
         c = int(fit.argmax())
-        weight, level = np.exp(fit - fit[c]), misfits.causes.level_branch[j]
+        weight = np.exp(fit - fit[c])
         alike = level == level[c] if level[c] >= 0 else fit == fit[c]  # the shapes of one curve are one cause
         share = weight[alike].sum() / weight.sum()
         probability = float(shape[c] * share) if fit[c] > 0.0 else 0.0
         at = c if probability >= LEAST_PROBABILITY else -1
-        found, left = [], misfits.residual_a2[j]
-        excess, fast = left[at] - usual.residual_a2, misfits.fast_a2[j] - usual.fast_a2
-        if unusual[at] >= LEAST_PROBABILITY and fast > 0.5 * excess:
+        found = [self._worded(c, probability)] if at >= 0 else []
+        if unusual[at] < LEAST_PROBABILITY:
+            return found
+        if misfits.fast_a2[j] - usual.fast_a2 > 0.5 * (left[at] - usual.residual_a2):
             k = int(misfits.noise_share[j].argmax())
             name = self.branches[k] if misfits.noise_share[j, k] >= NAMED else None
             rms_a, usual_a = np.sqrt(misfits.fast_a2[j]), np.sqrt(usual.fast_a2)
             text = f"{_who(name)}: noise of {rms_a:.1f} A RMS, usual are {usual_a:.1f} A; check its shield and its plug"
-            found.append(_finding(name, "noise", unusual[at], text))
-        elif unusual[at] >= LEAST_PROBABILITY and (
-            at < 0 or left[-1] - left[c] < EXPLAINED * (left[-1] - usual.residual_a2)
-        ):
+            return [_finding(name, "noise", unusual[at], text), *found]
+        if at < 0 or left[-1] - left[c] < EXPLAINED * (left[-1] - usual.residual_a2):
             rms_a, usual_a = np.sqrt(left[-1]), np.sqrt(usual.residual_a2)
-            text = (
-                f"the sum of the currents wanders by {rms_a:.1f} A RMS, usual are {usual_a:.1f} A; look for a branch "
-            )
-            text += "or load without a sensor, or a loose contact"
-            return [_finding(None, "switching", unusual[at], text)]
-        return [*found, self._worded(c, probability)] if at >= 0 else found
+            text = f"the sum of the currents wanders by {rms_a:.1f} A RMS, usual are {usual_a:.1f} A; look for a branch"
+            return [_finding(None, "switching", unusual[at], f"{text} or load without a sensor, or a loose contact")]
+        return found
 
     def _worded(self, c: int, probability: float) -> SensorFinding:
         """One of :data:`CAUSES`, with its sensor and figures."""
@@ -731,7 +710,7 @@ class _Vehicle:
         k = int(weight.argmax())
         name = self.branches[k] if weight[k] >= NAMED * weight.sum() else None
         size, place, level = causes.size[j, c], causes.place[j, c], causes.level_branch[j, c]
-        percent, rms_a = f"{100.0 * abs(size):.0f} %", misfits.misfit_a[j, c]
+        percent = f"{100.0 * abs(size):.0f} %"
         if cause in {"bend", "sign"}:
             cause = "clipped" if abs(size) >= CLIPPED else "sign" if place <= self.near_zero_a else "saturating"
         text = {
@@ -746,22 +725,22 @@ class _Vehicle:
             "ramp": "its gain or offset drifts with time",
             "temperature": f"its gain or offset drifts with temperature (standard deviation {place:.0f} K)",
         }[cause]
-        text = f"{_who(name)}: {text}; this makes {rms_a:.1f} A RMS; check the sensor against a reference"
-        return _finding(name, cause, probability, text)
+        this_makes = f"this makes {misfits.misfit_a[j, c]:.1f} A RMS; check the sensor against a reference"
+        return _finding(name, cause, probability, f"{_who(name)}: {text}; {this_makes}")
 
     def of_spikes(self) -> list[SensorFinding]:
         """Sensors with many spikes."""
-        found, n = [], self.misfits.samples[self.j]
+        found, n, usual = [], self.misfits.samples[self.j], self.usual.spike_rate
         for name, (up, down) in zip(self.branches, self.misfits.spikes[self.j], strict=True):
-            rate, usual = float(up + down), self.usual.spike_rate
-            if rate <= usual:
+            if (rate := float(up + down)) <= usual:
                 continue
             # Poisson counts at this rate against the fleet's, less what the unknown rate costs.
             likelihood = n * (rate * (np.log(rate / usual) - 1.0) + usual) - 0.5 * np.log(rate * n)
-            one_sided = min(up, down) <= ONE_SIDED * rate
+            one_sided = bool(min(up, down) <= ONE_SIDED * rate)
             cause = "spikes" if one_sided else "noise" if rate > NOISE_RATE else "outliers"
-            side = " to one side" if one_sided else ""
-            text = f"sensor {name}: spikes{side} in {100.0 * rate:.2f} % of the samples, which are left out; check its "
-            text += "plug and its shield"
+            text = (
+                f"sensor {name}: spikes{' to one side' * one_sided} in {100.0 * rate:.2f} % of the samples, which are "
+            )
+            text += "left out; check its plug and its shield"
             found.append(_finding(name, cause, float(_posterior(PRIOR * np.exp(min(likelihood, 500.0)))), text))
         return [each for each in found if each.probability >= LEAST_PROBABILITY]

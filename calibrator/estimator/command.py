@@ -30,36 +30,22 @@ from calibrator.terminal.options import (
     given_options,
     number_option,
 )
-from calibrator.terminal.text import counted, dumps, print_report, told_once
+from calibrator.terminal.text import dumps, end_if_internal, print_report
 from ecu_node.documents import write_atomically
 from ecu_node.layout import UnmeasuredLoad
-from ecu_node.program import INTERNAL_ERROR, say_error, write_output
+from ecu_node.program import say_error, write_output
 
 if TYPE_CHECKING:
     from calibrator.fleet_truth import FleetTruth
 
 __all__ = ["calibrate", "identify", "params"]
 
-OWN_OPTIONS = {
-    Method.POSTERIOR: [
-        "harm_limit",
-        "trusted",
-        "readings",
-        "load",
-        "charge",
-        "meter",
-        "expected_faults",
-        "scheduler",
-        "since",
-    ],
-    Method.PUBLISHED: ["classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"],
-}
+OF_POSTERIOR = ("harm_limit", "trusted", "readings", "load", "charge", "meter", "expected_faults", "scheduler", "since")
+OF_PUBLISHED = ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed")
 """What only one method heeds."""
 SHORTEST_POLE_S, LONGEST_POLE_S = 0.01, 600.0
 """Time constants of low-passes: from below the time base of any layout to ten minutes. [s]"""
 POLES_HELP = f"Low-passes to use: time constants with commas, each {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} [s]."
-MOST_NAMED = 5
-"""Internal errors that are named one by one."""
 
 
 def calibrate(
@@ -146,19 +132,18 @@ def calibrate(
     reference: its classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
     """
     with importing():
-        from calibrator.estimator.results import internal_errors
+        from calibrator.estimator.results import left_out_of
         from calibrator.estimator.run import calibrate_fleet
         from calibrator.estimator.settings import CalibrationSettings
         from calibrator.processes.run_many import Workers
 
     _require_truth_where_used(classifier, truth, method)
-    for other, names in OWN_OPTIONS.items():
-        given = given_options(context, names)
-        if other is not method and given:  # without a word, it would be ignored
-            raise typer.BadParameter(
-                f"belongs to --method {other.value}, not {method.value}; leave it out or change the method",
-                param_hint=given[0],
-            )
+    other, names = (Method.PUBLISHED, OF_PUBLISHED) if method is Method.POSTERIOR else (Method.POSTERIOR, OF_POSTERIOR)
+    if given := given_options(context, names):  # without a word, it would be ignored
+        raise typer.BadParameter(
+            f"belongs to --method {other.value}, not {method.value}; leave it out or change the method",
+            param_hint=given[0],
+        )
     settings = CalibrationSettings(
         method=method,
         harm_limit=harm_limit,
@@ -182,10 +167,7 @@ def calibrate(
     where = Workers(processes=workers, scheduler=scheduler)
     report = calibrate_fleet(fleet, vehicle_database(layout), out, settings, workers=where, since=since)
     print_report(report, json=json)
-    if failed := internal_errors(out):
-        lines = "; ".join(told_once(failed.items())[:MOST_NAMED])
-        say_error(f"calibrator: internal error in {counted(len(failed), 'vehicle')}, which are left out: {lines}")
-        raise typer.Exit(INTERNAL_ERROR)
+    end_if_internal(left_out_of(out))
     say_error(f"next: calibrator report {shlex.quote(str(out))}")
 
 

@@ -1,7 +1,7 @@
 """What to say of vehicles: estimate, confidence, and whether correction could make a branch worse.
 
 :func:`estimate_rows` does it for N vehicles: fault models of the fleet -> weighted draws (:class:`Explained`) -> one
-posterior per vehicle (:class:`Points`) -> :class:`RowsEstimate`.
+posterior per vehicle (:class:`Points`) -> :class:`FleetEstimate`.
 
 The estimate is the point near which, within the tolerance of "recovered", most of the posterior lies; that share is
 the confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
@@ -12,9 +12,9 @@ with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +25,12 @@ from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces
 from calibrator.estimator.learning import FaultModel, explain, weigh_draws
 from calibrator.estimator.posterior import Draws
 from calibrator.score import TOLERANCE
+from ecu_node.parameters import Explanation, SensorFinding
 
 __all__ = [
     "Explained",
+    "FleetEstimate",
     "Points",
-    "RowsEstimate",
     "best_estimate",
     "estimate_rows",
     "harm_probability",
@@ -245,8 +246,12 @@ def _harm(faults: Array, weight: Array, estimate: Array, mean: Array, square: Ar
                     break
 
 
-@dataclass(frozen=True, kw_only=True)
-class RowsEstimate:
+NOTHING: Any = None
+"""Of what was not looked for."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FleetEstimate:
     """What the evidence rows of N vehicles with K branches say, branches in their own order.
 
     Attributes
@@ -275,6 +280,18 @@ class RowsEstimate:
         order.
     full_scale_a : float
         Full scale of the junction. [A]
+    corrected : ndarray of bool of shape (N, K)
+        Whether the node is to correct the branch. This, and what follows, of whole vehicles alone, not of their rows.
+    held_back : ndarray of str of shape (N, K)
+        Why a fault that was found is not corrected; empty where it is, or where none was found.
+    verdicts : sequence of N str
+        Of each vehicle.
+    explanations : sequence of N sequences of Explanation
+        By falling probability, at least one.
+    findings : sequence of N sequences of SensorFinding
+        What no explanation fits.
+    evidence : ndarray of shape (N, 3, 5K)
+        For the pages of a report, see :func:`.reported_evidence`.
     """
 
     drift: Array
@@ -292,14 +309,33 @@ class RowsEstimate:
     order: tuple[int, ...]
     full_scale_a: float
     supports: Sequence[Sequence[tuple[float, Array]]] = ()
-    load_probability: Array = field(default_factory=lambda: np.zeros(0))
-    load_a: Array = field(default_factory=lambda: np.zeros(0))
-    group_probability: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    load_probability: Array = NOTHING
+    load_a: Array = NOTHING
+    group_probability: Array = NOTHING
+    corrected: Mask = NOTHING
+    held_back: NDArray[np.str_] = NOTHING
+    verdicts: Sequence[str] = ()
+    explanations: Sequence[Sequence[Explanation]] = ()
+    findings: Sequence[Sequence[SensorFinding]] = ()
+    evidence: Array = NOTHING
 
     @property
     def faulty(self) -> Mask:
         """Branches that would be corrected if nothing spoke against it, shape (N, K)."""
         return np.asarray((self.drift != 0.0) | (self.offset_a != 0.0))
+
+    def pit(self, drift: Array, offset_a: Array) -> tuple[Array, Array]:
+        """Probability integral transform of the truth: share of the posterior below it, each of shape (N, K).
+
+        Half of what lies exactly at the truth (a sensor without fault) counts as below.
+        """
+        place, N, K = np.argsort(self.order), *drift.shape
+        truth = np.concatenate([drift[:, list(self.order)], offset_a[:, list(self.order)] / self.full_scale_a], axis=1)
+        below = np.zeros((N, 2 * K))
+        for j, points in enumerate(self.points):
+            less, same = points.faults < truth[j] - 1e-9, np.abs(points.faults - truth[j]) <= 1e-9
+            below[j] = points.weight @ (less + 0.5 * same)
+        return below[:, :K][:, place], below[:, K:][:, place]
 
 
 def estimate_rows(
@@ -312,7 +348,7 @@ def estimate_rows(
     usual: Array,
     order: Sequence[int] | None = None,
     full_scale_a: float = 1.0,
-) -> RowsEstimate:
+) -> FleetEstimate:
     """Estimate N vehicles from their evidence rows.
 
     Parameters
@@ -334,7 +370,7 @@ def estimate_rows(
 
     Returns
     -------
-    RowsEstimate
+    FleetEstimate
         In the order of the rows.
     """
     N, K = mean.shape
@@ -362,7 +398,7 @@ def estimate_rows(
         hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
     first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])
     load_probability, load, group_probability = _unmeasured(explained)
-    return RowsEstimate(
+    return FleetEstimate(
         drift=estimate[:, place],
         offset_a=estimate[:, K + place] * full_scale_a,
         drift_sd=sd[:, place],

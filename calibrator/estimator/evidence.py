@@ -30,9 +30,8 @@ exactly: :func:`calibrator.estimator.posterior.row_residuals`.
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +49,6 @@ __all__ = [
     "FleetMoments",
     "ParameterPlaces",
     "RowPlaces",
-    "VehicleEvidence",
     "VehicleRegressions",
     "collect_rows",
     "densest_clusters",
@@ -598,41 +596,31 @@ class EvidenceRows:
 
     Attributes
     ----------
-    relative : ndarray of shape (N, 3K - 1)
-        log a (K), log(-g) (K - 1), bench readings of log(1 + d) (K). [1]
-    constant : ndarray of shape (N, 2K + 1)
-        b (K), c (1), readings of the offsets (K), in fractions of full scale. [1]
+    values : ndarray of shape (N, 5K)
+        Relative rows: log a (K), log(-g) (K - 1), bench readings of log(1 + d) (K); then constant rows in fractions of
+        full scale: b (K), c (1), readings of the offsets (K). [1]
     covariance : ndarray of shape (N, 5K, 5K)
-        Of the sampling error of both, relative rows first; of the constant rows as seen in true currents, that is
-        divided by 1 + d. [1]
+        Of their sampling error; of the constant rows as seen in true currents, that is divided by 1 + d. [1]
     means : ndarray of shape (N, 2, K)
         Means of the fleet model's and of the measured currents, in fractions of full scale, about which the lines of
         the constants pivot; zero where constants do not depend on the ratios. [1]
     """
 
-    relative: Array
-    constant: Array
+    values: Array
     covariance: Array
     means: Array
 
     def __post_init__(self) -> None:
-        N, K = len(self.relative), self.branches
-        shapes = [values.shape for values in vars(self).values()]
-        if shapes != [(N, 3 * K - 1), (N, 2 * K + 1), (N, 5 * K, 5 * K), (N, 2, K)]:
-            raise FleetError(
-                f"evidence of shapes {', '.join(map(str, shapes))}; expected relative rows of shape (N, 3K - 1), "
-                f"constant rows (N, 2K + 1), covariance (N, 5K, 5K) and means (N, 2, K)"
-            )
-        if not all(np.isfinite(values).all() for values in vars(self).values()):
+        if not all(np.isfinite(each).all() for each in vars(self).values()):
             raise FleetError("evidence is not finite; leave out the vehicles that have none")
 
     def __len__(self) -> int:
-        return len(self.relative)
+        return len(self.values)
 
     @property
     def branches(self) -> int:
         """Number of branches K."""
-        return int(self.relative.shape[1] + 1) // 3
+        return int(self.values.shape[1]) // 5
 
     @property
     def places(self) -> RowPlaces:
@@ -640,9 +628,14 @@ class EvidenceRows:
         return RowPlaces(self.branches)
 
     @property
-    def values(self) -> Array:
-        """All rows, relative ones first, shape (N, 5K)."""
-        return np.concatenate([self.relative, self.constant], axis=1)
+    def relative(self) -> Array:
+        """Relative rows, shape (N, 3K - 1). [1]"""
+        return self.values[:, self.places.relative]
+
+    @property
+    def constant(self) -> Array:
+        """Constant rows in fractions of full scale, shape (N, 2K + 1). [1]"""
+        return self.values[:, self.places.constant]
 
     @property
     def known(self) -> Mask:
@@ -661,7 +654,7 @@ class EvidenceRows:
     def intercept_covariance(self) -> Array:
         """Covariance of b + a mean(f), which does not depend on errors of the slopes a, shape (N, K, K)."""
         b = self.places.intercepts
-        return _shifted(self.covariance, -_pivot(self.means, self.relative), first=b.start)[:, b, b]
+        return _shifted(self.covariance, -_pivot(self.means, self.values), first=b.start)[:, b, b]
 
     def dispersed(self, dispersion: Array | float) -> tuple[Array, Array]:
         """Covariance if that of the intercepts at their means is larger.
@@ -684,12 +677,6 @@ class EvidenceRows:
         whole = self.covariance.copy()
         whole[:, b, b] += added
         return whole, added
-
-    def with_load_spread(self, sd: float) -> "EvidenceRows":
-        """Return the evidence if loads that no branch measures differ by a standard deviation, over full scale [1]."""
-        covariance, junction = self.covariance.copy(), self.places.junction
-        covariance[:, junction, junction] += sd**2
-        return replace(self, covariance=covariance)
 
 
 def collect_rows(
@@ -762,20 +749,19 @@ def collect_rows(
     covariance[vehicle, row, row] = UNKNOWN_VARIANCE
 
     unread = np.zeros((N, K))
-    relative = np.concatenate([np.log(safe), unread], axis=1)
+    everything = np.concatenate([np.log(safe), unread, constant, unread], axis=1)
     whole = np.tile(np.diag(np.full(5 * K, UNKNOWN_VARIANCE)), (N, 1, 1))
     place = RowPlaces(K).measured
-    whole[:, place[:, None], place] = _shifted(covariance, _pivot(means, relative), first=R)
-    constant = np.concatenate([constant, unread], axis=1)
-    return EvidenceRows(relative=relative, constant=constant, covariance=whole, means=means), usual
+    whole[:, place[:, None], place] = _shifted(covariance, _pivot(means, everything), first=R)
+    return EvidenceRows(values=everything, covariance=whole, means=means), usual
 
 
-def _pivot(means: Array, relative: Array) -> Array:
+def _pivot(means: Array, values: Array) -> Array:
     """Change of b and c, as seen in true currents, per error of log a and log(-g), shape (N, K + 1, 2K - 1)."""
     N, _, K = means.shape
     pivot = np.zeros((N, K + 1, 2 * K - 1))
     pivot[:, range(K), range(K)] = -means[:, 0]
-    pivot[:, K, K:] = means[:, 1, 1:] * np.exp(-relative[:, 1:K])  # -g_k / (1 + d_1) = 1 / (1 + d_k), about 1 / a_k
+    pivot[:, K, K:] = means[:, 1, 1:] * np.exp(-values[:, 1:K])  # -g_k / (1 + d_1) = 1 / (1 + d_k), about 1 / a_k
     return pivot
 
 
@@ -837,23 +823,6 @@ def evidence_names(branches: Sequence[str]) -> list[str]:
     ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class VehicleEvidence:
-    """What the parameters of one vehicle were found from, in the units of its sensors.
-
-    Attributes
-    ----------
-    value, sd, explained : list of 5K float or None
-        What was measured, its standard deviation, and what the estimate makes of it; None for both of the first two
-        where a row is unknown. ``evidence`` in the details of ``run.json`` names the rows: ratios [1], then constants
-        [A].
-    """
-
-    value: list[float | None]
-    sd: list[float | None]
-    explained: list[float]
-
-
 def reported_evidence(
     rows: EvidenceRows,
     *,
@@ -864,7 +833,7 @@ def reported_evidence(
     hardware_drift: Array,
     hardware_offset_a: Array,
     full_scale_a: float,
-) -> list[VehicleEvidence]:
+) -> Array:
     """The evidence rows in the units of the sensors, beside what the estimates make of them, for the pages of a report.
 
     Parameters
@@ -884,8 +853,9 @@ def reported_evidence(
 
     Returns
     -------
-    list of VehicleEvidence
-        In the order of the vehicles.
+    ndarray of shape (N, 3, 5K)
+        What was measured, its standard deviation, and what the estimate makes of it; NaN for the first two where a row
+        is unknown. ``evidence`` in the details of ``run.json`` names the rows: ratios [1], then constants [A].
     """
     gain, first = 1.0 + drift, 1.0 + drift[:, :1]
     ratios = np.exp(rows.relative)
@@ -899,9 +869,4 @@ def reported_evidence(
     at = rows.places
     made = np.concatenate([relative * np.exp(centre[at.relative]), constant + seen * centre[at.constant]], axis=1)
     value[~rows.known], sd[~rows.known] = np.nan, np.nan
-
-    def told(values: Array) -> list[list[float | None]]:
-        return [[v if isfinite(v) else None for v in row] for row in values.tolist()]
-
-    columns = zip(told(value), told(sd), made.tolist(), strict=True)
-    return [VehicleEvidence(value=v, sd=s, explained=m) for v, s, m in columns]
+    return np.stack([value, sd, made], axis=1)

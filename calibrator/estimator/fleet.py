@@ -6,7 +6,6 @@ become drives first (:mod:`calibrator.estimator.frames`).
 """
 
 import html
-import inspect
 import os
 import re
 import shutil
@@ -14,11 +13,11 @@ import warnings
 import weakref
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from numbers import Integral
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
-from typing import Any, Self, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias
 
 import pandas as pd
 
@@ -37,7 +36,8 @@ from calibrator.estimator.frames import (
     store_frames,
     summarise_frames,
 )
-from calibrator.estimator.results import CalibrationReport, internal_errors, read_part
+from calibrator.estimator.results import FILES as NODE_FILES
+from calibrator.estimator.results import PARTS, ROWS, internal_errors, read_part
 from calibrator.estimator.run import calibrate_fleet, require_fleet
 from calibrator.estimator.settings import CalibrationSettings
 from calibrator.estimator.vehicle_report import explained
@@ -58,7 +58,6 @@ __all__ = ["CalibratedVehicle", "Fleet", "FleetCalibrator", "JunctionCalibrator"
 Frames: TypeAlias = pd.DataFrame | Sequence[pd.DataFrame]
 Recordings: TypeAlias = Frames | Mapping[str, Frames] | str | Path
 
-NODE_FILES = "params"
 NAMES = {
     "drift": "gain_error",
     "drift_sd": "gain_error_sd",
@@ -254,6 +253,7 @@ class CalibratedVehicle:
 class _Calibrator:
     """What both calibrators share: scikit-learn's conventions, and what was learned in attributes that end in ``_``."""
 
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     parameters_: pd.DataFrame
     vehicles_: dict[str, CalibratedVehicle]
     left_out_: dict[str, str]
@@ -263,7 +263,7 @@ class _Calibrator:
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:  # noqa: ARG002 (scikit-learn's signature)
         """Parameters of the constructor by name."""
-        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def set_params(self, **parameters: Any) -> Self:
         """Set parameters of the constructor, and return the calibrator."""
@@ -274,19 +274,18 @@ class _Calibrator:
         return self
 
     def __repr__(self) -> str:
-        defaults = {name: item.default for name, item in inspect.signature(type(self)).parameters.items()}
-        changed = (
-            f"{name}={value!r}" for name, value in self.get_params().items() if repr(value) != repr(defaults[name])
-        )
+        given = [(each.name, repr(getattr(self, each.name)), repr(each.default)) for each in fields(self)]
+        changed = (f"{name}={value}" for name, value, default in given if value != default)
         return f"{type(self).__name__}({', '.join(changed)})"
 
     def _settings(self, *, alone: bool) -> CalibrationSettings:
         """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
         given = self.get_params()
-        for name in sorted(given.keys() & {"harm_limit", "expected_faults"}):
-            good = is_number(given[name], 0, 1) or (given[name] is None and name == "expected_faults")
-            require(good, name, given[name], "a number from 0 to 1")
-        for name in sorted(given.keys() & {"trusted", "hold_out"}):
+        for name in ("harm_limit", "expected_faults"):
+            value = given.get(name)
+            none = value is None and name == "expected_faults"
+            require(none or is_number(value, 0, 1), name, value, "a number from 0 to 1")
+        for name in given.keys() & {"trusted", "hold_out"}:
             names = [given[name]] if isinstance(given[name], str) else () if given[name] is None else given[name]
             given[name] = frozenset(names_of(names, name, sets=True))
         readings = given["readings"]
@@ -296,52 +295,43 @@ class _Calibrator:
             given["readings"] = path_of(readings, "readings", "a DataFrame or the path of a CSV table")
             require(given["readings"].is_file(), "readings", readings, "a file that exists")
         if alone:
-            meter, charge_ah = given["meter"], given["charge_ah"] or {}
+            meter, charge_ah, load = given["meter"], given["charge_ah"] or {}, given["load"]
             require(meter is None or isinstance(meter, str), "meter", meter, "the name of a branch")
             require(isinstance(charge_ah, Mapping), "charge_ah", charge_ah, "charges by branch")
             given["charge_ah"] = {str(name): _with_sd(pair, "charge_ah") for name, pair in charge_ah.items()}
-            if given["load"] is not None:
-                mean_a, sd_a = _with_sd(given["load"], "load", least=0.0)
+            if load is not None:
+                mean_a, sd_a = _with_sd(load, "load", least=0.0)
                 given["load"] = UnmeasuredLoad(mean_a=mean_a, sd_a=sd_a)
         used = CalibrationSettings.__dataclass_fields__.keys() & given.keys()
         return CalibrationSettings(alone=alone, **{name: given[name] for name in used})
 
     def _calibrate(
-        self, place: str | Path, database: VehicleDatabase, *, alone: bool, has_layout: bool, **workers: Any
+        self, place: str | Path, database: VehicleDatabase, *, alone: bool, has_layout: bool, workers: Workers
     ) -> None:
         """Calibrate as the command does, and take over what stands in the result folder."""
         with TemporaryDirectory(prefix="calibrator-") as folder:
             out = Path(folder) / "result"
-            settings = self._settings(alone=alone)
-            report = calibrate_fleet(place, database, out, settings, workers=Workers(**workers))
-            self._keep(out, report, has_layout=has_layout)
-
-    def _keep(self, out: Path, report: CalibrationReport, *, has_layout: bool) -> None:
-        """Take over what stands in a result folder."""
-        paths = [path for path in sorted(out.rglob("*")) if path.is_file()]
-        self._files = {
-            str(path.relative_to(out)): path.read_bytes()
-            for path in paths
-            if has_layout or path.parent.name != NODE_FILES
-        }
+            report = calibrate_fleet(place, database, out, self._settings(alone=alone), workers=workers)
+            files = {str(path.relative_to(out)): path for path in sorted(out.rglob("*")) if path.is_file()}
+            parts = [read_part(path) for path in files.values() if path.parent.name == PARTS]
+            rows, failed = pd.read_parquet(out / ROWS), internal_errors(out)
+            self._files = {
+                name: path.read_bytes() for name, path in files.items() if has_layout or path.parent.name != NODE_FILES
+            }
         self._report, self._has_layout = replace(report, result=""), has_layout
-        written = {
-            name: item for path in paths if path.parent.name == "parameters" for name, item in read_part(path).items()
-        }
+        written = {name: item.text for part in parts for name, item in part.items()}
         self.vehicles_ = {
-            name: CalibratedVehicle(parameters=decode_parameters(written[name].text, f"parameters of {name}"))
+            name: CalibratedVehicle(parameters=decode_parameters(written[name], f"parameters of {name}"))
             for name in sorted(written)
         }
-        rows = pd.read_parquet(out / "results.parquet")
         left_out = rows[rows["branch"].isna()]
         self.left_out_ = dict(zip(left_out["vehicle"], left_out["reason"], strict=True))
         self.parameters_ = rows[rows["branch"].notna()].rename(columns=NAMES)[list(COLUMNS)].reset_index(drop=True)
         self.parameters_["corrected"] = self.parameters_["corrected"].astype(bool)
         self.notices_ = [_in_python(notice) for notice in report.run.notices]
-        if failed := internal_errors(out):
-            warnings.warn(
-                f"internal error, left out: {'; '.join(told_once(failed.items()))}", RuntimeWarning, stacklevel=3
-            )
+        if failed:
+            said = "; ".join(told_once(failed.items()))
+            warnings.warn(f"internal error, left out: {said}", RuntimeWarning, stacklevel=3)
 
     def _require_fitted(self) -> None:
         if not hasattr(self, "parameters_"):
@@ -463,9 +453,10 @@ class FleetCalibrator(_Calibrator):
         require(is_number(self.workers, 1, 256, Integral), "workers", self.workers, "a whole number from 1 to 256")
         require(isinstance(self.scheduler, str | None), "scheduler", self.scheduler, "the address of a Dask scheduler")
         # frames are so few that another process takes longer to start than they take here
-        workers: dict[str, Any] = {"processes": 1 if fleet.in_memory else self.workers, "scheduler": self.scheduler}
+        processes = 1 if fleet.in_memory else self.workers
         with nullcontext() if self.verbose else no_progress(), _errors_in_python():
-            self._calibrate(fleet.place, fleet.database, alone=False, has_layout=fleet.has_layout, **workers)
+            workers = Workers(processes=processes, scheduler=self.scheduler)
+            self._calibrate(fleet.place, fleet.database, alone=False, has_layout=fleet.has_layout, workers=workers)
         return self
 
 
@@ -543,7 +534,7 @@ class JunctionCalibrator(_Calibrator):
                 named: Any = recordings if several else {"vehicle": recordings}
                 place = Path(folder) / "recordings"
                 database = store_frames(place, named, junction)
-            self._calibrate(place, database, alone=True, has_layout=junction.layout is not None, processes=1)
+            self._calibrate(place, database, alone=True, has_layout=junction.layout is not None, workers=Workers())
         return self
 
 

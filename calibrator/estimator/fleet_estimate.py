@@ -7,7 +7,7 @@ What is said of a vehicle does not depend on which others are estimated with it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.checks import UsualMisfits, find_misfits, learn_usual_misfits
-from calibrator.estimator.decision import RowsEstimate, estimate_rows
+from calibrator.estimator.decision import FleetEstimate, estimate_rows
 from calibrator.estimator.evidence import (
     EvidenceRows,
     FleetMoments,
     RowPlaces,
-    VehicleEvidence,
     collect_rows,
     densest_clusters,
     evidence_names,
@@ -30,13 +29,13 @@ from calibrator.estimator.evidence import (
 )
 from calibrator.estimator.learning import LEAST_SHARED, FaultModel, centre_rows, learn_fault_models
 from calibrator.estimator.prior import Prior
-from calibrator.estimator.readings import FEWEST_TRUSTED, Readings, untrusted_vehicles, with_readings
+from calibrator.estimator.readings import FEWEST_TRUSTED, untrusted_vehicles, with_knowledge
 from calibrator.estimator.settings import FEWEST_VEHICLES, HARM_LIMIT
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.parameters import Explanation, SensorFinding
 
-__all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "estimate_vehicles", "learn_fleet"]
+__all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "decided", "estimate_vehicles", "learn_fleet"]
 
 CONFIDENT, SUSPECTED = 0.95, 0.5
 """Confidence from which on a vehicle counts as sound, and probability from which on hardware is suspected. [1]"""
@@ -66,8 +65,8 @@ class FleetReference:
         Branches as they are worked with, the most moving first: position of each in their own order.
     feed : int
         Place in that order of the branch that feeds the others, and any load without a sensor.
-    ordered_read_out : ndarray of shape (M + 1, K)
-        Of the fleet model: ideal currents over the inputs, branches in the order worked with. [A]
+    read_out : ndarray of shape (M + 1, K)
+        Of the fleet model: ideal currents over the inputs, branches in their own order. [A]
     usual_correlation : ndarray of shape (3K, 3K)
         Of the evidence rows. [1]
     models : tuple of FaultModel
@@ -97,7 +96,7 @@ class FleetReference:
     branches: tuple[str, ...]
     order: tuple[int, ...]
     feed: int
-    ordered_read_out: Array
+    read_out: Array
     usual_correlation: Array
     models: tuple[FaultModel, ...]
     usual: Array
@@ -127,11 +126,6 @@ class FleetReference:
         spread, K = self.models[0].spread, len(self.branches)
         return float((spread.mean[RowPlaces(K).junction] - spread.shared[:K].sum()) * self.full_scale_a)
 
-    @property
-    def read_out(self) -> Array:
-        """Read-outs of the fleet model (M + 1, K), branches in their own order. [A]"""
-        return self.ordered_read_out[:, np.argsort(self.order)]
-
     def details(self) -> dict[str, object]:
         """What the run records of it."""
         ordered, model = self.ordered, self.models[0]
@@ -140,7 +134,7 @@ class FleetReference:
             "reference": {
                 "agreeing_share": dict(zip(self.branches, self.agreeing, strict=True)),
                 "unmeasured_a": self.expected_a,
-                "read_out": {name: self.ordered_read_out[:, k].tolist() for k, name in enumerate(ordered)},
+                "read_out": dict(zip(self.branches, self.read_out.T.tolist(), strict=True)),
             },
             "evidence": evidence_names(ordered),
             "hyperparameters": {
@@ -192,67 +186,13 @@ class FleetReference:
             )
         return notices
 
-    def rows_of(
-        self, summaries: Sequence[DriveSummary], readings: Readings | None, trusted: Mask
-    ) -> tuple[EvidenceRows, FleetMoments]:
-        """Evidence of some vehicles, with what is known of single sensors and of loads without one."""
-        fleet = stack_summaries(summaries, self.order)
-        rows, _ = collect_rows(
-            fleet, self.ordered_read_out, full_scale_a=self.full_scale_a, usual_correlation=self.usual_correlation
-        )
-        known = _with_knowledge(
-            rows, readings, trusted, order=self.order, full_scale_a=self.full_scale_a, load=self.load
-        )
-        return known, fleet
-
-
-@dataclass(frozen=True, kw_only=True)
-class FleetEstimate(RowsEstimate):
-    """Estimate of N vehicles with K branches in their own order, and what follows from it.
-
-    Attributes
-    ----------
-    corrected : ndarray of bool of shape (N, K)
-        Whether the node is to correct the branch.
-    held_back : ndarray of str of shape (N, K)
-        Why a fault that was found is not corrected; empty where it is, or where none was found.
-    verdicts : sequence of N str
-        Of each vehicle.
-    explanations : sequence of N sequences of Explanation
-        By falling probability, at least one.
-    findings : sequence of N sequences of SensorFinding
-        What no explanation fits.
-    evidence : sequence of N VehicleEvidence
-        For the pages of a report.
-    """
-
-    corrected: Mask
-    held_back: NDArray[np.str_]
-    verdicts: Sequence[str]
-    explanations: Sequence[Sequence[Explanation]]
-    findings: Sequence[Sequence[SensorFinding]]
-    evidence: Sequence[VehicleEvidence]
-
-    def pit(self, drift: Array, offset_a: Array) -> tuple[Array, Array]:
-        """Probability integral transform of the truth: share of the posterior below it, each of shape (N, K).
-
-        Half of what lies exactly at the truth (a sensor without fault) counts as below.
-        """
-        place, N, K = np.argsort(self.order), *drift.shape
-        truth = np.concatenate([drift[:, list(self.order)], offset_a[:, list(self.order)] / self.full_scale_a], axis=1)
-        below = np.zeros((N, 2 * K))
-        for j, points in enumerate(self.points):
-            less, same = points.faults < truth[j] - 1e-9, np.abs(points.faults - truth[j]) <= 1e-9
-            below[j] = points.weight @ (less + 0.5 * same)
-        return below[:, :K][:, place], below[:, K:][:, place]
-
 
 def learn_fleet(
     summaries: Sequence[DriveSummary],
     *,
     full_scale_a: float,
     branches: Sequence[str],
-    readings: Readings | None = None,
+    readings: Array | None = None,
     trusted: Mask | None = None,
     load: UnmeasuredLoad | None = None,
     expected_faults: float | None = None,
@@ -268,7 +208,7 @@ def learn_fleet(
         Full scale of the junction. [A]
     branches : sequence of str
         Names of the K branches.
-    readings : Readings or None
+    readings : ndarray of shape (2, 2, N, K), or None
         Direct readings of single sensors.
     trusted : ndarray of bool of shape (N,) or None
         Vehicles whose sensors were found faultless on a bench; at least three carry the reference. Those that break
@@ -302,12 +242,12 @@ def learn_fleet(
     carriers = np.zeros(len(fleet), bool) if trusted is None else trusted.copy()
     distrusted = untrusted_vehicles(measured, carriers, ordered, full_scale_a=full_scale_a, load=load)
     carriers[list(distrusted)] = False
-    rows = _with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load)
+    rows = with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load)
 
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
 
-    def learn() -> tuple[list[FaultModel], RowsEstimate]:
+    def learn() -> tuple[list[FaultModel], FleetEstimate]:
         models = learn_fault_models(
             rows,
             feed=feed,
@@ -324,15 +264,16 @@ def learn_fleet(
         carriers &= ~differing
         models, everyone = learn()
     place = np.argsort(order)
+    own_read_out = read_out[:, place]
     return FleetReference(
         branches=tuple(branches),
         order=order,
         feed=feed,
-        ordered_read_out=read_out,
+        read_out=own_read_out,
         usual_correlation=usual_correlation,
         models=tuple(models),
         usual=usual,
-        misfits=learn_usual_misfits(summaries, read_out[:, place], full_scale_a=full_scale_a),
+        misfits=learn_usual_misfits(summaries, own_read_out, full_scale_a=full_scale_a),
         full_scale_a=full_scale_a,
         load=load,
         vehicles=len(fleet),
@@ -364,24 +305,6 @@ def _require_balance(fleet: FleetMoments, branches: Sequence[str]) -> None:
             f"{-np.median(ratio[:, k]):+.2g} A in branch {branches[0]}, expected -1 A; check sign and unit of branch "
             f"{alone}"
         )
-
-
-def _with_knowledge(
-    rows: EvidenceRows,
-    readings: Readings | None,
-    trusted: Mask,
-    *,
-    order: Sequence[int],
-    full_scale_a: float,
-    load: UnmeasuredLoad | None,
-) -> EvidenceRows:
-    """Evidence with what is known of single sensors and of loads without one."""
-    N, K = len(rows), rows.branches
-    known = Readings.none(N, K) if readings is None else readings
-    known = known.merged(Readings.of_trusted(trusted, K, full_scale_a)).take_branches(order)
-    if load is not None:
-        rows = rows.with_load_spread(load.sd_a / full_scale_a)
-    return with_readings(rows, known, full_scale_a=full_scale_a)
 
 
 def _carried_centre(rows: EvidenceRows, carriers: Mask) -> Array:
@@ -434,7 +357,7 @@ def estimate_vehicles(
     summaries: Sequence[DriveSummary],
     reference: FleetReference,
     *,
-    readings: Readings | None = None,
+    readings: Array | None = None,
     trusted: Mask | None = None,
     harm_limit: float = HARM_LIMIT,
     limits: tuple[float, float] | None = None,
@@ -447,7 +370,7 @@ def estimate_vehicles(
         Of N vehicles.
     reference : FleetReference
         Of their fleet.
-    readings : Readings or None
+    readings : ndarray of shape (2, 2, N, K), or None
         Direct readings of their sensors.
     trusted : ndarray of bool of shape (N,) or None
         Vehicles that are trusted and do not break the junction law.
@@ -463,7 +386,11 @@ def estimate_vehicles(
     """
     scale_a, order = reference.full_scale_a, list(reference.order)
     trusted = np.zeros(len(summaries), bool) if trusted is None else trusted
-    rows, fleet = reference.rows_of(summaries, readings, trusted)
+    fleet = stack_summaries(summaries, order)
+    measured, _ = collect_rows(
+        fleet, reference.read_out[:, order], full_scale_a=scale_a, usual_correlation=reference.usual_correlation
+    )
+    rows = with_knowledge(measured, readings, trusted, order=order, full_scale_a=scale_a, load=reference.load)
     found = estimate_rows(
         rows,
         reference.models,
@@ -478,32 +405,31 @@ def estimate_vehicles(
         summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=reference.branches
     )
     drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
-    reasons = {  # the first that applies is reported
-        "": ~found.faulty,
-        "does not fit": np.array([_unfit(each, reference.branches) for each in unfit]),
-        "reference in doubt": reference.in_doubt & ~trusted[:, None],
-        "moved too little": ~found.identifiable,
-        "harm limit": ~(found.harm_probability < harm_limit),
-        "beyond the limits": (np.abs(found.drift) > drift_limit) | (np.abs(found.offset_a) > offset_limit_a),
-    }
-    held_back = np.select(list(reasons.values()), list(reasons), "")
-    corrected = found.faulty & (held_back == "")
-    sound = ~found.faulty.any(axis=1) & (found.confidence >= CONFIDENT) & ~np.array(list(map(bool, unfit)))
+    held_back, corrected, verdicts = decided(
+        found.faulty,
+        unfit=np.array([_unfit(each, reference.branches) for each in unfit]),
+        in_doubt=reference.in_doubt & ~trusted[:, None],
+        still=~found.identifiable,
+        harmful=~(found.harm_probability < harm_limit),
+        beyond=(np.abs(found.drift) > drift_limit) | (np.abs(found.offset_a) > offset_limit_a),
+        sound=~found.faulty.any(axis=1) & (found.confidence >= CONFIDENT) & ~np.array(list(map(bool, unfit))),
+    )
     linear = [
         1.0 - max((each.probability for each in mine if each.cause not in LINEAR_CAUSES), default=0.0) for mine in unfit
     ]
-    model = reference.models[0]
-    return FleetEstimate(
-        **{**vars(found), "confidence": found.confidence * linear},
+    spread = reference.models[0].spread
+    return replace(
+        found,
+        confidence=found.confidence * linear,
         corrected=corrected,
         held_back=held_back,
-        verdicts=np.select([corrected.any(axis=1), sound], ["corrected", "no sensor fault"], "cannot tell").tolist(),
+        verdicts=verdicts,
         explanations=[[_explanation(*each, reference) for each in mine] for mine in found.supports],
         findings=[(*each, *others) for each, others in zip(unfit, _shared_findings(found, reference), strict=True)],
         evidence=reported_evidence(
             rows,
-            centre=model.spread.mean,
-            covariance=rows.dispersed(model.spread.dispersion)[0] + model.spread.covariance,
+            centre=spread.mean,
+            covariance=rows.dispersed(spread.dispersion)[0] + spread.covariance,
             drift=found.drift[:, order],
             offset_a=found.offset_a[:, order],
             hardware_drift=found.hardware_drift,
@@ -513,37 +439,57 @@ def estimate_vehicles(
     )
 
 
-def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
+def decided(
+    faulty: Mask, *, unfit: Mask, in_doubt: Mask, still: Mask, harmful: Mask, beyond: Mask, sound: Mask
+) -> tuple[NDArray[np.str_], Mask, list[str]]:
+    """Why faults are not corrected (N, K), which branches are (N, K), and the verdicts of N vehicles.
+
+    Of the reasons, arrays that broadcast to (N, K), the first that applies is reported; ``sound`` (N,) says which
+    vehicles have no sensor fault.
+    """
+    reasons = {
+        "": ~faulty,
+        "does not fit": unfit,
+        "reference in doubt": in_doubt,
+        "moved too little": still,
+        "harm limit": harmful,
+        "beyond the limits": beyond,
+    }
+    held_back = np.select([np.broadcast_to(each, faulty.shape) for each in reasons.values()], list(reasons), "")
+    corrected = faulty & (held_back == "")
+    verdicts = np.select([corrected.any(axis=1), sound], ["corrected", "no sensor fault"], "cannot tell")
+    return held_back, corrected, verdicts.tolist()
+
+
+def _shared_findings(found: FleetEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
     """Loads without a sensor, batches and variants, of each vehicle: explained, and nothing of them is corrected."""
-    scale_a, feed = reference.full_scale_a, reference.ordered[reference.feed]
+    feed, findings = reference.ordered[reference.feed], list[list[SensorFinding]]()
     sensor = sum(model.probability for model in reference.models if model.spread.shared[-1])
     cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
     what = {"load": "a load without a sensor", "batch": "an offset of a batch of sensors"}
-    groups = max(
-        (model.prior.group_centre for model in reference.models), key=len
-    )  # those of the first model, if it has any
-    findings: list[list[SensorFinding]] = [[] for _ in found.load_probability]
-    for j, mine in enumerate(findings):
-        for g in np.flatnonzero(found.group_probability[j] > SUSPECTED):
-            size_a = groups[g] * scale_a
-            text = f"{size_a:+.1f} A in branch {feed} as in other vehicles: {what[cause]}, or {what[rival]}"
-            mine.append(_finding(feed, cause, found.group_probability[j, g], text))
-        if found.load_probability[j] > SUSPECTED:
-            text = f"a load without a sensor of {found.load_a[j]:.1f} A, or an offset of the {feed} sensor"
-            mine.append(_finding(feed, "load", found.load_probability[j], text))
-    for j, mine in enumerate(findings):
-        eta = [(p, float(np.log1p(values[0, 0]))) for p, values in found.supports[j]]
-        of = [sum(p for p, each in eta if abs(each - centre) < VARIANT_SPREAD) for centre in reference.variants]
-        if sum(of) > SUSPECTED:
-            size = f"{np.expm1(np.ptp(reference.variants)):.1%}"
-            than = "larger" if of[1] > of[0] else "smaller"
+    groups = max((model.prior.group_centre for model in reference.models), key=len)  # the first model's, if it has any
+    for j, supports in enumerate(found.supports):
+        others = f"A in branch {feed} as in other vehicles: {what[cause]}, or {what[rival]}"
+        said: list[tuple[str | None, str, float, str]] = [
+            (feed, cause, found.group_probability[j, g], f"{centre * reference.full_scale_a:+.1f} {others}")
+            for g, centre in enumerate(groups)
+        ]
+        load = f"a load without a sensor of {found.load_a[j]:.1f} A, or an offset of the {feed} sensor"
+        said.append((feed, "load", found.load_probability[j], load))
+        if reference.variants:
+            eta = [(p, float(np.log1p(values[0, 0]))) for p, values in supports]
+            of = [sum(p for p, each in eta if abs(each - centre) < VARIANT_SPREAD) for centre in reference.variants]
+            size, than = f"{np.expm1(np.ptp(reference.variants)):.1%}", "larger" if of[1] > of[0] else "smaller"
             text = f"all its currents are {than} by {size} than those of some other vehicles: one of two variants?"
-            mine.append(_finding(None, "variant", sum(of), text))
+            said.append((None, "variant", sum(of), text))
+        findings.append(
+            [
+                SensorFinding(branch=branch, cause=each, probability=float(min(p, 1.0)), text=text)
+                for branch, each, p, text in said
+                if p > SUSPECTED
+            ]
+        )
     return findings
-
-
-def _finding(branch: str | None, cause: str, probability: float, text: str) -> SensorFinding:
-    return SensorFinding(branch=branch, cause=cause, probability=float(min(probability, 1.0)), text=text)
 
 
 def _unfit(findings: Sequence[SensorFinding], branches: Sequence[str]) -> list[bool]:

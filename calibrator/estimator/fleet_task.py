@@ -7,23 +7,25 @@ its vehicle is left out by name, and the others go on.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 
 import numpy as np
 
+from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError, FleetError, internal_error
-from calibrator.estimator.evidence import VehicleEvidence
 from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
 from calibrator.estimator.readings import (
     CONTRADICTION,
+    FEWEST_TRUSTED,
     TRUSTED_DRIFT_SD,
     TRUSTED_OFFSET_SD,
     BenchTable,
-    Readings,
+    bench_readings,
     merge_readings,
-    trust_notices,
+    window_readings,
 )
 from calibrator.estimator.results import PARTS, encode_chunk, part_file, read_part
 from calibrator.estimator.settings import CalibrationSettings, require_learning
@@ -35,7 +37,7 @@ from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.errors import UserError
 from ecu_node.parameters import VehicleParameters, decode_parameters
 
-__all__ = ["Calibrated", "FleetTask", "calibrate_bucket", "learn_task"]
+__all__ = ["FleetTask", "calibrate_bucket", "learn_task"]
 
 LEAST_PROBABILITY = 1e-4
 """Of the explanations near a bench reading: below, the drives contradict it. [1]"""
@@ -43,16 +45,6 @@ MOVED_SD, MOVED_PROBABILITY = 4.0, 1e-3
 """Standard deviations within which earlier and new faults of a sensor are the same [1]; a sensor has moved if the
 explanations near the earlier faults are less probable than this. [1]"""
 NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
-
-
-@dataclass(kw_only=True)
-class Calibrated:
-    """What has been found of some vehicles so far, by name; what has moved by vehicle and branch."""
-
-    parameters: dict[str, VehicleParameters] = field(default_factory=dict)
-    left_out: dict[str, str] = field(default_factory=dict)
-    evidence: dict[str, VehicleEvidence] = field(default_factory=dict)
-    moved: dict[tuple[str, str], str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,37 +91,38 @@ class FleetTask:
             limits=(layout.limits.drift, layout.offset_limit_a),
         )
 
-    def calibrate(self, vehicles: Sequence[VehicleSummary], found: Calibrated) -> None:
-        """Estimate some vehicles and add their parameters, or why they have none, to what has been found.
+    def calibrate(self, vehicles: Sequence[VehicleSummary]) -> dict[str, tuple[VehicleParameters, Array] | str]:
+        """Parameters of some vehicles and the evidence for them, by name, or why one has none.
 
         If they cannot be estimated together, each is by itself: one bad vehicle never stops the others.
         """
         if not vehicles:
-            return
+            return {}
         try:
             with np.errstate(all="ignore"):  # numbers that are not finite are refused where they come out
                 estimate = self.estimate(vehicles)
-            for j, vehicle in enumerate(vehicles):
-                if why := impossible(estimate, j, self.branches):
-                    found.left_out[vehicle.vehicle] = why
-                else:
-                    found.parameters[vehicle.vehicle] = parameters_of(
-                        vehicle,
-                        estimate,
-                        j,
-                        identity=self.identity,
-                        branches=self.branches,
-                        expected_a=self.reference.expected_a,
-                        fleet_size=self.fleet_size,
-                    )
-                    found.evidence[vehicle.vehicle] = estimate.evidence[j]
+            return {vehicle.vehicle: self._written(vehicle, estimate, j) for j, vehicle in enumerate(vehicles)}
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
             if len(vehicles) > 1:
-                for vehicle in vehicles:
-                    self.calibrate([vehicle], found)
-                return
+                return {name: found for each in vehicles for name, found in self.calibrate([each]).items()}
             advice = f"its evidence cannot be used: {error}; look at its recordings"
-            found.left_out[vehicles[0].vehicle] = advice if isinstance(error, UserError) else internal_error(error)
+            return {vehicles[0].vehicle: advice if isinstance(error, UserError) else internal_error(error)}
+
+    def _written(
+        self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int
+    ) -> tuple[VehicleParameters, Array] | str:
+        if why := impossible(estimate, j, self.branches):
+            return why
+        parameters = parameters_of(
+            vehicle,
+            estimate,
+            j,
+            identity=self.identity,
+            branches=self.branches,
+            expected_a=self.reference.expected_a,
+            fleet_size=self.fleet_size,
+        )
+        return parameters, estimate.evidence[j]
 
 
 def learn_task(
@@ -181,7 +174,7 @@ def learn_task(
             [vehicle.summary for vehicle in learners],
             full_scale_a=layout.full_scale_a,
             branches=branches,
-            readings=readings.take(learning),
+            readings=readings[:, :, learning],
             trusted=trusted,
             load=settings.load or layout.unmeasured_load,
             expected_faults=settings.expected_faults,
@@ -201,16 +194,33 @@ def learn_task(
         wrong = _contradicted(task, vehicles, bench)
         task, notices = learn({sensor: values for sensor, values in bench.items() if sensor not in wrong})
         notices += wrong.values()
-    reference = task.reference
-    distrust = trust_notices(
-        learners,
-        trusted,
-        branches,
-        untrusted=reference.distrusted,
-        differing=reference.differing,
-        full_scale_a=layout.full_scale_a,
+    return task, [*task.reference.notices, *_distrust(learners, trusted, task.reference), *notices]
+
+
+def _distrust(vehicles: Sequence[VehicleSummary], trusted: Mask, reference: FleetReference) -> list[str]:
+    """Which trusted vehicles contradict the trust in them, or are too few to carry the reference."""
+    notices, names = [], [vehicle.vehicle for vehicle in vehicles]
+    carriers = int(np.count_nonzero(trusted)) - len(reference.distrusted) - len(reference.differing)
+    if trusted.any() and carriers < FEWEST_TRUSTED:
+        notices.append(
+            f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: it is the "
+            f"fleet's"
+        )
+    notices += [f"vehicle {names[j]} is not trusted: {why}; check it again" for j, why in reference.distrusted.items()]
+    notices += [
+        f"trusted vehicle {names[j]} does not carry the reference: it differs from the other trusted ones as by a "
+        f"hardware fault"
+        for j in reference.differing
+    ]
+    (_, offset_a), (_, sd_a) = window_readings(vehicles)
+    shown = trusted[:, None] & (
+        np.abs(offset_a) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * reference.full_scale_a)
     )
-    return task, [*reference.notices, *distrust, *notices]
+    return notices + [
+        f"trusted vehicle {names[j]}: its {reference.branches[k]} sensor showed {offset_a[j, k]:+.1f} A with open "
+        f"contactors; it was taken for faultless: check it again, or do not trust it"
+        for j, k in np.argwhere(shown).tolist()
+    ]
 
 
 def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: BenchTable) -> dict[tuple[str, str], str]:
@@ -220,7 +230,7 @@ def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: Be
     if not checked:
         return {}
     found, wrong = task.estimate(checked), set[tuple[str, str]]()
-    value, sd = Readings.of_bench(bench, [vehicle.vehicle for vehicle in checked], branches).values
+    value, sd = bench_readings(bench, [vehicle.vehicle for vehicle in checked], branches)
     for j, vehicle in enumerate(checked):
         faults = np.array([explained_faults(each, branches) for each in found.explanations[j]])
         apart = np.abs(value[:, j] - faults) / np.hypot(sd[:, j], [found.drift_sd[j], found.offset_sd_a[j]])
@@ -259,31 +269,36 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
         )
     records, before = store.read(bucket), {} if previous is None else read_part(part_file(previous, bucket))
     digests = {name: drives_digest(items) for name, items in records.items()}
-    found = Calibrated(left_out=dict.fromkeys(before.keys() - records.keys(), NOT_THERE))
-    todo: list[VehicleSummary] = []
+    parameters, evidence, moved = list[VehicleParameters](), dict[str, Array](), dict[tuple[str, str], str]()
+    left_out, todo = dict.fromkeys(before.keys() - records.keys(), NOT_THERE), list[VehicleSummary]()
     for name, items in records.items():
         earlier = decode_parameters(before[name].text, f"earlier parameters of {name}") if name in before else None
         if earlier is not None and before[name].drives == digests[name]:
-            found.parameters[name] = earlier  # its evidence was found against another reference, and is not kept
+            parameters.append(earlier)  # its evidence was found against another reference, and is not kept
             continue
         try:
-            todo.append(_what_holds(items, earlier, task, found))
+            summary, changes = _what_holds(items, earlier, task)
+            todo.append(summary)
+            moved |= {(name, branch): text for branch, text in changes.items()}
         except DriveError as error:
-            found.left_out[name] = str(error)
+            left_out[name] = str(error)
         except UserError:
             raise
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
-            found.left_out[name] = internal_error(error)
-    task.calibrate(todo, found)
-    return encode_chunk(
-        found.parameters.values(), found.left_out, moved=found.moved, drives=digests, evidence=found.evidence
-    )
+            left_out[name] = internal_error(error)
+    for name, found in task.calibrate(todo).items():
+        if isinstance(found, str):
+            left_out[name] = found
+        else:
+            parameters.append(found[0])
+            evidence[name] = found[1]
+    return encode_chunk(parameters, left_out, moved=moved, drives=digests, evidence=evidence)
 
 
 def _what_holds(
-    records: Sequence[Record], earlier: VehicleParameters | None, task: FleetTask, found: Calibrated
-) -> VehicleSummary:
-    """Summary of all drives of a vehicle, or of the new ones alone if they show that a sensor has moved.
+    records: Sequence[Record], earlier: VehicleParameters | None, task: FleetTask
+) -> tuple[VehicleSummary, dict[str, str]]:
+    """Summary of all drives of a vehicle, or of the new ones alone if they show that sensors have moved, and which.
 
     Records stand in the order in which they came. Those before the first one that the earlier parameters were found
     from are of a time before a sensor moved.
@@ -291,17 +306,14 @@ def _what_holds(
     drives = set() if earlier is None else set(earlier.provenance.drives)
     known = [place for place, record in enumerate(records) if record.drives and set(record.drives) <= drives]
     if earlier is None or not known:
-        return joined_records(records)
+        return joined_records(records), {}
     everything, new = joined_records(records[known[0] :]), records[known[-1] + 1 :]
-    if not any(record.found for record in new):
-        return everything
-    try:
-        recent = joined_records(new)
-        changes = _moved_sensors(earlier, task.estimate([recent]), task)
-    except UserError:  # the new drives alone do not suffice
-        return everything
-    found.moved |= {(earlier.vehicle, branch): text for branch, text in changes.items()}
-    return recent if changes else everything
+    if any(record.found for record in new):
+        with suppress(UserError):  # the new drives alone do not suffice
+            recent = joined_records(new)
+            if changes := _moved_sensors(earlier, task.estimate([recent]), task):
+                return recent, changes
+    return everything, {}
 
 
 def _moved_sensors(before: VehicleParameters, now: FleetEstimate, task: FleetTask) -> dict[str, str]:

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -36,17 +36,9 @@ from ecu_node.layout import Branch, Input, Layout
 from ecu_node.summary import TIME_RESOLUTION_S
 
 __all__ = [
-    "Junction",
-    "column_values",
-    "is_number",
-    "named_columns",
-    "names_of",
-    "path_of",
-    "require",
-    "require_columns",
-    "store_frames",
-    "summarise_frames",
-]
+    "Junction", "column_values", "is_number", "named_columns", "names_of", "path_of", "require", "require_columns",
+    "store_frames", "summarise_frames",
+]  # fmt: skip
 
 MOST_BRANCHES = 16
 MOST_MISSED, LEAST_AGE_S = 2.5, 0.5
@@ -202,11 +194,10 @@ def summarise_frames(
     FleetError, DriveError
         If the frames are no recordings of such a fleet.
     """
-    vehicles = _vehicles(frames)
-    labelled = _labelled(vehicles)
-    chosen = _chosen_inputs(labelled, junction, inputs)
+    recordings = _recordings(frames, fewest=2)
+    chosen = _chosen_inputs(recordings, junction, inputs)
     columns = (*junction.branches, *sorted(base_inputs(junction.layout, chosen) if junction.layout else chosen))
-    drives, database = _drives(vehicles, junction, columns, inputs=chosen)
+    drives, database = _drives(recordings, junction, columns, inputs=chosen)
     _require_amperes(drives, junction)
     equipment = Equipment(branches=tuple(junction.branches), inputs=chosen, fleet_inputs=chosen, notices=())
     identity = store_identity(equipment, database, vehicles=len(drives), fleet="frames", fleet_ids=frozenset())
@@ -239,39 +230,41 @@ def store_frames(folder: Path, frames: Mapping[str, Any], junction: Junction) ->
     FleetError, DriveError
         If the frames are no recordings of this junction.
     """
-    vehicles = _vehicles(frames, fewest=1)
-    labelled = _labelled(vehicles)
-    for where, frame in labelled.items():
+    recordings = _recordings(frames, fewest=1)
+    for each in recordings:
         try:
-            require_columns(frame, junction.branches, where)
+            require_columns(each.frame, junction.branches, each.where)
         except DriveError as error:
             raise DriveError(
                 f"{error}; rename its columns, positive into the junction, or name those in Junction(branches=...)"
             ) from None
     contactor = None if junction.layout is None else junction.layout.contactor
-    there = contactor is not None and all(contactor.input in frame.columns for frame in labelled.values())
-    columns = (*junction.branches, *([contactor.input] if contactor is not None and there else []))
-    drives, database = _drives(vehicles, junction, columns)
+    inputs = [] if contactor is None else [contactor.input]
+    there = [name for name in inputs if all(name in each.frame.columns for each in recordings)]
+    drives, database = _drives(recordings, junction, (*junction.branches, *there))
     _require_amperes(drives, junction, alone=True)
     for drive in (drive for mine in drives.values() for drive in mine):
         write_drive(folder, drive, database.layout)
     return database
 
 
-def _labelled(vehicles: Mapping[str, Sequence[pd.DataFrame]]) -> dict[str, pd.DataFrame]:
-    """All frames by what messages call them."""
-    return {
-        f"vehicle {vehicle}, frame {number}": frame
-        for vehicle, drives in vehicles.items()
-        for number, frame in enumerate(drives, start=1)
-    }
+class _Recording(NamedTuple):
+    """One frame of a vehicle, and what messages call it."""
+
+    vehicle: str
+    number: int
+    frame: pd.DataFrame
+
+    @property
+    def where(self) -> str:
+        return f"vehicle {self.vehicle}, frame {self.number}"
 
 
-def _vehicles(frames: Mapping[str, Any], *, fewest: int = 2) -> dict[str, list[pd.DataFrame]]:
-    """Frames by vehicle, so many vehicles at least with at least one frame each."""
+def _recordings(frames: Mapping[str, Any], *, fewest: int) -> list[_Recording]:
+    """Frames of so many vehicles at least, with at least one frame each."""
     if not isinstance(frames, Mapping) or not frames:
         raise FleetError(f"{type(frames).__name__} without vehicles: expected data frames by vehicle, {{'V1': frame}}")
-    found: dict[str, list[pd.DataFrame]] = {}
+    found: dict[str, list[_Recording]] = {}
     for key, given in frames.items():
         vehicle, drives = str(key), [given] if isinstance(given, pd.DataFrame) else given
         require_plain_name(vehicle, "vehicle")
@@ -281,49 +274,49 @@ def _vehicles(frames: Mapping[str, Any], *, fewest: int = 2) -> dict[str, list[p
             raise FleetError(f"vehicle {vehicle}: {type(given).__name__} given; expected a DataFrame or a list of them")
         if not drives:
             raise FleetError(f"vehicle {vehicle}: no frame in its list; leave the vehicle out")
-        found[vehicle] = [named_columns(frame, f"vehicle {vehicle}") for frame in drives]
+        named = [named_columns(frame, f"vehicle {vehicle}") for frame in drives]
+        found[vehicle] = [_Recording(vehicle, number, frame) for number, frame in enumerate(named, start=1)]
     if len(found) < fewest:
         raise FleetError(
             f"a single vehicle, {vehicle}: a fleet that is compared with itself needs {FEWEST_VEHICLES} or more; "
             f"JunctionCalibrator takes one, with a sensor that you trust"
         )
-    return found
+    return [each for mine in found.values() for each in mine]
 
 
 def _chosen_inputs(
-    labelled: Mapping[str, pd.DataFrame], junction: Junction, inputs: Sequence[str] | None
+    recordings: Sequence[_Recording], junction: Junction, inputs: Sequence[str] | None
 ) -> tuple[str, ...]:
     """Names of the inputs; every frame has the columns that it takes."""
-    branches, layout = list(junction.branches), junction.layout
-    for where, frame in labelled.items():
-        require_columns(frame, branches, where)
+    branches, layout, first = list(junction.branches), junction.layout, recordings[0]
+    for each in recordings:
+        require_columns(each.frame, branches, each.where)
     if both := sorted(set(inputs or ()) & set(branches)):
         raise FleetError(f"inputs {few(both)}: a branch of the junction cannot be an input of its model")
-    first = next(iter(labelled))
     if layout is not None:
         known = {item.name for item in layout.input} | {item.name for item in layout.derived}
         if unknown := sorted(set(inputs or ()) - known):
             raise FleetError(f"inputs {few(unknown)}: not in the layout; it has {few(sorted(known))}")
-        common = set.intersection(*(set(frame.columns) for frame in labelled.values()))
+        common = set.intersection(*(set(each.frame.columns) for each in recordings))
         usual = choose_inputs(layout, common, names=layout.fleet_inputs or layout.model_inputs)[0]
     else:
-        usual = tuple(name for name in labelled[first].columns if name not in branches)
+        usual = tuple(name for name in first.frame.columns if name not in branches)
     chosen = usual if inputs is None else tuple(inputs)
     needed = [*branches, *(chosen if layout is None else sorted(base_inputs(layout, chosen)))]
-    for where, frame in labelled.items():
-        more = sorted(set(frame.columns) - set(needed))
+    for each in recordings:
+        more = sorted(set(each.frame.columns) - set(needed))
         if more and layout is None and inputs is None:
             raise FleetError(
-                f"{where}: column {few(more)}, which {first} has not; all vehicles need the same columns, or name "
-                f"those to use with inputs=[...]"
+                f"{each.where}: column {few(more)}, which {first.where} has not; all vehicles need the same columns, "
+                f"or name those to use with inputs=[...]"
             )
     if not chosen or len(set(chosen)) < len(chosen):
         raise FleetError(
             f"inputs {few(chosen) or 'none'}: expected one or more different columns that the currents depend on, such "
             f"as speed, torque, or the demands of heater and air conditioning"
         )
-    for where, frame in labelled.items():
-        require_columns(frame, needed, where)
+    for each in recordings:
+        require_columns(each.frame, needed, each.where)
     return chosen
 
 
@@ -405,34 +398,30 @@ def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
 
 
 def _drives(
-    vehicles: Mapping[str, Sequence[pd.DataFrame]],
-    junction: Junction,
-    columns: Sequence[str],
-    inputs: Sequence[str] = (),
+    recordings: Sequence[_Recording], junction: Junction, columns: Sequence[str], inputs: Sequence[str] = ()
 ) -> tuple[dict[str, list[Drive]], VehicleDatabase]:
     """Drives by vehicle, and their layout; a frame that two vehicles have, or one has twice, is refused."""
-    times = {where: _seconds(frame, where) for where, frame in _labelled(vehicles).items()}
+    times = {each.where: _seconds(each.frame, each.where) for each in recordings}
     database = junction.as_database(inputs, _period_s(times, junction))
-    found: dict[str, list[Drive]] = {vehicle: [] for vehicle in vehicles}
-    seen: dict[bytes, str] = {}
-    for vehicle, frames in vehicles.items():
-        for number, frame in enumerate(frames, start=1):
-            where = f"vehicle {vehicle}, frame {number}"
-            # longer pauses are cut to those of logs whose clock was set, as time bases go through them
-            pauses_s = np.maximum(np.diff(times[where]) - CLOCK_GAP_S, 0.0)
-            time_s, channels = times[where] - np.append(0.0, np.cumsum(pauses_s)), dict[str, Channel]()
-            for name in columns:
-                value = column_values(frame, name, where)
-                if not (good := np.isfinite(value)).any():
-                    raise DriveError(f"{where}: column {name} has no number at all; leave the frame or the column out")
-                channels[name] = Channel(time_s=time_s, value=value, good=good)
-            content = b"".join(part.tobytes() for item in channels.values() for part in (item.time_s, item.value))
-            digest = hashlib.blake2b(content).digest()
-            if digest in seen:
-                raise FleetError(f"{where}: the same as {seen[digest]}; give each recording once")
-            seen[digest] = where
-            of_branches = {name: channels.pop(name) for name in junction.branches}
-            found[vehicle].append(Drive(vehicle=vehicle, name=f"frame {number}", branches=of_branches, inputs=channels))
+    found, seen = dict[str, list[Drive]](), dict[bytes, str]()
+    for each in recordings:
+        where = each.where
+        # longer pauses are cut to those of logs whose clock was set, as time bases go through them
+        pauses_s = np.maximum(np.diff(times[where]) - CLOCK_GAP_S, 0.0)
+        time_s, channels = times[where] - np.append(0.0, np.cumsum(pauses_s)), dict[str, Channel]()
+        for name in columns:
+            value = column_values(each.frame, name, where)
+            if not (good := np.isfinite(value)).any():
+                raise DriveError(f"{where}: column {name} has no number at all; leave the frame or the column out")
+            channels[name] = Channel(time_s=time_s, value=value, good=good)
+        content = b"".join(part.tobytes() for item in channels.values() for part in (item.time_s, item.value))
+        digest = hashlib.blake2b(content).digest()
+        if digest in seen:
+            raise FleetError(f"{where}: the same as {seen[digest]}; give each recording once")
+        seen[digest] = where
+        branches = {name: channels.pop(name) for name in junction.branches}
+        drive = Drive(vehicle=each.vehicle, name=f"frame {each.number}", branches=branches, inputs=channels)
+        found.setdefault(each.vehicle, []).append(drive)
     return found, database
 
 
@@ -465,10 +454,10 @@ def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction, 
 
 def _record(drives: Sequence[Drive], store: SummaryStore, database: VehicleDatabase) -> Record:
     """Summary of a vehicle's drives, or why they cannot be used."""
-    names = tuple(drive.name for drive in drives)
-    sources = ("",) * len(names)
+    found, problem, names = None, "", tuple(drive.name for drive in drives)
     try:
         found = summarise_drives(drives, store.identity.equipment, database, bank=store.identity.bank)
     except DriveError as error:
-        return Record(vehicle=drives[0].vehicle, drives=names, sources=sources, found=None, problem=str(error))
-    return Record(vehicle=drives[0].vehicle, drives=names, sources=sources, found=found)
+        problem = str(error)
+    sources = ("",) * len(names)
+    return Record(vehicle=drives[0].vehicle, drives=names, sources=sources, found=found, problem=problem)

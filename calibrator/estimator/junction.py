@@ -13,7 +13,7 @@ with its standard deviation, and is not corrected.
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -31,37 +31,34 @@ from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.checks import CAUSES, UsualMisfits, find_misfits
 from calibrator.estimator.decision import Points, harm_probability, recovery_probability
 from calibrator.estimator.evidence import junction_regression, stack_summaries
-from calibrator.estimator.fleet_estimate import SUSPECTED, FleetEstimate
+from calibrator.estimator.fleet_estimate import SUSPECTED, FleetEstimate, decided
 from calibrator.estimator.readings import (
     CONTRADICTION,
     TRUSTED_DRIFT_SD,
     TRUSTED_OFFSET_SD,
     BenchTable,
+    bench_readings,
     check_bench_table,
     read_bench_table,
+    window_readings,
 )
 from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
 from calibrator.estimator.vehicle_report import parameters_of, sensor_text
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.processes.run_many import Workers
-from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
+from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, probe_equipment, read_vehicles
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import summarise_samples
 from calibrator.summaries.vehicle_summary import VehicleSummary, most_moving_first, require_possible
 from calibrator.summaries.zero_current import weighted_mean, zero_current_offsets
+from calibrator.terminal.progress import progress_bar
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
 from ecu_node.layout import Layout, UnmeasuredLoad
 from ecu_node.parameters import Explanation, SensorFinding, VehicleParameters
 
-__all__ = [
-    "JunctionEstimate",
-    "JunctionKnowledge",
-    "Reading",
-    "calibrate_junctions",
-    "estimate_junction",
-    "read_junction",
-]
+__all__ = ["calibrate_junctions", "read_junction", "summarise_junction"]
 
 LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
 """Least valid data, shortest block, number of blocks of a short recording, and least number beyond that of branches:
@@ -101,68 +98,8 @@ SEEN = 3.0
 """Standard deviations from which on a fault is clear. [1]"""
 MOST_SHOWN = 5
 """Vehicles whose gain ratios are shown one by one."""
-
-
-class Reading(NamedTuple):
-    """A value with its standard deviation."""
-
-    mean: float
-    sd: float
-
-
-class Charge(NamedTuple):
-    """Mean current of a branch over the whole of its recordings: as measured, and by a known charge. [A]"""
-
-    measured_a: float
-    true_a: float
-    sd_a: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class JunctionKnowledge:
-    """What is known of a junction beside its recordings.
-
-    Attributes
-    ----------
-    trusted : mapping of str to (float, float)
-        Branches whose sensor is right: standard deviations of its gain error [1] and offset [A].
-    bench : mapping
-        Readings of single sensors by vehicle and branch.
-    load : UnmeasuredLoad or None
-        What flows out of the junction where no branch measures it; None: not known.
-    charge : mapping of str to Charge
-        Charge that went through a branch.
-    """
-
-    trusted: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    bench: BenchTable = field(default_factory=dict)
-    load: UnmeasuredLoad | None = None
-    charge: Mapping[str, Charge] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class JunctionEstimate:
-    """Estimate of N vehicles that share their sensors, but for one, and what to say of them.
-
-    Attributes
-    ----------
-    estimate : FleetEstimate
-        As of a fleet; drifts and offsets are the means of the posterior, also where no fault is suspected.
-    ratios : sequence of N mappings of str to Reading
-        Gain of a branch over that of another, by their names: "battery / motor". [1]
-    constant_a : sequence of N Reading
-        Sum of the measured currents at zero current: offsets and loads without a sensor together. [A]
-    deciding : sequence of N str
-        What would decide the rest; empty if all is known.
-    contradictions : tuple of str
-        Where what is known contradicts itself.
-    """
-
-    estimate: FleetEstimate
-    ratios: Sequence[Mapping[str, Reading]]
-    constant_a: Sequence[Reading]
-    deciding: Sequence[str]
-    contradictions: tuple[str, ...]
+MOST_READ_HERE = 5
+"""Vehicles that are read in this process: others would take longer to start."""
 
 
 def read_junction(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleSummary:
@@ -240,43 +177,51 @@ def _without_jumps(drives: Sequence[Samples], unknown: Sequence[str], layout: La
 
 
 class _Law(NamedTuple):
-    """Junction law (M8) of one vehicle, branches in an order that begins with the one that moves most."""
+    """Rows of the junction law (M8) of one vehicle: log(-g) of the K - 1 other branches, c over full scale. [1]"""
 
     order: list[int]
-    ratio: Array
-    """-g of the K - 1 other branches. [1]"""
-    constant_a: float
-    mean_a: Array
-    """Of the other branches. [A]"""
+    """Branches, the one that moves most first."""
+    value: Array
     covariance: Array
-    """Of (ratio, constant), shape (K, K)."""
+    constant_a: tuple[float, float]
+    """c with its standard deviation. [A]"""
 
 
 def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: float) -> _Law:
     order = np.argsort(-summary.variance_a2, kind="stable").tolist()
     fit = junction_regression(stack_summaries([summary], order))
+    K, others, mean_a = len(order), order[1:], summary.mean_a
     covariance = fit.influence.T @ fit.influence + fit.prior_covariance[0]
-    sign = np.append(-np.ones(len(order) - 1), 1.0)
     if summary.variance_a2.max() < (STILL * scale_a) ** 2:  # the ratios are open, and the sum tells the constant
-        open_ratio = np.diag(np.append(np.ones(len(order) - 1), covariance[-1, -1]))
-        mean_a = summary.mean_a
-        return _Law(order, np.ones(len(order) - 1), float(mean_a.sum()), mean_a[order[1:]], open_ratio)
-    *ratio, constant_a = fit.estimate[0] * sign
-    for k, value, sd in zip(order[1:], ratio, np.sqrt(np.diagonal(covariance)), strict=False):
-        if not 1.0 / MOST_RATIO < value < MOST_RATIO and sd < SURE_SD:
-            first = branches[order[0]]
-            raise FleetError(
-                f"{where}: the currents do not balance: 1 A in branch {branches[k]} goes with {-value:+.2g} A in "
-                f"branch {first}, expected -1 A; check sign and unit of branch {branches[k]} or {first}"
-            )
-    possible = np.clip(ratio, 1.0 / MOST_RATIO, MOST_RATIO)
-    return _Law(order, possible, float(constant_a), summary.mean_a[order[1:]], covariance * np.outer(sign, sign))
+        ratio: Array = np.ones(K - 1)
+        constant_a = float(mean_a.sum())
+        covariance = np.diag(np.append(np.ones(K - 1), covariance[-1, -1]))
+    else:
+        ratio, constant_a = -fit.estimate[0, :-1], float(fit.estimate[0, -1])
+        sign = np.append(-np.ones(K - 1), 1.0)
+        covariance *= np.outer(sign, sign)
+        sure = np.sqrt(np.diagonal(covariance)[:-1]) < SURE_SD
+        for k, value in zip(np.array(others)[sure].tolist(), ratio[sure].tolist(), strict=True):
+            if not 1.0 / MOST_RATIO < value < MOST_RATIO:
+                raise FleetError(
+                    f"{where}: the currents do not balance: 1 A in branch {branches[k]} goes with {-value:+.2g} A in "
+                    f"branch {branches[order[0]]}, expected -1 A; check sign and unit of branch {branches[k]} or "
+                    f"{branches[order[0]]}"
+                )
+        ratio = np.clip(ratio, 1.0 / MOST_RATIO, MOST_RATIO)
+    constant_sd_a = float(np.hypot(np.sqrt(covariance[-1, -1]), LAW_OFFSET_SD * scale_a))
+    unit = np.append(1.0 / ratio, 1.0 / scale_a)
+    # an error of a ratio turns the line about the mean current, and so moves the constant
+    turn = np.vstack([np.eye(K - 1), ratio * mean_a[others] / scale_a]) * LAW_GAIN_SD
+    covariance = covariance * np.outer(unit, unit) + turn @ turn.T
+    covariance[-1, -1] += LAW_OFFSET_SD**2
+    return _Law(order, np.append(np.log(ratio), constant_a / scale_a), covariance, (constant_a, constant_sd_a))
 
 
 class _System(NamedTuple):
     """Rows y = design x + error of N vehicles, over x = (lambda of S sensors, their offsets, N loads).
 
-    Offsets and loads are in fractions of full scale.
+    Offsets and loads are in fractions of full scale. Prior of x: as read, or open.
     """
 
     y: Array
@@ -284,80 +229,52 @@ class _System(NamedTuple):
     design: Array
     mean: Array
     sd: Array
-    """Prior of x: as read, or open."""
     read: Mask
     """Which of x were read."""
     sensors: int
 
 
-def _places(vehicles: int, branches: Sequence[str], meter: str | None) -> NDArray[np.int64]:
-    """Number of the sensor of each vehicle and branch, shape (N, K): they share all but the meter."""
-    places = np.tile(np.arange(len(branches)), (vehicles, 1))
-    if meter is not None:
-        places[1:, branches.index(meter)] = len(branches) + np.arange(vehicles - 1)
-    return places
-
-
-def _system(
-    vehicles: Sequence[VehicleSummary],
-    places: NDArray[np.int64],
-    branches: Sequence[str],
-    known: JunctionKnowledge,
-    *,
-    laws: Sequence[_Law],
-    full_scale_a: float,
-) -> _System:
-    """All that is measured and known, of sensors at places (N, K)."""
+def _system(laws: Sequence[_Law], places: NDArray[np.int64], load: UnmeasuredLoad | None, scale_a: float) -> _System:
+    """Junction laws of N vehicles whose sensors are at places (N, K); of loads what is declared."""
     (N, K), S = places.shape, int(places.max()) + 1
-    y, covariance, design = np.zeros(N * K), np.zeros((N * K, N * K)), np.zeros((N * K, 2 * S + N))
-    load = known.load or UnmeasuredLoad(mean_a=0.0, sd_a=OPEN_LOAD_SD * full_scale_a)
+    design, given = np.zeros((N * K, 2 * S + N)), load or UnmeasuredLoad(mean_a=0.0, sd_a=OPEN_LOAD_SD * scale_a)
     for j, law in enumerate(laws):
         first, *others = places[j][law.order].tolist()
-        rows, ratios, constant = slice(j * K, (j + 1) * K), range(j * K, (j + 1) * K - 1), (j + 1) * K - 1
-        unit = np.append(1.0 / law.ratio, 1.0 / full_scale_a)
-        y[rows] = np.append(np.log(law.ratio), law.constant_a / full_scale_a)
-        covariance[rows, rows] = law.covariance * np.outer(unit, unit)
-        # an error of a ratio turns the line about the mean current, and so moves the constant
-        turn = np.vstack([np.eye(K - 1), law.ratio * law.mean_a / full_scale_a]) * LAW_GAIN_SD
-        covariance[rows, rows] += turn @ turn.T
-        covariance[constant, constant] += LAW_OFFSET_SD**2
+        ratios, constant = range(j * K, (j + 1) * K - 1), (j + 1) * K - 1
         design[ratios, first], design[ratios, others] = 1.0, -1.0
-        design[constant, [S + first, *(S + s for s in others)]] = np.append(1.0, law.ratio)
+        design[constant, [S + first, *(S + s for s in others)]] = np.append(1.0, np.exp(law.value[:-1]))
         design[constant, 2 * S + j] = 1.0
-        design[constant, first] = load.mean_a / full_scale_a  # (1 + d_1) l
-    mean, sd = np.full(2 * S + N, np.nan), np.full(2 * S + N, np.nan)
-    mean[2 * S :], sd[2 * S :] = load.mean_a / full_scale_a, load.sd_a / full_scale_a
-    for s in range(S):
-        of = [(vehicles[j], k) for j, k in np.argwhere(places == s).tolist()]
-        value, spread = weighted_mean(*_readings(of, branches, known))
-        mean[s], sd[s] = np.log1p(value[0]), spread[0] / (1.0 + value[0])
-        mean[S + s], sd[S + s] = value[1] / full_scale_a, spread[1] / full_scale_a
-    read = np.isfinite(mean)
-    wide = np.repeat([OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD], [S, S, N])
-    for name, charge in known.charge.items():  # mean measured current = (1 + d) true + o
-        row = np.zeros(2 * S + N)
-        row[[branches.index(name), S + branches.index(name)]] = charge.true_a / full_scale_a, 1.0
-        y = np.append(y, (charge.measured_a - charge.true_a) / full_scale_a)
-        design = np.vstack([design, row])
-        covariance = block_diag(covariance, [[(charge.sd_a / full_scale_a) ** 2 + LAW_OFFSET_SD**2]])
-    return _System(y, covariance, design, np.where(read, mean, 0.0), np.where(read, sd, wide), read, S)
+        design[constant, first] = given.mean_a / scale_a  # (1 + d_1) l
+    return _System(
+        y=np.concatenate([law.value for law in laws]),
+        covariance=block_diag(*(law.covariance for law in laws)),
+        design=design,
+        mean=np.append(np.zeros(2 * S), np.full(N, given.mean_a / scale_a)),
+        sd=np.concatenate([np.repeat([OPEN_GAIN_SD, OPEN_OFFSET_SD], S), np.full(N, given.sd_a / scale_a)]),
+        read=np.arange(2 * S + N) >= 2 * S,
+        sensors=S,
+    )
 
 
-def _readings(
-    sensor: Sequence[tuple[VehicleSummary, int]], branches: Sequence[str], known: JunctionKnowledge
-) -> list[tuple[Array, Array]]:
-    """What is known of one sensor: (gain error, offset [A]) and standard deviations, NaN where not known."""
-    found: list[tuple[Array, Array]] = []
-    for vehicle, k in sensor:
-        shown, branch = vehicle.zero_current, branches[k]
-        found.append((np.array([np.nan, shown.offset_a[k]]), np.array([np.nan, shown.sd_a[k]])))
-        if (vehicle.vehicle, branch) in known.bench:
-            bench = known.bench[vehicle.vehicle, branch]
-            found.append((np.array([bench.drift, bench.offset_a]), np.array([bench.drift_sd, bench.offset_sd_a])))
-    branch = branches[sensor[0][1]]
-    if branch in known.trusted:
-        found.append((np.zeros(2), np.array(known.trusted[branch])))
-    return found
+def _with_reading(system: _System, s: int, value: Array, sd: Array, scale_a: float) -> _System:
+    """The system with gain error [1] and offset [A] of sensor s as read; NaN where they were not."""
+    mean, spread, read, at = system.mean.copy(), system.sd.copy(), system.read.copy(), [s, system.sensors + s]
+    read[at] = np.isfinite(value)
+    mean[at] = np.where(read[at], [np.log1p(value[0]), value[1] / scale_a], mean[at])
+    spread[at] = np.where(read[at], [sd[0] / (1.0 + value[0]), sd[1] / scale_a], spread[at])
+    return system._replace(mean=mean, sd=spread, read=read)
+
+
+def _with_charge(system: _System, k: int, charge_a: tuple[float, float, float], scale_a: float) -> _System:
+    """The system with the charge of branch k of one vehicle, see :func:`_charges`: mean measured = (1 + d) true + o."""
+    measured_a, true_a, sd_a = charge_a
+    row = np.zeros(len(system.mean))
+    row[[k, system.sensors + k]] = true_a / scale_a, 1.0
+    return system._replace(
+        y=np.append(system.y, (measured_a - true_a) / scale_a),
+        design=np.vstack([system.design, row]),
+        covariance=block_diag(system.covariance, [[(sd_a / scale_a) ** 2 + LAW_OFFSET_SD**2]]),
+    )
 
 
 def _condition(system: _System, sd: Array) -> tuple[Array, Array, float]:
@@ -436,10 +353,11 @@ def _disagreements(readings: Sequence[tuple[Array, Array]], name: str) -> list[s
     found = []
     for (a, a_sd), (b, b_sd) in combinations(readings, 2):
         apart = np.abs(a - b) > CONTRADICTION * np.hypot(a_sd, b_sd)
-        if apart[0]:
-            found.append(f"the gain error of {name} is known as {a[0]:+z.2%} and as {b[0]:+z.2%}")
-        if apart[1]:
-            found.append(f"the offset of {name} is known as {a[1]:+.2f} A and as {b[1]:+.2f} A")
+        texts = (
+            f"gain error of {name} is known as {a[0]:+z.2%} and as {b[0]:+z.2%}",
+            f"offset of {name} is known as {a[1]:+.2f} A and as {b[1]:+.2f} A",
+        )
+        found += [f"the {text}" for text, wrong in zip(texts, apart, strict=True) if wrong]
     return found
 
 
@@ -461,16 +379,25 @@ def _contradictions(system: _System, names: Sequence[str], scale_a: float) -> li
     return found
 
 
-def estimate_junction(
+class _Known(NamedTuple):
+    """What is known beside the recordings of N vehicles with K branches."""
+
+    read: Array
+    """Values and standard deviations of drifts [1] and offsets [A] by zero-current windows, bench and trust, shape
+    (3, 2, 2, N, K); NaN where there are none."""
+    load: UnmeasuredLoad | None
+    charge_a: Mapping[str, tuple[float, float, float]]
+    meter: str | None
+
+
+def _estimate(
     vehicles: Sequence[VehicleSummary],
     branches: Sequence[str],
-    known: JunctionKnowledge,
+    known: _Known,
     *,
-    full_scale_a: float,
+    layout: Layout,
     harm_limit: float,
-    limits: tuple[float, float] = (np.inf, np.inf),
-    meter: str | None = None,
-) -> JunctionEstimate:
+) -> tuple[FleetEstimate, list[_Law], list[str], list[str]]:
     """Estimate the sensors of one vehicle; or of one car in several recordings, each with its own meter.
 
     Parameters
@@ -479,38 +406,46 @@ def estimate_junction(
         N recordings of the same sensors in K branches, all but the meter; without a meter one.
     branches : sequence of str
         Names of the K branches.
-    known : JunctionKnowledge
+    known : _Known
         What is known beside the recordings.
-    full_scale_a : float
-        Full scale of the junction. [A]
+    layout : Layout
+        Has the full scale and the limits of corrections.
     harm_limit : float
         Largest probability of harm with which a branch is corrected. [1]
-    limits : tuple of float
-        Largest gain error [1] and offset [A] that are corrected.
-    meter : str or None
-        Branch that has another sensor in each recording.
 
     Returns
     -------
-    JunctionEstimate
-        In the order of the vehicles.
+    estimate : FleetEstimate
+        As of a fleet; drifts and offsets are the means of the posterior, also where no fault is suspected.
+    laws : list of N _Law
+        The junction laws.
+    deciding : list of N str
+        What would decide the rest; empty if all is known.
+    contradictions : list of str
+        Where what is known contradicts itself.
 
     Raises
     ------
     FleetError
         If currents do not balance as those of a junction: a sign or a unit is wrong.
     """
-    N, K, scale_a = len(vehicles), len(branches), full_scale_a
-    places = _places(N, branches, meter)
+    N, K, scale_a = len(vehicles), len(branches), layout.full_scale_a
+    places = np.tile(np.arange(K), (N, 1))  # number of the sensor of each vehicle and branch: they share all but meters
+    if known.meter is not None:
+        places[1:, branches.index(known.meter)] = K + np.arange(N - 1)
     laws = [_law(each.summary, branches, each.vehicle, scale_a) for each in vehicles]
-    system = _system(vehicles, places, branches, known, laws=laws, full_scale_a=scale_a)
-    names = [branches[k] if k < K else f"{meter} ({vehicles[k - K + 1].vehicle})" for k in range(system.sensors)]
-    contradictions = _contradictions(system, names, scale_a)
-    for s in range(system.sensors):
-        of = [(vehicles[j], k) for j, k in np.argwhere(places == s).tolist()]
-        contradictions += _disagreements(_readings(of, branches, known), names[s])
-    S, scale_known = system.sensors, bool(system.read[: system.sensors].any())
-    posterior = _posterior(system)
+    system = _system(laws, places, known.load, scale_a)
+    S, disagreements = system.sensors, list[str]()
+    names = [branches[k] if k < K else f"{known.meter} ({vehicles[k - K + 1].vehicle})" for k in range(S)]
+    for s in range(S):
+        readings = [(known.read[r, 0, :, j, k], known.read[r, 1, :, j, k])
+                    for j, k in np.argwhere(places == s).tolist() for r in range(len(known.read))]  # fmt: skip
+        system = _with_reading(system, s, *weighted_mean(*readings), scale_a)
+        disagreements += _disagreements(readings, names[s])
+    for name, charge_a in known.charge_a.items():
+        system = _with_charge(system, branches.index(name), charge_a, scale_a)
+    contradictions = _contradictions(system, names, scale_a) + disagreements
+    scale_known, posterior = bool(system.read[:S].any()), _posterior(system)
     mean, sd, draws, weight = posterior.mean, posterior.sd, posterior.draws, posterior.weight
     gain_fault = _fault_probability(mean[:S], sd[:S], OPEN_GAIN_SD, TRUSTED_DRIFT_SD)
     offset_fault = _fault_probability(mean[S : 2 * S], sd[S : 2 * S], OPEN_OFFSET_SD, TRUSTED_OFFSET_SD)
@@ -518,87 +453,59 @@ def estimate_junction(
     fault = (1.0 - (1.0 - gain_fault) * (1.0 - offset_fault))[places]
     drift, offset, gain_sd, offset_sd = np.expm1(mean[places]), mean[S + places], sd[places], sd[S + places]
     harm, harm_of_gain, confidence, points = np.zeros((N, K)), np.zeros((N, K)), np.zeros(N), []
+    kinds = np.arange(posterior.explanation[-1] + 1)
     for j, vehicle in enumerate(vehicles):
         faults = np.concatenate([np.expm1(draws[:, places[j]]), draws[:, S + places[j]]], axis=1)
-        kinds = np.arange(posterior.explanation[-1] + 1)
         points.append(Points(faults, weight, posterior.explanation, np.zeros_like(kinds), kinds))
         own = (vehicle.summary.mean_a / scale_a - offset[j]) / (1.0 + drift[j])
         spread = vehicle.summary.variance_a2 / scale_a**2 / (1.0 + drift[j]) ** 2
-        estimate = np.append(drift[j], offset[j])
-        true = own[None], (own**2 + spread)[None]
+        estimate, true = np.append(drift[j], offset[j]), (own[None], (own**2 + spread)[None])
         harm[j] = harm_probability(points[j], estimate, *true)
         harm_of_gain[j] = harm_probability(points[j], np.append(drift[j], np.zeros(K)), *true)
         confidence[j] = recovery_probability(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
-    vague = bool(gain_sd.min() > KNOWN_GAIN_SD)
-    known_well = (gain_sd <= SOUND_GAIN_SD) & (offset_sd <= SOUND_OFFSET_SD)
     # Where it is open whose an offset is, the gain alone may be corrected.
     gain_alone = (harm >= harm_limit) & (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED)
-    harm = np.where(gain_alone, harm_of_gain, harm)
-    faulty = fault > SUSPECTED
+    harm, faulty = np.where(gain_alone, harm_of_gain, harm), fault > SUSPECTED
     findings = _misfits([each.summary for each in vehicles], branches, scale_a)
     unfit = np.array([[bool(mine)] for mine in findings])
-    reasons = {  # the first that applies is reported
-        "": ~faulty,
-        "does not fit": np.broadcast_to(unfit, (N, K)),
-        "reference in doubt": np.full((N, K), not scale_known or bool(contradictions) or vague),
-        "moved too little": gain_sd > KNOWN_GAIN_SD,
-        "harm limit": ~(harm < harm_limit),
-        "beyond the limits": (np.abs(drift) > limits[0]) | (np.abs(offset * scale_a) > limits[1]),
-    }
-    held_back = np.select(list(reasons.values()), list(reasons), "")
-    corrected = faulty & (held_back == "")
-    deciding = [
-        "; ".join(
-            [each.text for each in findings[j][:1]]
-            + _deciding(
-                branches,
-                gain_sd[j],
-                offset_sd[j],
-                offset[j] * scale_a,
-                offset_fault[places[j]],
-                scale_known=scale_known,
-                load_known=known.load is not None,
-            )
-        )
-        for j in range(N)
-    ]
-    offset_sd = np.where(gain_alone & corrected, np.hypot(offset_sd, offset), offset_sd)
-    offset = np.where(gain_alone & corrected, 0.0, offset)
-    sound = (~faulty & known_well).all(axis=1) & ~unfit[:, 0] & scale_known & (not contradictions)
-    verdicts = np.select([corrected.any(axis=1), sound], ["corrected", "no sensor fault"], "cannot tell")
-    return JunctionEstimate(
-        estimate=FleetEstimate(
-            drift=drift,
-            offset_a=offset * scale_a,
-            drift_sd=gain_sd * (1.0 + drift),
-            offset_sd_a=offset_sd * scale_a,
-            hardware_drift=np.zeros(N),
-            hardware_offset_a=np.zeros((N, K)),
-            hardware_probability=np.full(N, np.nan),
-            confidence=confidence,
-            fault_probability=fault,
-            harm_probability=harm,
-            identifiable=gain_sd <= KNOWN_GAIN_SD,
-            points=points,
-            order=tuple(range(K)),
-            full_scale_a=scale_a,
-            corrected=corrected,
-            held_back=held_back,
-            verdicts=verdicts.tolist(),
-            explanations=[_explanations(each, branches, scale_a) for each in points],
-            findings=findings,
-            evidence=[],
-        ),
-        ratios=[_named_ratios(law, branches) for law in laws],
-        constant_a=[
-            Reading(law.constant_a, float(np.hypot(np.sqrt(law.covariance[-1, -1]), LAW_OFFSET_SD * scale_a)))
-            for law in laws
-        ],
-        deciding=deciding,
-        contradictions=(f"what is known contradicts itself, so nothing is corrected: {'; '.join(contradictions)}",)
-        if contradictions
-        else (),
+    in_doubt = not scale_known or bool(contradictions) or bool(gain_sd.min() > KNOWN_GAIN_SD)
+    well_known = (gain_sd <= SOUND_GAIN_SD) & (offset_sd <= SOUND_OFFSET_SD)
+    held_back, corrected, verdicts = decided(
+        faulty,
+        unfit=unfit,
+        in_doubt=np.array(in_doubt),
+        still=gain_sd > KNOWN_GAIN_SD,
+        harmful=~(harm < harm_limit),
+        beyond=(np.abs(drift) > layout.limits.drift) | (np.abs(offset * scale_a) > layout.offset_limit_a),
+        sound=(~faulty & well_known).all(axis=1) & ~unfit[:, 0] & scale_known & (not contradictions),
     )
+    alone = gain_alone & corrected
+    found = FleetEstimate(
+        drift=drift,
+        offset_a=np.where(alone, 0.0, offset) * scale_a,
+        drift_sd=gain_sd * (1.0 + drift),
+        offset_sd_a=np.where(alone, np.hypot(offset_sd, offset), offset_sd) * scale_a,
+        hardware_drift=np.zeros(N),
+        hardware_offset_a=np.zeros((N, K)),
+        hardware_probability=np.full(N, np.nan),
+        confidence=confidence,
+        fault_probability=fault,
+        harm_probability=harm,
+        identifiable=gain_sd <= KNOWN_GAIN_SD,
+        points=points,
+        order=tuple(range(K)),
+        full_scale_a=scale_a,
+        corrected=corrected,
+        held_back=held_back,
+        verdicts=verdicts,
+        explanations=[_explanations(each, branches, scale_a) for each in points],
+        findings=findings,
+    )
+    told, deciding = {"scale": scale_known, "load": known.load is not None}, list[str]()
+    for j, mine in enumerate(findings):
+        texts = _deciding(branches, gain_sd[j], offset_sd[j], offset[j] * scale_a, offset_fault[places[j]], **told)
+        deciding.append("; ".join([*(each.text for each in mine[:1]), *texts]))
+    return found, laws, deciding, contradictions
 
 
 def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a: float) -> list[list[SensorFinding]]:
@@ -617,14 +524,14 @@ def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a
     return [[each for each in mine if each.cause != "noise"] for mine in found]
 
 
-def _named_ratios(law: _Law, branches: Sequence[str]) -> dict[str, Reading]:
-    """Gain ratios "a / b" with a before b in the layout, whichever branch moves most."""
+def _named_ratios(law: _Law, branches: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Gain ratios "a / b" with a before b in the layout, whichever branch moves most, and standard deviations. [1]"""
     first, *others = law.order
-    relative_sd = np.hypot(np.sqrt(np.diagonal(law.covariance)[:-1]) / law.ratio, LAW_GAIN_SD)
+    ratios, sds = np.exp(law.value[:-1]).tolist(), np.sqrt(np.diagonal(law.covariance)[:-1]).tolist()
     found = {}
-    for k, ratio, sd in sorted(zip(others, law.ratio.tolist(), relative_sd.tolist(), strict=True)):
+    for k, ratio, sd in sorted(zip(others, ratios, sds, strict=True)):
         above, below, value = (first, k, ratio) if first < k else (k, first, 1.0 / ratio)
-        found[f"{branches[above]} / {branches[below]}"] = Reading(value, value * sd)
+        found[f"{branches[above]} / {branches[below]}"] = (value, value * sd)
     return found
 
 
@@ -653,13 +560,13 @@ def _deciding(
     gain_sd: Array,
     offset_sd: Array,
     offset_a: Array,
-    offset_probability: Array,
+    probability: Array,
     *,
-    scale_known: bool,
-    load_known: bool,
+    scale: bool,
+    load: bool,
 ) -> list[str]:
-    """What is not known of the sensors, and what would tell."""
-    if not scale_known:
+    """What is not known of the sensors, and what would tell; by the probabilities of offsets, and what is known."""
+    if not scale:
         return [
             f"only ratios of gains are known: name a sensor that you trust (--trusted {branches[0]}), or give bench "
             f"readings (--readings)"
@@ -669,7 +576,7 @@ def _deciding(
     texts = []
     if gains := [name for name, sd in zip(branches, gain_sd, strict=True) if sd > KNOWN_GAIN_SD]:
         texts.append(f"the gain of {', '.join(gains)} needs a drive in which that current varies more")
-    unclear = [k for k, p in enumerate(offset_probability) if load_known and UNCLEAR[0] < p < UNCLEAR[1]]
+    unclear = [k for k, p in enumerate(probability) if load and UNCLEAR[0] < p < UNCLEAR[1]]
     if len(unclear) > 1:
         whose = " or ".join(branches[k] for k in unclear)
         texts.append(
@@ -677,10 +584,9 @@ def _deciding(
             f"a bench reading of one of them, would decide"
         )
     elif offsets := [name for name, sd in zip(branches, offset_sd, strict=True) if sd > KNOWN_OFFSET_SD]:
-        load = "" if load_known else ", or the load that no branch measures (--load)"
-        texts.append(
-            f"the offset of {', '.join(offsets)} needs a zero-current window (contactors open), a bench reading{load}"
-        )
+        more = "" if load else ", or the load that no branch measures (--load)"
+        whose = ", ".join(offsets)
+        texts.append(f"the offset of {whose} needs a zero-current window (contactors open), a bench reading{more}")
     return texts
 
 
@@ -699,38 +605,30 @@ def _same_error(parameters: VehicleParameters, trusted: Collection[str]) -> list
 
 
 def calibrate_junctions(
-    drives: Mapping[str, Sequence[Drive]],
-    fleet: FleetSource,
-    equipment: Equipment,
-    identity: RunIdentity,
-    settings: CalibrationSettings,
-    *,
-    workers: Workers,
-) -> tuple[bytes, dict[str, object], tuple[str, ...]]:
+    fleet: FleetSource, identity: RunIdentity, settings: CalibrationSettings, *, workers: Workers
+) -> tuple[Equipment, bytes, dict[str, object], list[str]]:
     """Calibrate each vehicle by itself; with a meter all together, as they are recordings of one car.
 
     Parameters
     ----------
-    drives : mapping of str to sequence of Drive
-        Those that were read already, by vehicle: all of a few vehicles, or none.
     fleet : FleetSource
         The recordings.
-    equipment : Equipment
-        Has the K branches.
     identity : RunIdentity
         For the parameter files.
     settings : CalibrationSettings
         How; its trusted names are branches.
     workers : Workers
-        Where the drives are read.
+        Where the drives are read, if they are many.
 
     Returns
     -------
+    equipment : Equipment
+        Has the K branches.
     part : bytes
         Of the result: parameters of every vehicle that could be used, and why the others could not.
     details : dict of str to JSON values
         Gain ratios and constants, for the record of the run.
-    notices : tuple of str
+    notices : list of str
         What the user should know.
 
     Raises
@@ -738,137 +636,136 @@ def calibrate_junctions(
     UserError
         If no vehicle can be used, or something is said to be known that is not there.
     """
-    layout, branches = identity.database.layout, equipment.branches
-    vehicles, left_out = _summaries(fleet, drives, branches, identity.database, settings.time_limit_s, workers=workers)
-    known = _known(settings, layout, branches, [each.vehicle for each in vehicles], left_out)
-    if settings.charge_ah:
-        if len(drives) != 1:
-            raise FleetError(
-                f"--charge is of the recordings of one vehicle, and there are {len(fleet.vehicles)}; give those of one"
-            )
-        (mine,) = drives.values()
-        charges = {name: _charge(mine, name, *value) for name, value in settings.charge_ah.items()}
-        known = replace(known, charge=charges)
-    groups = [vehicles] if settings.meter is not None else [[each] for each in vehicles]
+    layout = identity.database.layout
+    equipment, vehicles, left_out, drives = _read(fleet, identity.database, settings, workers)
+    branches, load = equipment.branches, settings.load or layout.unmeasured_load
+    read = _known_readings(vehicles, branches, settings, layout, left_out)
+    charge_a = _charges(drives, settings, fleet)
+    groups = [range(len(vehicles))] if settings.meter is not None else [[j] for j in range(len(vehicles))]
     parameters, junctions, notices = [], dict[str, object](), list[str]()
     for group in groups:
+        known = _Known(read[..., list(group), :], load, charge_a, settings.meter)
         try:
-            found = estimate_junction(
-                group,
-                branches,
-                known,
-                full_scale_a=layout.full_scale_a,
-                harm_limit=settings.harm_limit,
-                limits=(layout.limits.drift, layout.offset_limit_a),
-                meter=settings.meter,
+            found, laws, deciding, contradictions = _estimate(
+                [vehicles[j] for j in group], branches, known, layout=layout, harm_limit=settings.harm_limit
             )
         except FleetError as error:
             if len(groups) == 1:
                 raise
-            left_out[group[0].vehicle] = str(error)
+            left_out[vehicles[group[0]].vehicle] = str(error)
             continue
-        notices += found.contradictions
-        for j, vehicle in enumerate(group):
-            parameters.append(
-                parameters_of(
-                    vehicle,
-                    found.estimate,
-                    j,
-                    identity=identity,
-                    branches=branches,
-                    expected_a=0.0 if known.load is None else known.load.mean_a,
-                    fleet_size=1,
-                    decisive=found.deciding[j],
-                )
+        if contradictions:
+            why = "; ".join(contradictions)
+            notices.append(f"what is known contradicts itself, so nothing is corrected: {why}")
+        for i, j in enumerate(group):
+            name, ratios, constant_a = vehicles[j].vehicle, _named_ratios(laws[i], branches), laws[i].constant_a
+            expected_a = 0.0 if load is None else load.mean_a
+            mine = parameters_of(
+                vehicles[j],
+                found,
+                i,
+                identity=identity,
+                branches=branches,
+                expected_a=expected_a,
+                fleet_size=1,
+                decisive=deciding[i],
             )
-            junctions[vehicle.vehicle] = {
-                "gain_ratio": found.ratios[j],
-                "constant_a": found.constant_a[j],
-            }
+            parameters.append(mine)
+            junctions[name] = {"gain_ratio": ratios, "constant_a": constant_a}
             if len(vehicles) <= MOST_SHOWN:
-                sensors = parameters[-1].branches.items()
-                notices += [f"{vehicle.vehicle}: {name}: {sensor_text(branch)}" for name, branch in sensors]
-                notices.append(_shown(vehicle.vehicle, found.ratios[j], found.constant_a[j]))
-                notices += [f"{vehicle.vehicle}: {text}" for text in _same_error(parameters[-1], settings.trusted)]
-    return encode_chunk(parameters, left_out), {"junction": junctions}, tuple(notices)
+                said = ", ".join(f"{value:.4f} +- {sd:.4f} ({pair})" for pair, (value, sd) in ratios.items())
+                texts = [f"{branch}: {sensor_text(sensor)}" for branch, sensor in mine.branches.items()]
+                texts.append(
+                    f"gain ratios {said}; at zero current the sensors sum to {constant_a[0]:+.2f} +- "
+                    f"{constant_a[1]:.2f} A: their offsets, and loads without a sensor"
+                )
+                notices += [f"{name}: {text}" for text in (*texts, *_same_error(mine, settings.trusted))]
+    return equipment, encode_chunk(parameters, left_out), {"junction": junctions}, notices
 
 
-def _summaries(
-    fleet: FleetSource,
-    drives: Mapping[str, Sequence[Drive]],
-    branches: tuple[str, ...],
-    database: VehicleDatabase,
-    limit_s: float,
-    *,
-    workers: Workers,
-) -> tuple[list[VehicleSummary], dict[str, str]]:
-    """Summaries of the vehicles that can be used, and why the others cannot."""
-    if not drives:
-        equipment = Equipment(branches=branches, inputs=(), fleet_inputs=(), notices=())
-        return read_vehicles(read_junction, fleet, equipment, database, workers=workers, limit_s=limit_s)
-    found, left_out = list[VehicleSummary](), dict(fleet.left_out)
-    for name, mine in drives.items():
+def _read(
+    fleet: FleetSource, database: VehicleDatabase, settings: CalibrationSettings, workers: Workers
+) -> tuple[Equipment, list[VehicleSummary], dict[str, str], list[Sequence[Drive]]]:
+    """Branches; summaries of the vehicles that can be used, why the others cannot; drives of each, if they are few."""
+    branches, limit_s = settings.branches, settings.time_limit_s
+    if len(fleet.vehicles) > MOST_READ_HERE:
+        equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False)
+        found = read_vehicles(read_junction, fleet, equipment, database, workers=workers, limit_s=limit_s)
+        return equipment, *found, []
+    drives, vehicles, left_out = dict[str, Sequence[Drive]](), list[VehicleSummary](), dict(fleet.left_out)
+    error: UserError | None = None
+    with progress_bar("read drives", len(fleet.vehicles), "vehicles") as progress:
+        for number, (vehicle, entries) in enumerate(fleet.vehicles.items(), start=1):
+            try:
+                drives[vehicle] = [load_drive(entry, database) for entry in entries]
+            except UserError as problem:
+                error, left_out[vehicle] = problem, str(problem)
+            progress(number)
+    if error and not drives:
+        raise error
+    first = [mine[0] for mine in drives.values()]
+    equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False, drives=first)
+    for vehicle, mine in drives.items():
         try:
-            found.append(summarise_junction(mine, branches, database))
-        except DriveError as error:
-            left_out[name] = last = str(error)
-    if not found:
-        raise DriveError(last)
-    return found, left_out
+            vehicles.append(summarise_junction(mine, equipment.branches, database))
+        except DriveError as problem:
+            error, left_out[vehicle] = problem, str(problem)
+    if error and not vehicles:
+        raise error
+    return equipment, vehicles, left_out, list(drives.values())
 
 
-def _shown(vehicle: str, ratios: Mapping[str, Reading], constant_a: Reading) -> str:
-    """Gain ratios and constant of a vehicle in words."""
-    said = ", ".join(f"{value.mean:.4f} +- {value.sd:.4f} ({pair})" for pair, value in ratios.items())
-    return (
-        f"{vehicle}: gain ratios {said}; at zero current the sensors sum to {constant_a.mean:+.2f} +- "
-        f"{constant_a.sd:.2f} A: their offsets, and loads without a sensor"
-    )
-
-
-def _charge(drives: Sequence[Drive], branch: str, charge_ah: float, sd_ah: float) -> Charge:
-    """Mean currents of a branch over the whole of some drives; FleetError if too much of it is missing."""
-    measured_as = span_s = missing_s = 0.0
-    for drive in drives:
-        channel = drive.branches[branch]
-        time_s, value_a = channel.time_s[channel.good], channel.value[channel.good]
-        step_s = np.diff(time_s)
-        measured_as += float(np.trapezoid(value_a, time_s))
-        span_s += float(time_s[-1] - time_s[0])
-        missing_s += float(step_s[step_s > GAP_PERIODS * np.median(step_s)].sum())
-    if missing_s > MOST_MISSING * span_s:
-        raise FleetError(
-            f"--charge {branch}: {missing_s:.0f} s of {span_s:.0f} s have no samples of it, so its charge is not "
-            f"known; leave the option out"
-        )
-    hours = span_s / 3600.0
-    return Charge(measured_as / span_s, charge_ah / hours, sd_ah / hours)
-
-
-def _known(
+def _known_readings(
+    vehicles: Sequence[VehicleSummary],
+    branches: Sequence[str],
     settings: CalibrationSettings,
     layout: Layout,
-    branches: Sequence[str],
-    vehicles: Sequence[str],
     left_out: Mapping[str, str],
-) -> JunctionKnowledge:
-    """What the user knows; FleetError if it is of something that is not there."""
-    scale_a, meter = layout.full_scale_a, [settings.meter] if settings.meter else []
-    for option, names in {"--trusted": settings.trusted, "--charge": settings.charge_ah, "--meter": meter}.items():
-        for name in names:
+) -> Array:
+    """What is known of the sensors, see :class:`_Known`; FleetError if it is of something that is not there."""
+    scale_a, names = layout.full_scale_a, [each.vehicle for each in vehicles]
+    meter = [settings.meter] if settings.meter else []
+    for option, given in {"--trusted": settings.trusted, "--charge": settings.charge_ah, "--meter": meter}.items():
+        for name in given:
             if name not in branches:
                 raise FleetError(f"{option} {name}: no such branch was recorded; there are {', '.join(branches)}")
-    if settings.meter is not None and len(vehicles) < 2:
+    if meter and len(vehicles) < 2:
         raise FleetError(f"--meter {settings.meter}: one folder of recordings; give one for each of its sensors")
     bench: BenchTable = {}
     if settings.readings is not None:
         bench = read_bench_table(settings.readings, branches, full_scale_a=scale_a)
-        check_bench_table(bench, vehicles, left_out=left_out, trusted=(), full_scale_a=scale_a)
-    return JunctionKnowledge(
-        trusted={
-            name: (max(TRUSTED_DRIFT_SD, layout.find_branch(name).uncertainty), TRUSTED_OFFSET_SD * scale_a)
-            for name in settings.trusted
-        },
-        bench=bench,
-        load=settings.load or layout.unmeasured_load,
-    )
+        check_bench_table(bench, names, left_out=left_out, trusted=(), full_scale_a=scale_a)
+    trusted = np.full((2, 2, len(names), len(branches)), np.nan)
+    for k, name in enumerate(branches):
+        if name in settings.trusted:
+            of = slice(None) if name == settings.meter or not meter else slice(1)  # once of each sensor
+            trusted[0, :, of, k] = 0.0
+            trusted[1, 0, of, k] = max(TRUSTED_DRIFT_SD, layout.find_branch(name).uncertainty)
+            trusted[1, 1, of, k] = TRUSTED_OFFSET_SD * scale_a
+    return np.stack([window_readings(vehicles), bench_readings(bench, names, branches), trusted])
+
+
+def _charges(
+    drives: Sequence[Sequence[Drive]], settings: CalibrationSettings, fleet: FleetSource
+) -> dict[str, tuple[float, float, float]]:
+    """Mean current of branches over all drives of one vehicle: as measured, by their charge, its deviation. [A]"""
+    if settings.charge_ah and len(drives) != 1:
+        raise FleetError(
+            f"--charge is of the recordings of one vehicle, and there are {len(fleet.vehicles)}; give those of one"
+        )
+    found = {}
+    for branch, (charge_ah, sd_ah) in settings.charge_ah.items():
+        measured_as = span_s = missing_s = 0.0
+        for channel in (drive.branches[branch] for drive in drives[0]):
+            time_s, value_a = channel.time_s[channel.good], channel.value[channel.good]
+            step_s = np.diff(time_s)
+            measured_as += float(np.trapezoid(value_a, time_s))
+            span_s += float(time_s[-1] - time_s[0])
+            missing_s += float(step_s[step_s > GAP_PERIODS * np.median(step_s)].sum())
+        if missing_s > MOST_MISSING * span_s:
+            raise FleetError(
+                f"--charge {branch}: {missing_s:.0f} s of {span_s:.0f} s have no samples of it, so its charge is not "
+                f"known; leave the option out"
+            )
+        found[branch] = measured_as / span_s, charge_ah * 3600.0 / span_s, sd_ah * 3600.0 / span_s
+    return found

@@ -9,9 +9,10 @@ and the verdict is 'cannot tell': whatever they are, they do not explain this ve
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from calibrator.processes.run_many import Workers
 from calibrator.published.classify import ExpectedFaults
 from calibrator.published.recovery import Recovery, calibrate_published
 from calibrator.published.state_space import StateSpaceModel, bridged, identify_model, simulation_snr_db
-from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
+from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, probe_equipment, read_vehicles
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import counted, few
 from ecu_node.database import VehicleDatabase
@@ -94,27 +95,7 @@ class VehicleModel:
 
 
 def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleModel:
-    """Read the drives of one vehicle and identify its model.
-
-    Parameters
-    ----------
-    entries : sequence of DriveFile
-        Drives of one vehicle.
-    equipment : Equipment
-        Branches and model inputs of the fleet.
-    database : VehicleDatabase
-        DBC and layout.
-
-    Returns
-    -------
-    VehicleModel
-        The vehicle.
-
-    Raises
-    ------
-    UserError
-        If a drive cannot be read, or there is too little valid data; the message says which and how much.
-    """
+    """Read the drives of one vehicle and identify its model, see :func:`identify_vehicle`."""
     read = (load_drive(entry, database) for entry in entries)
     drives = [align(drive, database.layout, equipment.branches, inputs=equipment.inputs) for drive in read]
     names = tuple(entry.name for entry in entries)
@@ -155,10 +136,13 @@ def identify_vehicle(
         )
     # The drives one after the other, each followed by a gap that is not valid.
     gap = int(GAP_S / period_s)
-    inputs = np.concatenate([np.pad(drive.inputs, ((0, gap), (0, 0))) for drive in drives])
-    currents = np.concatenate([np.pad(drive.currents_a, ((0, gap), (0, 0))) for drive in drives])
-    valid = np.concatenate([np.pad(drive.valid, (0, gap)) for drive in drives])
-    training = valid & np.concatenate([np.pad(_in_training(drive.valid), (0, gap)) for drive in drives])
+
+    def joined(parts: Iterable[Any]) -> Any:
+        return np.concatenate([np.pad(part, [(0, gap), *[(0, 0)] * (part.ndim - 1)]) for part in parts])
+
+    inputs, currents = joined(drive.inputs for drive in drives), joined(drive.currents_a for drive in drives)
+    valid = joined(drive.valid for drive in drives)
+    training = valid & joined(_in_training(drive.valid) for drive in drives)
     held_out, stop = valid & ~training, int(np.flatnonzero(training)[-1]) + 1
     model = _identify_excited(inputs[:stop], currents[:stop], training[:stop])
     simulated = model.simulate(bridged(inputs, valid), initial_state=model.x0)
@@ -200,14 +184,14 @@ def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpace
 
 
 def calibrate_fleet_published(
-    fleet: FleetSource, equipment: Equipment, identity: RunIdentity, settings: CalibrationSettings, *, workers: Workers
-) -> tuple[bytes, dict[str, object], tuple[str, ...]]:
+    fleet: FleetSource, identity: RunIdentity, settings: CalibrationSettings, *, workers: Workers
+) -> tuple[Equipment, bytes, dict[str, object], tuple[str, ...]]:
     """Calibrate a fleet as published.
 
     Parameters
     ----------
-    fleet, equipment : FleetSource, Equipment
-        The fleet, its branches and inputs.
+    fleet : FleetSource
+        The fleet.
     identity : RunIdentity
         For the parameter files.
     settings : CalibrationSettings
@@ -217,6 +201,8 @@ def calibrate_fleet_published(
 
     Returns
     -------
+    equipment : Equipment
+        Its branches and inputs.
     part : bytes
         Parameters of every vehicle that could be used, and why the others could not.
     details : dict of str to JSON values
@@ -229,18 +215,18 @@ def calibrate_fleet_published(
     FleetError
         If too few vehicles can be used.
     """
-    branches, layout = equipment.branches, identity.database.layout
-    vehicles, left_out = read_vehicles(
-        read_vehicle_model, fleet, equipment, identity.database, workers=workers, limit_s=settings.time_limit_s
-    )
+    database, limit_s = identity.database, settings.time_limit_s
+    equipment = probe_equipment(fleet, database, settings.branches, limit_s=limit_s)
+    branches, layout = equipment.branches, database.layout
+    vehicles, left_out = read_vehicles(read_vehicle_model, fleet, equipment, database, workers=workers, limit_s=limit_s)
     vehicles = _without_misfits(vehicles, settings.hold_out, branches, left_out)
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
     learners = list(compress(vehicles, learning))
-    unity = _unity_vehicle(learners, settings.unity)
+    unity, truth = _unity_vehicle(learners, settings.unity), settings.truth
+    if truth is not None and tuple(truth.branches) != branches:
+        raise FleetError(f"the truth is of branches {truth.branches}, the fleet has {branches}")
     with progress_bar("estimate the faults", None):
-        if settings.truth is not None and tuple(settings.truth.branches) != branches:
-            raise FleetError(f"the truth is of branches {settings.truth.branches}, the fleet has {branches}")
         recovery = calibrate_published(
             [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles],  # (2)
             junction_a2=np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles]),
@@ -249,12 +235,9 @@ def calibrate_fleet_published(
             full_scale_a=layout.full_scale_a,
             classifier=settings.classifier,
             expected=ExpectedFaults(
-                sparsity=settings.sparsity,
-                magnitude=settings.magnitude,
-                symmetric=settings.symmetric,
-                seed=settings.seed,
+                **{name: getattr(settings, name) for name in ("sparsity", "magnitude", "symmetric", "seed")}
             ),
-            truth=None if settings.truth is None else faults_of(settings.truth, names),
+            truth=None if truth is None else faults_of(truth, names),
         )
     left_out |= {names[j]: reason for j, reason in recovery.failed.items()}
     parameters = [
@@ -268,7 +251,7 @@ def calibrate_fleet_published(
         "simulation_snr_db": by_branch(branches, np.nanmedian([vehicle.snr_db for vehicle in vehicles], axis=0)),
     }
     notices = () if settings.symmetric else few_vehicles_notice(len(learners))
-    return encode_chunk(parameters, left_out), details, notices
+    return equipment, encode_chunk(parameters, left_out), details, notices
 
 
 def few_vehicles_notice(learning: int) -> tuple[str, ...]:

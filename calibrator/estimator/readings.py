@@ -10,8 +10,7 @@ import csv
 import math
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import compress
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,26 +19,16 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
-from calibrator.faults import Index
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import weighted_mean
 from calibrator.terminal.text import few
 from ecu_node.layout import UnmeasuredLoad
 
 __all__ = [
-    "FEWEST_TRUSTED",
-    "TRUSTED_DRIFT_SD",
-    "TRUSTED_OFFSET_SD",
-    "BenchReading",
-    "BenchTable",
-    "Readings",
-    "check_bench_table",
-    "merge_readings",
-    "read_bench_table",
-    "trust_notices",
-    "untrusted_vehicles",
-    "with_readings",
-]
+    "FEWEST_TRUSTED", "TRUSTED_DRIFT_SD", "TRUSTED_OFFSET_SD", "BenchReading", "BenchTable", "bench_readings",
+    "check_bench_table", "merge_readings", "read_bench_table", "untrusted_vehicles", "window_readings",
+    "with_knowledge",
+]  # fmt: skip
 
 TRUSTED_DRIFT_SD = 0.002
 """Accuracy of a bench check of the gain, as of a laboratory shunt. [1]"""
@@ -64,62 +53,6 @@ LARGEST = 0.9
 """Largest fault that a sensor of a running vehicle is read with; a drift of 2 is 2 %, wrongly typed. [1]"""
 
 
-@dataclass(frozen=True)
-class Readings:
-    """Readings of N vehicles with K branches; NaN where there is none.
-
-    Attributes
-    ----------
-    values : ndarray of shape (2, 2, N, K)
-        Value and its standard deviation, positive, each of drift [1], above -1, and offset [A].
-    """
-
-    values: Array
-
-    @classmethod
-    def none(cls, vehicles: int, branches: int) -> "Readings":
-        """No readings at all."""
-        return cls(np.full((2, 2, vehicles, branches), np.nan))
-
-    @classmethod
-    def of_trusted(cls, trusted: Mask, branches: int, full_scale_a: float) -> "Readings":
-        """Readings of zero for all K sensors of the trusted of N vehicles, none for the others; full scale in A."""
-        accuracy = np.array([[0.0, 0.0], [TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD * full_scale_a]])
-        return cls(np.where(trusted[:, None], accuracy[:, :, None, None], np.nan) * np.ones(branches))
-
-    @classmethod
-    def of_bench(cls, bench: "BenchTable", vehicles: Sequence[str], branches: Sequence[str]) -> "Readings":
-        """Readings of a bench table for N vehicles and K branches, by their names."""
-        unread = BenchReading(np.nan, np.nan, np.nan, np.nan, "")
-        read = [[bench.get((vehicle, branch), unread) for branch in branches] for vehicle in vehicles]
-        values = np.array([[each[:4] for each in row] for row in read]).reshape(len(vehicles), len(branches), 2, 2)
-        return cls(values.transpose(3, 2, 0, 1))
-
-    def merged(self, other: "Readings") -> "Readings":
-        """Both together: of a sensor that was read twice the mean, weighted by precision."""
-        return Readings(np.array(weighted_mean((self.values[0], self.values[1]), (other.values[0], other.values[1]))))
-
-    def take(self, index: Index) -> "Readings":
-        """Return the readings of some of the vehicles."""
-        return Readings(self.values[:, :, index])
-
-    def take_branches(self, order: Sequence[int]) -> "Readings":
-        """Return the same readings with the branches in another order."""
-        return Readings(self.values[..., list(order)])
-
-
-def with_readings(rows: EvidenceRows, readings: Readings, *, full_scale_a: float) -> EvidenceRows:
-    """Evidence rows of N vehicles with direct readings of the same vehicles and branches; full scale in A."""
-    at, ((drift, offset_a), (drift_sd, offset_sd_a)) = rows.places, readings.values
-    value = np.array([np.log1p(drift), offset_a / full_scale_a])
-    sd = np.array([drift_sd / (1.0 + drift), offset_sd_a / full_scale_a])
-    known = np.isfinite(value) & np.isfinite(sd)
-    values, covariance, row = rows.values, rows.covariance.copy(), np.r_[at.gain_reads, at.offset_reads]
-    values[:, row] = np.hstack([*np.where(known, value, 0.0)])
-    covariance[:, row, row] = np.hstack([*np.where(known, sd**2, UNKNOWN_VARIANCE)])
-    return replace(rows, relative=values[:, at.relative], constant=values[:, at.constant], covariance=covariance)
-
-
 class BenchReading(NamedTuple):
     """What a bench showed of one sensor; NaN where it was not read. [1], [A]"""
 
@@ -134,6 +67,73 @@ class BenchReading(NamedTuple):
 Names = Collection[str]
 BenchTable = Mapping[tuple[str, str], BenchReading]
 """Bench readings by vehicle and branch."""
+
+
+def window_readings(vehicles: Sequence[VehicleSummary]) -> Array:
+    """What the sensors of N vehicles showed in zero-current windows, as :func:`bench_readings`: offsets alone."""
+    shown = np.array([(each.zero_current.offset_a, each.zero_current.sd_a) for each in vehicles])
+    return np.stack([np.full_like(shown, np.nan), shown]).transpose(2, 0, 1, 3)
+
+
+def bench_readings(bench: BenchTable, vehicles: Sequence[str], branches: Sequence[str]) -> Array:
+    """Readings of a bench table for N vehicles and K branches, by their names.
+
+    Returns
+    -------
+    ndarray of shape (2, 2, N, K)
+        Value and its standard deviation, each of drift [1] and offset [A]; NaN where a sensor was not read.
+    """
+    unread = BenchReading(np.nan, np.nan, np.nan, np.nan, "")
+    read = [[bench.get((vehicle, branch), unread)[:4] for branch in branches] for vehicle in vehicles]
+    return np.array(read).reshape(len(vehicles), len(branches), 2, 2).transpose(3, 2, 0, 1)
+
+
+def with_knowledge(
+    rows: EvidenceRows,
+    readings: Array | None,
+    trusted: Mask,
+    *,
+    order: Sequence[int],
+    full_scale_a: float,
+    load: UnmeasuredLoad | None,
+) -> EvidenceRows:
+    """Evidence with what is known beside the drives.
+
+    Parameters
+    ----------
+    rows : EvidenceRows
+        Of N vehicles.
+    readings : ndarray of shape (2, 2, N, K), or None
+        Direct readings of their sensors, see :func:`bench_readings`, branches in their own order.
+    trusted : ndarray of bool of shape (N,)
+        Vehicles all of whose sensors read right.
+    order : sequence of int
+        Branches of the rows: position of each in their own order.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    load : UnmeasuredLoad or None
+        Load that no branch measures, if it is known.
+
+    Returns
+    -------
+    EvidenceRows
+        The same with rows of readings, and the constant of the junction as sure as the load is.
+    """
+    at, N, K = rows.places, len(rows), rows.branches
+    given = np.full((2, 2, N, K), np.nan) if readings is None else readings
+    accuracy = np.array([[0.0, 0.0], [TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD * full_scale_a]])
+    right = np.where(trusted[:, None], accuracy[:, :, None, None], np.nan) * np.ones(K)
+    known = np.array(weighted_mean((given[0], given[1]), (right[0], right[1])))[..., list(order)]
+    (drift, offset_a), (drift_sd, offset_sd_a) = known
+    value = np.array([np.log1p(drift), offset_a / full_scale_a])
+    sd = np.array([drift_sd / (1.0 + drift), offset_sd_a / full_scale_a])
+    read = np.isfinite(value) & np.isfinite(sd)
+    values, covariance, row = rows.values.copy(), rows.covariance.copy(), np.r_[at.gain_reads, at.offset_reads]
+    values[:, row] = np.hstack([*np.where(read, value, 0.0)])
+    covariance[:, row, row] = np.hstack([*np.where(read, sd**2, UNKNOWN_VARIANCE)])
+    if load is not None:
+        covariance[:, at.junction, at.junction] += (load.sd_a / full_scale_a) ** 2
+    return replace(rows, values=values, covariance=covariance)
 
 
 def _text(path: Path) -> str:
@@ -262,7 +262,7 @@ def check_bench_table(
 
 def merge_readings(
     vehicles: Sequence[VehicleSummary], bench: BenchTable, branches: Sequence[str]
-) -> tuple[Readings, list[str]]:
+) -> tuple[Array, list[str]]:
     """Merge what the sensors showed on a bench with what they showed in zero-current windows.
 
     Parameters
@@ -276,18 +276,17 @@ def merge_readings(
 
     Returns
     -------
-    readings : Readings
-        Both together; neither where they contradict each other.
+    readings : ndarray of shape (2, 2, N, K)
+        Both together, see :func:`bench_readings`; neither where they contradict each other.
     notices : list of str
         Where they do, and readings that could not be used.
     """
     names = [vehicle.vehicle for vehicle in vehicles]
-    read = Readings.of_bench(bench, names, branches)
-    shown = Readings.none(len(names), len(branches))
-    shown.values[:, 1] = np.stack([(each.zero_current.offset_a, each.zero_current.sd_a) for each in vehicles], axis=1)
-    merged, (offset_a, sd_a), (read_a, read_sd_a) = shown.merged(read), shown.values[:, 1], read.values[:, 1]
+    read, shown = bench_readings(bench, names, branches), window_readings(vehicles)
+    merged = np.array(weighted_mean((shown[0], shown[1]), (read[0], read[1])))
+    (offset_a, sd_a), (read_a, read_sd_a) = shown[:, 1], read[:, 1]
     apart = np.abs(offset_a - read_a) > CONTRADICTION * np.hypot(sd_a, read_sd_a)
-    merged.values[:, 1, apart] = np.nan
+    merged[:, 1, apart] = np.nan
     notices = [
         f"vehicle {names[j]}: its {branches[k]} sensor was read as {read_a[j, k]:+.1f} A on the bench, and "
         f"showed {offset_a[j, k]:+.1f} A with open contactors: neither is used; check it again"
@@ -347,58 +346,3 @@ def untrusted_vehicles(
         if off[j, k]:
             found[j] = f"the gains of its sensors {branches[k + 1]} and {branches[0]} differ by {ratio[j, k]:+z.1%}"
     return found
-
-
-def trust_notices(
-    vehicles: Sequence[VehicleSummary],
-    trusted: Mask,
-    branches: Sequence[str],
-    *,
-    untrusted: Mapping[int, str],
-    differing: Collection[int],
-    full_scale_a: float,
-) -> list[str]:
-    """Say which trusted vehicles contradict the trust in them, or are too few to carry the reference.
-
-    Parameters
-    ----------
-    vehicles : sequence of VehicleSummary
-        N vehicles.
-    trusted : ndarray of bool of shape (N,)
-        Which are called trusted.
-    branches : sequence of str
-        Names of the K branches in the order of the summaries.
-    untrusted : mapping of int to str
-        From :func:`untrusted_vehicles`.
-    differing : collection of int
-        Trusted vehicles that differ as by a hardware fault, by position.
-    full_scale_a : float
-        Full scale of the junction. [A]
-
-    Returns
-    -------
-    list of str
-        Notices.
-    """
-    notices = []
-    carriers = int(np.count_nonzero(trusted)) - len(untrusted) - len(differing)
-    if trusted.any() and carriers < FEWEST_TRUSTED:
-        notices.append(
-            f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: it is the "
-            f"fleet's"
-        )
-    notices += [f"vehicle {vehicles[j].vehicle} is not trusted: {why}; check it again" for j, why in untrusted.items()]
-    notices += [
-        f"trusted vehicle {vehicles[j].vehicle} does not carry the reference: it differs from the other trusted ones "
-        f"as by a hardware fault"
-        for j in differing
-    ]
-    return notices + [
-        f"trusted vehicle {vehicle.vehicle}: its {branch} sensor showed {offset_a:+.1f} A with open contactors; it was "
-        f"taken for faultless: check it again, or do not trust it"
-        for vehicle in compress(vehicles, trusted)
-        for branch, offset_a, sd_a in zip(
-            branches, vehicle.zero_current.offset_a, vehicle.zero_current.sd_a, strict=True
-        )
-        if abs(offset_a) > CONTRADICTION * math.hypot(sd_a, TRUSTED_OFFSET_SD * full_scale_a)
-    ]

@@ -16,19 +16,20 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import INTERNAL_ERROR, FleetError
-from calibrator.estimator.evidence import VehicleEvidence
+from calibrator.files.parameter_files import held_back_lines
 from calibrator.files.storage import DISK_FULL
 from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
@@ -38,28 +39,10 @@ from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters, encode_parameters
 
 __all__ = [
-    "MOST_FILES",
-    "PARTS",
-    "SCHEMA",
-    "CalibrationReport",
-    "RunRecord",
-    "Unfinished",
-    "Written",
-    "deployed_rms_a",
-    "encode_chunk",
-    "internal_errors",
-    "join_rows",
-    "left_out_of",
-    "part_file",
-    "read_part",
-    "read_results",
-    "read_run",
-    "report_of",
-    "unfinished_run",
-    "write_parameter_files",
-    "write_run",
-    "written_of",
-]
+    "MOST_FILES", "PARTS", "SCHEMA", "CalibrationReport", "RunRecord", "Unfinished", "Written", "copy_summaries",
+    "deployed_rms_a", "encode_chunk", "internal_errors", "join_rows", "left_out_of", "part_file", "read_part",
+    "read_results", "read_run", "report_of", "unfinished_run", "write_parameter_files", "write_run", "written_of",
+]  # fmt: skip
 
 MOST_FILES = 10_000
 """Vehicles whose parameters are files of their own in one folder."""
@@ -97,28 +80,31 @@ _UNITS = {
     "moved": "",
 }
 """Columns after vehicle, branch and verdict: numbers with their unit, texts (empty), and flags (None)."""
-SCHEMA = pa.schema(
-    [
-        pa.field("vehicle", pa.string(), nullable=False),
-        pa.field("branch", pa.string()),
-        pa.field("verdict", pa.string(), nullable=False),
-        *(
-            pa.field(name, pa.float64(), metadata={"unit": unit})
-            if unit
-            else pa.field(name, pa.bool_() if unit is None else pa.string())
-            for name, unit in _UNITS.items()
-        ),
-    ]
-)
+
+
+def _column(name: str, unit: str | None) -> pa.Field:
+    kind = pa.float64() if unit else pa.bool_() if unit is None else pa.string()
+    return pa.field(name, kind, metadata={"unit": unit} if unit else None)
+
+
+_NAMES = [pa.field(name, pa.string(), nullable=name == "branch") for name in ("vehicle", "branch", "verdict")]
+SCHEMA = pa.schema([*_NAMES, *(_column(name, unit) for name, unit in _UNITS.items())])
 """Of ``results.parquet``."""
+_ONCE = {
+    "drives": "digest of the drives' files",
+    "parameters": "text of the parameter file",
+    "evidence_value": "rows named in run.json",
+    "evidence_sd": "standard deviation of the same",
+    "evidence_explained": "what the estimate makes of it",
+}
+_EVIDENCE = [name for name in _ONCE if name.startswith("evidence")]
 PART_SCHEMA = pa.schema(
     [
         *SCHEMA,
-        pa.field("drives", pa.string(), metadata={"meaning": "digest of the drives' files"}),
-        pa.field("parameters", pa.string(), metadata={"meaning": "text of the parameter file"}),
-        pa.field("evidence_value", pa.list_(pa.float32()), metadata={"meaning": "rows named in run.json"}),
-        pa.field("evidence_sd", pa.list_(pa.float32()), metadata={"meaning": "standard deviation of the same"}),
-        pa.field("evidence_explained", pa.list_(pa.float32()), metadata={"meaning": "what the estimate makes of it"}),
+        *(
+            pa.field(name, pa.list_(pa.float32()) if name in _EVIDENCE else pa.string(), metadata={"meaning": meaning})
+            for name, meaning in _ONCE.items()
+        ),
     ]
 )
 """Of a part with the vehicles of one bucket; the last five only in the first row of each vehicle."""
@@ -159,8 +145,8 @@ class Written(NamedTuple):
     drives: str
     """Digest of the drives' files; empty: not known."""
     text: bytes
-    evidence: VehicleEvidence | None
-    """What they were found from; None: not kept."""
+    evidence: Array | None
+    """What they were found from, shape (3, 5K), see :func:`.reported_evidence`; None: not kept."""
 
 
 def encode_chunk(
@@ -169,7 +155,7 @@ def encode_chunk(
     *,
     moved: Mapping[tuple[str, str], str] = {},
     drives: Mapping[str, str] = {},
-    evidence: Mapping[str, VehicleEvidence] = {},
+    evidence: Mapping[str, Array] = {},
 ) -> bytes:
     """Write down the result of some vehicles, in the order of their names.
 
@@ -183,8 +169,8 @@ def encode_chunk(
         What has moved since an earlier result, by vehicle and branch.
     drives : mapping of str to str
         Digest of the drives' files by vehicle.
-    evidence : mapping of str to VehicleEvidence
-        What the parameters were found from, by vehicle.
+    evidence : mapping of str to ndarray of shape (3, 5K)
+        What the parameters were found from, by vehicle, see :func:`.reported_evidence`.
 
     Returns
     -------
@@ -200,12 +186,12 @@ def encode_chunk(
         except ParameterError as error:
             reasons[name] = f"{error}; look at its recordings"
             continue
-        found = vars(evidence[name]) if name in evidence else {}
-        once = {"drives": drives.get(name, ""), "parameters": text}
-        once |= {f"evidence_{key}": values for key, values in found.items()}
-        for row in _rows_of(item):
-            rows.append({**row, "moved": moved.get((name, row["branch"])), **once})
-            once = {}
+        of_vehicle = _rows_of(item)
+        for row in of_vehicle:
+            row["moved"] = moved.get((name, row["branch"]))
+        of_vehicle[0] |= {"drives": drives.get(name, ""), "parameters": text}
+        of_vehicle[0] |= dict(zip(_EVIDENCE, evidence[name], strict=True)) if name in evidence else {}
+        rows += of_vehicle
     return _parquet(pa.Table.from_pylist(rows + _left_out_rows(reasons), schema=PART_SCHEMA))
 
 
@@ -227,7 +213,7 @@ def _rows_of(item: VehicleParameters) -> Rows:
             "junction_rms_measured_a": residual.measured_a,
             "junction_rms_corrected_a": residual.corrected_a,
             "duration_s": item.provenance.duration_s,
-            "reason": item.deciding_evidence or None,
+            "reason": item.deciding_evidence or "; ".join(held_back_lines(item)) or None,
         }
         for name, branch in item.branches.items()
     ]
@@ -269,9 +255,9 @@ def join_rows(folder: Path, left_out: Mapping[str, str]) -> int:
         writer.write_table(pa.Table.from_pylist(_left_out_rows(others), schema=SCHEMA))
     if pq.read_metadata(path).num_rows <= MOST_SORTED:
         rows = pq.read_table(path, use_threads=False)
-        keys = list(zip(pc.equal(rows["verdict"], LEFT_OUT).to_pylist(), rows["vehicle"].to_pylist(), strict=True))
-        order = sorted(range(len(keys)), key=keys.__getitem__)  # stable: branches keep their order
-        path.write_bytes(_parquet(rows.take(order)))
+        keys = pd.DataFrame({"left_out": pc.equal(rows["verdict"], LEFT_OUT), "vehicle": rows["vehicle"]})
+        order = keys.sort_values(["left_out", "vehicle"], kind="stable").index  # branches keep their order
+        path.write_bytes(_parquet(rows.take(order.to_numpy())))
     return calibrated
 
 
@@ -301,11 +287,11 @@ def part_file(result: Path, number: int) -> Path:
 def read_part(path: Path) -> dict[str, Written]:
     """Parameters of a part by vehicle, none if there is no such file; FleetError if it is damaged."""
     try:
-        columns = pq.ParquetFile(path).read(["vehicle", *PART_SCHEMA.names[len(SCHEMA) :]], use_threads=False)
+        rows = pq.ParquetFile(path).read(["vehicle", *_ONCE], use_threads=False)
         found = {}
-        for row in columns.filter(pc.field("parameters").is_valid()).to_pylist():
-            value, sd, explained = (row[f"evidence_{name}"] for name in ("value", "sd", "explained"))
-            evidence = None if value is None else VehicleEvidence(value=value, sd=sd, explained=explained)
+        for row in rows.filter(pc.field("parameters").is_valid()).to_pylist():
+            kept = row["evidence_value"] is not None
+            evidence = np.array([row[name] for name in _EVIDENCE], float) if kept else None
             found[row["vehicle"]] = Written(row["drives"], row["parameters"].encode(), evidence)
         return found
     except FileNotFoundError:
@@ -424,9 +410,11 @@ class CalibrationReport:
     def as_text(self) -> str:
         """The report for people."""
         run, details = self.run, self.run.details
-        agreeing = details.get("reference", {}).get("agreeing_share", {})
-        spread = details.get("hyperparameters", {}).get("model_spread", {})
-        snr = details.get("simulation_snr_db", {})
+        by_branch = {
+            "simulation SNR, median, {} [dB]": (details.get("simulation_snr_db", {}), ".1f"),
+            "vehicles that agree, {}": (details.get("reference", {}).get("agreeing_share", {}), ".0%"),
+            "faultless vehicles differ by, {}": (details.get("hyperparameters", {}).get("model_spread", {}), ".1%"),
+        }
         rows = [
             ("vehicles calibrated", f"{run.vehicles}"),
             *((f"  {verdict}", f"{count}") for verdict, count in self.verdicts.items()),
@@ -435,9 +423,11 @@ class CalibrationReport:
             *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
             ("junction sum RMS, median, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
             ("junction sum RMS, median, deployed [A]", f"{self.junction_rms_deployed_a:.2f}"),
-            *((f"simulation SNR, median, {name} [dB]", f"{value:.1f}") for name, value in snr.items()),
-            *((f"vehicles that agree, {name}", f"{value:.0%}") for name, value in agreeing.items()),
-            *((f"faultless vehicles differ by, {name}", f"{value:.1%}") for name, value in spread.items()),
+            *(
+                (what.format(name), format(value, digits))
+                for what, (values, digits) in by_branch.items()
+                for name, value in values.items()
+            ),
         ]
         parts = [
             table((f"method {run.method}", ""), rows),
@@ -471,47 +461,48 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
     CalibrationReport
         Of all its vehicles.
     """
-    rows = pq.read_table(result / ROWS, use_threads=False).filter(pc.field("branch").is_valid())
-    vehicles = rows.filter(pc.field("branch") == run.branches[0])  # each has what is said of its vehicle as a whole
+    rows = pd.read_parquet(result / ROWS, use_threads=False)
+    rows = rows[rows["branch"].notna()].astype({"applied": bool, "hardware_fault": bool})
+    vehicles = rows[rows["branch"] == run.branches[0]]  # each has what is said of its vehicle as a whole
     measured_a, corrected_a = (vehicles[f"junction_rms_{name}_a"].to_numpy() for name in ("measured", "corrected"))
-    applied, moved = rows["applied"].to_numpy().reshape(-1, len(run.branches)), pc.field("moved").is_valid()
-    deployed_a = deployed_rms_a(applied, measured_a=measured_a, corrected_a=corrected_a)
+    applied = rows["applied"].to_numpy().reshape(-1, len(run.branches))
+    suspected, moved = vehicles[vehicles["hardware_fault"]], rows[rows["moved"].notna()]
 
-    def counts(column: pa.ChunkedArray) -> dict[str, int]:
-        return {item["values"]: item["counts"] for item in pc.value_counts(column).to_pylist()}
+    def said(rows: pd.DataFrame, text: Callable[[pd.DataFrame], str]) -> dict[str, str]:
+        """What is said of the first vehicles."""
+        return {str(name): text(mine) for name, mine in islice(rows.groupby("vehicle", sort=False), MOST_NAMED)}
 
-    def corrected(rows: Rows) -> str:
-        names, confidence = ", ".join(row["branch"] for row in rows), rows[0]["confidence"]
-        unsure = confidence is not None and confidence < CONFIDENT
-        return f"{names} (all of its faults within 10 %: probability {confidence:.2f})" if unsure else names
+    def corrected(mine: pd.DataFrame) -> str:
+        names, confidence = ", ".join(mine["branch"]), mine["confidence"].iloc[0]
+        unsure = f" (all of its faults within 10 %: probability {confidence:.2f})"
+        return names + unsure if confidence < CONFIDENT else names
 
-    def suspected(rows: Rows) -> str:
-        probability = rows[0]["hardware_probability"]
-        return "" if probability is None else f"probability {probability:.1f}"
+    def probability(mine: pd.DataFrame) -> str:
+        value = mine["hardware_probability"].iloc[0]
+        return "" if np.isnan(value) else f"probability {value:.1f}"
 
     return CalibrationReport(
         result=str(shown),
         parameters=parameters,
         run=run,
-        verdicts=counts(vehicles["verdict"]),
-        undecided=_said(vehicles, pc.field("verdict") == "cannot tell", lambda rows: rows[0]["reason"] or ""),
-        corrected=_said(rows, (pc.field("verdict") == "corrected") & pc.field("applied"), corrected),
-        hardware_suspected=_said(vehicles, pc.field("hardware_fault"), suspected),
-        hardware_count=vehicles.filter(pc.field("hardware_fault")).num_rows,
-        held_back=counts(rows["held_back"].drop_null()),
-        moved=_said(rows, moved, lambda rows: "; ".join(f"{row['branch']} {row['moved']}" for row in rows)),
-        moved_count=len(pc.unique(rows.filter(moved)["vehicle"])),
+        verdicts=_counts(vehicles["verdict"]),
+        undecided=said(vehicles[vehicles["verdict"] == "cannot tell"], lambda mine: mine["reason"].iloc[0] or ""),
+        corrected=said(rows[(rows["verdict"] == "corrected") & rows["applied"]], corrected),
+        hardware_suspected=said(suspected, probability),
+        hardware_count=len(suspected),
+        held_back=_counts(rows["held_back"].dropna()),
+        moved=said(moved, lambda mine: "; ".join(mine["branch"] + " " + mine["moved"])),
+        moved_count=moved["vehicle"].nunique(),
         junction_rms_measured_a=float(np.median(measured_a)),
-        junction_rms_deployed_a=float(np.median(deployed_a)),
+        junction_rms_deployed_a=float(
+            np.median(deployed_rms_a(applied, measured_a=measured_a, corrected_a=corrected_a))
+        ),
     )
 
 
-def _said(rows: pa.Table, which: pc.Expression, text: Callable[[Rows], str]) -> dict[str, str]:
-    """What is said of the first vehicles with rows of some condition; rows of a vehicle stand together."""
-    rows = rows.filter(which)
-    names = pc.unique(rows["vehicle"]).slice(0, MOST_NAMED)
-    found = rows.filter(pc.is_in(rows["vehicle"], value_set=names)).to_pylist()
-    return {name: text(list(group)) for name, group in groupby(found, key=lambda row: str(row["vehicle"]))}
+def _counts(column: "pd.Series[str]") -> dict[str, int]:
+    """How often each text stands there, in the order in which they come."""
+    return {str(text): len(rows) for text, rows in column.groupby(column, sort=False)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -545,6 +536,11 @@ class Unfinished:
         """Folder of the result."""
         return self.folder / "result"
 
+    @property
+    def _since(self) -> Path:
+        """Which earlier result's summaries were copied; comes with them, and is not copied on."""
+        return self.summaries / ".since"
+
     def put(self, number: int, part: bytes) -> None:
         """Keep the vehicles of a bucket."""
         write_atomically(part_file(self.result, number), part)
@@ -572,23 +568,14 @@ class Unfinished:
     def summaries_since(self, earlier: Path | None) -> None:
         """Begin the store of summaries with those of an earlier result, unless this was done before, or with none."""
         mark = "" if earlier is None else f"{earlier.absolute()} {file_digest(earlier / 'run.json')}"
-        there = self._since.read_text() if self._since.exists() else ""
-        if there == mark and (earlier is None or self.summaries.exists()):
+        if (self._since.read_text() if self._since.exists() else "") == mark:
             return
-        self._since.unlink(missing_ok=True)
         shutil.rmtree(self.summaries, ignore_errors=True)
-        if earlier is None:
-            return
-        copy = self.folder / "summaries.copy"
-        shutil.rmtree(copy, ignore_errors=True)
-        shutil.copytree(earlier / "summaries", copy, ignore=shutil.ignore_patterns(".*"))
-        copy.rename(self.summaries)
-        write_atomically(self._since, mark.encode())
-
-    @property
-    def _since(self) -> Path:
-        """Which earlier result's summaries were copied; written after them."""
-        return self.folder / "since"
+        if earlier is not None:
+            copy = self.folder / "summaries.copy"
+            copy_summaries(earlier / "summaries", copy)
+            (copy / self._since.name).write_text(mark)
+            copy.rename(self.summaries)
 
     def worth_keeping(self) -> bool:
         """Whether anything was computed: a part, or summaries of drives besides those of an earlier result."""
@@ -606,6 +593,12 @@ class Unfinished:
             why = f"cannot be replaced: {error.strerror}; what was made stands in {self.result}"
             raise FleetError(f"{self.out}: {why}") from None
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def copy_summaries(store: Path, copy: Path) -> None:
+    """Copy a store of summaries without its hidden files, over what a killed run has left."""
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(store, copy, ignore=shutil.ignore_patterns(".*"))
 
 
 @contextmanager

@@ -10,16 +10,15 @@ Faults of the program in single vehicles (:mod:`calibrator.estimator.fleet_task`
 
 import hashlib
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import msgspec
 from threadpoolctl import threadpool_limits
 
-from calibrator.drive import Drive
 from calibrator.drives.store import DRIVES_FOLDER
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
@@ -30,6 +29,7 @@ from calibrator.estimator.results import (
     CalibrationReport,
     RunRecord,
     Unfinished,
+    copy_summaries,
     join_rows,
     left_out_of,
     read_run,
@@ -49,11 +49,10 @@ from calibrator.sources.fleet_source import (
     Equipment,
     FleetSource,
     find_fleet,
-    load_drive,
     probe_equipment,
 )
 from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity
-from calibrator.summaries.record import Outline, joined_records
+from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore, open_store
 from calibrator.summaries.summarise_fleet import add_drives
 from calibrator.summaries.vehicle_summary import VehicleSummary
@@ -62,24 +61,17 @@ from calibrator.terminal.text import few, few_reasons
 from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import UserError
 from ecu_node.layout import Layout, file_digest
 
-__all__ = [
-    "Census",
-    "calibrate_fleet",
-    "read_sample",
-    "require_fleet",
-    "take_census",
-]
+__all__ = ["Census", "calibrate_fleet", "read_sample", "require_fleet", "take_census"]
 
 MOST_LEARNT = 2000
 """Vehicles that the reference is learnt from. With so many its centre is known to a fortieth of what faultless vehicles
 differ by, so more would not tell any vehicle's faults better. [1]"""
 MOST_REASONS = 20
 """Reasons of vehicles left out that are kept for messages."""
-MOST_READ_HERE = 5
-"""Vehicles of single junctions that are read in this process."""
+Calibrate: TypeAlias = Callable[..., tuple[Equipment, bytes, dict[str, object], Sequence[str]]]
+"""Calibrates a fleet in one piece: branches, part of the result, details and notices of the run."""
 
 
 def calibrate_fleet(
@@ -124,25 +116,23 @@ def calibrate_fleet(
         raise ContradictionError("--branches and --since exclude each other: the earlier result has decided on that")
     require_new_folder(out)
     storage = open_storage(place)
-    identity = require_fleet(storage, place, database)
-    if identity is None:
-        fleet = find_fleet(storage.url)
-        alone = _stands_alone(fleet, settings, database.layout, since)
-        if alone:
-            _require_alone(settings, since)
-        elif since is None:
-            _require_vehicles(fleet, settings)
-        passes = 2 if alone else 3 if settings.method is Method.PUBLISHED else 5
-    else:
+    identity, fleet, passes = require_fleet(storage, place, database), None, 4  # look, learn, calibrate, write
+    calibrate: Calibrate | None = None
+    if identity is not None:
         _require_summaries_enough(storage, settings)
-        passes = 4  # look, learn, calibrate, write
+    else:
+        fleet = find_fleet(storage.url)
+        calibrate = _at_once(fleet, settings, database.layout, since)
+        passes = 5 if calibrate is None else 3 if settings.method is Method.PUBLISHED else 2
+        if since is None and (calibrate is None or settings.method is Method.PUBLISHED):
+            _require_named(settings, set(fleet.vehicles), fleet.left_out, str(fleet.place))
+            require_learning(list(fleet.vehicles), settings, fleet.left_out)
     with unfinished_run(out) as unfinished, numbered_passes(passes):
         run = _Run(unfinished=unfinished, database=database, settings=settings, workers=workers, since=since)
         if identity is not None:
             return run.summaries(SummaryStore(storage=storage, identity=identity), identity, {})
-        if alone:
-            return run.junctions(fleet)
-        return run.published(fleet) if settings.method is Method.PUBLISHED else run.drives(fleet)
+        assert fleet is not None
+        return run.drives(fleet) if calibrate is None else run.at_once(fleet, calibrate)
 
 
 def require_fleet(storage: Storage, place: str | Path, database: VehicleDatabase) -> StoreIdentity | None:
@@ -168,39 +158,39 @@ def _require_summaries_enough(storage: Storage, settings: CalibrationSettings) -
         raise FleetError(f"{storage.url}: a store of summaries, and {option} needs the drives; give the drive store")
 
 
-def _stands_alone(fleet: FleetSource, settings: CalibrationSettings, layout: Layout, since: Path | None) -> bool:
-    """Whether each vehicle is calibrated by itself: there is but one, or what is known is of branches.
+def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout, since: Path | None) -> Calibrate | None:
+    """What calibrates a whole fleet in one piece: the published method, or one junction after the other; None: neither.
 
-    With an earlier result of a fleet, one vehicle may be the only one that has driven since.
+    Each vehicle is calibrated by itself if there is but one, or what is known is of branches. With an earlier result of
+    a fleet, one vehicle may be the only one that has driven since.
     """
     if settings.method is Method.PUBLISHED:
-        return False
+        from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second)
+
+        return calibrate_fleet_published
     of_branches = bool(settings.trusted) and not settings.trusted & fleet.vehicles.keys()
     of_branches = of_branches and settings.trusted <= set(layout.branch_names)
     alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
-    return alone or of_branches or (len(fleet.vehicles) == 1 and since is None)
-
-
-def _require_alone(settings: CalibrationSettings, since: Path | None) -> None:
-    """Refuse what only a fleet heeds."""
+    if not (alone or of_branches or (len(fleet.vehicles) == 1 and since is None)):
+        return None
     fleets = {
-        "--hold-out": bool(settings.hold_out),
+        "--hold-out": settings.hold_out,
         "--expected-faults": settings.expected_faults is not None,
         "--since": since is not None,
     }
     for option in (option for option, given in fleets.items() if given):
         raise ContradictionError(f"{option} is for a fleet that is compared with itself, not for single junctions")
+    from calibrator.estimator.junction import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
+
+    return calibrate_junctions
 
 
-def _require_vehicles(fleet: FleetSource, settings: CalibrationSettings) -> None:
-    """Refuse names of vehicles that there are not, and too few to learn from."""
-    path = fleet.place
-    for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
-        if unknown := sorted(names - fleet.vehicles.keys()):
-            reasons = few_reasons({name: fleet.left_out[name] for name in unknown if name in fleet.left_out})
-            there = few(sorted(fleet.vehicles))
-            raise FleetError(f"{path}: no vehicle {few(unknown)} to {what}{reasons}; there are {there}")
-    require_learning(list(fleet.vehicles), settings, fleet.left_out)
+def _require_named(settings: CalibrationSettings, usable: Set[str], problems: Mapping[str, str], place: str) -> None:
+    """Refuse names of vehicles that there are not, or that cannot be used, with the reason if there is one."""
+    for names, what in ((settings.hold_out - problems.keys(), "hold out"), (settings.trusted, "trust")):
+        if missing := sorted(names - usable):
+            reasons = few_reasons({name: problems[name] for name in missing if name in problems})
+            raise FleetError(f"{place}: no usable vehicle {few(missing)} to {what}{reasons}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,18 +201,18 @@ class Census:
     ----------
     usable : mapping of int to int
         How many vehicles can be calibrated, by bucket; of all buckets.
-    reasons : mapping of str to str
-        Why others cannot; the first few.
     left_out : int
         How many others there are.
-    known : mapping of str to Outline
-        Of the vehicles that were asked for and are there, and of those of the first bucket.
+    reasons : mapping of str to str
+        Why they cannot: of the first few, and of those that were asked for.
+    named : frozenset of str
+        Vehicles that can be calibrated, of those that were asked for, and of the first bucket.
     """
 
     usable: Mapping[int, int]
-    reasons: Mapping[str, str]
     left_out: int
-    known: Mapping[str, Outline]
+    reasons: Mapping[str, str]
+    named: frozenset[str]
 
     @property
     def size(self) -> int:
@@ -232,20 +222,21 @@ class Census:
 
 def take_census(store: SummaryStore, workers: Workers, asked: Collection[str] = ()) -> Census:
     """Look at every bucket of a store; UserError if one cannot be read, or there is no vehicle."""
-    buckets, usable, reasons, known, seen = store.buckets(), dict[int, int](), dict[str, str](), dict[str, Outline](), 0
+    buckets, usable, reasons, named, seen = store.buckets(), dict[int, int](), dict[str, str](), set[str](), 0
     with progress_bar("look at vehicles", len(buckets), "chunks") as progress:
-        for done, (bucket, outlines) in enumerate(
-            zip(buckets, run_many(store.outlines, buckets, workers), strict=True), 1
-        ):
+        found = run_many(store.outlines, buckets, workers)
+        for done, (bucket, outlines) in enumerate(zip(buckets, found, strict=True), 1):
             seen += len(outlines)
             problems = {item.vehicle: item.problem for item in outlines if item.problem}
             usable[bucket] = len(outlines) - len(problems)
-            reasons |= dict(list(problems.items())[: MOST_REASONS - len(reasons)])
-            known |= {item.vehicle: item for item in outlines if done == 1 or item.vehicle in asked}
+            first = list(problems)[: max(MOST_REASONS - len(reasons), 0)]
+            reasons |= {name: problems[name] for name in problems if name in asked or name in first}
+            named |= {item.vehicle for item in outlines if done == 1 or item.vehicle in asked} - problems.keys()
             progress(done)
     if not seen:
         raise FleetError(f"{store.url}: the store of summaries is empty; add drives with 'calibrator summarise'")
-    return Census(usable=usable, reasons=reasons, left_out=seen - sum(usable.values()), known=known)
+    left_out = seen - sum(usable.values())
+    return Census(usable=usable, left_out=left_out, reasons=reasons, named=frozenset(named))
 
 
 def read_sample(
@@ -296,46 +287,12 @@ class _Run:
     workers: Workers
     since: Path | None
 
-    def published(self, fleet: FleetSource) -> CalibrationReport:
-        """Calibrate by the published method, which needs all models at once."""
-        from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second to import)
-
-        return self._at_once(fleet, self._equipment(fleet), calibrate_fleet_published)
-
-    def _at_once(self, fleet: FleetSource, equipment: Equipment, calibrate: Callable[..., Any]) -> CalibrationReport:
+    def at_once(self, fleet: FleetSource, calibrate: Calibrate) -> CalibrationReport:
         """Calibrate all vehicles in one piece, which is the only part of the result."""
-        about = self._about(fleet, equipment)
-        identity = self._identity(about, None)
-        part, details, notices = calibrate(fleet, equipment, identity, self.settings, workers=self.workers)
+        identity = self._identity(fleet.name, None)
+        equipment, part, details, notices = calibrate(fleet, identity, self.settings, workers=self.workers)
         self.unfinished.put(0, part)
-        return self._result(about, identity, {}, details=details, notices=notices)
-
-    def junctions(self, fleet: FleetSource) -> CalibrationReport:
-        """Calibrate each vehicle by what is known of its own junction."""
-        from calibrator.estimator.junction import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
-
-        drives: dict[str, list[Drive]] = {}
-        if len(fleet.vehicles) <= MOST_READ_HERE:  # other processes would take longer to start
-            left_out = dict(fleet.left_out)
-            with progress_bar("read drives", len(fleet.vehicles), "vehicles") as progress:
-                for number, (vehicle, entries) in enumerate(fleet.vehicles.items(), start=1):
-                    try:
-                        drives[vehicle] = [load_drive(entry, self.database) for entry in entries]
-                    except UserError as error:
-                        if len(fleet.vehicles) == 1:
-                            raise
-                        left_out[vehicle] = str(error)
-                    progress(number)
-            fleet = replace(fleet, vehicles={name: fleet.vehicles[name] for name in drives}, left_out=left_out)
-        equipment = probe_equipment(
-            fleet,
-            self.database,
-            self.settings.branches,
-            limit_s=self.settings.time_limit_s,
-            modelled=False,
-            drives=[mine[0] for mine in drives.values()],
-        )
-        return self._at_once(fleet, equipment, partial(calibrate_junctions, drives))
+        return self._result(self._about(fleet, equipment), identity, {}, details=details, notices=notices)
 
     def drives(self, fleet: FleetSource) -> CalibrationReport:
         """Summarise drives, and calibrate from the summaries."""
@@ -360,15 +317,12 @@ class _Run:
             identity = read_identity(storage, self.database)
             assert identity is not None
             return SummaryStore(storage=storage, identity=identity)
-        equipment = self._equipment(fleet)
+        equipment = probe_equipment(fleet, self.database, self.settings.branches, limit_s=self.settings.time_limit_s)
         try:
             return open_store(storage, equipment, self.database, fleet)
         except FleetError:
             shutil.rmtree(folder, ignore_errors=True)
             return open_store(storage, equipment, self.database, fleet)
-
-    def _equipment(self, fleet: FleetSource) -> Equipment:
-        return probe_equipment(fleet, self.database, self.settings.branches, limit_s=self.settings.time_limit_s)
 
     def _about(self, fleet: FleetSource, equipment: Equipment) -> StoreIdentity:
         """What a result says of a fleet of drives."""
@@ -382,13 +336,12 @@ class _Run:
         if self.since is not None:
             _require_previous(self.since, self.database, store.identity)
         versions = store.versions()
-        identity = self._identity(about, self._plan(store, versions, previous))
+        identity = self._identity(about.fleet, self._plan(store, versions, previous))
         bench = self._bench_table(store)
         checked = {vehicle for vehicle, _ in bench}
         census = take_census(store, self.workers, self.settings.hold_out | self.settings.trusted | checked)
-        self._require_named(census, fleet=about.fleet)
-        problems = {name: item.problem for name, item in census.known.items() if item.problem}
-        self._check(bench, census.known.keys() - problems.keys(), problems)
+        _require_named(self.settings, census.named, census.reasons, f"fleet {about.fleet}")
+        self._check(bench, census.named, census.reasons)
         with progress_bar("learn the fleet", None), threadpool_limits(1):  # one: the reference is the same anywhere
             sample = read_sample(store, census, self.settings, checked)
             task, notices = learn_task(
@@ -414,18 +367,9 @@ class _Run:
         decides = (__version__, store.identity, versions, self.settings.record(), earlier)
         return hashlib.blake2b(msgspec.json.encode(decides, order="sorted"), digest_size=16).hexdigest()
 
-    def _identity(self, about: StoreIdentity, plan: str | None) -> RunIdentity:
+    def _identity(self, fleet: str, plan: str | None) -> RunIdentity:
         created = self.unfinished.begin(plan, time_of_run())
-        return RunIdentity(database=self.database, method=self.settings.method, fleet=about.fleet, created=created)
-
-    def _require_named(self, census: Census, *, fleet: str) -> None:
-        """Refuse names of vehicles that there are not."""
-        known = census.known
-        for names, what in ((self.settings.hold_out, "hold out"), (self.settings.trusted, "trust")):
-            unusable = {name for name in names if name not in known or (known[name].problem and what == "trust")}
-            if missing := sorted(unusable):
-                reasons = few_reasons({name: known[name].problem for name in missing if name in known})
-                raise FleetError(f"fleet {fleet}: no usable vehicle {few(missing)} to {what}{reasons}")
+        return RunIdentity(database=self.database, method=self.settings.method, fleet=fleet, created=created)
 
     def _bench_table(self, store: SummaryStore) -> BenchTable:
         given, scale_a = self.settings.readings, self.database.layout.full_scale_a
@@ -456,9 +400,7 @@ class _Run:
         with progress_bar("write the result", None):
             where = write_parameter_files(folder, vehicles=vehicles)
         if unfinished.summaries.exists():
-            copy = folder / unfinished.summaries.name
-            shutil.rmtree(copy, ignore_errors=True)  # of a run that was killed
-            shutil.copytree(unfinished.summaries, copy, ignore=shutil.ignore_patterns(".*"))
+            copy_summaries(unfinished.summaries, folder / unfinished.summaries.name)
         run = RunRecord(
             tool=identity.tool,
             method=identity.method.value,
@@ -487,26 +429,24 @@ class _Run:
 
 def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:
     """Refuse an earlier result that a run cannot go on from."""
-    run = read_run(folder)
+    run, anew = read_run(folder), "calibrate it without --since"
     if run.method != Method.POSTERIOR.value:
         raise FleetError(f"{folder}: a result of the method {run.method}; --since goes on from one of the posterior")
     if run.branches != list(store.branches):
-        raise FleetError(
-            f"{folder}: a result with branches {', '.join(run.branches)}; this fleet has {', '.join(store.branches)}: "
-            f"calibrate it without --since"
-        )
+        have, need = ", ".join(run.branches), ", ".join(store.branches)
+        raise FleetError(f"{folder}: a result with branches {have}; this fleet has {need}: {anew}")
     if not (folder / PARTS).is_dir():
         raise FleetError(
             f"{folder / PARTS}: no such folder; expected the parameters of the earlier result: give the whole folder "
-            f"that 'calibrator calibrate' wrote, or calibrate without --since"
+            f"that 'calibrator calibrate' wrote, or {anew}"
         )
     if (run.layout_sha256, run.dbc_sha256) != (database.layout.digest, database.digest):
         raise FleetError(
             f"{folder}: made with another version of layout or DBC than {database.layout.path}; the node would not "
-            f"accept its parameters: calibrate without --since"
+            f"accept its parameters: {anew}"
         )
     if run.buckets != store.buckets:
         raise FleetError(
             f"{folder}: made from a store of {run.buckets} buckets, and this one has {store.buckets}; give the same "
-            f"store, with the new drives added, or calibrate without --since"
+            f"store, with the new drives added, or {anew}"
         )

@@ -1,26 +1,21 @@
 """What is said of one vehicle: its parameters, what would decide where they are in doubt, and all of it in words."""
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.drives.delays import BranchDelays
 from calibrator.estimator.fleet_estimate import CONFIDENT, SUSPECTED, FleetEstimate
-from calibrator.files.parameter_files import RunIdentity, by_branch, junction_residual
+from calibrator.files.parameter_files import REASONS, RunIdentity, by_branch, held_back_lines, junction_residual
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, HeldBack, VehicleParameters, Verdict
 
 __all__ = [
-    "deciding_evidence",
-    "explained",
-    "explained_faults",
-    "explanation_text",
-    "impossible",
-    "parameters_of",
+    "REASONS", "deciding_evidence", "explained", "explained_faults", "explanation_text", "impossible", "parameters_of",
     "sensor_text",
-]
+]  # fmt: skip
 
 MOST_REPORTED, LEAST_REPORTED = 3, 0.02
 """Explanations that are reported, and the least probability of one after the first. [1]"""
@@ -28,14 +23,6 @@ LEAST_RIVAL, LEAST_IN_THE_WAY = 0.02, 1e-4
 """Probability from which on another explanation is a rival, and from which on it can hold a correction back. [1]"""
 RESOLVED = 0.002
 """Smallest difference that a zero-current window or a bench check shows: drifts, offsets over full scale. [1]"""
-REASONS: dict[HeldBack, str] = {
-    "beyond the limits": "it is beyond the limits of the layout: replace the sensor",
-    "does not fit": "no gain error and offset explain what the sensor shows",
-    "reference in doubt": "what it is compared with, the fleet or a known sensor, is in doubt",
-    "moved too little": "its current moved too little for the gain to be known",
-    "harm limit": "the correction might do harm",
-}
-"""Why a fault that was found is not corrected, in words."""
 
 
 def impossible(estimate: FleetEstimate, j: int, branches: Sequence[str]) -> str:
@@ -88,23 +75,15 @@ def parameters_of(
     VehicleParameters
         Content of its parameter file.
     """
-    corrected = estimate.corrected[j]
-    reported: list[Explanation] = []
-    deciding = decisive or ""
-    if (
-        estimate.verdicts[j] == "cannot tell"
-        or not estimate.confidence[j] >= CONFIDENT
-        or (estimate.held_back[j] != "").any()
-    ):
+    corrected, held_back = estimate.corrected[j], estimate.held_back[j] != ""
+    reported, deciding = list[Explanation](), decisive or ""
+    if estimate.verdicts[j] == "cannot tell" or not estimate.confidence[j] >= CONFIDENT or held_back.any():
         first, *others = estimate.explanations[j][:MOST_REPORTED]
         reported = [first, *(each for each in others if each.probability >= LEAST_REPORTED)]
-        layout = identity.database.layout
         if decisive is None:
-            deciding, rival = deciding_evidence(
-                estimate, j, branches, full_scale_a=layout.full_scale_a, layout=layout.path.name
-            )
+            deciding, rival = deciding_evidence(estimate, j, branches, layout=identity.database.layout.path.name)
             reported += [rival] if rival is not None and rival not in reported else []
-    hardware = _probability(estimate.hardware_probability[j])
+    hardware, inputs = _probability(estimate.hardware_probability[j]), vehicle.summary.inputs
     return VehicleParameters(
         vehicle=vehicle.vehicle,
         layout=identity.layout,
@@ -122,7 +101,7 @@ def parameters_of(
         deciding_evidence=deciding,
         findings=list(estimate.findings[j]),
         junction_residual=junction_residual(
-            vehicle.summary.moments[:, vehicle.summary.inputs :, vehicle.summary.inputs :],
+            vehicle.summary.moments[:, inputs:, inputs:],
             gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
             offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
             expected_a=expected_a,
@@ -136,11 +115,11 @@ def parameters_of(
 def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int], name: str) -> BranchParameters:
     k = delays.branches.index(name)
     delay_s, delay_sd_s = (float(values[k]) if delays.known[k] else None for values in (delays.delay_s, delays.sd_s))
+    numbers: dict[str, Any] = {
+        each: float(getattr(estimate, each)[place]) for each in ("drift", "offset_a", "drift_sd", "offset_sd_a")
+    }
     return BranchParameters(
-        drift=float(estimate.drift[place]),
-        offset_a=float(estimate.offset_a[place]),
-        drift_sd=float(estimate.drift_sd[place]),
-        offset_sd_a=float(estimate.offset_sd_a[place]),
+        **numbers,
         apply=bool(estimate.corrected[place]),
         held_back=cast("HeldBack | None", str(estimate.held_back[place]) or None),
         delay_s=delay_s,
@@ -157,7 +136,7 @@ def _probability(value: float) -> float | None:
 
 
 def deciding_evidence(
-    estimate: FleetEstimate, j: int, branches: Sequence[str], *, full_scale_a: float, layout: str = "the layout"
+    estimate: FleetEstimate, j: int, branches: Sequence[str], *, layout: str = "the layout"
 ) -> tuple[str, Explanation | None]:
     """What would decide where it cannot be told what is faulty, or where a correction is held back.
 
@@ -167,8 +146,6 @@ def deciding_evidence(
         Of N vehicles, and which of them.
     branches : sequence of str
         Names of the K branches.
-    full_scale_a : float
-        Full scale of the junction. [A]
     layout : str
         What the limits stand in.
 
@@ -180,6 +157,7 @@ def deciding_evidence(
         The explanation that it tells from the most probable one, if it is about one.
     """
     held_back, drift, offset_a = estimate.held_back[j], estimate.drift[j], estimate.offset_a[j]
+    full_scale_a = estimate.full_scale_a
 
     def those(reason: HeldBack) -> list[str]:
         return [branches[k] for k in np.flatnonzero(held_back == reason).tolist()]
@@ -244,9 +222,7 @@ def explained(parameters: VehicleParameters) -> str:
     sure = "" if confidence is None else f" (confidence {confidence:.2f})"
     lines = [f"{parameters.vehicle}: {parameters.verdict}{sure}"]
     lines += [f"  {name}: {sensor_text(branch)}" for name, branch in parameters.branches.items()]
-    for reason, why in REASONS.items():
-        held_back = [name for name, branch in parameters.branches.items() if branch.held_back == reason]
-        lines += [f"  {', '.join(held_back)} not corrected, because {why}"] if held_back else []
+    lines += [f"  {line}" for line in held_back_lines(parameters)]
     if hardware.suspected:
         offset_a = {name: value for name, value in hardware.offset_a.items() if value}
         changes = Explanation(probability=1.0, hardware_drift=hardware.drift, hardware_offset_a=offset_a)
@@ -266,12 +242,14 @@ def explained(parameters: VehicleParameters) -> str:
 
 def sensor_text(branch: BranchParameters) -> str:
     """Faults of a sensor, how sure they are, and whether they are corrected."""
-    probability = "" if branch.fault_probability is None else f" (probability of one {branch.fault_probability:.2f})"
+    probability = (
+        "" if branch.fault_probability is None else f" (probability of a fault {branch.fault_probability:.2f})"
+    )
     if not branch.drift and not branch.offset_a:
         return f"no fault found{probability}"
     drift_sd = "" if branch.drift_sd is None else f" +- {branch.drift_sd:.2%}"
     offset_sd = "" if branch.offset_sd_a is None else f" +- {branch.offset_sd_a:.2f} A"
-    fate = "corrected" if branch.apply else "not corrected"
+    fate = f"corrected{probability}" if branch.apply else f"not corrected{probability}"
     return f"gain error (drift) {branch.drift:+z.2%}{drift_sd}, offset {branch.offset_a:+.2f} A{offset_sd}: {fate}"
 
 

@@ -52,15 +52,15 @@ def experiment(
     """
     with importing():
         from calibrator.errors import FleetError
-        from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, fleet_for
-        from calibrator.experiments.pages import result_table, write_page
-        from calibrator.experiments.runner import (
+        from calibrator.experiments.experiments import (
+            CALIBRATION,
+            EXPERIMENTS,
             ExperimentResult,
-            made_now,
-            pool_confidences,
+            fleet_for,
             read_records,
-            run_experiment,
         )
+        from calibrator.experiments.pages import result_table, write_page
+        from calibrator.experiments.runner import made_now, pool_confidences, run_experiment
 
     if name is None:
         write_output("\n".join(f"{row.name:<12} {row.title}" for row in EXPERIMENTS.values()))

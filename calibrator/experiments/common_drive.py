@@ -295,9 +295,9 @@ def common_rows(
         unit = np.array([np.ones(N), np.full(N, 1.0 / full_scale_a)]).T / slope[:, k, None]
         place = np.array([k, 3 * K - 1 + k])
         covariance[:, place[:, None], place] = of_line[:, k] * unit[:, :, None] * unit[:, None, :]
+    constants_a = np.concatenate([intercept_a, constant_a], axis=1)
     return EvidenceRows(
-        relative=np.concatenate([np.log(slope), np.log(-gain), nothing], axis=1),
-        constant=np.concatenate([intercept_a / full_scale_a, constant_a / full_scale_a, nothing], axis=1),
+        values=np.concatenate([np.log(slope), np.log(-gain), nothing, constants_a / full_scale_a, nothing], axis=1),
         covariance=covariance,
         means=np.zeros((N, 2, K)),
     )

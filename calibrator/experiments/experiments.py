@@ -1,4 +1,4 @@
-"""The table of experiments, those of the paper [1]_ and ours.
+"""The table of experiments, those of the paper [1]_ and ours, and the record of a result.
 
 An experiment is a row of :data:`EXPERIMENTS`: settings (a case of how fleets are made, and where it stands in the
 table), the methods that are compared on them, and how it is shown. A new one is a new row;
@@ -7,15 +7,20 @@ table), the methods that are compared on them, and how it is shown. A new one is
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+import pandas as pd
+
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, builtin_common_drive
+from calibrator.experiments.figures import TENTH_COLUMNS
 from calibrator.experiments.methods import (
     BASELINES,
     CEILING,
@@ -34,7 +39,13 @@ from calibrator.experiments.recorded_trips import (
 from calibrator.experiments.trial import ComparedMethod
 from calibrator.files.layout_files import vehicle_database
 
-__all__ = ["CALIBRATION", "COVERAGE", "EXPERIMENTS", "REAL", "Experiment", "Setting", "fleet_for"]
+__all__ = [
+    "CALIBRATION", "COVERAGE", "EXPERIMENTS", "KEYS", "REAL", "Experiment", "ExperimentResult", "Setting", "fleet_for",
+    "read_records",
+]  # fmt: skip
+
+KEYS = ["series", "x", "method"]
+"""Columns of a result that say what a row is of."""
 
 QUICK_VEHICLES, QUICK_TRAINING_VEHICLES, QUICK_TRIPS, QUICK_DURATION_S = 20, 400, 8, 300.0
 DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
@@ -156,7 +167,7 @@ def _named(case: RecordedCase) -> Setting:
     """Setting by sparsity, with branches, sizes of faults and whatever is unusual as series."""
     load = "" if not any(case.unmeasured_a) else ", load {:g}+-{:g} A".format(*case.unmeasured_a)
     hardware = "" if case.balanced else ", any vehicle"
-    named = "own prior" if case.own_prior else f"{_sizes(case.magnitude)} %{hardware}{load}"
+    named = "own prior" if case.own_prior is not None else f"{_sizes(case.magnitude)} %{hardware}{load}"
     return Setting(x=case.sparsity, series=f"K={case.branches}, {named}", case=case)
 
 
@@ -325,7 +336,7 @@ TABLE = (
         x_label=SPARSITY,
         series_label="branches, faults",
         methods=(POSTERIOR,),
-        settings=(*REAL, *(_named(replace(case, own_prior=True)) for case in MAIN)),
+        settings=(*REAL, *(_named(replace(case, own_prior=POSTERIOR)) for case in MAIN)),
         quick={"K=2, 5-25 %": (80.0,), "K=2, own prior": (80.0,)},
         note="Of a normal distribution 0.683 are within 1 standard deviation, and 0.0027 beyond 3. 'own prior': faults "
         f"drawn from what the default has learnt of the balanced fleet with this K and S. {BALANCED}",
@@ -382,3 +393,85 @@ def fleet_for(
         return made(database)
     fleet = read_fleet(drives, database)
     return fleet.take(QUICK_TRIPS, duration_s=QUICK_DURATION_S) if quick else fleet
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ExperimentResult:
+    """What was found, and what is needed to repeat it.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        The row that was run.
+    settings : mapping
+        Seed, repetitions, drive, and what all settings have in common.
+    figures : DataFrame
+        A row per setting (columns ``series``, ``x``), ``method`` and ``figure``, with the columns of
+        :func:`~calibrator.experiments.figures.figure_rows`.
+    tenths : DataFrame
+        By setting and method, from :func:`~calibrator.experiments.figures.tenths_of`.
+    made : str
+        Version, machine and day, as :func:`~calibrator.experiments.runner.made_now` says; empty for an experiment that
+        was called as a function.
+    """
+
+    experiment: Experiment
+    settings: Mapping[str, bool | int | float | str]
+    figures: pd.DataFrame
+    tenths: pd.DataFrame
+    made: str = ""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Methods in the order of their first rows."""
+        return tuple(dict.fromkeys(self.figures["method"]))
+
+    def value(self, figure: str, *, x: float, method: str, series: str = "") -> float:
+        """Return a figure of a method under a setting; KeyError if there is none."""
+        return float(self.figures.set_index([*KEYS, "figure"])["value"].to_dict()[series, x, method, figure])
+
+    def to_json(self) -> str:
+        """Encode as JSON."""
+        tables = {
+            name: json.loads(table.to_json(orient="records", double_precision=15))
+            for name, table in (("figures", self.figures), ("tenths", self.tenths))
+        }
+        named = {name: getattr(self.experiment, name) for name in ("name", "title", "x_label", "series_label")}
+        return json.dumps({**named, "settings": dict(self.settings), "made": self.made, **tables}, ensure_ascii=False)
+
+
+class _Record(msgspec.Struct):
+    """What is read back of NAME.json; titles and labels stand in it for other readers."""
+
+    settings: dict[str, bool | int | float | str]
+    made: str
+    figures: list[dict[str, str | float | None]]
+    tenths: list[dict[str, str | float | None]]
+
+
+def read_records(folder: Path, names: Iterable[str]) -> list[ExperimentResult]:
+    """Read the records ``NAME.json`` of a folder in the given order; those that are not there are left out.
+
+    Raises
+    ------
+    FleetError
+        If one is no record of an experiment.
+    """
+    found = []
+    for path in (path for name in names if (path := folder / f"{name}.json").is_file()):
+        try:
+            record = msgspec.json.decode(path.read_bytes(), type=_Record)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            raise FleetError(
+                f"{path}: not a record of an experiment: {error}; expected what 'calibrator experiment --out' writes; "
+                "remove it, or run the experiment again"
+            ) from None
+        result = ExperimentResult(
+            experiment=EXPERIMENTS[path.stem],
+            settings=record.settings,
+            figures=pd.DataFrame(record.figures).astype({"value": float, "low": float, "high": float}),
+            tenths=pd.DataFrame(record.tenths, columns=[*KEYS, *TENTH_COLUMNS]),
+            made=record.made,
+        )
+        found.append(result)
+    return found

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrator.drive import Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.decision import RowsEstimate, estimate_rows
+from calibrator.estimator.decision import FleetEstimate, estimate_rows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_vehicles, learn_fleet
 from calibrator.estimator.learning import learn_fault_models
 from calibrator.estimator.prior import Prior, known_prior
@@ -75,7 +75,7 @@ def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float)
     return _estimated(found, found.faulty & found.identifiable & (found.harm_probability < HARM_LIMIT), models[0].prior)
 
 
-def _estimated(found: RowsEstimate, corrected: Mask, prior: Prior) -> Estimate:
+def _estimated(found: FleetEstimate, corrected: Mask, prior: Prior) -> Estimate:
     return Estimate(
         faults=Faults(
             hardware_drift=found.hardware_drift,

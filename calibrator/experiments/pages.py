@@ -11,11 +11,17 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from calibrator.experiments.experiments import COVERAGE, EXPERIMENTS, Experiment
+from calibrator.experiments.experiments import (
+    COVERAGE,
+    EXPERIMENTS,
+    KEYS,
+    Experiment,
+    ExperimentResult,
+    read_records,
+)
 from calibrator.experiments.figures import ALL, FIGURES, calibration_errors, pool_figures, pool_tenths
 from calibrator.experiments.methods import BASELINES, CEILING, MEANINGS, POSTERIOR
 from calibrator.experiments.picture import write_picture
-from calibrator.experiments.runner import KEYS, ExperimentResult, read_records
 from calibrator.terminal.text import counted
 from ecu_node.documents import write_atomically
 

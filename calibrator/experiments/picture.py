@@ -17,7 +17,7 @@ from calibrator.experiments.figures import ALL
 from calibrator.experiments.methods import BASELINES, CEILING, LEFT_IN, PERFECT, POSTERIOR, THRESHOLD, TREE
 
 if TYPE_CHECKING:
-    from calibrator.experiments.runner import ExperimentResult
+    from calibrator.experiments.experiments import ExperimentResult
 
 __all__ = ["draw_result", "write_picture"]
 

@@ -21,8 +21,7 @@ from calibrator.drives.delays import estimate_delays, without_delays
 from calibrator.errors import FleetError
 from calibrator.estimator.published_fleet import identify_vehicle
 from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
-from calibrator.experiments.methods import POSTERIOR
-from calibrator.experiments.trial import Trial, UnseenDrive, drawn_distribution
+from calibrator.experiments.trial import ComparedMethod, Trial, UnseenDrive, drawn_distribution
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.random_streams import Purpose, random_stream
@@ -184,8 +183,8 @@ class RecordedCase:
         Whether half of the vehicles have no hardware fault; else any vehicle may have one.
     world : str
         What else befalls some vehicles, of :data:`~calibrator.experiments.attacks.WORLDS`; empty: nothing.
-    own_prior : bool
-        Draw the faults from the prior that the default learns of this very fleet: its prior is then right.
+    own_prior : ComparedMethod or None
+        Draw the faults from the prior that this method learns of this very fleet: its prior is then right.
     vehicles, minutes : int or None, float or None
         Number of vehicles, each of which starts at a random instant of the trips and drives so long, from trip to
         trip; None: each trip is a vehicle.
@@ -201,7 +200,7 @@ class RecordedCase:
     unmeasured_a: tuple[float, float] = (0.0, 0.0)
     balanced: bool = True
     world: str = ""
-    own_prior: bool = False
+    own_prior: ComparedMethod | None = None
     vehicles: int | None = None
     minutes: float | None = None
     delay_max_s: float | None = None
@@ -272,8 +271,8 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
     if case.minutes is not None:
         fleet = replace(fleet, trips=_runs(fleet, case.minutes, case.vehicles or len(fleet.trips), seed))
     trips, truth, N = fleet.with_branches(case.branches), None, len(fleet.trips)
-    if case.own_prior:
-        learnt = POSTERIOR.estimate(recorded_trial(fleet, replace(case, own_prior=False), seed)).learnt
+    if case.own_prior is not None:
+        learnt = case.own_prior.estimate(recorded_trial(fleet, replace(case, own_prior=None), seed)).learnt
         assert learnt is not None
         truth = learnt.draw(random_stream(Purpose.TRAINING_FAULTS, seed), N, fleet.full_scale_a)
     vehicles = record_vehicles(fleet, case, trips, seed, truth=truth)

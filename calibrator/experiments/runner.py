@@ -1,26 +1,21 @@
-"""The one runner of all experiments, and the record of a result.
+"""The one runner of all experiments, and the pool of what they have found.
 
 Every setting is run with the same seeds; all methods of a setting see the same trials.
 """
 
-import json
 import os
 import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-import msgspec
 import pandas as pd
 
 from calibrator.errors import FleetError
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, common_trial
-from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, Experiment, Setting
+from calibrator.experiments.experiments import CALIBRATION, KEYS, Experiment, ExperimentResult, Setting
 from calibrator.experiments.figures import (
     ALL,
-    TENTH_COLUMNS,
     calibration_errors,
     figure_rows,
     judge,
@@ -35,60 +30,15 @@ from calibrator.terminal.progress import shown
 from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 
-__all__ = ["ALL", "ExperimentResult", "made_now", "pool_confidences", "read_records", "run_experiment"]
+__all__ = ["made_now", "pool_confidences", "run_experiment"]
 
 NOT_POOLED = (CALIBRATION.name, "attacks")
 """Attacks are worlds that the estimator does not expect; what becomes of confidences there is in their own table."""
-KEYS = ["series", "x", "method"]
 TRIALS: dict[tuple[type, type], Callable[..., Any]] = {
     (CommonCase, CommonDrive): common_trial,
     (RecordedCase, RecordedFleet): recorded_trial,
 }
 """What makes a trial, by case and fleet."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ExperimentResult:
-    """What was found, and what is needed to repeat it.
-
-    Attributes
-    ----------
-    experiment : Experiment
-        The row that was run.
-    settings : mapping
-        Seed, repetitions, drive, and what all settings have in common.
-    figures : DataFrame
-        A row per setting (columns ``series``, ``x``), ``method`` and ``figure``, with the columns of
-        :func:`~calibrator.experiments.figures.figure_rows`.
-    tenths : DataFrame
-        By setting and method, from :func:`~calibrator.experiments.figures.tenths_of`.
-    made : str
-        Version, machine and day, as :func:`made_now` says; empty for an experiment that was called as a function.
-    """
-
-    experiment: Experiment
-    settings: Mapping[str, bool | int | float | str]
-    figures: pd.DataFrame
-    tenths: pd.DataFrame
-    made: str = ""
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """Methods in the order of their first rows."""
-        return tuple(dict.fromkeys(self.figures["method"]))
-
-    def value(self, figure: str, *, x: float, method: str, series: str = "") -> float:
-        """Return a figure of a method under a setting; KeyError if there is none."""
-        return float(self.figures.set_index([*KEYS, "figure"])["value"].to_dict()[series, x, method, figure])
-
-    def to_json(self) -> str:
-        """Encode as JSON."""
-        tables = {
-            name: json.loads(table.to_json(orient="records", double_precision=15))
-            for name, table in (("figures", self.figures), ("tenths", self.tenths))
-        }
-        named = {name: getattr(self.experiment, name) for name in ("name", "title", "x_label", "series_label")}
-        return json.dumps({**named, "settings": dict(self.settings), "made": self.made, **tables}, ensure_ascii=False)
 
 
 def run_experiment(
@@ -168,10 +118,11 @@ def _keyed(tables: Iterable[pd.DataFrame], series: str, x: float, method: str) -
 
 def _common(settings: Sequence[Setting]) -> dict[str, Any]:
     """What all cases have in common, without what is not used."""
-    cases = [asdict(setting.case) for setting in settings]
+    cases = [vars(setting.case) for setting in settings]
     common = {key: value for key, value in cases[0].items() if all(case[key] == value for case in cases)}
     pairs = {key: "{:g} to {:g}".format(*value) for key, value in common.items() if isinstance(value, tuple)}
-    return {key: value for key, value in (common | pairs).items() if value not in {None, ""}}
+    told = {key: getattr(value, "name", value) for key, value in (common | pairs).items()}
+    return {key: value for key, value in told.items() if value not in {None, ""}}
 
 
 def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
@@ -235,46 +186,9 @@ def _pooled(series: str, figures: pd.DataFrame, tenths: pd.DataFrame) -> list[pd
     return _keyed((pd.concat([kept, errors]), pooled), series, vehicles, POSTERIOR.name)
 
 
-class _Record(msgspec.Struct):
-    """What is read back of NAME.json; titles and labels stand in it for other readers."""
-
-    settings: dict[str, bool | int | float | str]
-    made: str
-    figures: list[dict[str, str | float | None]]
-    tenths: list[dict[str, str | float | None]]
-
-
 def made_now() -> str:
     """Version of the calibrator, machine and day, in words."""
     return (
         f"calibrator {__version__}, Python {platform.python_version()} on {platform.machine()} with "
         f"{os.cpu_count()} cores, {time_of_run()[:10]}"
     )
-
-
-def read_records(folder: Path, names: Iterable[str]) -> list[ExperimentResult]:
-    """Read the records ``NAME.json`` of a folder in the given order; those that are not there are left out.
-
-    Raises
-    ------
-    FleetError
-        If one is no record of an experiment.
-    """
-    found = []
-    for path in (path for name in names if (path := folder / f"{name}.json").is_file()):
-        try:
-            record = msgspec.json.decode(path.read_bytes(), type=_Record)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise FleetError(
-                f"{path}: not a record of an experiment: {error}; expected what 'calibrator experiment --out' writes; "
-                "remove it, or run the experiment again"
-            ) from None
-        result = ExperimentResult(
-            experiment=EXPERIMENTS[path.stem],
-            settings=record.settings,
-            figures=pd.DataFrame(record.figures).astype({"value": float, "low": float, "high": float}),
-            tenths=pd.DataFrame(record.tenths, columns=[*KEYS, *TENTH_COLUMNS]),
-            made=record.made,
-        )
-        found.append(result)
-    return found

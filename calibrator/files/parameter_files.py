@@ -10,14 +10,25 @@ from calibrator.drive import Array
 from calibrator.options import Method
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import FileReference, JunctionResidual, Provenance
+from ecu_node.parameters import FileReference, HeldBack, JunctionResidual, Provenance, VehicleParameters
 
 __all__ = [
+    "REASONS",
     "RunIdentity",
     "by_branch",
     "current_moments",
+    "held_back_lines",
     "junction_residual",
 ]
+
+REASONS: dict[HeldBack, str] = {
+    "beyond the limits": "it is beyond the limits of the layout: replace the sensor",
+    "does not fit": "no gain error and offset explain what the sensor shows",
+    "reference in doubt": "what it is compared with, the fleet or a known sensor, is in doubt",
+    "moved too little": "its current moved too little for the gain to be known",
+    "harm limit": "the correction might do harm",
+}
+"""Why a fault that was found is not corrected, in words."""
 
 
 QUIET_SHARE = 0.25
@@ -156,3 +167,14 @@ def _spread(moments: Array, sums: Array) -> tuple[float, float]:
     rest_a2 = float(square_a2[quiet].sum() / share[quiet].sum())
     growth = max(float(square_a2.sum()) - rest_a2, 0.0) / max(float(throughput_a2.sum()), TINY_A2)
     return math.sqrt(rest_a2), math.hypot(math.sqrt(growth), STABILITY)
+
+
+def held_back_lines(parameters: VehicleParameters) -> list[str]:
+    """Which faults that were found are not corrected, and why: a line per reason."""
+    lines = []
+    for reason, why in REASONS.items():
+        held_back = {name: branch for name, branch in parameters.branches.items() if branch.held_back == reason}
+        harm = [branch.harm_probability for branch in held_back.values() if branch.harm_probability is not None]
+        more = f", with {max(harm):.2%} (see --harm-limit)" if reason == "harm limit" and harm else ""
+        lines += [f"{', '.join(held_back)} not corrected, because {why}{more}"] if held_back else []
+    return lines

@@ -171,9 +171,8 @@ def read_details(table: FleetTable, listed: NDArray[np.int64]) -> tuple[dict[int
                 files[int(listed[i])] = msgspec.json.decode(written.text, type=ParameterDetails)
             except msgspec.DecodeError as error:
                 raise FleetError(f"{part}: damaged part of a result: {error}; calibrate again") from None
-            evidence = written.evidence
-            if evidence is not None and len(evidence.value) == len(names):
-                rows[i] = np.array([evidence.value, evidence.sd, evidence.explained], float)
+            if written.evidence is not None and written.evidence.shape[1] == len(names):
+                rows[i] = written.evidence
     if missing := [str(table.vehicle[j]) for j in listed.tolist() if j not in files]:
         raise FleetError(
             f"{table.folder / 'parameters'}: no parameters of vehicle {missing[0]} there; give the whole folder that "

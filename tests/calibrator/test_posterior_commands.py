@@ -158,5 +158,5 @@ def test_a_vehicle_cannot_be_trusted_and_held_out(fleet: Path, tmp_path: Path) -
 def test_a_vehicle_that_is_not_there_cannot_be_trusted(fleet: Path, tmp_path: Path) -> None:
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", "--trusted", "V999")
     assert run.returncode == 1
-    assert "no vehicle V999 to trust" in run.stderr
+    assert "no usable vehicle V999 to trust" in run.stderr
     assert not (tmp_path / "result").exists()

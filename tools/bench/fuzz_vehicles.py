@@ -409,78 +409,72 @@ _MODES = {"both": p01.E2E_P01_DATAID_BOTH, "alternating": p01.E2E_P01_DATAID_ALT
 def _draw_protection(rng: Random, identifier: int, size: int) -> Protection | None:
     """Draw a profile that fits a message and leaves room in it; None if there is none."""
     fitting = [name for name, (_, bits, *_) in _PROFILES.items() if bits <= 8 * (size - 1)]
-    often = [
-        *fitting,
-        *(name for name in fitting if name in {"P04", "P07"}),
-        "P01",
-        "CRC8",
-    ]  # P04, P07 fit few messages
-    name, step = rng.choice(often), rng.randint(1, 4)
+    seldom = [name for name in fitting if name in {"P04", "P07"}]  # they fit few messages
+    name, step = rng.choice([*fitting, *seldom, "P01", "CRC8"]), rng.randint(1, 4)
     windows: tuple[Window, ...] = (Window(1, 0, 1),) * 3  # each frame counts by itself
     if rng.random() < 0.5:
         sizes = [rng.randint(1, 12) for _ in range(3)]
         windows = tuple(Window(n, rng.randint(0, (n + 1) // 2), rng.randint(0, n // 2)) for n in sizes)
-    toml = f"max_delta_counter = {step}\n"
-    for state, (window, min_ok, max_error) in zip(("init", "valid", "invalid"), windows, strict=True):
-        toml += f"{state} = {{ window = {window}, min_ok = {min_ok}, max_error = {max_error} }}\n"
-    if name != "CRC8":
-        found = _autosar(rng, name, identifier, size) if name in fitting else None
-    else:
-        found = _counter_crc8(rng, identifier & 0xFFFF, size) if size >= 3 else None
-    if found is None:
-        return None
-    return Protection(**{**found, "toml": toml + found["toml"]}, max_step=step, windows=windows)
+    states = zip(("init", "valid", "invalid"), windows, strict=True)
+    toml = "".join(f"{state} = {{ window = {w}, min_ok = {ok}, max_error = {e} }}\n" for state, (w, ok, e) in states)
+    common: dict[str, Any] = {"max_step": step, "windows": windows, "toml": f"max_delta_counter = {step}\n{toml}"}
+    if name == "CRC8":
+        return _counter_crc8(rng, identifier & 0xFFFF, size, **common) if size >= 3 else None
+    return _autosar(rng, name, identifier, size, **common) if name in fitting else None
 
 
-def _autosar(rng: Random, name: str, identifier: int, size: int) -> dict[str, Any]:
+def _autosar(rng: Random, name: str, identifier: int, size: int, *, toml: str, **common: Any) -> Protection:
     protect, header_bits, counter_byte, counter_bits, modulus = _PROFILES[name]
-    offset = 0 if name == "P02" else rng.choice((0, 0, 0, rng.randrange(size - (header_bits + 7) // 8)))
-    mode = rng.choice({"P01": ("both", *_MODES), "P11": ("both", "nibble")}.get(name, ("",)))
-    longest = 0xFFFFFFFF if name in {"P04", "P07"} else 0xFFFF
-    given = rng.randrange(longest + 1) if rng.random() < 0.5 else None
-    numbers, options = rng.randbytes(16), {"data_id_mode": _MODES[mode]} if mode else {}
+    toml += f'profile = "{name}"\n'
     if name == "P02":
+        numbers = rng.randbytes(16)
         identity: int | bytes = numbers
-        toml = f'data_id_list = {{ "%" = {[*numbers]} }}\n'
+        offset, mode, options = 0, "", dict[str, int]()
+        toml += f'data_id_list = {{ "%" = {[*numbers]} }}\n'
     else:
-        options["offset"] = offset
-        identity = identifier & longest if given is None else given
-        toml = f"offset = {offset}\n" + (f'data_id = {{ "%" = {given} }}\n' if given is not None else "")
-        toml += f'data_id_mode = "{mode}"\n' if mode else ""
-    first, end = offset + counter_byte, offset + counter_byte + (counter_bits + 7) // 8
+        offset = rng.choice((0, 0, 0, rng.randrange(size - (header_bits + 7) // 8)))
+        mode = rng.choice({"P01": ("both", *_MODES), "P11": ("both", "nibble")}.get(name, ("",)))
+        options = {"offset": offset, **({"data_id_mode": _MODES[mode]} if mode else {})}
+        longest = 0xFFFFFFFF if name in {"P04", "P07"} else 0xFFFF
+        identity, given = identifier & longest, rng.random() < 0.5
+        if given:
+            identity = rng.randrange(longest + 1)
+            toml += f'data_id = {{ "%" = {identity} }}\n'
+        toml += f"offset = {offset}\n" + (f'data_id_mode = "{mode}"\n' if mode else "")
 
     def seal(payload: bytearray) -> None:
         protect(payload, identity, increment_counter=False, **options)
 
-    return {
-        "mask": (1 << header_bits + 4 * (mode == "nibble")) - 1 << 8 * offset,
-        "place": (first, end - first, 0, counter_bits),
-        "modulus": modulus,
-        "seal": seal,
-        "toml": f'profile = "{name}"\n{toml}',
-    }
+    return Protection(
+        mask=(1 << header_bits + 4 * (mode == "nibble")) - 1 << 8 * offset,
+        place=(offset + counter_byte, (counter_bits + 7) // 8, 0, counter_bits),
+        modulus=modulus,
+        seal=seal,
+        toml=toml,
+        **common,
+    )
 
 
-def _counter_crc8(rng: Random, data_id: int, size: int) -> dict[str, Any]:
+def _counter_crc8(rng: Random, data_id: int, size: int, *, toml: str, **common: Any) -> Protection:
     """A counter and a CRC-8 over all other bytes, both signals of the DBC."""
     byte, counter_byte = rng.sample(range(min(size, 4)), 2)
     shift, bytes_of_id, place = rng.choice((0, 3, 4)), rng.choice((0, 1, 2)), rng.choice(("before", "after"))
     modulus, algorithm = rng.choice((15, 16)), rng.choice(("sae_j1850", "autosar"))
-    crc = getattr(crc8, algorithm)
-
-    identity = data_id.to_bytes(2, "little")[:bytes_of_id]
+    crc, identity = getattr(crc8, algorithm), data_id.to_bytes(2, "little")[:bytes_of_id]
 
     def seal(payload: bytearray) -> None:
         rest = bytes(payload[:byte] + payload[byte + 1 :])
         payload[byte] = crc(identity + rest if place == "before" else rest + identity)
 
-    toml = f'counter = "Counter"\ncrc = "Crc"\nalgorithm = "{algorithm}"\ncounter_modulus = {modulus}\n'
-    return {
-        "mask": 0xFF << 8 * byte | 0xF << (8 * counter_byte + shift),
-        "place": (counter_byte, 1, shift, 4),
-        "modulus": modulus,
-        "seal": seal,
-        "toml": f'profile = "counter CRC8"\n{toml}data_id_bytes = {bytes_of_id}\ndata_id_at = "{place}"\n',
-        "dbc": f' SG_ Crc : {8 * byte}|8@1+ (1,0) [0|0] "" X\n'
+    toml += f'profile = "counter CRC8"\ncounter = "Counter"\ncrc = "Crc"\nalgorithm = "{algorithm}"\n'
+    toml += f'counter_modulus = {modulus}\ndata_id_bytes = {bytes_of_id}\ndata_id_at = "{place}"\n'
+    return Protection(
+        mask=0xFF << 8 * byte | 0xF << (8 * counter_byte + shift),
+        place=(counter_byte, 1, shift, 4),
+        modulus=modulus,
+        seal=seal,
+        toml=toml,
+        dbc=f' SG_ Crc : {8 * byte}|8@1+ (1,0) [0|0] "" X\n'
         f' SG_ Counter : {8 * counter_byte + shift}|4@1+ (1,0) [0|0] "" X',
-    }
+        **common,
+    )

@@ -102,12 +102,9 @@ def _simulated(branches: int, vehicles: int, sparsity: float) -> EvidenceRows:
     made = parameters @ row_design(K, feed=0).T
     made += np.where(sd < 1.0, sd, 0.0) * rng.normal(size=(vehicles, 5 * K))
     made[:, at.gain_reads] = made[:, at.offset_reads] = 0.0
-    return EvidenceRows(
-        relative=made[:, at.relative],
-        constant=made[:, at.constant] * np.concatenate([factor, factor[:, :1], factor], axis=1),
-        covariance=np.tile(np.diag(sd**2), (vehicles, 1, 1)),
-        means=np.zeros((vehicles, 2, K)),
-    )
+    made[:, at.constant] *= np.concatenate([factor, factor[:, :1], factor], axis=1)
+    covariance = np.tile(np.diag(sd**2), (vehicles, 1, 1))
+    return EvidenceRows(values=made, covariance=covariance, means=np.zeros((vehicles, 2, K)))
 
 
 if __name__ == "__main__":

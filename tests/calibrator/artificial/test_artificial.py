@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,19 @@ def frames(database: VehicleDatabase, v: Vehicle) -> list[FrameSeries]:
     return vehicle_frames(np.random.default_rng(3), database, v, trip())
 
 
-def test_unmeasured_load_is_carried_by_the_battery_alone(database: VehicleDatabase) -> None:
-    for message, signal, extra in (("HV_Battery", "BatteryCurrent", 3.0), ("HV_Motor", "MotorCurrent", 0.0)):
-        _, with_load = decoded(database, frames(database, vehicle(faults(), unmeasured_a=3.0)), message, signal)
-        _, without = decoded(database, frames(database, vehicle(faults())), message, signal)
-        np.testing.assert_allclose(with_load - without, extra, atol=0.0201)
+def test_frames_show_the_true_currents_through_faulty_late_and_noisy_sensors(database: VehicleDatabase) -> None:
+    quiet = vehicle(faults(0.2, 10.0), delay_s=np.array([0.0, 0.3]), unmeasured_a=3.0)
+    for message, signal, name, sign in (
+        ("HV_Battery", "BatteryCurrent", "battery", 1.0),
+        ("HV_Motor", "MotorCurrent", "motor", -1.0),
+    ):
+        time_s, value = decoded(database, frames(database, quiet), message, signal)
+        delay_s = 0.3 if name == "motor" else 0.0
+        ideal = np.interp(time_s - delay_s, trip().time_s, trip().currents_a[name])
+        expected = 1.2 * ideal + 10.0 if name == "motor" else ideal + 3.0  # the battery carries the load
+        np.testing.assert_allclose(sign * value, expected, atol=0.0101)
+        _, noisy = decoded(database, frames(database, replace(quiet, noise_a=0.4)), message, signal)
+        assert np.std(noisy - value) == pytest.approx(0.4, rel=0.1)
 
 
 def test_messages_keep_their_cycle_time_and_their_own_instants(database: VehicleDatabase) -> None:

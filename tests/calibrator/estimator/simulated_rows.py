@@ -88,8 +88,7 @@ def rows_of(
     turn[:, range(c, c + K), range(K)] = -ideal
     turn[:, c + K, K : 2 * K - 1] = measured[:, 1:] * np.exp(-relative[:, 1:K])
     return EvidenceRows(
-        relative=values[:, :c],
-        constant=values[:, c:],
+        values=values,
         covariance=turn @ np.diag(sd**2) @ np.swapaxes(turn, 1, 2),
         means=np.stack([ideal, measured], axis=1),
     )

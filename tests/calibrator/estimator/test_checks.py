@@ -142,15 +142,6 @@ def test_finding_does_not_depend_on_the_order_of_the_branches() -> None:
     assert (second.cause, second.branch, second.text) == (first.cause, first.branch, first.text)
 
 
-def test_summaries_without_fit_sums_have_no_findings() -> None:
-    summaries = a_fleet(2, CAUSES["step"])
-    plain = [replace(summary, fit=None) for summary in summaries]
-    assert learn_usual_misfits(plain, read_out(2), full_scale_a=FULL_SCALE_A) is None
-    assert checked(plain, 2) == [()] * 9
-    mixed = [plain[0], *summaries[1:]]
-    assert [bool(mine) for mine in checked(mixed, 2)] == [j == BAD for j in range(9)]
-
-
 def test_vehicle_that_stands_still_has_no_findings() -> None:
     summaries = a_fleet(2)
     still = samples_of(np.zeros((SAMPLES, INPUTS)), np.zeros((SAMPLES, 2)))

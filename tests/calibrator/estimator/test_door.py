@@ -17,7 +17,6 @@ from sklearn.base import clone
 import calibrator
 from calibrator import Fleet, FleetCalibrator, Junction, read_log
 from calibrator.artificial.builtin_drives import builtin_trip
-from calibrator.drives import align
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.results import read_results
 from calibrator.summaries.store import SummaryStore
@@ -194,14 +193,6 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made_once(tmp_path_factory, "two_vehicles", "simulate", *options)
 
 
-def test_logs_give_what_the_command_writes(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    done = command("calibrate", logs, "--layout", LAYOUT, "--out", tmp_path / "command", "--workers", 1)
-    assert done.returncode == 0, done.stderr
-    found = FleetCalibrator(workers=1).fit(Fleet.from_folder(logs, LAYOUT))
-    assert contents(found.write(tmp_path / "python")) == contents(tmp_path / "command")
-
-
 def test_log_reads_as_a_frame_that_makes_a_fleet(logs: Path) -> None:
     paths = sorted((logs / "logs").rglob("*.log*"))
     log = read_log(paths[0], LAYOUT)
@@ -260,33 +251,6 @@ def test_several_frames_and_bad_samples_are_taken_as_they_are() -> None:
     assert "at least 120 s are needed" in found.left_out_["V8"]
 
 
-@pytest.mark.parametrize("kind", [list, np.array, pd.Index, tuple, iter])
-def test_labels_of_columns_may_be_numbers_and_inputs_anything_like_a_list(kind: Callable[[list[Any]], Any]) -> None:
-    numbered: dict[Any, pd.DataFrame] = {
-        name: each.rename(columns={"battery": 0, "power": 1, "heat": 2}) for name, each in enumerate(frames().values())
-    }
-    junction = Junction(branches=[0, "motor"], full_scale_a=400.0)  # type: ignore[list-item]
-    found = FleetCalibrator(trusted=kind([1])).fit(Fleet.from_frames(numbered, junction, inputs=kind([1, 2])))
-    assert "or 3 bench-checked vehicles (trusted)" in found.notices_[0]
-    pd.testing.assert_frame_equal(found.vehicles_["1"].correct(numbered[1]), numbered[1])
-    named = FleetCalibrator(trusted=["V2"], hold_out=None).fit(Fleet.from_frames(frames(), JUNCTION, inputs=INPUTS))  # type: ignore[arg-type]
-    columns = ["gain_error", "offset_a", "fault_probability"]
-    pd.testing.assert_frame_equal(found.parameters_[columns], named.parameters_[columns])
-
-
-def test_drives_of_a_month_in_one_frame_are_as_frames_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(align, "MAX_SAMPLES", 1000)
-    later = frame(90, gain_error=0.1)
-    month = pd.concat([frame(91, gain_error=0.1), later.set_index(later.index + 86400.0)])
-    parted, joined = (
-        FleetCalibrator().fit(Fleet.from_frames(frames(5) | {"V9": given}, JUNCTION)).vehicles_["V9"].parameters
-        for given in ([frame(91, gain_error=0.1), later], month)
-    )
-    assert joined.provenance.duration_s == pytest.approx(parted.provenance.duration_s, abs=2.0)
-    for name, branch in joined.branches.items():
-        assert branch.drift == pytest.approx(parted.branches[name].drift, abs=0.002)
-
-
 def changed(**changes: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     """Three vehicles, one or more of them changed."""
     return lambda: {name: changes.get(name, lambda each: each)(each) for name, each in frames().items()}
@@ -300,14 +264,12 @@ def scaled(column: str, factor: float) -> Callable[[pd.DataFrame], pd.DataFrame]
     ("given", "message"),
     [
         (dict, r"dict without vehicles: expected data frames by vehicle"),
-        (lambda: [frame(1)], r"list without vehicles: expected data frames by vehicle"),
         (lambda: frames(1), r"a single vehicle, V1: a fleet that is compared with itself needs 5 or more"),
         (lambda: {1: frame(1), "1": frame(2)}, r"vehicle 1 is there twice; give all of its frames as one list"),
         (lambda: {"a/b": frame(1), "V2": frame(2)}, r"vehicle 'a/b' cannot be used"),
         (changed(V2=lambda _: []), r"vehicle V2: no frame in its list"),
         (changed(V2=lambda each: each["motor"]), r"vehicle V2: Series given; expected a DataFrame or a list of them"),
         (changed(V2=lambda _: frame(1)), r"vehicle V2, frame 1: the same as vehicle V1, frame 1"),
-        (changed(V2=lambda each: [each, each]), r"vehicle V2, frame 2: the same as vehicle V2, frame 1"),
         (changed(V2=lambda each: each.drop(columns="motor")), r"vehicle V2, frame 1: no column motor; it has battery"),
         (changed(V3=lambda each: each.drop(columns="heat")), r"vehicle V3, frame 1: no column heat; it has battery"),
         (changed(V3=lambda each: each.assign(wind=1.0)), r"V3, frame 1: column wind, which vehicle V1, frame 1 has n"),
@@ -325,32 +287,15 @@ def scaled(column: str, factor: float) -> Callable[[pd.DataFrame], pd.DataFrame]
             changed(V2=lambda each: each.set_index(each.index.where(each.index != 7.0))),
             r"V2, frame 1: 1 rows without a time",
         ),
-        (
-            changed(V2=lambda each: each.set_index(pd.to_datetime(each.index.where(each.index > 1.0), unit="s"))),
-            r"V2, frame 1: 2 rows without a time",
-        ),
         (changed(V2=lambda each: each.iloc[:1]), r"V2, frame 1: 1 rows; leave the frame out"),
         (changed(V2=scaled("motor", 1e-3)), r"V2: the largest motor current is 0.\d+ A.*perhaps it is in kA"),
-        (changed(V2=scaled("motor", 1e3)), r"V2: the largest motor current is .*perhaps it is in mA"),
         (
             lambda: {name: each.set_index(60.0 * each.index) for name, each in frames().items()},
             r"vehicle V1, frame 1: rows are 60 s apart, expected 5 s at most",
         ),
         (
-            changed(V2=lambda each: [each, frame(8).set_index(1e3 * each.index)]),
-            r"vehicle V2, frame 2: rows are 1e\+03 s apart, and those of the fleet 1 s; if the index is not in seconds",
-        ),
-        (
             changed(V2=lambda each: each.set_index(1e-3 * each.index)),
             r"vehicle V2, frame 1: rows are 0.001 s apart, and those of the fleet 1 s; if the index is not in seconds",
-        ),
-        (
-            changed(V2=lambda each: each.set_index(10.0 * each.index)),
-            r"vehicle V2, frame 1: rows are 10 s apart, expected 5 s at most",
-        ),
-        (
-            changed(V2=lambda each: each.rename(columns={"motor": "other"})),
-            r"vehicle V2, frame 1: no column motor; it has battery, other",
         ),
         (
             lambda: {name: each[["battery", "motor"]] for name, each in frames().items()},
@@ -368,36 +313,12 @@ def test_frames_that_are_no_recordings_of_a_fleet_are_refused_in_one_line(
 
 
 @pytest.mark.parametrize(
-    ("inputs", "message"),
-    [
-        ("power", r"inputs 'power': expected a list of names"),
-        ({"power", "heat"}, r"inputs \{.*\}: expected a list of names"),
-        (5, r"inputs 5: expected a list of names"),
-        (np.array(5), r"inputs array\(5\): expected a list of names"),
-        ([True], r"inputs \[True\]: expected a list of names"),
-        ([1], r"vehicle V1, frame 1: no column 1; it has battery"),
-        (["power", "motor"], r"inputs motor: a branch of the junction cannot be an input"),
-        (["power", "power"], r"inputs power, power: expected one or more different columns"),
-        (["power", "wind"], r"vehicle V1, frame 1: no column wind; it has battery"),
-    ],
-)
-def test_inputs_that_are_none_are_refused(inputs: Any, message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        Fleet.from_frames(frames(), JUNCTION, inputs=inputs)
-
-
-@pytest.mark.parametrize(
     ("branches", "full_scale_a", "message"),
     [
         (["battery"], 400.0, r"branches \['battery'\]: a junction has 2 to 16 branches"),
         ("battery", 400.0, r"branches 'battery': expected a list of names"),
-        ({"battery", "motor"}, 400.0, r"branches \{.*\}: expected a list of names"),
-        (None, 400.0, r"branches None: expected a list of names"),
-        (3, 400.0, r"branches 3: expected a list of names"),
-        (["battery", None], 400.0, r"branches \['battery', None\]: expected a list of names"),
         (["battery", "battery"], 400.0, r"branches \['battery', 'battery'\]: expected different names"),
         (["battery", "motor"], 0.0, r"full_scale_a 0.0: expected the nominal maximum current in A"),
-        (["battery", "motor"], True, r"full_scale_a True: expected the nominal maximum current in A"),
         (["battery", "motor"], "400 A", r"full_scale_a '400 A': expected the nominal maximum current in A"),
     ],
 )
@@ -406,32 +327,6 @@ def test_junction_of_one_branch_or_without_full_scale_is_refused(
 ) -> None:
     with pytest.raises(FleetError, match=message):
         Junction(branches=branches, full_scale_a=full_scale_a)
-
-
-WRONG_CALLS: tuple[tuple[Callable[[Any], Any], Any, str], ...] = (
-    (lambda given: Fleet.from_frames(frames(), given), ["battery", "motor"], r"junction \['battery', .*ed a Junction"),
-    (lambda given: Fleet.from_frames(frames(), given), None, "junction None: expected a Junction"),
-    (Junction.from_layout, None, r"path None: expected the path of a layout \(TOML\)"),
-    (lambda given: Junction.from_layout(LAYOUT, branches=given), "battery", "branches 'battery': expected a list of n"),
-    (lambda given: Fleet.from_folder(ROOT, given), JUNCTION, r"layout Junction\(.*: expected the path of a layout"),
-    (
-        lambda given: Fleet.from_folder(given, LAYOUT),
-        None,
-        "path None: expected a drive store, a folder of logs, or su",
-    ),
-    (lambda given: read_log(given, given), None, "path None: expected the path of a log"),
-    (lambda given: read_log("a.log", given), None, "layout None: expected the path of a layout"),
-    (FleetCalibrator().fit, frames(), r"fleet of type dict: expected Fleet.from_frames\(...\) or Fleet.from_folder"),
-)
-
-
-@pytest.mark.parametrize(("call", "given", "message"), WRONG_CALLS)
-def test_arguments_of_another_type_are_refused_in_one_line(
-    call: Callable[[Any], Any], given: object, message: str
-) -> None:
-    with pytest.raises(FleetError, match=message) as caught:
-        call(given)
-    assert "\n" not in str(caught.value)
 
 
 def bench_rows(vehicles: list[str], drift: float) -> pd.DataFrame:
@@ -448,10 +343,8 @@ def test_wrong_places_and_parameters_are_refused(tmp_path: Path) -> None:
     fleet = Fleet.from_frames(frames(), JUNCTION)
     wrong: tuple[tuple[dict[str, Any], str], ...] = (
         ({"harm_limit": 2.0}, "harm_limit 2.0: expected a number from 0 to 1"),
-        ({"harm_limit": True}, "harm_limit True: expected a number from 0 to 1"),
         ({"expected_faults": "half"}, "expected_faults 'half': expected a number from 0 to 1"),
         ({"workers": 0}, "workers 0: expected a whole number from 1 to 256"),
-        ({"workers": 1.5}, "workers 1.5: expected a whole number from 1 to 256"),
         ({"scheduler": 1}, "scheduler 1: expected the address of a Dask scheduler"),
         ({"readings": "nothere.csv"}, "readings 'nothere.csv': expected a file that exists"),
         ({"readings": [1]}, r"readings \[1\]: expected a DataFrame or the path of a CSV table"),
@@ -467,9 +360,7 @@ def test_wrong_places_and_parameters_are_refused(tmp_path: Path) -> None:
             {"readings": bench_rows(["V1", "V2"], 0.1).assign(branch=["battery", "x"])},
             "^readings: row 1: no branch 'x'",
         ),
-        ({"trusted": 1}, "trusted 1: expected a list of names"),
         ({"trusted": [1]}, "fleet frames: no usable vehicle 1 to trust"),
-        ({"hold_out": [None]}, r"hold_out \[None\]: expected a list of names"),
         ({"trusted": ["V1"], "hold_out": "V1"}, "vehicle V1 is both held out and trusted"),
         ({"trusted": "V9"}, "fleet frames: no usable vehicle V9 to trust"),
     )

@@ -30,9 +30,3 @@ def test_two_variants_give_two_clusters_the_larger_first() -> None:
     assert second.centre == pytest.approx(1.15, abs=0.002)
     assert first.share > second.share
     assert densest_clusters(values, sd, farthest=0.5) == []
-
-
-def test_values_that_agree_within_their_errors_are_one_cluster() -> None:
-    (cluster,) = densest_clusters(np.array([0.5, 0.5001, 0.4999]), np.full(3, 0.01), most=2)
-    assert (cluster.centre, cluster.share) == (0.5, 1.0)
-    assert densest_clusters(np.array([1.3]), np.array([0.1]))[0].centre == 1.3

@@ -1,14 +1,11 @@
 """Read-outs on a shared filter bank against their samples, and the choice of the bank for known vehicles."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from bench.dynamic_vehicles import INPUT_NAMES, PERIOD_S, bank_model, drive_inputs, recorded
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
-from calibrator.errors import DriveError
 from calibrator.estimator.fleet_identification import (
     FIRST_HELD_OUT,
     FOLDS,
@@ -17,13 +14,12 @@ from calibrator.estimator.fleet_identification import (
     read_outs,
 )
 from calibrator.published.state_space import StateSpaceModel, simulation_snr_db
-from calibrator.summaries.filter_bank import FilterBank, low_pass_bank, plain_bank
+from calibrator.summaries.filter_bank import FilterBank, low_pass_bank
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import summarise_samples
 
 BLOCK = round(BLOCK_S / PERIOD_S)
 LEAD_IN = 600
-PLAIN = plain_bank(INPUT_NAMES, period_s=PERIOD_S)
 FILTERED = low_pass_bank(INPUT_NAMES, (0.5, 3.0), period_s=PERIOD_S)
 GAINS = np.random.default_rng(0).normal(size=(4, 3))
 
@@ -106,10 +102,3 @@ def test_one_common_pole_is_found_through_the_noise_and_beside_an_input_that_sta
     for (drive,) in vehicles:
         drive.inputs[:, 2] = 5.0
     assert choose_filter_bank(vehicles, period_s=PERIOD_S).poles != ()
-
-
-def test_drives_by_which_no_bank_can_be_judged_are_refused() -> None:
-    ((short,),) = pool([lagging_vehicle()], samples=400)
-    for drive in (short, replace(short, valid=np.zeros(400, bool))):
-        with pytest.raises(DriveError, match="none of 1 vehicles has three blocks of varied, valid samples"):
-            choose_filter_bank([[drive]], period_s=PERIOD_S)

@@ -1,7 +1,6 @@
 """Models of single vehicles from their drives, and ``calibrator identify`` as a user types it."""
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,27 +74,6 @@ def test_static_vehicle_is_simulated_exactly_from_one_drive_or_two(database: Veh
     assert len(one.held_out_inputs) == pytest.approx(600 + one.lead_in, abs=1)
 
 
-def test_input_that_never_varies_has_no_effect_in_the_model(database: VehicleDatabase, tmp_path: Path) -> None:
-    whole = drive("a")
-    heating = {"heater_demand": channel(np.zeros(SAMPLES))}
-    motor = whole.branches["motor"]
-    still = {"battery": channel(-motor.value), "auxiliary": heating["heater_demand"]}
-    unheated = replace(whole, inputs={**whole.inputs, **heating}, branches={**whole.branches, **still})
-    model = model_of(database, tmp_path, unheated).model
-    np.testing.assert_array_equal(model.D[:, 1], 0.0)
-    np.testing.assert_array_equal(model.B[:, 1], 0.0)
-    varied = np.column_stack([np.full(100, 5.0), np.linspace(0.0, 10.0, 100)])
-    np.testing.assert_allclose(model.simulate(varied)[:, 0], 5.0, atol=1e-6)
-
-
-def test_drive_that_is_good_only_at_its_start_has_held_out_data(database: VehicleDatabase, tmp_path: Path) -> None:
-    whole = drive("a")
-    half = channel(whole.branches["battery"].value, np.arange(SAMPLES) < 1500)
-    vehicle = model_of(database, tmp_path, replace(whole, branches={**whole.branches, "battery": half}))
-    assert np.isfinite(vehicle.simulation_error_a).all()
-    assert vehicle.duration_s == pytest.approx(150.0, abs=0.2)
-
-
 def test_parked_and_hardly_recorded_vehicles_are_refused(database: VehicleDatabase, tmp_path: Path) -> None:
     moving, still = drive("a"), channel(np.zeros(SAMPLES))
     parked = replace(moving, inputs={**moving.inputs, "torque": still, "heater_demand": still})
@@ -118,20 +96,6 @@ def test_junction_residual_from_moments_is_that_of_the_samples() -> None:
     assert [found.measured_mean_a, found.corrected_mean_a] == pytest.approx(means)
     about = [float(np.sqrt(np.mean((values - 1.5) ** 2))) for values in sums[:2]]
     assert found.about_expected() == pytest.approx(about)
-
-
-def test_spread_of_corrected_sums_is_told_at_rest_and_per_ampere() -> None:
-    random = np.random.default_rng(2)
-    throughput_a = np.repeat(np.linspace(0.0, 300.0, 40), 500)
-    noise = random.normal(size=(2, len(throughput_a)))
-    battery_a = throughput_a + 1.5 + 0.8 * noise[0] + 0.03 * throughput_a * noise[1]
-    samples = np.stack([battery_a, -throughput_a, np.ones_like(battery_a)], axis=1).reshape(40, 500, 3)
-    moments = np.einsum("bsk,bsl->bkl", samples, samples)
-    found = junction_residual(moments, gain=np.ones((1, 2)), offset_a=np.zeros(2), expected_a=1.5)
-    assert found.corrected_sd_a is not None
-    assert found.corrected_sd_per_a is not None
-    assert 0.8 <= found.corrected_sd_a <= 2.0
-    assert found.corrected_sd_per_a == pytest.approx(math.hypot(0.03, 0.01), rel=0.1)
 
 
 @pytest.fixture(scope="module")

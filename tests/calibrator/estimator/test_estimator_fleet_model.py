@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.estimator.evidence import fit_fleet_model, regress_on_fleet, stack_summaries
-from calibrator.faults import Faults, slopes_and_intercepts
+from calibrator.faults import Faults
 from calibrator.summaries.moments import DriveSummary
 from tests.calibrator.estimator.simulated_drives import no_faults, read_out_of, summaries_of
 
@@ -53,22 +52,6 @@ def test_read_outs_are_those_of_faultless_vehicles_however_lopsided_the_faults(s
     assert largest_error(read_out) < 0.005
     assert np.abs(read_out[-1]).max() < 0.5
     np.testing.assert_allclose(read_out.sum(axis=1), 0.0, atol=1e-9)
-
-
-def test_slopes_and_intercepts_are_those_of_the_faults() -> None:
-    faults = draw_faults(
-        np.random.default_rng(1),
-        vehicles=40,
-        branches=K,
-        sparsity=70.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=400.0,
-        balanced=True,
-    )
-    a, b = slopes_of(summaries_of(faults, seed=1))
-    slopes, intercepts = slopes_and_intercepts(faults)
-    np.testing.assert_allclose(a, slopes, atol=0.02)
-    np.testing.assert_allclose(b, intercepts, atol=1.0)
 
 
 def test_order_of_vehicles_units_and_copies_of_inputs_do_not_matter() -> None:

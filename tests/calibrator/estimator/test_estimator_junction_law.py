@@ -63,15 +63,6 @@ def test_noise_on_a_small_branch_does_not_draw_its_gain_to_zero() -> None:
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.006)
 
 
-def test_load_without_a_sensor_moves_the_constant_alone() -> None:
-    (loaded, truth), (plain, _) = (
-        summary_of(5, noise_a=(0.5, 0.5, 0.5), size_a=(80.0, 10.0), load_a=load_a) for load_a in (3.0, 0.0)
-    )
-    fit = law_of(loaded, plain)
-    assert (np.abs(fit.estimate[0] - truth) < 5.0 * fit.sd[0]).all()
-    np.testing.assert_allclose(fit.estimate[0, :2], fit.estimate[1, :2], rtol=1e-6)
-
-
 def test_branch_that_never_moves_keeps_the_prior_and_one_of_noise_gets_no_sensor_s_gain() -> None:
     still = law_of(summary_of(6, noise_a=(0.5, 0.5, 0.0), size_a=(80.0, 0.0))[0])
     assert still.estimate[0, 1] == pytest.approx(-1.0, abs=0.05)

@@ -12,13 +12,12 @@ from calibrator.estimator.learning import FaultModel, Spread, explain, learn_fau
 from calibrator.estimator.prior import Prior, first_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
-from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
+from tests.calibrator.estimator.simulated_rows import random_faults, rows_of
 
 
 def moved(rows: EvidenceRows, by: Array) -> EvidenceRows:
     """Rows (N, 5K) that differ by so much more, known ones only."""
-    c, by = rows.relative.shape[1], by * rows.known
-    return replace(rows, relative=rows.relative + by[:, :c], constant=rows.constant + by[:, c:])
+    return replace(rows, values=rows.values + by * rows.known)
 
 
 def learned(rows: EvidenceRows, **knowledge: float) -> FaultModel:
@@ -78,49 +77,12 @@ def test_what_vehicles_without_faults_differ_by_is_learned() -> None:
     assert np.linalg.eigvalsh(spread.covariance).min() > 0.0
 
 
-def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> None:
-    K = 2
-    rows = rows_of(random_faults(4, vehicles=60, branches=K), seed=4, errors=Errors(intercept=0.004))
-    stated = rows.covariance.copy()
-    at = RowPlaces(K).intercepts
-    stated[:, at, at] -= np.diag([0.004**2 - 0.001**2] * K)
-    wide, plain = (learned(each).spread for each in (replace(rows, covariance=stated), rows))
-    variance = 0.001**2 * wide.dispersion + np.diag(wide.covariance)[at]
-    np.testing.assert_allclose(variance, 0.004**2, rtol=0.5)
-    assert (wide.dispersion > 2.0 * plain.dispersion).all()
-
-
-def test_error_of_the_reference_that_all_vehicles_share_is_its_centre() -> None:
-    K, at = 2, RowPlaces(2)
-    rows, by = rows_of(random_faults(5, vehicles=40, branches=K), seed=5), np.zeros(5 * K)
-    by[at.slopes], by[at.intercept(0)] = (0.02, -0.015), 0.006
-    plain, shifted = learned(rows), learned(moved(rows, np.tile(by, (40, 1))))
-    np.testing.assert_allclose(shifted.spread.mean - plain.spread.mean, by, atol=0.0012)
-    np.testing.assert_allclose(shifted.prior.counts, plain.prior.counts, atol=0.03)
-
-
 def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(learning, "MOST_LEARNT", 25)
     rows = rows_of(random_faults(6, vehicles=40, branches=2), seed=6)
     same(learned(rows.take(np.random.default_rng(6).permutation(40))), learned(rows), rtol=1e-6)
-
-
-def test_share_of_faulty_vehicles_is_as_expected() -> None:
-    rows = rows_of(random_faults(9, vehicles=20, branches=2, sparsity=90.0), seed=9)
-    for share in (0.1, 0.6):
-        assert learned(rows, expected_faults=share).prior.counts[:, 1:].sum() == pytest.approx(share, abs=1e-9)
-
-
-def test_centre_that_trusted_vehicles_carry_is_kept() -> None:
-    K, at = 2, RowPlaces(2)
-    rows, fixed = rows_of(random_faults(10, vehicles=25, branches=K), seed=10), np.full(5 * K, np.nan)
-    trusted = [at.slope(0), at.intercept(0)]
-    fixed[trusted] = 0.001, -0.0005
-    model = learn_fault_models(rows, feed=0, fixed=fixed)[0]
-    np.testing.assert_array_equal(model.spread.mean[trusted], fixed[trusted])
-    assert np.isnan(fixed[at.junction]), "what the caller gave is not changed"
 
 
 @pytest.mark.parametrize("declared", [None, 0.0125])
@@ -133,16 +95,6 @@ def test_load_of_all_vehicles_is_found_or_taken_as_declared(declared: float | No
     assert models[0].prior.counts[0].sum() == pytest.approx(0.7, abs=0.2)
     if declared is not None:
         assert models[0].spread.mean[at.junction] == declared
-
-
-@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors(K: int) -> None:
-    load = np.random.default_rng(15).normal(0.0075, 0.0025, 30).clip(0.0)
-    errors = Errors(intercept=0.0003, junction=0.0001)  # as on recorded trips
-    model = learned(rows_of(random_faults(15, vehicles=30, branches=K), seed=15, errors=errors, load=load))
-    carried = [model.spread.covariance[row, 4 * K - 1] for row in (3 * K - 1, 4 * K - 1)]
-    np.testing.assert_allclose(np.sqrt(carried), load.std(), rtol=0.3)
-    assert not model.spread.shared.any()
 
 
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])

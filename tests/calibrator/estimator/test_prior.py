@@ -7,9 +7,6 @@ import pytest
 
 from calibrator.drive import Array
 from calibrator.estimator.prior import (
-    GRID,
-    TAIL_DENSITY,
-    Slab,
     first_prior,
     known_prior,
     sparse_counts,
@@ -19,28 +16,12 @@ from tests.calibrator.estimator.simulated_rows import random_faults
 BRANCHES = pytest.mark.parametrize("K", [2, 3, 5])
 
 
-def mass(density: Array, low: float = 0.0, high: float = np.inf) -> float:
-    return float(np.trapezoid(np.where((low < GRID) & (high > GRID), density, 0.0), GRID))
-
-
 def counted(K: int, sparsity: float, vehicles: int = 4000) -> Array:
     """Numbers of vehicles with so many hardware and sensor faults, as the paper draws them."""
     faults, tally = random_faults(1, vehicles=vehicles, branches=K, sparsity=sparsity), np.zeros((K + 1, 2 * K + 1))
     hardware = (faults.hardware_drift != 0.0) + np.count_nonzero(faults.hardware_offset_a[:, :-1], axis=1)
     np.add.at(tally, (hardware, np.count_nonzero(np.hstack([faults.drift, faults.offset_a]), axis=1)), 1.0)
     return tally
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.05, 0.25), (0.004, 1.0), (0.1, 0.12)])
-@pytest.mark.parametrize("tail", [0.001, 0.1])
-def test_slab_is_uniform_between_its_bounds_and_has_its_tail_beyond(low: float, high: float, tail: float) -> None:
-    density = Slab(low=low, high=high, tail=tail).density
-    assert mass(density) == pytest.approx(1.0, abs=1e-9)
-    assert mass(density - tail * TAIL_DENSITY, 0.85 * low, 1.15 * high) == pytest.approx(1.0 - tail, abs=0.02)
-    middle = np.interp(np.linspace(1.1 * low, 0.9 * high, 9), GRID, density - tail * TAIL_DENSITY)
-    if low < 0.1:
-        np.testing.assert_allclose(middle, middle.mean(), rtol=0.06)
-    assert (density[(GRID > 0.002) & (GRID < 1.5)] > 0.0).all(), "no size is impossible"
 
 
 @BRANCHES

@@ -7,7 +7,6 @@ import pytest
 from msgspec.structs import replace
 
 from calibrator.errors import FleetError
-from calibrator.estimator.evidence import VehicleEvidence
 from calibrator.estimator.results import (
     MOST_FILES,
     PARTS,
@@ -16,7 +15,6 @@ from calibrator.estimator.results import (
     join_rows,
     left_out_of,
     part_file,
-    read_part,
     read_results,
     read_run,
     report_of,
@@ -81,14 +79,6 @@ def test_unknown_vehicle_is_named(result: Path, name: str) -> None:
         written_of(result, name)
 
 
-def test_vehicle_left_out_is_named_with_its_reason(result: Path, tmp_path: Path) -> None:
-    part_file(result, BUCKETS).write_bytes(encode_chunk([], {"v3": "too short"}))
-    assert join_rows(result, {"a log": "unreadable", "v3": "known"}) == 2
-    assert left_out_of(result) == {"a log": "unreadable", "v3": "too short"}
-    with pytest.raises(FleetError, match=r"no parameters of vehicle 'v3', it was left out: too short"):
-        written_of(result, "v3")
-
-
 def test_parameter_files_are_written_by_the_command(
     result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,14 +88,6 @@ def test_parameter_files_are_written_by_the_command(
     assert run_command(["params", str(result), "v1", "v9", "--out", str(tmp_path / "none")]) == 1
     assert "no vehicle 'v9' in it" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
-
-
-def test_chunk_keeps_evidence_and_digest_of_the_drives(tmp_path: Path, database: VehicleDatabase) -> None:
-    evidence = VehicleEvidence(value=[1.0, None], sd=[0.5, None], explained=[1.0, 2.0])
-    chunk = encode_chunk([vehicle(database, "v1")], {}, drives={"v1": "abc"}, evidence={"v1": evidence})
-    (tmp_path / "part").write_bytes(chunk)
-    (written,) = read_part(tmp_path / "part").values()
-    assert (written.drives, written.evidence) == ("abc", evidence)
 
 
 def test_parameters_that_cannot_be_written_leave_their_vehicle_out(tmp_path: Path, database: VehicleDatabase) -> None:

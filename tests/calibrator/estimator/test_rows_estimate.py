@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.decision import RowsEstimate, estimate_rows
+from calibrator.estimator.decision import FleetEstimate, estimate_rows
 from calibrator.estimator.evidence import EvidenceRows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT
 from calibrator.estimator.learning import learn_fault_models
@@ -25,7 +25,7 @@ def moments(rows: EvidenceRows) -> dict[str, Any]:
     return {"mean": mean, "mean_square": mean**2 + VARIANCE, "usual": np.stack([ideal, ideal**2 + VARIANCE])}
 
 
-def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[RowsEstimate, Faults]:
+def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[FleetEstimate, Faults]:
     """Estimate, and what of it would be deployed."""
     rows = rows_of(faults, seed=seed, load=load)
     found = estimate_rows(rows, learn_fault_models(rows, feed=0), feed=0, **moments(rows))

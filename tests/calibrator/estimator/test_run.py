@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.estimator import run
-from calibrator.estimator.fleet_task import NOT_THERE, FleetTask, calibrate_bucket, learn_task
+from calibrator.estimator.fleet_task import FleetTask, calibrate_bucket, learn_task
 from calibrator.estimator.results import read_results, read_run, unfinished_run
 from calibrator.estimator.run import read_sample, take_census
 from calibrator.estimator.settings import CalibrationSettings
@@ -159,45 +157,11 @@ def test_killed_run_goes_on_where_it_stopped(store: SummaryStore, result: Path, 
     assert contents(out) == contents(result)
 
 
-def test_chunks_of_other_settings_are_not_used(store: SummaryStore, result: Path, tmp_path: Path) -> None:
-    unfinished = tmp_path / ".out.unfinished"
-    (unfinished / "result" / "parameters").mkdir(parents=True)
-    (unfinished / "plan").write_text("another plan\n1999")
-    (unfinished / "result" / "parameters" / "00000.parquet").write_bytes(b"nonsense")
-    assert calibrate(store.url, tmp_path / "out", "--workers", 1).returncode == 0
-    assert contents(tmp_path / "out") == contents(result)
-
-
 def test_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: Path) -> None:
     with unfinished_run(tmp_path / "out"):
         second = calibrate_here(store.url, tmp_path / "out")
     assert second.returncode == 1
     assert "another run is writing this result; wait for it or choose another --out" in second.stderr
-
-
-def test_only_computed_work_is_kept(store: SummaryStore, tmp_path: Path) -> None:
-    out, folder = tmp_path / "out", tmp_path / ".out.unfinished"
-    for name, kept in (
-        ("result/parameters/00003.parquet", True),
-        ("summaries/buckets/00003.parquet", True),
-        ("plan", False),
-    ):
-        with suppress(FleetError), unfinished_run(out):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).touch()
-            raise FleetError("a slip")
-        assert folder.exists() == kept
-        shutil.rmtree(folder, ignore_errors=True)
-    (tmp_path / "earlier").mkdir()
-    (tmp_path / "earlier" / "run.json").touch()
-    shutil.copytree(store.url, tmp_path / "earlier" / "summaries")
-    for new in (False, True):
-        with suppress(FleetError), unfinished_run(out) as unfinished:
-            unfinished.summaries_since(tmp_path / "earlier")
-            if new:
-                (unfinished.summaries / "buckets" / "00003.parquet").touch()
-            raise FleetError("a slip")
-        assert folder.exists() == new, "copies of earlier summaries are nothing new"
 
 
 @pytest.mark.parametrize(
@@ -224,19 +188,10 @@ def test_full_disk_says_what_to_do(tmp_path: Path, error: OSError) -> None:
         (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
         (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
         (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
-        (
-            ("--trusted", ",".join(f"V{number}" for number in range(700, 710))),
-            1,
-            "V700, V701, V702, V703, V704, V705 and 4 more to trust",
-        ),
         (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
         (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
         (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
-        (("--expected-faults", "1.5"), 2, "1.5: expected a number from 0 to 1"),
-        (("--expected-faults", "0.5", "--method", "published"), 2, "belongs to --method posterior, not published"),
         (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
-        (("--scheduler", ""), 2, "'': expected the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT"),
-        (("--scheduler", "tcp://127.0.0.1:99999"), 2, "port 1 to 65535"),
     ],
 )
 def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
@@ -268,50 +223,7 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
         assert not (tmp_path / ".out.unfinished").exists()
 
 
-def test_summaries_do_not_go_into_a_folder_of_something_else(result: Path, tmp_path: Path) -> None:
-    (tmp_path / "fleet").mkdir()
-    for out, code, message in (
-        (result, 1, "no store of summaries, and not empty: parameters, params, results.parquet, run.json; choose"),
-        (result / "run.json", 1, "run.json: is a file; name a folder"),
-        ("memory://m", 1, "memory://m: is gone when the command ends"),
-    ):
-        done = calibrator("summarise", tmp_path / "fleet", "--layout", LAYOUT, "--out", out)
-        assert (done.returncode, message in done.stderr.splitlines()[-1]) == (code, True), done.stderr
-
-
-def test_cluster_without_dask_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)  # makes its import fail
-    with pytest.raises(FleetError, match=r"--scheduler needs Dask: pip install 'hv-current-correction\[cluster\]'"):
-        Workers(processes=1, scheduler="tcp://127.0.0.1:8786")
-
-
 # First pass
-
-
-def test_sample_of_a_small_fleet_is_all_of_it_less_those_held_out(store: SummaryStore) -> None:
-    census = take_census(store, ONE)
-    names = {item.vehicle for item in read_sample(store, census, CalibrationSettings(), ())}
-    assert names == {f"V{j:03d}" for j in range(VEHICLES)}
-    held_out = CalibrationSettings(hold_out=frozenset({"V003", "V004"}))
-    assert names - {item.vehicle for item in read_sample(store, census, held_out, ("V004",))} == {"V003"}
-
-
-def test_sample_of_a_large_fleet_has_a_fixed_size_and_holds_the_trusted(
-    store: SummaryStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "MOST_LEARNT", 10)
-    census = take_census(store, ONE)
-    last = list(store.read(max(census.usable)))[-1]
-    settings = CalibrationSettings(trusted=frozenset({last}))
-    sample = [item.vehicle for item in read_sample(store, census, settings, ())]
-    assert last in sample
-    assert len(sample) == 11
-
-
-def test_one_vehicle_is_no_fleet(database: VehicleDatabase, tmp_path: Path) -> None:
-    lonely = small_store(tmp_path, database, random_faults(1))
-    with pytest.raises(FleetError, match=r"1 usable vehicle to learn from; a fleet that is .* needs 5"):
-        read_sample(lonely, take_census(lonely, ONE), CalibrationSettings(), ())
 
 
 # Second pass
@@ -441,14 +353,6 @@ def test_only_those_who_drove_since_are_calibrated(store: SummaryStore, result: 
     assert [name for name in old if old[name] != now[name]] == ["V009.json"]
 
 
-def test_since_a_result_without_its_parameters_is_refused(store: SummaryStore, result: Path, tmp_path: Path) -> None:
-    shutil.copytree(result, tmp_path / "earlier")
-    shutil.rmtree(tmp_path / "earlier" / "parameters")
-    done = calibrate_here(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
-    assert done.returncode == 1
-    assert "earlier/parameters: no such folder; expected the parameters of the earlier result: give" in done.stderr
-
-
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
@@ -468,16 +372,6 @@ def test_since_a_result_of_something_else_is_refused(
     assert (done.returncode, message in done.stderr.splitlines()[-1]) == (1, True), done.stderr
 
 
-def test_vehicles_that_have_not_driven_keep_their_parameters(
-    store: SummaryStore, task: FleetTask, tmp_path: Path
-) -> None:
-    bucket = fullest(store)
-    first = calibrate_bucket(bucket, store=store, task=task)
-    later = replace(task, identity=replace(task.identity, created="2027-01-01T00:00:00+00:00"))
-    again = calibrate_bucket(bucket, store=store, task=later, previous=earlier_result(tmp_path, first, bucket))
-    assert texts(again) == texts(first)
-
-
 def test_changed_drive_counts_though_its_name_is_known(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
@@ -489,27 +383,6 @@ def test_changed_drive_counts_though_its_name_is_known(store: SummaryStore, task
     chunk = calibrate_bucket(bucket, store=other, task=task, previous=previous)
     (battery,) = [row for row in rows(chunk) if row["vehicle"] == name and row["branch"] == "battery"]
     assert battery["drift"] == pytest.approx(0.08, abs=0.005)
-
-
-def test_earlier_vehicle_that_the_store_lacks_is_named(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
-    bucket = fullest(store)
-    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
-    previous = earlier_result(tmp_path / "r", calibrate_bucket(bucket, store=store, task=task), bucket)
-    name = max(records)
-    del records[name]
-    other = rewritten(store, tmp_path / "s", bucket, records)
-    reasons = left_out(calibrate_bucket(bucket, store=other, task=task, previous=previous))
-    assert reasons == {name: NOT_THERE}
-
-
-def test_earlier_result_that_cannot_be_read_is_refused(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
-    bucket = fullest(store)
-    with pytest.raises(FleetError, match="the earlier result cannot be reached from here"):
-        calibrate_bucket(bucket, store=store, task=task, previous=tmp_path)
-    (tmp_path / "parameters").mkdir()
-    (tmp_path / "parameters" / f"{bucket:05d}.parquet").write_bytes(b"nonsense")
-    with pytest.raises(FleetError, match="damaged part of a result"):
-        calibrate_bucket(bucket, store=store, task=task, previous=tmp_path)
 
 
 @pytest.mark.parametrize(("changes", "text"), [({}, None), ({"drift": 0.08}, "drift"), ({"offset_a": 30.0}, "offset")])

@@ -14,12 +14,20 @@ from typer.testing import CliRunner
 from calibrator.cli import app
 from calibrator.errors import FleetError
 from calibrator.experiments.common_drive import CommonCase
-from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, Experiment, Setting, fleet_for
+from calibrator.experiments.experiments import (
+    CALIBRATION,
+    EXPERIMENTS,
+    Experiment,
+    ExperimentResult,
+    Setting,
+    fleet_for,
+    read_records,
+)
 from calibrator.experiments.figures import ALL
 from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR
 from calibrator.experiments.pages import headline, result_markdown, result_table, write_page
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
-from calibrator.experiments.runner import ExperimentResult, pool_confidences, read_records, run_experiment
+from calibrator.experiments.runner import pool_confidences, run_experiment
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
 
 RUN = [name for name in EXPERIMENTS if name != CALIBRATION.name]
@@ -67,19 +75,6 @@ def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path) -> None
     assert re.search(r"\| 5 \| [01]\.\d{3} \([01]\.\d{3} to [01]\.\d{3}\)", page), "each rate with its interval"
     assert (tmp_path / "results" / "loads.png").read_bytes().startswith(b"\x89PNG")
     assert "(results/loads.md)" in (tmp_path / "results.md").read_text()
-
-
-@pytest.mark.parametrize("name", RUN)
-def test_every_row_is_whole_and_has_a_small_version(name: str) -> None:
-    row, small = EXPERIMENTS[name], EXPERIMENTS[name].small()
-    places = [(setting.series, setting.x, setting.methods) for setting in row.settings]
-    assert len(places) == len(set(places))
-    assert {type(setting.case) for setting in row.settings} == {RecordedCase if row.recorded else CommonCase}
-    assert bool(row.series_label) == any(setting.series for setting in row.settings)
-    assert {x for x, _ in row.paper} <= {setting.x for setting in row.settings}
-    assert 1 <= len(small.settings) <= 4
-    for setting in small.settings:
-        assert not isinstance(setting.case, CommonCase) or setting.case.vehicles <= 20
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.experiments.experiments import EXPERIMENTS
+from calibrator.experiments.experiments import EXPERIMENTS, ExperimentResult
 from calibrator.experiments.methods import PERFECT, POSTERIOR
 from calibrator.experiments.pages import headline, result_markdown
-from calibrator.experiments.runner import ExperimentResult, run_experiment
+from calibrator.experiments.runner import run_experiment
 from calibrator.experiments.trial import ComparedMethod, Estimate, Trial
 from calibrator.faults import Faults
 from tests.calibrator.experiments.small_trials import smooth_drive

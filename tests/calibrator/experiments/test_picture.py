@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from calibrator.drive import Array
-from calibrator.experiments.experiments import EXPERIMENTS
+from calibrator.experiments.experiments import EXPERIMENTS, ExperimentResult
 from calibrator.experiments.figures import figure_rows
 from calibrator.experiments.methods import PERFECT, POSTERIOR
 from calibrator.experiments.picture import draw_result
-from calibrator.experiments.runner import ExperimentResult, pool_confidences
+from calibrator.experiments.runner import pool_confidences
 
 BIASES = ("0", "0.2", "0.4", "0.5")
 

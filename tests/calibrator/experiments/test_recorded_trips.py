@@ -1,11 +1,7 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from calibrator.artificial.random_fleet import draw_faults
-from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
 from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import PERFECT, POSTERIOR
@@ -13,14 +9,11 @@ from calibrator.experiments.recorded_trips import (
     NOISE,
     RecordedCase,
     RecordedFleet,
-    read_fleet,
     record_vehicles,
     recorded_trial,
 )
 from calibrator.experiments.trial import drawn_distribution
-from ecu_node.database import read_database
-from ecu_node.layout import read_layout
-from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
+from tests.calibrator.experiments.small_trials import small_fleet
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +83,7 @@ def test_distribution_is_that_of_drawn_fleets_and_draws_such_fleets(
 @pytest.mark.long
 def test_faults_of_the_own_prior_are_drawn_anew_for_the_same_trips(fleet: RecordedFleet) -> None:
     first = recorded_trial(fleet, RecordedCase(), 0)
-    own = recorded_trial(fleet, RecordedCase(own_prior=True), 0)
+    own = recorded_trial(fleet, RecordedCase(own_prior=POSTERIOR), 0)
     assert not np.array_equal(own.truth.drift, first.truth.drift)
     values = judge(POSTERIOR.estimate(own), own)
     assert values["recovery_rate"].mean() >= 0.8
@@ -114,25 +107,3 @@ def test_delays_are_found_and_taken_out(fleet: RecordedFleet) -> None:
     left_in = recorded_trial(few, RecordedCase(delay_max_s=0.3, delays_left_in=True), 0)
     assert left_in.delay_error_s is None
     np.testing.assert_array_equal(left_in.truth.drift, trial.truth.drift)
-
-
-def test_trips_of_a_store_are_read_and_those_without_good_samples_left_out(
-    fleet: RecordedFleet, tmp_path: Path
-) -> None:
-    layout = read_layout(LAYOUT)
-    for number, trip in enumerate(fleet.trips[:5]):
-        good = np.full(100, number != 4)
-
-        def channel(values: Array, good: Mask = good) -> Channel:
-            return Channel(time_s=0.1 * np.arange(100.0), value=values[:100], good=good)
-
-        drive = Drive(
-            vehicle=trip.name,
-            name="d",
-            branches={name: channel(values) for name, values in trip.currents_a.items()},
-            inputs={name: channel(values) for name, values in trip.inputs.items()},
-        )
-        write_drive(tmp_path / "store", drive, layout)
-    read = read_fleet(tmp_path / "store", read_database(layout))
-    assert read.name == "4 drives of store (1 left out)"
-    assert len(read.trips) == 4

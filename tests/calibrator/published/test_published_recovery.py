@@ -61,14 +61,6 @@ def test_fleet_of_sparse_faults_is_recovered_through_noise() -> None:
     assert recovered(found.faults, truth, full_scale_a=FULL_SCALE_A, smallest_fault=0.05).mean() > 0.99
 
 
-def test_case_three_reads_the_parameters_from_the_regression() -> None:
-    truth = faults_from(np.array([[0.0, 0.0, 0.1, -0.2, 0.05, -0.15]]))
-    classes = Classification(hardware=np.array([False]), sensor=np.array([True]))
-    found = recover_fleet(evidence_of(truth), classes, full_scale_a=FULL_SCALE_A)
-    np.testing.assert_allclose(found.faults.drift, truth.drift)
-    np.testing.assert_allclose(found.faults.offset_a, truth.offset_a)
-
-
 def test_result_does_not_depend_on_the_unit_of_current() -> None:
     truth = faults_from(np.array([[0.1, 0.0, 0.2, 0.0, 0.1, 0.0], [0.0, 0.2, 0.0, -0.1, 0.0, 0.0]]))
     plain = evidence_of(truth, slope_sd=0.001, offset_sd=0.001)

@@ -3,9 +3,11 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 from msgspec.structs import replace
 
-from calibrator.estimator.evidence import VehicleEvidence, evidence_names
+from calibrator.drive import Array
+from calibrator.estimator.evidence import evidence_names
 from calibrator.estimator.results import (
     PARTS,
     RunRecord,
@@ -114,7 +116,7 @@ def six_vehicles(database: VehicleDatabase) -> list[VehicleParameters]:
     ]
 
 
-def evidence_of(item: VehicleParameters) -> VehicleEvidence:
+def evidence_of(item: VehicleParameters) -> Array:
     """What a noise-free vehicle with these faults shows."""
     battery, motor = (item.branches[name] for name in BRANCHES)
     hardware = 1.0 + item.hardware_fault.drift
@@ -130,12 +132,9 @@ def evidence_of(item: VehicleParameters) -> VehicleEvidence:
         constant_a,
         *(battery.offset_a, motor.offset_a),
     ]
-    unknown = (3, 4, 8, 9)
-    return VehicleEvidence(
-        value=[None if r in unknown else value for r, value in enumerate(told)],
-        sd=[None if r in unknown else 0.002 if r < 5 else 0.2 for r in range(10)],
-        explained=told,
-    )
+    evidence = np.stack([told, np.where(np.arange(10) < 5, 0.002, 0.2), told])
+    evidence[:2, [3, 4, 8, 9]] = np.nan
+    return evidence
 
 
 def write_result(
