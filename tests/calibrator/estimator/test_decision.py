@@ -4,23 +4,12 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.decision import (
-    Explained,
-    Points,
-    best_estimate,
-    harm_probability,
-    posterior_points,
-)
-from calibrator.estimator.posterior import draw_explanations, fit_explanations, weigh
-from calibrator.estimator.prior import Prior, Slab, first_prior
+from calibrator.estimator.decision import Points, best_estimate, harm_probability
 from calibrator.faults import Faults
 from calibrator.score import recovered
-from tests.calibrator.estimator.simulated_drives import no_faults
-from tests.calibrator.estimator.simulated_rows import plain_evidence, rows_of
 
 K = 2
 LEAST = np.array([0.05, 0.05])
-MEAN, SQUARE = np.array([[0.1, -0.1]]), np.array([[0.05, 0.05]])
 TWO_EXPLANATIONS = [(0.7, [0.12, 0.0, 0.0, 0.0]), (0.3, [0.0, -0.11, 0.1, 0.1])]
 
 
@@ -79,33 +68,3 @@ def test_harm_is_that_of_simulated_currents() -> None:
     worse = ((corrected - true) ** 2).mean(axis=1) > ((measured - true) ** 2).mean(axis=1)
     np.testing.assert_allclose(harm_probability(found, estimate, mean, square), worse.mean(axis=0), atol=1e-9)
     assert 0.0 < worse.mean() < 1.0
-
-
-def explained(truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0) -> Explained:
-    """One model's draws of a fleet."""
-    shared = np.zeros(2 * K + 1) if shared is None else shared
-    centre = np.zeros(5 * K)
-    centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
-    evidence = plain_evidence(rows_of(truth, seed=2, load=load), centre=centre, shared=shared)
-    log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
-    draws = draw_explanations(fit_explanations(evidence, prior.log_supports + 1.0, log_load), evidence)
-    return Explained(1.0, draws, weigh(draws, prior)[0], prior.group_centre)
-
-
-def group_prior() -> Prior:
-    slab = Slab(low=0.02, high=0.3, tail=0.01)
-    share, centre, sd = np.array([[0.4], [0.03], [0.001]])
-    counts = first_prior(K).counts
-    return Prior(counts=counts, gain=slab, offset=slab, group_share=share, group_centre=centre, group_sd=sd)
-
-
-@pytest.mark.parametrize("of_sensor", [False, True])
-def test_what_a_group_shares_is_an_offset_where_it_is_one_of_the_sensors(of_sensor: bool) -> None:
-    truth, load = no_faults(1, K), 0.0
-    if of_sensor:
-        truth.offset_a[0, 0] = 0.03
-    else:
-        load = 0.03
-    found = posterior_points([explained(truth, group_prior(), shared=np.append(np.zeros(4), of_sensor), load=load)])[0]
-    expected = [0.0, 0.0, 0.03 * of_sensor, 0.0]
-    np.testing.assert_allclose(best_estimate(found, LEAST)[0], expected, atol=1e-9)

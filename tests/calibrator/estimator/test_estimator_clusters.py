@@ -19,14 +19,3 @@ def test_centre_is_that_of_agreeing_values_however_many_are_faulty(good: int, fa
     cluster = densest_clusters(values, np.full(len(values), 0.002))[0]
     assert cluster.centre == pytest.approx(1.0, abs=4.0 * 0.002 / np.sqrt(good) + 2e-4)
     assert abs(values.mean() - 1.0) > 0.03
-
-
-def test_two_variants_give_two_clusters_the_larger_first() -> None:
-    rng = np.random.default_rng(6)
-    values = np.concatenate([rng.normal(1.0, 0.002, 60), rng.normal(1.15, 0.002, 30), rng.uniform(0.8, 1.3, 20)])
-    sd = np.full(len(values), 0.002)
-    first, second = densest_clusters(values, sd, most=2)
-    assert first.centre == pytest.approx(1.0, abs=0.002)
-    assert second.centre == pytest.approx(1.15, abs=0.002)
-    assert first.share > second.share
-    assert densest_clusters(values, sd, farthest=0.5) == []

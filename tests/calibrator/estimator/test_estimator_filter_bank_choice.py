@@ -1,42 +1,15 @@
-"""Read-outs on a shared filter bank against their samples, and the choice of the bank for known vehicles."""
+"""The filter bank that is chosen for known vehicles follows them, and finds a pole that they share."""
 
 import numpy as np
 import pytest
 
-from bench.dynamic_vehicles import INPUT_NAMES, PERIOD_S, bank_model, drive_inputs, recorded
-from calibrator.drive import Array
+from bench.dynamic_vehicles import PERIOD_S, bank_model, drive_inputs, recorded
 from calibrator.drives.align import Samples
-from calibrator.estimator.fleet_identification import (
-    FIRST_HELD_OUT,
-    FOLDS,
-    choose_filter_bank,
-    held_out_snr_db,
-    read_outs,
-)
+from calibrator.estimator.fleet_identification import choose_filter_bank
 from calibrator.published.state_space import StateSpaceModel, simulation_snr_db
-from calibrator.summaries.filter_bank import FilterBank, low_pass_bank
-from calibrator.summaries.moments import BLOCK_S, DriveSummary
-from calibrator.summaries.summariser import summarise_samples
 
-BLOCK = round(BLOCK_S / PERIOD_S)
 LEAD_IN = 600
-FILTERED = low_pass_bank(INPUT_NAMES, (0.5, 3.0), period_s=PERIOD_S)
 GAINS = np.random.default_rng(0).normal(size=(4, 3))
-
-
-def summary_of(drive: Samples, bank: FilterBank = FILTERED) -> DriveSummary:
-    return summarise_samples([drive], period_s=PERIOD_S, bank=bank)
-
-
-def by_samples(drive: Samples) -> tuple[Array, Array, Array]:
-    """Columns with the constant, currents, and the number of the block, of the blocks that are in the summary."""
-    columns, used = FILTERED.run(drive.inputs, drive.valid)
-    block = np.arange(len(used)) // BLOCK
-    kept = np.unique(block[used], return_counts=True)
-    good = kept[0][kept[1] >= 0.2 * BLOCK]
-    used &= np.isin(block, good)
-    number = np.searchsorted(good, block[used]).astype(float)
-    return np.column_stack([columns[used], np.ones(int(used.sum()))]), drive.currents_a[used], number
 
 
 def pool(models: list[StateSpaceModel], *, samples: int = 6000, snr_db: float = 30.0) -> list[list[Samples]]:
@@ -55,21 +28,6 @@ def lagging_vehicle(*poles: float) -> StateSpaceModel:
         offset_a=np.ones(4),
         snr_db=np.zeros(4),
     )
-
-
-def test_read_outs_and_their_snr_are_those_of_least_squares_on_the_samples() -> None:
-    drives = [recorded(j, snr_db=20.0, samples=3000 + 500 * j).samples for j in range(4)]
-    summaries = [summary_of(drive) for drive in drives]
-    coefficients, offset_a = read_outs(np.stack([summary.total for summary in summaries]), 4)
-    snr_db = held_out_snr_db(summaries)
-    for j, drive in enumerate(drives):
-        z, y, block = by_samples(drive)
-        expected = np.linalg.lstsq(z, y, rcond=None)[0]
-        np.testing.assert_allclose(coefficients[j], expected[:-1], rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(offset_a[j], expected[-1], rtol=1e-6, atol=1e-6)
-        held_out = block % FOLDS == FIRST_HELD_OUT
-        fit = np.linalg.lstsq(z[~held_out], y[~held_out], rcond=None)[0]
-        np.testing.assert_allclose(snr_db[j], simulation_snr_db(y[held_out], z[held_out] @ fit), atol=1e-6)
 
 
 @pytest.mark.parametrize(

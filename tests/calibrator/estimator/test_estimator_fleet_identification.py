@@ -126,16 +126,6 @@ def test_given_pole_is_used_and_the_vehicle_that_has_another_is_named(store: Pat
     assert json.loads(run_identify(store, "--bank", bank, "--json").stdout) == figures
 
 
-@pytest.mark.long
-def test_bank_is_chosen_that_simulates_the_fleet(store: Path) -> None:
-    run = run_identify(store)
-    assert run.exit_code == 0, run.output
-    assert "the plain inputs" not in run.stdout
-    (motor,) = [line.split() for line in run.stdout.splitlines() if line.startswith("motor ")]
-    assert float(motor[1]) > 30.0
-    assert "vehicles: 5" in run.stdout
-
-
 def test_bank_of_other_inputs_and_a_folder_as_output_are_refused(store: Path, tmp_path: Path) -> None:
     path = tmp_path / "bank.json"
     path.write_bytes(low_pass_bank(("pedal",), [1.0], period_s=PERIOD_S).to_json())

@@ -157,12 +157,6 @@ def test_charge_balance_tells_an_offset() -> None:
     assert row.offset_sd_a < 0.5
 
 
-def test_bench_reading_is_a_reference() -> None:
-    readings = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
-    rows = found(recording(gain=(0.03, 0.05, 0.0)), readings=readings).loc["vehicle"]
-    assert rows.gain_error["battery"] == pytest.approx(0.03, abs=3.0 * rows.gain_error_sd["battery"])
-
-
 def test_meters_of_one_car_are_one_system() -> None:
     """The battery is known by the first meter, so the second meter is known by the battery."""
     junction = Junction(branches=["battery", "charger"], full_scale_a=400.0)

@@ -64,19 +64,6 @@ def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magni
     assert model.prior.load_share < 0.02
 
 
-def test_what_vehicles_without_faults_differ_by_is_learned() -> None:
-    K, rng, b = 2, np.random.default_rng(3), RowPlaces(2).intercept(0)
-    rows = rows_of(random_faults(3, vehicles=80, branches=K), seed=3)
-    more = np.zeros((80, 5 * K))
-    more[:, [0, b]] = rng.normal(0.0, [0.01, 0.004], (80, 2))
-    spread = learned(moved(rows, more)).spread
-    sd = np.sqrt(np.diag(spread.covariance))
-    assert sd[0] == pytest.approx(0.01, rel=0.35)
-    assert np.hypot(sd[b], 0.001 * np.sqrt(spread.dispersion[0])) == pytest.approx(0.004, rel=0.35)
-    assert sd[1] < 0.005
-    assert np.linalg.eigvalsh(spread.covariance).min() > 0.0
-
-
 def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

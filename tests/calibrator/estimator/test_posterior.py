@@ -16,7 +16,6 @@ from calibrator.estimator.posterior import (
     weigh,
 )
 from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, known_prior, with_slabs
-from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import (
     Errors,
     all_supports,
@@ -116,26 +115,6 @@ def test_weights_are_those_of_integration_on_a_grid(faults: int, points: int, to
             if share > 0.01:
                 assert found[on][0] == pytest.approx(share, abs=tolerance)
                 np.testing.assert_allclose(found[on][1], mean, atol=0.004)
-
-
-def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
-    prior = Prior(
-        counts=paper_prior(2, 0, 1).counts,
-        gain=Slab(low=0.05, high=0.25, tail=1e-6),
-        offset=Slab(low=0.01, high=0.25, tail=1e-6),
-        load_share=0.3,
-    )
-    rows = rows_of(no_faults(3, 2), errors=Errors(intercept=0.003, junction=0.003), load=np.array([0.01, 0.004, -0.02]))
-    draws = drawn(rows, prior)
-    weight, _ = weigh(draws, prior)
-    supports = [on for on in all_supports(2) if len(on) <= 1]
-    for j in range(3):
-        grid = {on: integrated(rows.take(slice(j, j + 1)), prior, on, 2001)[0] for on in supports}
-        share = np.exp(grid[6,] - logsumexp(list(grid.values())))
-        assert of_supports(draws, weight, j)[6,][0] == pytest.approx(share, abs=0.04)
-    loads = draws.values[..., 6] * draws.fits.support[:, :, None, 6]
-    assert weight[loads < 0.0].max() < 1e-30
-    assert [of_supports(draws, weight, j)[6,][0] > 0.5 for j in range(3)] == [True, False, False]
 
 
 @pytest.mark.parametrize("kind", [GAIN, OFFSET])

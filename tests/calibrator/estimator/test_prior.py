@@ -1,14 +1,10 @@
 """Prior of the faults: densities, numbers of faults, and the law that they follow."""
 
-from math import comb
-
 import numpy as np
 import pytest
 
 from calibrator.drive import Array
 from calibrator.estimator.prior import (
-    first_prior,
-    known_prior,
     sparse_counts,
 )
 from tests.calibrator.estimator.simulated_rows import random_faults
@@ -22,15 +18,6 @@ def counted(K: int, sparsity: float, vehicles: int = 4000) -> Array:
     hardware = (faults.hardware_drift != 0.0) + np.count_nonzero(faults.hardware_offset_a[:, :-1], axis=1)
     np.add.at(tally, (hardware, np.count_nonzero(np.hstack([faults.drift, faults.offset_a]), axis=1)), 1.0)
     return tally
-
-
-@BRANCHES
-def test_supports_of_every_prior_sum_to_one(K: int) -> None:
-    for prior in (first_prior(K), known_prior(counted(K, 70.0) / 4000.0, (0.05, 0.25))):
-        ways = [[comb(K, h) * comb(2 * K, s) for s in range(2 * K + 1)] for h in range(K + 1)]
-        assert prior.counts.sum() == pytest.approx(1.0, abs=1e-6)
-        assert np.sum(ways * np.exp(prior.log_supports)) == pytest.approx(1.0, abs=1e-6)
-        assert prior.branches == K
 
 
 @BRANCHES

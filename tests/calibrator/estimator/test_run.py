@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -162,6 +163,31 @@ def test_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: 
         second = calibrate_here(store.url, tmp_path / "out")
     assert second.returncode == 1
     assert "another run is writing this result; wait for it or choose another --out" in second.stderr
+
+
+def test_only_computed_work_is_kept(store: SummaryStore, tmp_path: Path) -> None:
+    out, folder = tmp_path / "out", tmp_path / ".out.unfinished"
+    for name, kept in (
+        ("result/parameters/00003.parquet", True),
+        ("summaries/buckets/00003.parquet", True),
+        ("plan", False),
+    ):
+        with suppress(FleetError), unfinished_run(out):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).touch()
+            raise FleetError("a slip")
+        assert folder.exists() == kept
+        shutil.rmtree(folder, ignore_errors=True)
+    (tmp_path / "earlier").mkdir()
+    (tmp_path / "earlier" / "run.json").touch()
+    shutil.copytree(store.url, tmp_path / "earlier" / "summaries")
+    for new in (False, True):
+        with suppress(FleetError), unfinished_run(out) as unfinished:
+            unfinished.summaries_since(tmp_path / "earlier")
+            if new:
+                (unfinished.summaries / "buckets" / "00003.parquet").touch()
+            raise FleetError("a slip")
+        assert folder.exists() == new, "copies of earlier summaries are nothing new"
 
 
 @pytest.mark.parametrize(
