@@ -229,7 +229,7 @@ def _write(
         found = VehicleSummary(
             vehicle=name,
             drives=("trip",),
-            summary=_measured(trips[int(name[1:]) % TRIPS], faults.take(j)),
+            summary=_measured(trips[int(name[1:]) % len(trips)], faults.take(j)),
             delays=BranchDelays(branches=branches, delay_s=zero, sd_s=zero, known=np.ones(K, bool)),
             zero_current=ZeroCurrent(offset_a=unknown, sd_a=unknown),
         )
