@@ -72,7 +72,7 @@ for function, lines in (
         ],
     ),
     (params, ["calibrator params result V001 V002 --out params"]),
-    (report, ["calibrator report result --out report.html"]),
+    (report, ["calibrator report result"]),
     (export, ["calibrator export result/params/V001.json --layout my_car.toml --format c --out hv_calibration.c"]),
     (simulate, ["calibrator simulate --layout dbc/hv_powertrain.toml --vehicles 40 --currents 3 --out fleet"]),
     (identify, ["calibrator identify store --layout my_car.toml --out bank.json"]),

@@ -21,7 +21,7 @@ MAX_LIMIT_A, MAX_VOLTAGE_V = 10_000.0, 2000.0
 def report(
     result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
     out: Annotated[
-        Path | None, typer.Option(help="HTML file to write; report.html, or VEHICLE.html, without it.")
+        Path | None, typer.Option(help="HTML file to write; without it report.html, or VEHICLE.html, in the result.")
     ] = None,
     vehicle: Annotated[str | None, typer.Option(help="The page of this vehicle alone.")] = None,
     battery: Annotated[
@@ -41,7 +41,7 @@ def report(
     with importing():
         from calibrator.report.page import fleet_report, vehicle_report
 
-    target = out if out is not None else Path(f"{vehicle or 'report'}.html")
+    target = out if out is not None else result / f"{vehicle or 'report'}.html"
     if target.suffix.lower() != ".html":
         raise typer.BadParameter(f"{target}: expected a file name that ends with .html", param_hint="--out")
     require_possible_file(target)

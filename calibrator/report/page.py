@@ -36,6 +36,7 @@ from calibrator.report.overview import (
     workshop_list,
 )
 from calibrator.terminal.text import counted, few
+from calibrator.words import is_battery
 from ecu_node.parameters import VehicleParameters, decode_parameters
 
 __all__ = ["fleet_report", "vehicle_report"]
@@ -47,7 +48,7 @@ MOST_DETAILED = 5_000
 MOST_WORKSHOP, MOST_MOVED = 500, 200
 """Rows of the lists."""
 BATTERY = "battery"
-"""What a layout calls the branch of the battery, unless the user says otherwise."""
+"""What a layout calls the branch of the battery, in this or another language, unless the user says otherwise."""
 METHOD_WITHOUT_SD = "published"
 """Method that gives no standard deviations: what it does not find is taken for 0."""
 DIGITS = {"drift": 6, "drift_sd": 4, "offset_a": 2, "offset_sd_a": 2, "fault_probability": 3, "harm_probability": 4}
@@ -81,8 +82,8 @@ def fleet_report(result: Path, **options: Any) -> tuple[str, dict[str, Any]]:
     result : Path
         Folder that ``calibrator calibrate`` wrote.
     **options
-        ``battery``, branch of the battery (without it :data:`BATTERY`); ``limit_a``, its current limit (full scale);
-        ``voltage_v``, its voltage (the margin is given in A alone). [A], [V]
+        ``battery``, branch of the battery (without it the one of such a name); ``limit_a``, its current limit (full
+        scale); ``voltage_v``, its voltage (the margin is given in A alone). [A], [V]
 
     Returns
     -------
@@ -120,8 +121,8 @@ def _page(
     voltage_v: float | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Write the page of some vehicles: all of a fleet, or one of them; `fleet` is all of the result."""
-    branch, protection = battery or BATTERY, None
-    no_protection = f"No branch is called {BATTERY!r}; name the battery's with --battery to see its margin."
+    branch, protection = battery or next((name for name in table.branches if is_battery(name, "")), ""), None
+    no_protection = f"No branch is called {BATTERY!r} or alike; name the battery's with --battery to see its margin."
     if branch in table.branches:
         protection = battery_margin(table, branch, limit_a=limit_a, voltage_v=voltage_v)
         no_protection = f"How wrong the {branch} sensor can be is not known, so no margin follows."

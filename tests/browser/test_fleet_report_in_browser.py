@@ -19,6 +19,7 @@ from selenium.webdriver.support.wait import WebDriverWait
 from calibrator.report.page import fleet_report
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
+from ecu_node.parameters import Explanation, SensorFinding
 from tests.calibrator.report.results_at_hand import sensor, six_vehicle_result, vehicle, write_result
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
@@ -224,7 +225,9 @@ def test_text_can_be_read_against_its_background(page: webdriver.Chrome) -> None
 def test_one_junction_by_itself_opens_without_an_error(
     browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
 ) -> None:
-    item = vehicle(database, "car", sensor(0.1, 4.0, apply=True), replace(sensor(), identifiable=False))
+    rivals = [Explanation(probability=0.6), Explanation(probability=0.4, offset_a={"motor": 2.2})]
+    mixed = replace(sensor(0.0, 0.9, sd=0.011), identifiable=False)
+    item = vehicle(database, "car", sensor(0.1, 4.0, apply=True), mixed, explanations=rivals)
     item = replace(item, hardware_fault=replace(item.hardware_fault, probability=None))
     result = write_result(tmp_path / "r", [item], evidence=False)
     opened(browser, fleet_report(result)[0], tmp_path / "car.html")
@@ -232,7 +235,20 @@ def test_one_junction_by_itself_opens_without_an_error(
     assert browser.execute_script("return document.body.dataset.failed") is None
     text = browser.find_element(By.TAG_NAME, "main").text
     assert "battery +10.00 ± 0.10 +4.00 ± 0.10 99.5 % 0.02 % 20 ms corrects it" in text
+    assert "motor not known none (60 %) or +2.20 (40 %)" in text
     assert "Not known: this calibration keeps no evidence." in text
+    until(browser, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 1")
+    axes = browser.execute_script(
+        "const {yaxis, yaxis2} = document.querySelector('#vehicle .plot').layout;"
+        "return [yaxis, yaxis2].map(({categoryarray, range}) => [categoryarray, range])"
+    )
+    assert axes == [[["battery", "motor"], [1.5, -0.5]]] * 2
+    item = replace(item, findings=[SensorFinding(cause="wander", probability=0.9, text="the sum wanders")])
+    result = write_result(tmp_path / "unfit", [item], evidence=False)
+    opened(browser, fleet_report(result)[0], tmp_path / "unfit.html")
+    text = browser.find_element(By.TAG_NAME, "main").text
+    assert "No: a gain error" in text
+    assert "Not known: this calibration" not in text
 
 
 def test_it_prints_on_a4_with_its_figures_whole(page: webdriver.Chrome) -> None:

@@ -42,7 +42,7 @@ def test_calibrator_takes_a_fleet_from_logs_to_reports_and_exports(
     calibrator(venv, tmp_path, "calibrate", "store", *layout, "--out", result)
     calibrator(venv, tmp_path, "score", result, "--truth", fleet / "truth.json")
     calibrator(venv, tmp_path, "report", result)
-    assert "<script>" in (tmp_path / "report.html").read_text()
+    assert "<script>" in (result / "report.html").read_text()
     calibrator(venv, tmp_path, "report", result, "--vehicle", VEHICLE, "--out", "vehicle.html")
     parameters = result / "params" / f"{VEHICLE}.json"
     for kind in ("dcm", "cdfx", "csv", "c"):

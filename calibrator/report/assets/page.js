@@ -266,16 +266,18 @@
   function sensorTable(j, columns, rivals, delays) {
     const quantity = (i, name, values, sds, part, factor) => {
       const value = values[i], sd = sds[i], unknown = columns.unknown[i] & part, written = (v) => (v ? fixed(factor * v, 2, "", true) : "none");
-      const near = Math.max(3 * (sd || 0), RESOLVED * (part === 1 ? 1 : facts.full_scale_a)), peaks = unknown ? [] : [{ value, p: 0 }];
+      // Of one junction by itself the value is a mean over all explanations, and its deviation that of all of them.
+      const mean = unknown || Number.isNaN(columns.hardware_probability[j]), resolved = RESOLVED * (part === 1 ? 1 : facts.full_scale_a);
+      const near = mean ? resolved : Math.max(3 * (sd || 0), resolved), peaks = mean ? [] : [{ value, p: 0 }];
       for (const rival of rivals) {
-        const fault = faultOf(rival, part, name), at = peaks.find((peak) => Math.abs(peak.value - fault) <= (unknown ? RESOLVED : near));
+        const fault = faultOf(rival, part, name), at = peaks.find((peak) => Math.abs(peak.value - fault) <= near);
         if (at) at.p += rival.probability;
         else peaks.push({ value: fault, p: rival.probability });
       }
       const own = sd > 0 ? `${fixed(factor * value, 2, "", true)}\u00a0±\u00a0${(factor * sd).toFixed(2)}` : written(value);
-      const several = peaks.filter((peak, n) => (n === 0 && !unknown) || peak.p >= LEAST_RIVAL);
+      const several = peaks.filter((peak, n) => (n === 0 && !mean) || peak.p >= LEAST_RIVAL);
       if (several.length < 2) return unknown ? UNKNOWN : own;
-      return several.map((peak, n) => `${n === 0 && !unknown ? own : written(peak.value)} (${percent(peak.p, 0)})`).join(" or ");
+      return several.map((peak, n) => `${n === 0 && !mean ? own : written(peak.value)} (${percent(peak.p, 0)})`).join(" or ");
     };
     const node = (i) => columns.applied[i] && columns.faulty[i] ? "corrects it"
       : columns.faulty[i] ? ["does not correct it", columns.held_back[i]].filter(Boolean).join(": ")
@@ -317,7 +319,7 @@
         : `${most.z <= MISFITS ? "Nearly" : "Not all of it"}: what was measured is up to ${away} from what the estimate predicts.`));
       parts.push(element("figure", {}, plot(evidenceFigure(evidence)), element("figcaption", {},
         "What was measured, with standard deviations, and what the estimate predicts. A vehicle without faults is at zero; a load without a sensor moves the junction constant and an intercept.")));
-    } else {
+    } else if (!misfit) {
       parts.push(element("p", { class: "soft" }, detailed ? `Not known: ${R ? "the parameters of this vehicle are of an earlier run" : "this calibration keeps no evidence"}.`
         : "The evidence of this vehicle is not part of this page, which would be too large; it stands on the vehicle's own page."));
     }
@@ -333,7 +335,8 @@
         text: points.map(({ p }) => percent(p, 1)), hovertemplate: "%{y}: %{x:.2f}, probability %{text}<extra></extra>",
         marker: { size: points.map(({ p }) => 6 + 26 * Math.sqrt(p)), color: AFTER, opacity: 0.55, line: { color: IDEAL, width: 1 } } });
       layout[`xaxis${axis}`] = { domain: panel(side).x, title: { text }, anchor: `y${axis}` };
-      layout[`yaxis${axis}`] = { domain: panel(side).y, autorange: "reversed", type: "category", anchor: `x${axis}`, showticklabels: NARROW || !side };
+      layout[`yaxis${axis}`] = { domain: panel(side).y, type: "category", categoryorder: "array", categoryarray: facts.branches, range: [K - 0.5, -0.5],
+        anchor: `x${axis}`, showticklabels: NARROW || !side };  // all branches in both panels, also those without a circle
     });
     return { data, layout };
   }

@@ -24,12 +24,15 @@ def test_its_numbers_come_as_json(result: Path, tmp_path: Path, capsys: pytest.C
     assert found["workshop"][0]["cause"] == "hardware"
 
 
-def test_the_page_of_a_vehicle_is_named_after_it(
+def test_the_page_of_a_vehicle_is_named_after_it_and_stands_in_the_result(
     result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run_command(["report", str(result), "--vehicle", "V3", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["page"] == "V3.html"
+    assert found["page"] == str(result / "V3.html")
     assert found["parameters"]["hardware_fault"]["drift"] == -0.06
-    assert "Look at the hardware of V3" in (tmp_path / "V3.html").read_text()
+    assert "Look at the hardware of V3" in (result / "V3.html").read_text()
+    assert run_command(["report", str(result)]) == 0
+    assert (result / "report.html").exists()
+    assert not [*tmp_path.glob("*.html")]
