@@ -13,12 +13,27 @@ from cantools.database.conversion import BaseConversion
 from ecu_node.core.signals import AMPERE, VOLT, WATT, impossible_values, unit_factor
 from ecu_node.documents import read_user_file, text_digest
 from ecu_node.errors import DatabaseError, LayoutError
-from ecu_node.layout import Layout, joint_digest, read_layout, split_signal
+from ecu_node.layout import Layout, SignalName, joint_digest, read_layout, split_signal
 
-__all__ = ["MAX_DBC_BYTES", "VehicleDatabase", "look_everything_up", "node_database", "read_database"]
+__all__ = [
+    "MAX_DBC_BYTES",
+    "VehicleDatabase",
+    "codes_of_no_value",
+    "look_everything_up",
+    "means_not_available",
+    "node_database",
+    "read_database",
+]
 
 MAX_DBC_BYTES = 16_000_000
 """The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""
+
+
+_NOT_AVAILABLE = re.compile(
+    r"(signal |value |data )?"
+    r"(sna|snv|na|n a|not available|unavailable|invalid|not valid|error|not defined|undefined|init)"
+    r"( signal| value| data| indicator)?"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,3 +283,43 @@ def look_everything_up(vehicle: VehicleDatabase) -> None:
     for place, entry in layout.protections:
         for name in entry.messages:
             vehicle.message(name, place)
+
+
+def means_not_available(name: str) -> bool:
+    """Whether a name of a value table says that the value is not one.
+
+    Such names are SNA, "Signal not available", "Invalid", "Error", "Not_Defined" or "Init", in any spelling, with or
+    without "signal", "value" or "data". Names that only contain such words ("No error") are values.
+
+    Parameters
+    ----------
+    name : str
+        The name that the DBC gives to a raw value.
+    """
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", name)
+    return _NOT_AVAILABLE.fullmatch(spaced.strip().lower()) is not None
+
+
+def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[int]:
+    """Raw codes of a signal that are no values.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+    name : str
+        The signal, as MESSAGE.SIGNAL.
+
+    Returns
+    -------
+    frozenset of int
+        Of a branch's current, power, voltage or corrected signal: every code with a name and, of the measured one, its
+        ``no_value``, as :mod:`ecu_node.core.signals` has it. Of other signals with named values (a gear selector):
+        codes with a name that :func:`means_not_available`.
+    """
+    named: Mapping[int, object] = database.signal(name)[1].choices or {}
+    branches = [item for item in database.layout.branch if name in {item.source, item.voltage, item.corrected}]
+    if not branches:
+        return frozenset(int(code) for code, text in named.items() if means_not_available(str(text)))
+    extra = [code for item in branches if item.source == name for code in item.no_value]
+    return frozenset([*map(int, named), *extra])

@@ -7,17 +7,11 @@ without spikes, which are looked for in :data:`BATCH_SAMPLES` at a time. A block
 :mod:`ecu_node.bus.on_board_summary` in plain Python; a test compares them.
 """
 
-import re
 import zlib
 from array import array
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import msgspec
-
-if TYPE_CHECKING:
-    from ecu_node.database import VehicleDatabase
-    from ecu_node.layout import SignalName
 
 # ---- what a block is
 
@@ -67,53 +61,6 @@ ZERO_RESOLUTION_A = 0.02
 """Least standard deviation of such a reading: sensors drift within a window by about so much. [A]"""
 ZERO_PIECE_S = 5.0
 """Of a window: what wanders within it moves the medians of its pieces. [s]"""
-
-_NOT_AVAILABLE = re.compile(
-    r"(signal |value |data )?"
-    r"(sna|snv|na|n a|not available|unavailable|invalid|not valid|error|not defined|undefined|init)"
-    r"( signal| value| data| indicator)?"
-)
-
-
-def means_not_available(name: str) -> bool:
-    """Whether a name of a value table says that the value is not one.
-
-    Such names are SNA, "Signal not available", "Invalid", "Error", "Not_Defined" or "Init", in any spelling, with or
-    without "signal", "value" or "data". Names that only contain such words ("No error") are values.
-
-    Parameters
-    ----------
-    name : str
-        The name that the DBC gives to a raw value.
-    """
-    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", name)
-    return _NOT_AVAILABLE.fullmatch(spaced.strip().lower()) is not None
-
-
-def codes_of_no_value(database: "VehicleDatabase", name: "SignalName") -> frozenset[int]:
-    """Raw codes of a signal that are no values.
-
-    Parameters
-    ----------
-    database : VehicleDatabase
-        DBC and layout.
-    name : str
-        The signal, as MESSAGE.SIGNAL.
-
-    Returns
-    -------
-    frozenset of int
-        Of a branch's current, power, voltage or corrected signal: every code with a name and, of the measured one, its
-        ``no_value``, as :mod:`ecu_node.core.signals` has it. Of other signals with named values (a gear selector):
-        codes with a name that :func:`means_not_available`.
-    """
-    named: Mapping[int, object] = database.signal(name)[1].choices or {}
-    branches = [item for item in database.layout.branch if name in {item.source, item.voltage, item.corrected}]
-    if not branches:
-        return frozenset(int(code) for code, text in named.items() if means_not_available(str(text)))
-    extra = [code for item in branches if item.source == name for code in item.no_value]
-    return frozenset([*map(int, named), *extra])
-
 
 # ---- on board
 

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from calibrator.compiled import compiled
 from calibrator.drive import Array, Mask
 from ecu_node.core.e2e import protection_of
-from ecu_node.database import VehicleDatabase
+from ecu_node.database import VehicleDatabase, means_not_available
 from ecu_node.errors import DatabaseError
 from ecu_node.layout import ProfileP01
-from ecu_node.summary import RANGE_SLACK, means_not_available
+from ecu_node.summary import RANGE_SLACK
 
 __all__ = [
     "Decoded",

@@ -24,10 +24,9 @@ from calibrator.recordings.frames import read_frames
 from calibrator.recordings.tables import Table, is_table, read_table
 from calibrator.terminal.text import Notice
 from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, usual_unit
-from ecu_node.database import VehicleDatabase
+from ecu_node.database import VehicleDatabase, codes_of_no_value
 from ecu_node.formulas import formula_names, parse_formula
 from ecu_node.layout import Branch, split_signal
-from ecu_node.summary import codes_of_no_value
 
 __all__ = [
     "FrameSource",

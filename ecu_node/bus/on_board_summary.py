@@ -30,13 +30,13 @@ from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.core.e2e import protection_of
 from ecu_node.core.signals import AMPERE, VOLT, WATT, FrameKey, placed_signal, unit_factor
 from ecu_node.core.status import Counters
-from ecu_node.database import VehicleDatabase
+from ecu_node.database import VehicleDatabase, codes_of_no_value
 from ecu_node.documents import write_atomically
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.formulas import base_inputs, formula_value, parse_formula
 from ecu_node.layout import Layout
 from ecu_node.parameters import VehicleParameters
-from ecu_node.summary import SummaryFile, codes_of_no_value, encode_summary, packed
+from ecu_node.summary import SummaryFile, encode_summary, packed
 
 MOST_BATCHES = 48
 """Of a file: two hours at 10 Hz, so that no file that is written again and again grows large."""

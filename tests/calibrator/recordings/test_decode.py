@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from calibrator.recordings.decode import decode_signal, p01_is_sound
+from ecu_node.database import means_not_available
 from ecu_node.errors import DatabaseError
-from ecu_node.summary import means_not_available
 
 MULTIPLEXED = """VERSION ""
 BU_: A
