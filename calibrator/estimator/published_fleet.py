@@ -9,16 +9,14 @@ and the verdict is 'cannot tell': whatever they are, they do not explain this ve
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from itertools import compress
-from typing import Any
 
 import numpy as np
 
-from calibrator.drive import Array, DriveFile, Mask
-from calibrator.drives.align import Samples, align
-from calibrator.errors import DriveError, FleetError
+from calibrator.drive import Array, DriveFile
+from calibrator.drives.align import align
+from calibrator.errors import FleetError
 from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
@@ -26,14 +24,14 @@ from calibrator.fleet_truth import faults_of
 from calibrator.processes.run_many import Workers
 from calibrator.published.classify import ExpectedFaults
 from calibrator.published.recovery import Recovery, calibrate_published
-from calibrator.published.state_space import StateSpaceModel, bridged, identify_model, simulation_snr_db
+from calibrator.published.state_space import VehicleModel, identify_vehicle
 from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, probe_equipment, read_vehicles
 from calibrator.terminal.progress import progress_bar
-from calibrator.terminal.text import counted, few
+from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParameters, Verdict
 
-__all__ = ["VehicleModel", "calibrate_fleet_published", "few_vehicles_notice", "identify_vehicle", "read_vehicle_model"]
+__all__ = ["calibrate_fleet_published", "few_vehicles_notice", "read_vehicle_model"]
 
 MISFIT = 5.0
 """Simulation error over the fleet's median from which on a model is not one of the fleet. [1]"""
@@ -42,56 +40,6 @@ SLOPE_SPREAD = 0.093
 (S = 80, the default). [1]"""
 LEAST_VEHICLES = 20
 """Below, the mean of the fleet is off by more than 2 %, nearly half of the smallest of these faults."""
-TRAIN_SHARE = 0.8
-"""Share of each drive that a model is identified on, section IV-C of [1]_. [1]"""
-LEAD_IN_S = 60.0
-"""Inputs before the held-out part by which the states of the models settle. [s]"""
-LEAST_DURATION_S = 60.0
-"""Valid data below which a vehicle is left out: a few changes of speed and load. [s]"""
-QUIET = 0.03
-"""Standard deviation over mean below which an input counts as constant: a constant power over a varying voltage. [1]"""
-GAP_S = 60.0
-"""Invalid time put between two drives of a vehicle, so that no state carries over. [s]"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class VehicleModel:
-    """One vehicle with a model of its own.
-
-    Attributes
-    ----------
-    vehicle : str
-        Name.
-    drives : tuple of str
-        Names of the drives used.
-    duration_s : float
-        Valid data of all drives. [s]
-    model : StateSpaceModel
-        Inputs to measured currents (2).
-    snr_db : ndarray of shape (K,)
-        Simulation signal-to-noise ratio on held-out data. [dB]
-    simulation_error_a : ndarray of shape (K,)
-        Root mean square of the simulation error on held-out data. [A]
-    mean_a : ndarray of shape (K,)
-        Mean measured currents on all valid samples. [A]
-    moment_a2 : ndarray of shape (K, K)
-        Mean of the products of measured currents on all valid samples. [A^2]
-    held_out_inputs : ndarray of shape (L + T, M)
-        Inputs of the last 20 % of the longest drive with a lead-in of L samples before them, gaps bridged.
-    lead_in : int
-        L.
-    """
-
-    vehicle: str
-    drives: tuple[str, ...]
-    duration_s: float
-    model: StateSpaceModel
-    snr_db: Array
-    simulation_error_a: Array
-    mean_a: Array
-    moment_a2: Array
-    held_out_inputs: Array
-    lead_in: int
 
 
 def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleModel:
@@ -100,87 +48,6 @@ def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, datab
     drives = [align(drive, database.layout, equipment.branches, inputs=equipment.inputs) for drive in read]
     names = tuple(entry.name for entry in entries)
     return identify_vehicle(drives, period_s=database.layout.period_s, vehicle=entries[0].vehicle, names=names)
-
-
-def identify_vehicle(
-    drives: Sequence[Samples], *, period_s: float, vehicle: str, names: tuple[str, ...]
-) -> VehicleModel:
-    """Identify the model of one vehicle from its aligned drives.
-
-    Parameters
-    ----------
-    drives : sequence of Samples
-        Drives of one vehicle, with the same branches and inputs.
-    period_s : float
-        Distance of the samples. [s]
-    vehicle : str
-        Name of the vehicle.
-    names : tuple of str
-        Names of the drives.
-
-    Returns
-    -------
-    VehicleModel
-        The vehicle.
-
-    Raises
-    ------
-    DriveError
-        If there is too little valid data; the message says how much.
-    """
-    duration_s = period_s * sum(int(drive.valid.sum()) for drive in drives)
-    if duration_s < LEAST_DURATION_S:
-        raise DriveError(
-            f"{duration_s:.1f} s of usable data in {counted(len(drives), 'drive')}; at least {LEAST_DURATION_S:.0f} s "
-            f"are needed"
-        )
-    # The drives one after the other, each followed by a gap that is not valid.
-    gap = int(GAP_S / period_s)
-
-    def joined(parts: Iterable[Any]) -> Any:
-        return np.concatenate([np.pad(part, [(0, gap), *[(0, 0)] * (part.ndim - 1)]) for part in parts])
-
-    inputs, currents = joined(drive.inputs for drive in drives), joined(drive.currents_a for drive in drives)
-    valid = joined(drive.valid for drive in drives)
-    training = valid & joined(_in_training(drive.valid) for drive in drives)
-    held_out, stop = valid & ~training, int(np.flatnonzero(training)[-1]) + 1
-    model = _identify_excited(inputs[:stop], currents[:stop], training[:stop])
-    simulated = model.simulate(bridged(inputs, valid), initial_state=model.x0)
-    longest = max(drives, key=lambda drive: int(drive.valid.sum()))
-    first_held_out = int(np.argmin(_in_training(longest.valid)))
-    start = max(0, first_held_out - int(LEAD_IN_S / period_s))
-    return VehicleModel(
-        vehicle=vehicle,
-        drives=names,
-        duration_s=duration_s,
-        model=model,
-        snr_db=simulation_snr_db(currents[held_out], simulated[held_out]),
-        simulation_error_a=np.sqrt(np.mean((currents - simulated)[held_out] ** 2, axis=0)),
-        mean_a=np.mean(currents[valid], axis=0),
-        moment_a2=currents[valid].T @ currents[valid] / valid.sum(),
-        held_out_inputs=bridged(longest.inputs, longest.valid)[start:],
-        lead_in=first_held_out - start,
-    )
-
-
-def _in_training(valid: Mask) -> Mask:
-    """First 80 % of the valid samples of a drive, and what lies between them."""
-    return np.asarray(np.cumsum(valid) <= TRAIN_SHARE * valid.sum())
-
-
-def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpaceModel:
-    """Identify from the inputs that vary; what the others do cannot be learnt from this vehicle, so it is zero."""
-    excited = inputs[valid].std(axis=0) > QUIET * np.abs(inputs[valid].mean(axis=0))
-    if not excited.any():
-        raise DriveError("none of its inputs varies: was it parked? record a drive in which it is used")
-    try:
-        model = identify_model(inputs[:, excited], currents, valid=valid)
-    except np.linalg.LinAlgError as error:
-        raise DriveError(
-            f"no model can be identified from its drives ({error}); record a longer, varied drive"
-        ) from None
-    columns = np.eye(len(excited))[excited]
-    return replace(model, B=model.B @ columns, D=model.D @ columns)
 
 
 def calibrate_fleet_published(

@@ -19,11 +19,11 @@ from calibrator.drive import Array
 from calibrator.drives.align import Samples, align, base_inputs, choose_inputs, evaluate_formula
 from calibrator.drives.delays import estimate_delays, without_delays
 from calibrator.errors import FleetError
-from calibrator.estimator.published_fleet import identify_vehicle
 from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
 from calibrator.experiments.trial import ComparedMethod, Trial, UnseenDrive, drawn_distribution
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
+from calibrator.published.state_space import identify_vehicle
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise_samples

@@ -13,8 +13,8 @@ the simulation error (output error), so noise on the currents leaves no bias in 
    from input-output data", Automatica 30 (1994) 61-74.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,19 +24,33 @@ from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 from calibrator.drive import Array, Complex, Mask
+from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
+from calibrator.terminal.text import counted
 
 __all__ = [
     "StateSpaceModel",
+    "VehicleModel",
     "bridged",
     "choose_order",
     "identify_model",
+    "identify_vehicle",
     "pooled_poles",
     "simulation_snr_db",
     "snr_from_power",
     "solve_scaled",
 ]
 
+TRAIN_SHARE = 0.8
+"""Share of each drive that a model is identified on, section IV-C of [1]_. [1]"""
+LEAD_IN_S = 60.0
+"""Inputs before the held-out part by which the states of the models settle. [s]"""
+LEAST_DURATION_S = 60.0
+"""Valid data below which a vehicle is left out: a few changes of speed and load. [s]"""
+QUIET = 0.03
+"""Standard deviation over mean below which an input counts as constant: a constant power over a varying voltage. [1]"""
+GAP_S = 60.0
+"""Invalid time put between two drives of a vehicle, so that no state carries over. [s]"""
 ORDERS = (0, 1, 2, 3, 4, 6, 8)
 """Orders to choose from: a power train as seen at 10 Hz has few modes. [1]"""
 BLOCK_ROWS = 10
@@ -298,3 +312,124 @@ def solve_scaled(normal: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
     scale = np.where(scale > 0.0, scale, 1.0)
     scaled = normal / (scale * np.swapaxes(scale, -1, -2)) + RIDGE * np.eye(normal.shape[-1])
     return np.asarray(np.linalg.solve(scaled, right / scale) / scale)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleModel:
+    """One vehicle with a model of its own.
+
+    Attributes
+    ----------
+    vehicle : str
+        Name.
+    drives : tuple of str
+        Names of the drives used.
+    duration_s : float
+        Valid data of all drives. [s]
+    model : StateSpaceModel
+        Inputs to measured currents (2).
+    snr_db : ndarray of shape (K,)
+        Simulation signal-to-noise ratio on held-out data. [dB]
+    simulation_error_a : ndarray of shape (K,)
+        Root mean square of the simulation error on held-out data. [A]
+    mean_a : ndarray of shape (K,)
+        Mean measured currents on all valid samples. [A]
+    moment_a2 : ndarray of shape (K, K)
+        Mean of the products of measured currents on all valid samples. [A^2]
+    held_out_inputs : ndarray of shape (L + T, M)
+        Inputs of the last 20 % of the longest drive with a lead-in of L samples before them, gaps bridged.
+    lead_in : int
+        L.
+    """
+
+    vehicle: str
+    drives: tuple[str, ...]
+    duration_s: float
+    model: StateSpaceModel
+    snr_db: Array
+    simulation_error_a: Array
+    mean_a: Array
+    moment_a2: Array
+    held_out_inputs: Array
+    lead_in: int
+
+
+def identify_vehicle(
+    drives: Sequence[Samples], *, period_s: float, vehicle: str, names: tuple[str, ...]
+) -> VehicleModel:
+    """Identify the model of one vehicle from its aligned drives.
+
+    Parameters
+    ----------
+    drives : sequence of Samples
+        Drives of one vehicle, with the same branches and inputs.
+    period_s : float
+        Distance of the samples. [s]
+    vehicle : str
+        Name of the vehicle.
+    names : tuple of str
+        Names of the drives.
+
+    Returns
+    -------
+    VehicleModel
+        The vehicle.
+
+    Raises
+    ------
+    DriveError
+        If there is too little valid data; the message says how much.
+    """
+    duration_s = period_s * sum(int(drive.valid.sum()) for drive in drives)
+    if duration_s < LEAST_DURATION_S:
+        raise DriveError(
+            f"{duration_s:.1f} s of usable data in {counted(len(drives), 'drive')}; at least {LEAST_DURATION_S:.0f} s "
+            f"are needed"
+        )
+    # The drives one after the other, each followed by a gap that is not valid.
+    gap = int(GAP_S / period_s)
+
+    def joined(parts: Iterable[Any]) -> Any:
+        return np.concatenate([np.pad(part, [(0, gap), *[(0, 0)] * (part.ndim - 1)]) for part in parts])
+
+    inputs, currents = joined(drive.inputs for drive in drives), joined(drive.currents_a for drive in drives)
+    valid = joined(drive.valid for drive in drives)
+    training = valid & joined(_in_training(drive.valid) for drive in drives)
+    held_out, stop = valid & ~training, int(np.flatnonzero(training)[-1]) + 1
+    model = _identify_excited(inputs[:stop], currents[:stop], training[:stop])
+    simulated = model.simulate(bridged(inputs, valid), initial_state=model.x0)
+    longest = max(drives, key=lambda drive: int(drive.valid.sum()))
+    first_held_out = int(np.argmin(_in_training(longest.valid)))
+    start = max(0, first_held_out - int(LEAD_IN_S / period_s))
+    return VehicleModel(
+        vehicle=vehicle,
+        drives=names,
+        duration_s=duration_s,
+        model=model,
+        snr_db=simulation_snr_db(currents[held_out], simulated[held_out]),
+        simulation_error_a=np.sqrt(np.mean((currents - simulated)[held_out] ** 2, axis=0)),
+        mean_a=np.mean(currents[valid], axis=0),
+        moment_a2=currents[valid].T @ currents[valid] / valid.sum(),
+        held_out_inputs=bridged(longest.inputs, longest.valid)[start:],
+        lead_in=first_held_out - start,
+    )
+
+
+def _in_training(valid: Mask) -> Mask:
+    """First 80 % of the valid samples of a drive, and what lies between them."""
+    return np.asarray(np.cumsum(valid) <= TRAIN_SHARE * valid.sum())
+
+
+def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpaceModel:
+    """Identify from the inputs that vary; what the others do cannot be learnt from this vehicle, so it is zero."""
+    excited = inputs[valid].std(axis=0) > QUIET * np.abs(inputs[valid].mean(axis=0))
+    if not excited.any():
+        raise DriveError("none of its inputs varies: was it parked? record a drive in which it is used")
+    try:
+        model = identify_model(inputs[:, excited], currents, valid=valid)
+    except np.linalg.LinAlgError as error:
+        raise DriveError(
+            f"no model can be identified from its drives ({error}); record a longer, varied drive"
+        ) from None
+    columns = np.eye(len(excited))[excited]
+    return replace(model, B=model.B @ columns, D=model.D @ columns)

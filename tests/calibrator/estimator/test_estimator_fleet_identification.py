@@ -14,9 +14,10 @@ from calibrator.cli import app
 from calibrator.drive import Array, Channel, Drive, DriveFile, Mask
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError, FleetError
-from calibrator.estimator.published_fleet import VehicleModel, read_vehicle_model
+from calibrator.estimator.published_fleet import read_vehicle_model
 from calibrator.faults import corrected_currents
 from calibrator.files.parameter_files import current_moments, junction_residual
+from calibrator.published.state_space import VehicleModel
 from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.filter_bank import low_pass_bank, read_bank
 from ecu_node.database import VehicleDatabase
