@@ -32,6 +32,10 @@ def split_signal(name: SignalName) -> tuple[str, str]:
     return message, signal
 
 
+LONGEST_PERIOD_S = 900.0
+"""Loggers of plants write a row every quarter of an hour. [s]"""
+
+
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A table of the file."""
 
@@ -309,7 +313,7 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
     """In place of the DBC, where logs hold several buses."""
     full_scale_a: _Positive
     branch: Annotated[list[Branch], msgspec.Meta(min_length=2, max_length=16)]
-    period_s: Annotated[float, msgspec.Meta(gt=0.0, le=10.0)] = 0.1
+    period_s: Annotated[float, msgspec.Meta(gt=0.0, le=LONGEST_PERIOD_S)] = 0.1
     max_age_s: _Positive = 1.0
     """An input without a frame for this long is stale. [s]"""
     input: list[Input] = []

@@ -105,7 +105,7 @@ MISTAKES = [
     ("calibrator repository key a/b --no-passphrase --out x", 2, "'a/b': a name for a file is expected"),
     ("calibrator repository publish x --key none.key", 1, "none.key: cannot read the private key: No such file"),
     ("calibrator repository publish x --key empty", 1, "empty: cannot be used as a private key (PEM, PKCS #8)"),
-    ("calibrator repository rotate x root --public empty", 1, "empty: no public key (PEM) of Ed25519, ECDSA or RSA"),
+    ("calibrator repository rotate x root --public empty", 1, "x: no repository; make one with"),
     ("calibrator repository add empty v1.json", 1, "empty: no repository; make one with 'calibrator repository init'"),
     ("ecu-node provision --vehicle v1 --root none.json --state s", 1, "none.json: cannot read the root: No such file"),
     ("ecu-node provision --vehicle v1 --root cut.json --state s", 1, "cut.json: 1.root.json of 'calibrator repository"),

@@ -15,7 +15,7 @@ from calibrator.estimator.junction import summarise_junction
 from calibrator.findings import Finding, worst_first
 from calibrator.kirchhoff.findings import Findings, error, hint, sum_findings, times, warning
 from calibrator.kirchhoff.sums import VOLTAGE, compare_kirchhoff
-from calibrator.summaries.vehicle_summary import LEAST_DURATION_S
+from calibrator.summaries.vehicle_summary import LEAST_DURATION_S, too_slow
 from calibrator.terminal.text import figure
 from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.errors import UserError
@@ -196,6 +196,8 @@ def _for_fleet(facts: Facts) -> str:
     if not kept:
         names = ", ".join(sorted(base_inputs(layout, lacking) - available))
         return f"none of the model_inputs is recorded ({names})"
+    if problem := too_slow(facts.junction.database.layout.period_s):
+        return problem
     if facts.junction.valid_s < LEAST_DURATION_S:
         valid_s = figure(facts.junction.valid_s)
         return f"the logs of a vehicle of a fleet need {LEAST_DURATION_S:.0f} s together, and these have {valid_s} s"

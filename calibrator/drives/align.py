@@ -11,6 +11,7 @@ are not valid stay in place with NaN in all columns.
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +27,7 @@ __all__ = [
     "align",
     "align_channels",
     "at_instants",
+    "at_pace",
     "base_inputs",
     "choose_inputs",
     "evaluate_formula",
@@ -34,7 +36,18 @@ __all__ = [
 MAX_SAMPLES = 20_000_000
 """23 days at 0.1 s; a drive that claims more has a wrong time."""
 
+SLOWER = 1.5
+"""Frames that are farther apart than so many periods tell nothing at each of them. [1]"""
 _STALE, _NOT_GOOD = "stale", "not good"
+
+
+def at_pace(layout: Layout, drives: Sequence[Drive]) -> Layout:
+    """The layout with the distance of the frames as its period, where even the fastest branch is slower than that."""
+    channels = [channel for drive in drives for channel in drive.branches.values() if channel.good.sum() > 1]
+    fastest_s = min((float(np.median(np.diff(each.time_s[each.good]))) for each in channels), default=0.0)
+    if fastest_s < SLOWER * layout.period_s:
+        return layout
+    return msgspec.structs.replace(layout, period_s=round(fastest_s, 3))
 
 
 def choose_inputs(

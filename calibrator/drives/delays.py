@@ -172,7 +172,7 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
     complete = [tuple(curve for curve in curves if curve is not None) for curves in recorded if None not in curves]
     slowest_s = max((curve.period_s for curves in complete for curve in curves), default=0.0)
     band = Band(short_s=max(SHORT_S, SHORT_PERIODS * slowest_s), long_s=LONG_S)
-    stretches, blocks = _stretches(complete, band)
+    stretches, blocks = _stretches(complete, band) if band.short_s < LONG_S else ([], 0)  # else frames are too rare
     if blocks < FEWEST_BLOCKS:
         sd_s = np.where(reference, 0.0, np.inf)
         return BranchDelays(branches=tuple(branches), delay_s=np.zeros(len(branches)), sd_s=sd_s, known=reference)

@@ -29,10 +29,10 @@ from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
-from calibrator.summaries.vehicle_summary import summarise_drives
+from calibrator.summaries.vehicle_summary import COARSEST_PERIOD_S, summarise_drives
 from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase
-from ecu_node.layout import Branch, Input, Layout
+from ecu_node.layout import LONGEST_PERIOD_S, Branch, Input, Layout
 from ecu_node.summary import TIME_RESOLUTION_S
 
 __all__ = [
@@ -43,8 +43,8 @@ __all__ = [
 MOST_BRANCHES = 16
 MOST_MISSED, LEAST_AGE_S = 2.5, 0.5
 """Rows of a data frame farther apart than so many periods, and than this, leave a gap. [1], [s]"""
-FINEST_PERIOD_S, COARSEST_PERIOD_S = 0.1, 5.0
-"""Time base of data frames without a layout: that of logs, or slower; still several rows per block of 30 s. [s]"""
+FINEST_PERIOD_S = 0.1
+"""Time base of data frames without a layout: that of logs, or slower. [s]"""
 LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
 """Of full scale: currents that never reach the former, or go beyond the latter, are in another unit. [1]"""
 OTHER_SPACING = 20.0
@@ -362,13 +362,13 @@ def _seconds(frame: pd.DataFrame, where: str) -> Array:
     return np.asarray(time_s - time_s[0])
 
 
-def _period_s(times: Mapping[str, Array], junction: Junction) -> float:
+def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: float) -> float:
     """Time base of the fleet: that of the layout, or of the rows, which are about as far apart in every frame."""
     layout = junction.layout
     spacing_s = {where: float(np.median(np.diff(time_s))) for where, time_s in times.items()}
     usual_s = float(np.median([*spacing_s.values()]))
     unit = "if the index is not in seconds, convert it"
-    most_s, why = COARSEST_PERIOD_S, f"expected {COARSEST_PERIOD_S:g} s at most; {unit}"
+    most_s, why = coarsest_s, f"expected {coarsest_s:g} s at most; {unit}"
     if layout is not None:
         most_s = min(layout.max_age_s, *(branch.timeout_s for branch in layout.branch))
         why = (
@@ -402,7 +402,8 @@ def _drives(
 ) -> tuple[dict[str, list[Drive]], VehicleDatabase]:
     """Drives by vehicle, and their layout; a frame that two vehicles have, or one has twice, is refused."""
     times = {each.where: _seconds(each.frame, each.where) for each in recordings}
-    database = junction.as_database(inputs, _period_s(times, junction))
+    coarsest_s = COARSEST_PERIOD_S if inputs else LONGEST_PERIOD_S
+    database = junction.as_database(inputs, _period_s(times, junction, coarsest_s=coarsest_s))
     found, seen = dict[str, list[Drive]](), dict[bytes, str]()
     for each in recordings:
         where = each.where

@@ -24,7 +24,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.stats import norm, qmc
 
 from calibrator.drive import Array, Drive, DriveFile, Mask
-from calibrator.drives.align import Samples, align
+from calibrator.drives.align import Samples, align, at_pace
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
 from calibrator.errors import DriveError, FleetError
@@ -44,7 +44,7 @@ from calibrator.estimator.readings import (
 )
 from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
-from calibrator.estimator.vehicle_report import parameters_of, sensor_text
+from calibrator.estimator.vehicle_report import parameters_of, sensor_texts
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, probe_equipment, read_vehicles
@@ -63,6 +63,8 @@ __all__ = ["calibrate_junctions", "read_junction", "summarise_junction"]
 LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
 """Least valid data, shortest block, number of blocks of a short recording, and least number beyond that of branches:
 enough to tell how sure all is."""
+FULL_BLOCK = 10
+"""Samples that a block has where there are enough."""
 MOST_MISSING = 0.05
 """Share of a recording without samples of a branch up to which its charge is integrated. [1]"""
 LAW_GAIN_SD, LAW_OFFSET_SD = 0.002, 0.0005
@@ -129,7 +131,7 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
     DriveError
         If a branch is missing, or there is too little valid data.
     """
-    layout = database.layout
+    layout = at_pace(database.layout, drives)
     for drive in drives:
         require_possible(drive, layout)
     delays = estimate_delays(drives, most_moving_first(drives, branches))
@@ -141,7 +143,8 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
             f"{duration_s:.1f} s in which all branches have usable samples; at least {LEAST_DURATION_S:g} s are "
             f"needed; rows farther apart than the timeout_s of their branch are stale"
         )
-    block_s = max(min(BLOCK_S, duration_s / BLOCKS), SHORTEST_BLOCK_S, layout.period_s)
+    longest_s = max(BLOCK_S, FULL_BLOCK * layout.period_s)
+    block_s = max(min(longest_s, duration_s / BLOCKS), SHORTEST_BLOCK_S, layout.period_s)
     summary = summarise_samples(samples, period_s=layout.period_s, block_s=block_s)
     if len(summary.moments) < len(branches) + FEWEST_BLOCKS:
         raise DriveError(
@@ -674,13 +677,14 @@ def calibrate_junctions(
             junctions[name] = {"gain_ratio": ratios, "constant_a": constant_a}
             if len(vehicles) <= MOST_SHOWN:
                 said = ", ".join(f"{value:.4f} +- {sd:.4f} ({pair})" for pair, (value, sd) in ratios.items())
-                texts = [f"{branch}: {sensor_text(sensor)}" for branch, sensor in mine.branches.items()]
+                texts = [f"{branch}: {text}" for branch, text in sensor_texts(mine).items()]
                 texts.append(
                     f"gain ratios {said}; at zero current the sensors sum to {constant_a[0]:+.2f} +- "
                     f"{constant_a[1]:.2f} A: their offsets, and loads without a sensor"
                 )
                 notices += [f"{name}: {text}" for text in (*texts, *_same_error(mine, settings.trusted))]
-    return equipment, encode_chunk(parameters, left_out), {"junction": junctions}, notices
+    details = {"junction": junctions, "declared_load_a": 0.0 if load is None else load.mean_a}
+    return equipment, encode_chunk(parameters, left_out), details, notices
 
 
 def _read(

@@ -198,6 +198,9 @@ def encode_chunk(
 def _rows_of(item: VehicleParameters) -> Rows:
     """Rows of a vehicle, one per branch; keys that are no columns are not written."""
     hardware, residual = item.hardware_fault, item.junction_residual
+    measured_a, corrected_a = residual.measured_a, residual.corrected_a
+    if item.provenance.fleet_size == 1:  # what is expected was declared; of a fleet it is a part of the estimate
+        measured_a, corrected_a = residual.about_expected()
     return [
         {
             **msgspec.structs.asdict(branch),
@@ -210,8 +213,8 @@ def _rows_of(item: VehicleParameters) -> Rows:
             "hardware_probability": hardware.probability,
             "hardware_drift": hardware.drift,
             "hardware_offset_a": hardware.offset_a.get(name, 0.0),
-            "junction_rms_measured_a": residual.measured_a,
-            "junction_rms_corrected_a": residual.corrected_a,
+            "junction_rms_measured_a": measured_a,
+            "junction_rms_corrected_a": corrected_a,
             "duration_s": item.provenance.duration_s,
             "reason": item.deciding_evidence or "; ".join(held_back_lines(item)) or None,
         }
@@ -410,10 +413,16 @@ class CalibrationReport:
     def as_text(self) -> str:
         """The report for people."""
         run, details = self.run, self.run.details
+        load_a = details.get("declared_load_a", 0.0)
+        about = (", median" if run.vehicles > 1 else "") + (f" about the {load_a:g} A declared" if load_a else "")
+        spread = details.get("hyperparameters", {}).get("model_spread", {})
         by_branch = {
-            "simulation SNR, median, {} [dB]": (details.get("simulation_snr_db", {}), ".1f"),
-            "vehicles that agree, {}": (details.get("reference", {}).get("agreeing_share", {}), ".0%"),
-            "faultless vehicles differ by, {}": (details.get("hyperparameters", {}).get("model_spread", {}), ".1%"),
+            "simulation SNR, median, {} [dB]": (details.get("simulation_snr_db", {}), "{:.1f}"),
+            "vehicles that agree, {} [%]": (details.get("reference", {}).get("agreeing_share", {}), "{:.0%}"),
+            "faultless vehicles differ by, {} [%]": (
+                details.get("hyperparameters", {}).get("model_spread", {}),
+                "{:.1%}",
+            ),
         }
         rows = [
             ("vehicles calibrated", f"{run.vehicles}"),
@@ -421,10 +430,10 @@ class CalibrationReport:
             ("  hardware fault suspected", f"{self.hardware_count}"),
             ("vehicles left out", f"{run.left_out_count}"),
             *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
-            ("junction sum RMS, median, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
-            ("junction sum RMS, median, deployed [A]", f"{self.junction_rms_deployed_a:.2f}"),
+            (f"junction sum RMS{about}, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
+            (f"junction sum RMS{about}, corrected [A]", f"{self.junction_rms_deployed_a:.2f}"),
             *(
-                (what.format(name), format(value, digits))
+                (what.format(name), digits.format(value).rstrip("%"))
                 for what, (values, digits) in by_branch.items()
                 for name, value in values.items()
             ),

@@ -13,9 +13,14 @@ from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, HeldBack, VehicleParameters, Verdict
 
 __all__ = [
-    "REASONS", "deciding_evidence", "explained", "explained_faults", "explanation_text", "impossible", "parameters_of",
-    "sensor_text",
-]  # fmt: skip
+    "deciding_evidence",
+    "explained",
+    "explained_faults",
+    "explanation_text",
+    "impossible",
+    "parameters_of",
+    "sensor_texts",
+]
 
 MOST_REPORTED, LEAST_REPORTED = 3, 0.02
 """Explanations that are reported, and the least probability of one after the first. [1]"""
@@ -165,8 +170,8 @@ def deciding_evidence(
     if beyond := those("beyond the limits"):
         k = branches.index(beyond[0])
         return (
-            f"the {branches[k]} sensor is off by {drift[k]:+z.1%} and {offset_a[k]:+.1f} A, beyond the limits of "
-            f"{layout}: replace the sensor"
+            f"the {branches[k]} sensor is off by {100.0 * drift[k]:+z.1f} % and {offset_a[k]:+.1f} A, beyond the "
+            f"limits of {layout}: replace the sensor"
         ), None
     if unfit := those("does not fit"):  # a finding of such a branch, else of no branch, else of another one
         found = sorted(estimate.findings[j], key=lambda each: (each.branch not in unfit, each.branch is not None))
@@ -187,8 +192,9 @@ def deciding_evidence(
     unsure = (sd / np.where(size > 0.0, size, 1.0)).max(axis=0)
     k = int(np.argmax(np.where((held_back != "") | ~(held_back != "").any(), unsure, -np.inf)))
     return (
-        f"more drives would decide: the {branches[k]} sensor's drift is known to +-{estimate.drift_sd[j, k]:.2%} and "
-        f"its offset to +-{estimate.offset_sd_a[j, k]:.2f} A only; record drives in which that current varies"
+        f"more drives would decide: the {branches[k]} sensor's drift is known to "
+        f"+-{100.0 * estimate.drift_sd[j, k]:.2f} % and its offset to "
+        f"+-{estimate.offset_sd_a[j, k]:.2f} A only; record drives in which that current varies"
     ), None
 
 
@@ -213,7 +219,7 @@ def _rival(
         return f"{what} {best[1, k] * full_scale_a:+.1f} A or {rival[1, k] * full_scale_a:+.1f} A", explanation
     k = int(np.argmax(drift))
     what = f"a check of the {branches[k]} sensor against a reference would decide: its gain is off by"
-    return f"{what} {best[0, k]:+z.1%} or {rival[0, k]:+z.1%}", explanation
+    return f"{what} {100.0 * best[0, k]:+z.1f} % or {100.0 * rival[0, k]:+z.1f} %", explanation
 
 
 def explained(parameters: VehicleParameters) -> str:
@@ -221,7 +227,7 @@ def explained(parameters: VehicleParameters) -> str:
     confidence, hardware, residual = parameters.confidence, parameters.hardware_fault, parameters.junction_residual
     sure = "" if confidence is None else f" (confidence {confidence:.2f})"
     lines = [f"{parameters.vehicle}: {parameters.verdict}{sure}"]
-    lines += [f"  {name}: {sensor_text(branch)}" for name, branch in parameters.branches.items()]
+    lines += [f"  {name}: {text}" for name, text in sensor_texts(parameters).items()]
     lines += [f"  {line}" for line in held_back_lines(parameters)]
     if hardware.suspected:
         offset_a = {name: value for name, value in hardware.offset_a.items() if value}
@@ -240,17 +246,31 @@ def explained(parameters: VehicleParameters) -> str:
     return "\n".join(lines)
 
 
-def sensor_text(branch: BranchParameters) -> str:
-    """Faults of a sensor, how sure they are, and whether they are corrected."""
-    probability = (
-        "" if branch.fault_probability is None else f" (probability of a fault {branch.fault_probability:.2f})"
-    )
+def sensor_texts(parameters: VehicleParameters) -> dict[str, str]:
+    """Faults of each sensor by branch, how sure they are, and whether they are corrected."""
+    alone = parameters.provenance.fleet_size == 1  # values then are means over all explanations
+    rivals = parameters.explanations if alone else []
+    return {
+        name: _sensor_text(branch, [(each.probability, each.offset_a.get(name, 0.0)) for each in rivals])
+        for name, branch in parameters.branches.items()
+    }
+
+
+def _sensor_text(branch: BranchParameters, offsets: Sequence[tuple[float, float]]) -> str:
+    """The same of one sensor; offsets: what it may be by each explanation, with its probability. [1], [A]"""
+    chance = branch.fault_probability
+    probability = "" if chance is None else f" (probability of a fault {chance:.2f})"
     if not branch.drift and not branch.offset_a:
         return f"no fault found{probability}"
-    drift_sd = "" if branch.drift_sd is None else f" +- {branch.drift_sd:.2%}"
-    offset_sd = "" if branch.offset_sd_a is None else f" +- {branch.offset_sd_a:.2f} A"
-    fate = f"corrected{probability}" if branch.apply else f"not corrected{probability}"
-    return f"gain error (drift) {branch.drift:+z.2%}{drift_sd}, offset {branch.offset_a:+.2f} A{offset_sd}: {fate}"
+    drift_sd = "" if branch.drift_sd is None else f" +- {100.0 * branch.drift_sd:.2f} %"
+    drift = f"{100.0 * branch.drift:+z.2f} %{drift_sd}" if branch.identifiable else f"not known{drift_sd}"
+    offset = f"{branch.offset_a:+.2f} A" + ("" if branch.offset_sd_a is None else f" +- {branch.offset_sd_a:.2f} A")
+    peaks = dict.fromkeys(f"{offset_a:+.1f}" if offset_a else "0" for p, offset_a in offsets if p >= LEAST_RIVAL)
+    if len(peaks) > 1 and not branch.apply:
+        offset = f"{' or '.join(peaks)} A"
+    return (
+        f"gain error (drift) {drift}, offset {offset}: {'corrected' if branch.apply else 'not corrected'}{probability}"
+    )
 
 
 def explanation_text(explanation: Explanation) -> str:
@@ -258,9 +278,9 @@ def explanation_text(explanation: Explanation) -> str:
     sensors = []
     for name in dict.fromkeys([*explanation.drift, *explanation.offset_a]):
         drift, offset_a = explanation.drift.get(name), explanation.offset_a.get(name)
-        values = [f"drift {drift:+z.2%}"] if drift else []
+        values = [f"drift {100.0 * drift:+z.2f} %"] if drift else []
         values += [f"offset {offset_a:+.2f} A"] if offset_a else []
         sensors.append(f"{name} sensor: {', '.join(values)}")
-    hardware = [f"all currents {explanation.hardware_drift:+z.2%}"] if explanation.hardware_drift else []
+    hardware = [f"all currents {100.0 * explanation.hardware_drift:+z.2f} %"] if explanation.hardware_drift else []
     hardware += [f"{name} {value:+.2f} A" for name, value in explanation.hardware_offset_a.items()]
     return "; ".join([*sensors, *(f"hardware: {text}" for text in hardware)]) or "no fault"

@@ -191,8 +191,10 @@ def delays(junction: Junction) -> Findings:
     for k in np.flatnonzero(found.known):
         late_s = float(found.delay_s[k] - found.delay_s[usual])
         sd_s = float(np.hypot(found.sd_s[k], found.sd_s[usual]))
+        sd_ms = figure(1e3 * sd_s, 1)
         if abs(late_s) >= max(LEAST_DELAY_S, SURE * sd_s) and not junction.is_small(found.branches[k]):
-            late = f"{abs(1e3 * late_s):.0f} +- {figure(1e3 * sd_s, 1)} ms {'late' if late_s > 0 else 'early'}"
+            late_ms = f"{abs(1e3 * late_s):.{len(sd_ms.partition('.')[2])}f}"
+            late = f"{late_ms} +- {sd_ms} ms {'late' if late_s > 0 else 'early'}"
             say, text = warning if abs(late_s) >= LONG_DELAY_S else hint, f"its frames are {late} against "
             yield say("delay", found.branches[k], text + found.branches[usual], advice, late_s)
 

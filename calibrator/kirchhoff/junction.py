@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from calibrator.drive import Array, Drive
+from calibrator.drives.align import at_pace
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 from calibrator.kirchhoff.signs import WELL_CORRELATED, Bands, bands_of, likely_multipliers, sag
@@ -56,7 +57,7 @@ class Junction:
     Attributes
     ----------
     database : VehicleDatabase
-        With the voltages, see :func:`.with_voltages`.
+        With the voltages, see :func:`.with_voltages`, and at the pace of the drives.
     branches : tuple of str
         The K branches.
     drives : tuple of Drive
@@ -171,7 +172,8 @@ def look_at_junction(
     full_scale_a : float, optional
         What currents are plausible up to, if it is not that of the layout. [A]
     """
-    layout = database.layout
+    layout = at_pace(database.layout, drives)
+    database = replace(database, layout=layout)
     usable = {name for drive in drives for name, channel in drive.branches.items() if channel.good.any()}
     names = tuple(name for name in layout.branch_names if name in usable)
     whole = [drive for drive in drives if all(n in drive.branches and drive.branches[n].good.any() for n in names)]

@@ -25,6 +25,8 @@ STEP_S = 0.25
 """Distance of the instants: a third of the shorter window. [s]"""
 BLOCK_S = 10.0
 """Blocks count as independent: as long as the longer window reaches. [s]"""
+FAST_S = 1.0
+"""Of frames farther apart than this all these are longer by as much. [s]"""
 FACTORS = (1.0, 1e-1, 1e-2, 1e-3, 1e1, 1e2, 1e3)
 """Slips of units and scales. [1]"""
 LEAST_RATIO = 1e-4
@@ -65,11 +67,13 @@ def bands_of(recordings: Sequence[Sequence[Channel]]) -> Bands:
         if len(curves) < len(channels):
             continue
         start_s, stop_s = max(curve.time_s[0] for curve in curves), min(curve.time_s[-1] for curve in curves)
-        time_s = np.arange(start_s, max(stop_s, start_s), STEP_S)
-        time_s = time_s[covered(curves, time_s, BAND.long_s)]
+        slow = max(1.0, *(curve.period_s / FAST_S for curve in curves))
+        band = Band(short_s=slow * BAND.short_s, long_s=slow * BAND.long_s)
+        time_s = np.arange(start_s, max(stop_s, start_s), slow * STEP_S)
+        time_s = time_s[covered(curves, time_s, band.long_s)]
         if len(time_s):
-            block = np.unique(np.floor(time_s / BLOCK_S), return_inverse=True)[1]
-            parts.append(np.stack([curve.band(time_s, BAND)[0] for curve in curves], axis=1))
+            block = np.unique(np.floor(time_s / (slow * BLOCK_S)), return_inverse=True)[1]
+            parts.append(np.stack([curve.band(time_s, band)[0] for curve in curves], axis=1))
             blocks.append(np.asarray(block, np.intp) + count)
             count = int(blocks[-1][-1]) + 1
     return Bands(np.concatenate(parts), np.concatenate(blocks))

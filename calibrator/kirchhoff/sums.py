@@ -4,9 +4,9 @@ Of a current x(t) over the valid instants of the common time base of :mod:`calib
 
     RMSE = sqrt(mean(x^2)),    maximum = max |x|,    mean,    sd = standard deviation
 
-For the sum S of all branches the ideal is 0 A (or the declared load), so its RMSE is an error. For a single branch
-nobody knows the ideal: its RMSE is the root mean square of the current itself; what the correction did to it stands
-under *change*, the figures of (corrected - measured).
+For the sum S of all branches the ideal is 0 A, or the load that layout or parameter file expect; its RMSE and maximum
+are about that, so that they are errors. For a single branch nobody knows the ideal: its RMSE is the root mean square of
+the current itself; what the correction did to it stands under *change*, the figures of (corrected - measured).
 
 Right sensors do not sum to exactly 0 A either. The standard deviation that is expected of S at the instant t is
 
@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.align import align_channels
+from calibrator.drives.align import align_channels, at_pace
 from calibrator.drives.delays import MAX_DELAY_S
 from calibrator.errors import DriveError
 from ecu_node.core.signals import VOLT, WATT, unit_factor
@@ -72,7 +72,7 @@ class Comparison:
         ``before`` and, if something is corrected, ``after``: a column per branch and :data:`SUM`, positive into the
         junction, by the instant [s]; NaN where not valid. [A]
     expected_a : float
-        Sum that right sensors show: the declared load, or 0. [A]
+        Sum that right sensors show: the load that the parameters expect or the layout declares, or 0. [A]
     expected_sd_a : ndarray of shape (T,)
         Its standard deviation at each instant, see the top of this module. [A]
     parts_a : mapping of str to float
@@ -112,10 +112,10 @@ class Comparison:
 
         The stages are ``before``, and ``after`` and ``change`` if something is corrected.
         """
-        stages = dict(self.stages)
-        if "after" in stages:
-            stages["change"] = stages["after"] - stages["before"]
-        return {stage: _figures(frame) for stage, frame in stages.items()}
+        found = {stage: _figures(frame, self.expected_a) for stage, frame in self.stages.items()}
+        if "after" in found:
+            found["change"] = _figures(self.stages["after"] - self.stages["before"], 0.0)
+        return found
 
     @property
     def usual_sd_a(self) -> float:
@@ -134,8 +134,8 @@ class Comparison:
         unused, reasons = int(np.sum(~self.valid)), (f"{n:,} {reason}" for reason, n in self.masked.items() if n)
         texts = {
             f"no usable frames of {', '.join(self.left_out)}: left out of the sum": self.left_out,
-            f"no correction of {', '.join(self.uncorrected)}: the sum after has measured values": self.uncorrected,
-            "no corrected frames: only the figures before": "after" not in self.stages,
+            f"no correction of {', '.join(self.uncorrected)}: summed up as measured": self.uncorrected,
+            "no corrected frames: only measured currents": "after" not in self.stages,
             f"{unused:,} of {len(self.valid):,} instants not used: {', '.join(reasons)}": unused,
         }
         return [text for text, is_said in texts.items() if is_said]
@@ -156,9 +156,10 @@ class Comparison:
         }
 
 
-def _figures(a: pd.DataFrame) -> pd.DataFrame:
-    rmse_a = np.sqrt((a**2).mean())
-    return pd.DataFrame({"rmse_a": rmse_a, "max_a": a.abs().max(), "mean_a": a.mean(), "sd_a": a.std(ddof=0)})
+def _figures(a: pd.DataFrame, expected_a: float) -> pd.DataFrame:
+    error_a = a.assign(**{SUM: a[SUM] - expected_a})
+    rmse_a, max_a = np.sqrt((error_a**2).mean()), error_a.abs().max()
+    return pd.DataFrame({"rmse_a": rmse_a, "max_a": max_a, "mean_a": a.mean(), "sd_a": a.std(ddof=0)})
 
 
 def _noise(value: Array) -> float:
@@ -209,7 +210,7 @@ def compare_kirchhoff(
     corrected: Mapping[str, Channel] | None = None,
     parameters: VehicleParameters | None = None,
 ) -> Comparison:
-    """Put measured and corrected currents of a recording on one time base.
+    """Put measured and corrected currents of a recording on one time base, no finer than its frames.
 
     Parameters
     ----------
@@ -228,7 +229,7 @@ def compare_kirchhoff(
         If fewer than two branches have usable values, no instant is valid for all of them, or the parameters are of
         other branches.
     """
-    layout, where = database.layout, f"vehicle {drive.vehicle}, drive {drive.name}"
+    layout, where = at_pace(database.layout, [drive]), f"vehicle {drive.vehicle}, drive {drive.name}"
     usable = {name: channel for name, channel in drive.branches.items() if channel.good.any()}
     names = [name for name in layout.branch_names if name in usable]
     if len(names) < 2:
@@ -253,7 +254,9 @@ def compare_kirchhoff(
     before = {name: values[name] for name in names}
     stages = {"before": before} | ({"after": before | after} if after or parameters is not None else {})
     frames = {stage: pd.DataFrame(each, index=pd.Index(time_s, name="time_s")) for stage, each in stages.items()}
-    sd_a, parts_a, residual = _explained(frames, valid, database, drive)
+    load = layout.unmeasured_load
+    expected_a = (parameters.junction_residual.expected_a if parameters else 0.0) or (load.mean_a if load else 0.0)
+    sd_a, parts_a, residual = _explained(frames, valid, database, drive, expected_a)
     for frame in frames.values():
         frame[SUM] = frame.sum(axis=1)
         frame[~valid] = np.nan
@@ -263,7 +266,7 @@ def compare_kirchhoff(
         uncorrected=tuple(name for name in names if name not in after) if "after" in frames else (),
         masked={reason: int(mask.sum()) for reason, mask in reasons.items()},
         stages=frames,
-        expected_a=layout.unmeasured_load.mean_a if layout.unmeasured_load is not None else 0.0,
+        expected_a=expected_a,
         expected_sd_a=sd_a,
         parts_a=parts_a,
         residual=residual,
@@ -271,7 +274,7 @@ def compare_kirchhoff(
 
 
 def _explained(
-    frames: Mapping[str, pd.DataFrame], valid: Mask, database: VehicleDatabase, drive: Drive
+    frames: Mapping[str, pd.DataFrame], valid: Mask, database: VehicleDatabase, drive: Drive, expected_a: float
 ) -> tuple[Array, dict[str, float], dict[str, dict[str, Any] | None]]:
     """Standard deviation of the sum by the formula at the top of this module, its parts, and the shares in the sum."""
     time_s, measured_a = frames["before"].index.to_numpy(), frames["before"].to_numpy()
@@ -289,10 +292,7 @@ def _explained(
     most_a = _noise(measured_a.sum(axis=1)[valid])
     for _ in range(2):
         noise_a = np.maximum(np.minimum(noise_a, most_a), step_a / np.sqrt(12.0))
-        shares = {
-            stage: _shares(frame[valid], slope[valid], noise_a, load.mean_a if load is not None else 0.0)
-            for stage, frame in frames.items()
-        }
+        shares = {stage: _shares(frame[valid], slope[valid], noise_a, expected_a) for stage, frame in frames.items()}
         _, delay_s, left_a = shares["before"]
         most_a = min(most_a, _noise(left_a))
     period_s = np.array([np.median(np.diff(each_s)) if len(each_s) > 1 else 0.0 for each_s in good_s])

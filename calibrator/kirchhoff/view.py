@@ -19,6 +19,8 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 """Okabe and Ito's colours, which colour-blind readers can tell apart; black is kept for the sum."""
 _BAND_COLOUR = "#D9D9D9"
 _SUMS = {"before": "black", "after": _COLOURS[1]}
+STAGES = {"before": "measured", "after": "corrected"}
+"""What people call the stages of a comparison."""
 _Panels = Mapping[str, Mapping[str, tuple[pd.Series, str]]]
 """Diagrams from top to bottom by title: name, course and colour of each line; the band belongs to the last one."""
 SLIP = 0.5
@@ -35,7 +37,7 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
     rows = [
         [name, *(f"{value:.2f}" for value in row)] for name, *row in pd.concat(stages.values(), axis=1).itertuples()
     ]
-    header = ["", *(word for stage in stages for word in (stage, "", "", ""))]
+    header = ["", *(word for stage in stages for word in (STAGES[stage], "", "", ""))]
     parts = ", ".join(f"{name} {figure(value, 2)}" for name, value in comparison.parts_a.items() if value >= 0.001)
     lines = [
         "Currents [A], positive into the junction",
@@ -48,7 +50,7 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
     for stage, residual in comparison.residual.items():
         if residual is not None:
             shares = ", ".join(f"{name} {_percent(residual[name])}" for name in ("constant", "gains", "delays", "rest"))
-            lines.append(f"of the sum {stage} (mean square): {shares} ({figure(residual['rest_a'], 2)} A)")
+            lines.append(f"of the sum {STAGES[stage]} (mean square): {shares} ({figure(residual['rest_a'], 2)} A)")
     alone = (list(comparison.residual.values())[-1] or {}).get("alone", {})
     if any(own["gain_share"] > LEAST_SHARE for own in alone.values()):
         errors = {name: 100.0 * own["gain_error"] for name, own in alone.items()}
@@ -59,10 +61,11 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
         title = "What the gain of one branch alone could explain of how the sum varies"
         lines += ["", title, table(["", "gain error", "explains"], rows), ""]
     before_a, *corrected_a = (found.loc[SUM, "rmse_a"] for found in stages.values())
-    total = f"RMSE of the sum: {before_a:.2f} A before"
+    about = f" about the {figure(comparison.expected_a)} A expected" if comparison.expected_a else ""
+    total = f"RMSE of the sum{about}: {before_a:.2f} A measured"
     for after_a in corrected_a:
         ratio = f", {figure(before_a / after_a, 2)} times less" if 0.0 < after_a < before_a else ""
-        total += f", {after_a:.2f} A after{ratio}"
+        total += f", {after_a:.2f} A corrected{ratio}"
     return "\n".join([*lines, *notices, f"{total} ({comparison.full_scale_a:g} A full scale)"])
 
 
@@ -71,7 +74,7 @@ def _percent(share: float) -> str:
 
 
 def _inside(comparison: Comparison) -> str:
-    return ", ".join(f"{stage} {_percent(share)}" for stage, share in comparison.in_band.items())
+    return ", ".join(f"{STAGES[stage]} {_percent(share)}" for stage, share in comparison.in_band.items())
 
 
 def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
@@ -99,9 +102,11 @@ def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
         rmse_a = comparison.figures[stage].loc[SUM, "rmse_a"]
         share = f"{100.0 * rmse_a / comparison.full_scale_a:.2f} % of full scale"
         lines = {name: (frame[name], colour) for name, colour in zip(comparison.branches, cycle(_COLOURS))}
-        panels[f"{stage}: RMSE of the sum {rmse_a:.2f} A = {share}"] = lines | {"sum of all": (frame[SUM], "black")}
+        lines["sum of all"] = (frame[SUM], "black")
+        about = f" about {figure(comparison.expected_a)} A" if comparison.expected_a else ""
+        panels[f"{STAGES[stage]}: RMSE of the sum{about} {rmse_a:.2f} A = {share}"] = lines
     heading = f"sum, and band of right sensors (in it: {_inside(comparison)})"
-    panels[heading] = {f"sum {stage}": (frame[SUM], _SUMS[stage]) for stage, frame in stages.items()}
+    panels[heading] = {f"sum {STAGES[stage]}": (frame[SUM], _SUMS[stage]) for stage, frame in stages.items()}
     sd_a = pd.Series(comparison.expected_sd_a, comparison.stages["before"].index)[comparison.valid][::every]
     band = comparison.expected_a + BAND * pd.DataFrame({"low": -sd_a, "high": sd_a})
     form = path.suffix.lower()[1:]
@@ -144,9 +149,12 @@ def _page(panels: _Panels, band: pd.DataFrame, title: str) -> bytes:
             drawing.add_scatter(x=course_a.index, y=course_a, name=name, **style, row=row, col=1)
     drawing.update_yaxes(title_text="current [A]")
     drawing.update_xaxes(title_text="time [s]", row=rows, col=1)
-    heading, legend = {"text": title.replace(": ", ":<br>", 1), "font_size": 15}, {"orientation": "h", "y": -0.12}
-    drawing.update_layout(title=heading, template="plotly_white", hovermode="x unified", height=180 + 280 * rows)
-    drawing.update_layout(legend=legend, margin={"l": 60, "r": 15})
+    heading, height = {"text": title.replace(": ", ":<br>", 1), "font_size": 15, "yref": "container"}, 220 + 280 * rows
+    # Title, then legend from above, so that it is seen without scrolling.
+    heading |= {"y": 1.0 - 15 / height, "yanchor": "top"}
+    legend = {"orientation": "h", "yref": "container", "y": 1.0 - 70 / height, "yanchor": "top"}
+    drawing.update_layout(title=heading, template="plotly_white", hovermode="x unified", height=height)
+    drawing.update_layout(legend=legend, margin={"l": 60, "r": 15, "t": 145})
     drawing.update_annotations(x=0.0, xanchor="left", font_size=12)
     page = drawing.to_html(include_plotlyjs=True, config={"displaylogo": False, "responsive": True})
     head = f'<head><title>{html.escape(title)}</title><meta name="viewport" content="width=device-width">'

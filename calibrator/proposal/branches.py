@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -51,6 +52,8 @@ CLEAR = 2.0
 """By so much more the sum must vary with the other sign. [1]"""
 OWN_GAIN, FEWEST_BINS = 1.3, 20
 """Gain errors that a load which closes the sum may leave to any branch, and means that it takes to tell. [1]"""
+MOST_TOGETHER, MOST_TRIED = 2, 12
+"""Currents without a place that are tried together, and that are tried at all, the best first. [1]"""
 MEANS = 50
 """One row of means for so many instants: loads that no branch measures are in them."""
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
@@ -95,7 +98,7 @@ def _of_range(item: Candidate, place: str) -> tuple[float, str]:
 def _of_recording(item: Candidate, channel: Channel) -> tuple[float, str]:
     value, unit = item.good, UNITS[item.quantity]
     if len(value) < 0.5 * len(channel.value):
-        unusable = f"{1.0 - len(value) / len(channel.value):.0%} of its values are not usable"
+        unusable = f"{100.0 * (1.0 - len(value) / len(channel.value)):.0f} % of its values are not usable"
         return NEVER, item.comment if item.signal is None and item.comment else unusable
     if np.ptp(value) == 0.0:
         empty = 0.0 if item.signal is None else item.factor * float(item.signal.offset)
@@ -202,7 +205,7 @@ def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
 
 
 def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
-    """Take measured currents that no word places, where the recording shows that they close the sum of the others.
+    """Take measured currents that no word places, alone or two at a time, where they close the sum of the others.
 
     The battery's current is fitted by the other branches, each with a gain: with the current, all gains must be near 1,
     which those of copies are not, and the rest must be half of what it is without.
@@ -220,21 +223,28 @@ def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Ca
         All, the branches first.
     """
     result = list(judged)
-    for k, item in enumerate(result):
-        taken = [other for other in result if other.branch]
-        is_free = not item.branch and not item.place and item.score > 0.5 * AGAINST and item.quantity == "current"
-        if not is_free or len(taken) < 2 or taken[0].place != "battery":
+    free = [
+        k
+        for k, item in enumerate(result)
+        if not item.branch and not item.place and item.score > 0.5 * AGAINST and item.quantity == "current"
+    ]
+    for group in (group for size in range(1, MOST_TOGETHER + 1) for group in combinations(free[:MOST_TRIED], size)):
+        taken, added = [other for other in result if other.branch], [result[k] for k in group]
+        if any(item.branch for item in added) or len(taken) < 2 or taken[0].place != "battery":
             continue
-        channels = _channels((*taken, item), voltage)
+        channels = _channels((*taken, *added), voltage)
         if not channels or len(current := bands_of([channels]).current_a) < FEWEST_BINS:
             continue
         battery, others = current[:, 0], current[:, 1:]
         gain = np.abs(np.linalg.lstsq(others, battery)[0])
-        left = [_rms(battery - part @ np.linalg.lstsq(part, battery)[0]) for part in (others[:, :-1], others)]
+        left = [_rms(battery - part @ np.linalg.lstsq(part, battery)[0]) for part in (others[:, : -len(group)], others)]
         if CLEAR * left[1] < left[0] and np.all((gain > 1.0 / OWN_GAIN) & (gain < OWN_GAIN)):
-            name = "auxiliary" if all(other.branch != "auxiliary" for other in taken) else f"auxiliary_{len(taken)}"
-            why = f"closes the sum: it varies by {left[1]:.2g} A with it, and by {left[0]:.2g} A without"
-            result[k] = replace(item, place="auxiliary", branch=name, score=TAKEN, why=why)
+            for number, k in enumerate(group, start=len(taken)):
+                is_first = all(other.branch != "auxiliary" for other in result)
+                name = "auxiliary" if is_first else f"auxiliary_{number}"
+                why = f"varies by {figure(left[1], 2)} A with it, and by {figure(left[0], 2)} A without"
+                why = f"closes the sum{' with others' if len(group) > 1 else ''}: it {why}"
+                result[k] = replace(result[k], place="auxiliary", branch=name, score=TAKEN, why=why)
     return sorted(result, key=lambda item: not item.branch)
 
 
@@ -301,7 +311,8 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
     for k, item in enumerate(chosen):
         other = best * np.where(np.arange(len(chosen)) == k, -1.0, 1.0)
         with_it, without = _rms(current @ best), _rms(current @ other)
-        sign, reason = int(best[k]), f"with it the sum of all varies by {with_it:.2g} A, else by {without:.2g} A"
+        sums = f"with it the sum of all varies by {figure(with_it, 2)} A, else by {figure(without, 2)} A"
+        sign, reason = int(best[k]), sums
         if k == sure:
             reason = "with it the voltage falls when the current rises" if by_voltage else item.sign_reason
         elif without < CLEAR * with_it or without == 0.0:

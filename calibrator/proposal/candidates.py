@@ -13,7 +13,7 @@ from calibrator.drive import Array, Channel, Mask
 from calibrator.errors import LogError
 from calibrator.recordings.decode import decode_signal, raw_values, signal_range
 from calibrator.recordings.frame_arrays import Frames, frame_key, repaired_time
-from calibrator.recordings.tables import Table
+from calibrator.recordings.tables import Table, peak_of
 from calibrator.words import CURRENT, POWER, VOLTAGE, words_of
 from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, unit_factor
 from ecu_node.errors import DatabaseError
@@ -125,7 +125,7 @@ class Candidate:
     @property
     def peak(self) -> float:
         """Greatest magnitude but for wild samples; 0 without any. [A, V, W]"""
-        return float(np.quantile(np.abs(self.good), 0.999)) if len(self.good) else 0.0
+        return peak_of(self.good)
 
     def at(self, time_s: Array) -> Array:
         """Good values of the recording at some instants, interpolated; NaN without any."""

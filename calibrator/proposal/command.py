@@ -95,7 +95,8 @@ def propose(
         write_output(text.rstrip("\n"))
         return
     names = ", ".join(item.branch for item in proposal.branches)
-    write_output(f"{printable(str(out))}: branches {names}; {text.count('# confirm:')} guesses to confirm")
+    guesses = text.count("# confirm:")
+    write_output(f"{printable(str(out))}: branches {names}; {guesses} guess{'' if guesses == 1 else 'es'} to confirm")
     recording = "LOG" if proposal.recording is None else shlex.quote(str(proposal.recording))
     say_error(f"next: calibrator doctor --layout {shlex.quote(str(out))} --log {recording}")
 

@@ -25,7 +25,7 @@ from calibrator.proposal.branches import (
 from calibrator.proposal.candidates import Candidate, of_database, of_table, with_log, with_table
 from calibrator.proposal.inputs import FOR_FLEETS, computed_motor, derive, find_inputs
 from calibrator.recordings.frames import read_frames
-from calibrator.recordings.tables import bare_name, is_table, layout_from_branches, read_table
+from calibrator.recordings.tables import bare_name, is_table, layout_from_branches, likely_full_scale_a, read_table
 from calibrator.words import PLACES, places_of, words_of
 from ecu_node.database import read_database
 from ecu_node.errors import DatabaseError, printable
@@ -37,9 +37,6 @@ TYPICAL_A = 400.0
 """Full scale of many cars' junctions, where neither database nor recording tells it. [A]"""
 LARGEST_A = 2000.0
 """A range beyond it is that of the number of bits, not of a current. [A]"""
-HEADROOM = 2.0
-"""A recorded drive hardly ever has the nominal maximum in it. [1]"""
-ROUND = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 COMPUTED = 0.1
 """Relative standard deviation of a current that is computed from torque and speed: the losses. [1]"""
 OPEN = 0.6
@@ -49,8 +46,10 @@ OTHER_UNIT = 100.0
 TIMEOUT_PERIODS, GAP_TIMES = 5.0, 1.5
 """A time-out bridges four lost frames, and the gaps that a recording shows. [1]"""
 LEAST_TIMEOUT_S, USUAL_TIMEOUT_S, LONGEST_TIMEOUT_S = 0.1, 0.5, 2.0
-"""A time base of 0.1 s needs no less; where no rate is known; longer gaps are losses. [s]"""
+"""A time base of 0.1 s needs no less; where no rate is known; longer gaps are losses, unless frames are as rare. [s]"""
 TIMEOUT_STEP_S = 0.05
+STATED = "as --branches says"
+"""Reason of a sign that is no guess."""
 CHECKS = frozenset({"crc", "checksum", "crc8", "chk"})
 """Words of the signal that protects a message."""
 
@@ -134,7 +133,7 @@ class Proposal:
                 max(self.branches, key=lambda item: item.peak),
             )
             unit = f"; {most.name} reaches {most.peak:,.0f}: in mA?" if most.peak > OTHER_UNIT * battery.peak else ""
-            varies = f"the sum of {names} still varies by {share:.0%} of the greatest of them"
+            varies = f"the sum of {names} still varies by {100.0 * share:.0f} % of the greatest of them"
             return f"{varies}: a branch is missing or wrong{unit}"
         return self.unready()
 
@@ -227,7 +226,7 @@ def parsed_branches(text: str, proposal: Proposal) -> Proposal:
         item = _named(branch.source, proposal)
         place = next(iter(places_of(words_of(branch.name))), judged.get(item.name, ""))
         item = replace(item, quantity=item.quantity or "current", place=place, score=100.0, why="", branch=branch.name)
-        chosen.append(replace(item, sign=branch.sign, sign_reason="as --branches says"))
+        chosen.append(replace(item, sign=branch.sign, sign_reason=STATED))
     made = replace(proposal, candidates=tuple(chosen))
     return replace(made, voltage=find_inputs(made.found, battery=made.battery, roles=["voltage"]).get("voltage"))
 
@@ -290,6 +289,7 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
         wrong_ranges=[item.name for item in (*branches, *inputs.values()) if item.wrong == "range"],
         checked=[name for name, m in messages.items() if any(CHECKS & set(words_of(s.name)) for s in m.signals)],
         taken=TAKEN,
+        stated=STATED,
         uncertainty=COMPUTED,
         timeout_s=_timeout_s,
     )
@@ -299,10 +299,7 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
 def _full_scale(proposal: Proposal) -> tuple[float, str]:
     peak_a, battery = max(item.peak * (item.quantity == "current") for item in proposal.branches), proposal.battery
     if proposal.recording is not None and peak_a > 0.0:
-        least = HEADROOM * peak_a
-        decade = 10.0 ** math.floor(math.log10(least))
-        scale_a = next(step * decade for step in ROUND if step * decade >= least * (1.0 - 1e-9))
-        return scale_a, f"the recording reaches {peak_a:.0f} A; give the nominal maximum"
+        return likely_full_scale_a(peak_a), f"the recording reaches {peak_a:.0f} A; give the nominal maximum"
     if battery is not None and battery.quantity == "current" and battery.reach <= LARGEST_A:
         return battery.reach, f"the database lets {battery.name} reach {battery.reach:g} A"
     return TYPICAL_A, "typical of a car; nothing tells it"
@@ -312,8 +309,8 @@ def _timeout_s(item: Candidate) -> float:
     """From the cycle time, or from what a recording shows."""
     steps_s = np.diff(item.channel.time_s) if item.channel is not None else np.zeros(0)
     period_s = (item.message.cycle_time or 0) * 1e-3 if item.message is not None else 0.0
-    wanted_s = TIMEOUT_PERIODS * period_s or USUAL_TIMEOUT_S
+    wanted_s = min(TIMEOUT_PERIODS * period_s or USUAL_TIMEOUT_S, LONGEST_TIMEOUT_S)
     if len(steps_s):
-        wanted_s = max(TIMEOUT_PERIODS * float(np.median(steps_s)), GAP_TIMES * float(steps_s.max()))
-    wanted_s = min(wanted_s, LONGEST_TIMEOUT_S)
+        longest_s = min(GAP_TIMES * float(steps_s.max()), LONGEST_TIMEOUT_S)
+        wanted_s = max(TIMEOUT_PERIODS * float(np.median(steps_s)), longest_s)
     return max(round(math.ceil(wanted_s / TIMEOUT_STEP_S - 1e-9) * TIMEOUT_STEP_S, 3), LEAST_TIMEOUT_S)

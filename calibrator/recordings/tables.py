@@ -42,7 +42,7 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError
 from ecu_node.layout import layout_of
 
-__all__ = ["Table", "bare_name", "is_table", "layout_from_branches", "read_table"]
+__all__ = ["Table", "bare_name", "is_table", "layout_from_branches", "likely_full_scale_a", "peak_of", "read_table"]
 
 MOST_SHARING = 1.5
 """Rows with the same time, on average, from which on the time is too coarse: loggers repeat a few instants. [1]"""
@@ -74,6 +74,9 @@ _LONG_STEPS = ((5000.0, "us"), (5.0, "ms"))
 Steps below 100 are milliseconds only where the table is then not shorter than :data:`_SHORTEST_S`.
 """
 _SHORTEST_S = 60.0
+HEADROOM = 2.0
+"""A recorded drive hardly ever has the nominal maximum in it. [1]"""
+ROUND = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,7 +240,7 @@ def layout_from_branches(
         Branches between commas, as ``battery=Ibat,-motor=Imot``: name and column, or the column alone. A minus stands
         before a current that is positive out of the junction. Quotients such as ``-motor=Pmot/Ubat`` are formulas [A].
     full_scale_a : float, optional
-        Of the junction [A]; without it the largest current, rounded up to 1, 2 or 5.
+        Of the junction [A]; without it what the table makes likely.
     table : Table, optional
         Tells full scale, period and time-outs, and checks the columns.
 
@@ -269,11 +272,10 @@ def layout_from_branches(
         columns = {item["name"]: table.column(item["signal"]) for item in branches if "signal" in item}
         periods_s = {name: _period_s(table.time_s[np.isfinite(table.columns[c])]) for name, c in columns.items()}
         factors = {name: AMPERE.get(table.units.get(column, "A"), 1.0) for name, column in columns.items()}
-        largest_a = [
-            factors[name] * float(np.nanmax(np.abs(table.columns[c]), initial=0.0)) for name, c in columns.items()
+        peaks_a = [
+            factors[name] * peak_of(table.columns[c][np.isfinite(table.columns[c])]) for name, c in columns.items()
         ]
-        keys["full_scale_a"] = full_scale_a or _rounded_up(max([*largest_a, 0.5]))
-        keys["period_s"] = min(max(0.1, min(periods_s.values(), default=0.1)), 10.0)
+        keys["full_scale_a"] = full_scale_a or likely_full_scale_a(max([*peaks_a, 0.5]))
         longest_s = max(periods_s.values(), default=0.0)
         for branch in branches:
             branch["timeout_s"] = max(0.5, GAP_PERIODS * periods_s.get(branch["name"], longest_s))
@@ -286,10 +288,16 @@ def _period_s(time_s: Array) -> float:
     return round(float(np.median(np.diff(time_s))), 3) if len(time_s) > 1 else 0.0
 
 
-def _rounded_up(value: float) -> float:
-    """The next of 1, 2, 5, 10, 20, ..."""
-    decade = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= value * (1.0 - 1e-9)))
+def peak_of(value: Array) -> float:
+    """Greatest magnitude but for wild samples; 0 without any."""
+    return float(np.quantile(np.abs(value), 0.999)) if len(value) else 0.0
+
+
+def likely_full_scale_a(peak_a: float) -> float:
+    """Full scale of a junction of which a recording reaches so much, rounded up. [A]"""
+    least_a = HEADROOM * peak_a
+    decade = 10.0 ** np.floor(np.log10(least_a))
+    return float(next(step * decade for step in ROUND if step * decade >= least_a * (1.0 - 1e-9)))
 
 
 def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -> Table:

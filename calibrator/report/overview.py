@@ -48,9 +48,11 @@ def overview_of(table: FleetTable) -> dict[str, Any]:
         corrected, and of those in which a hardware fault is suspected (None if the method cannot see one); of sensors
         with a fault, of those of them that are corrected, of others by reason (``held_back``), and of those that
         changed since the earlier result of ``calibrate --since``. The Kirchhoff sum per vehicle before and after what
-        is applied [A], the load that no branch measures [A], length of the drives [h] and delay of each branch [ms],
-        as median and the values between which the middle 90 % lie; of the ``reference`` by branch the share of the
-        vehicles that agree, and the spread of their slopes [1]; the most frequent reasons of vehicles left out.
+        is applied [A], the load that no branch measures: of a fleet as it shows it (``unmeasured_a``), of vehicles by
+        themselves as the user declared it (``declared_load_a``), and their sums are about it [A]; length of the drives
+        [h] and delay of each branch [ms], as median and the values between which the middle 90 % lie; of the
+        ``reference`` by branch the share of the vehicles that agree, and the spread of their slopes [1]; the most
+        frequent reasons of vehicles left out.
     """
     reference = table.run.details.get("reference", {})
     spread = table.run.details.get("hyperparameters", {}).get("model_spread", {})
@@ -69,6 +71,7 @@ def overview_of(table: FleetTable) -> dict[str, Any]:
         "junction_measured_a": _spread(table.of_vehicles("junction_rms_measured_a")),
         "junction_deployed_a": _spread(table.deployed_a),
         "unmeasured_a": reference.get("unmeasured_a"),
+        "declared_load_a": table.run.details.get("declared_load_a", 0.0),
         "duration_h": _spread(table.of_vehicles("duration_s") / 3600.0),
         "delay_ms": {
             name: _spread(1e3 * delay_s)

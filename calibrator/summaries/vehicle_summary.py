@@ -8,7 +8,7 @@ from operator import add
 import numpy as np
 
 from calibrator.drive import Array, Channel, Drive, Equipment, Samples
-from calibrator.drives.align import align
+from calibrator.drives.align import align, at_pace
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank
@@ -20,6 +20,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
 __all__ = [
+    "COARSEST_PERIOD_S",
     "VehicleSummary",
     "added_summaries",
     "aligned_drives",
@@ -27,10 +28,13 @@ __all__ = [
     "require_possible",
     "summarise_drives",
     "too_short",
+    "too_slow",
 ]
 
 LEAST_DURATION_S = 120.0
 """Valid data below which a vehicle is left out: fewer than four blocks do not tell how sure anything is. [s]"""
+COARSEST_PERIOD_S = 5.0
+"""Frames of a fleet farther apart leave too few in a block of 30 s. [s]"""
 
 MOST_OVER_FULL_SCALE = 10.0
 """Largest current that is taken for one, over full scale. [1]"""
@@ -126,6 +130,8 @@ def aligned_drives(
     layout = database.layout
     for drive in drives:
         require_possible(drive, layout)
+    if problem := too_slow(at_pace(layout, drives).period_s):
+        raise DriveError(problem)
     delays = estimate_delays(drives, most_moving_first(drives, equipment.branches))
     samples = [
         align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.fleet_inputs)
@@ -134,6 +140,14 @@ def aligned_drives(
     if problem := too_short(layout.period_s * sum(int(part.valid.sum()) for part in samples), len(drives)):
         raise DriveError(problem)
     return delays, samples
+
+
+def too_slow(period_s: float) -> str:
+    """Why frames so far apart cannot be used in a fleet; empty if they can."""
+    if period_s <= COARSEST_PERIOD_S:
+        return ""
+    alone = "a vehicle by itself is calibrated at any distance, with --trusted"
+    return f"its rows are {period_s:g} s apart, and those of a fleet may be {COARSEST_PERIOD_S:g} s at most; {alone}"
 
 
 def too_short(duration_s: float, drives: int) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from calibrator.drive import Array
 from calibrator.estimator.results import read_results
 from tests.calibrator.command_here import calibrator
 from tests.calibrator.estimator.test_junction import recording
@@ -112,6 +113,47 @@ def test_report_of_tables(result: Path, tmp_path: Path) -> None:
     done = calibrator("report", result, "--out", tmp_path / "report.html")
     assert done.returncode == 0, done.stderr
     assert "V4" in (tmp_path / "report.html").read_text()
+
+
+def solar_plant(folder: Path) -> Path:
+    """A table of three days with a row a minute: noise of 0.02 A, and a string of which the gain is 5 % off."""
+    rng, rows = np.random.default_rng(2), 4320
+
+    def wander(size_a: float) -> Array:
+        return size_a * np.convolve(rng.normal(size=rows), np.full(15, 0.26), "same")
+
+    sun, inverter = np.clip(np.sin(np.arange(rows) / 229.2), 0.0, None), 12.0 + wander(4.0)
+    strings = [size_a * sun * (1.0 + wander(0.1)) for size_a in (20.0, 15.0)]
+    true = {"Ibat": inverter - sum(strings), "I1": 1.05 * strings[0], "I2": strings[1], "Iinv": inverter}
+    frame = pd.DataFrame({name: value + 0.02 * rng.normal(size=rows) for name, value in true.items()}).round(3)
+    frame.index = pd.date_range("2026-06-01", periods=rows, freq="60s", name="time")
+    frame.to_csv(folder / "solar.csv")
+    return folder / "solar.csv"
+
+
+def test_rows_a_minute_apart_go_through_every_command(tmp_path: Path) -> None:
+    table, layout = solar_plant(tmp_path), tmp_path / "solar.toml"
+    branches = ("--branches", "battery=Ibat,string1=I1,string2=I2,-inverter=Iinv")
+    found = json.loads(calibrator("kirchhoff", table, *branches, "--json").stdout)
+    assert found["expected"]["parts_a"]["noise"] == pytest.approx(2.0 * 0.02, rel=0.15)
+    done = calibrator("layout", "init", table, *branches, "--out", layout)
+    assert (done.returncode, layout.read_text().count("timeout_s = 300")) == (0, 4), done.stderr
+    assert f"full_scale_a = {found['full_scale_a']:g}" in layout.read_text()
+    found = json.loads(calibrator("doctor", "--layout", layout, "--log", table, "--json").stdout)
+    assert "calibrate --trusted" in found["ready"]
+    assert [each["code"] for each in found["findings"]] == ["gain"]
+    options = ["--trusted", "battery", "--load", "0:0.05", "--out", tmp_path / "result"]
+    assert calibrator("calibrate", table, "--layout", layout, *options).returncode == 0
+    results = pd.DataFrame(read_results(tmp_path / "result")).set_index("branch")
+    assert results.drift["string1"] == pytest.approx(0.05, abs=0.01)
+    assert results.index[results.applied].to_list() == ["string1"]
+
+
+def test_two_currents_that_close_the_sum_together_are_branches(tmp_path: Path) -> None:
+    found = json.loads(calibrator("layout", "init", solar_plant(tmp_path), "--json").stdout)
+    taken = {each["signal"]: (each["branch"], each["sign"]) for each in found["candidates"]}
+    wanted = {"Ibat": ("battery", 1), "Iinv": ("motor", -1), "I1": ("auxiliary", 1), "I2": ("auxiliary_3", 1)}
+    assert taken == wanted
 
 
 def test_table_has_no_frames_to_replay(place: Path) -> None:

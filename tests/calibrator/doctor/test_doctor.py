@@ -332,7 +332,7 @@ def test_short_log_is_called_so_by_kirchhoff(
     assert short.text in " ".join(shown.split())
     assert "stand still" not in shown
     assert told.findings("stands still") == []
-    assert ("of the sum before" in shown) is (seconds == 40.0)
+    assert ("of the sum measured" in shown) is (seconds == 40.0)
 
 
 def exchange(layout: Path, one: str, other: str) -> None:

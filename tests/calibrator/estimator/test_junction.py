@@ -1,5 +1,7 @@
 """One junction by itself: gains from a sensor that is known, offsets from what tells them, and what stays open."""
 
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +99,8 @@ def test_offset_of_one_of_two_has_two_explanations() -> None:
     assert {*first.offset_a, *second.offset_a} == {"motor", "heater"}
     assert first.probability + second.probability > 0.9
     assert not calibrator.parameters_.corrected.any()
+    (motor,) = [text for text in calibrator.notices_ if "motor: gain" in text]
+    assert re.search(r"offset (\+5\.\d|\+6\.\d) or 0 A: not corrected|offset 0 or \+[56]\.\d A: not corrected", motor)
     deciding = calibrator.vehicles_["vehicle"].parameters.deciding_evidence
     assert "A is of motor or heater: a zero-current window" in deciding
 
@@ -295,6 +299,27 @@ def test_command_writes_what_python_finds(table: Path, tmp_path: Path, motor_off
     rows = pd.read_parquet(out / "results.parquet").set_index("branch")
     here = found(motor_off, trusted=["battery"]).loc["vehicle"]
     assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
+
+
+def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:
+    frame = recording(gain=(0.0, 0.05, 0.0), offset_a=(0.0, -1.5, 0.0), load_a=2.0)
+    frame = frame.rename(columns={"battery": "batterie"})
+    frame.rename_axis("time_s").to_csv(tmp_path / "drive.csv")
+    drive, layout = tmp_path / "drive.csv", write_layout(tmp_path, frame)
+    options = ["--trusted", "batterie", "--trusted", "heater", "--load", "2:0.1", "--out", tmp_path / "result"]
+    said = command("calibrate", drive, "--layout", layout, *options, "--json").stdout
+    found = json.loads(said)
+    assert found["junction_rms_deployed_a"] < 0.5 < 2.0 < found["junction_rms_measured_a"]
+    (parameters,) = (tmp_path / "result" / "params").iterdir()
+    sums = command("kirchhoff", drive, "--layout", layout, "--parameters", parameters)
+    assert "right sensors would sum to 2 +- 0.3" in sums.stdout
+    assert re.search(r"RMSE of the sum about the 2 A expected: 2.\d+ A measured, 0.4\d A corrected", sums.stdout)
+    (share,) = re.findall(r"corrected (\d+) % of the instants", sums.stdout)
+    assert float(share) > 90.0
+    command("report", tmp_path / "result", "--out", tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "Kirchhoff sum after correction about the 2.00 A declared" in page
+    assert "No branch is called" not in page
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def advice(found: FleetEstimate) -> str:
         (
             (of(0.6, drift=(0.1, 0)), of(0.4, drift=(0, -0.2))),
             ("", ""),
-            "a check of the motor sensor against a reference would decide: its gain is off by +0.0% or -20.0%",
+            "a check of the motor sensor against a reference would decide: its gain is off by +0.0 % or -20.0 %",
         ),
         (
             (of(0.5, drift=(0.1, 0)), of(0.5, drift=(0.1, 0))),
@@ -96,12 +96,12 @@ def advice(found: FleetEstimate) -> str:
         (
             (of(0.99, drift=(0.1, 0)), of(0.01, drift=(0, 0.1))),
             ("harm limit", ""),
-            "a check of the battery sensor against a reference would decide: its gain is off by +10.0% or +0.0%",
+            "a check of the battery sensor against a reference would decide: its gain is off by +10.0 % or +0.0 %",
         ),
         (
             (of(1.0, drift=(0.9, 0)),),
             ("beyond the limits", ""),
-            "the battery sensor is off by +90.0% and +0.0 A, beyond the limits of hv.toml: replace the sensor",
+            "the battery sensor is off by +90.0 % and +0.0 A, beyond the limits of hv.toml: replace the sensor",
         ),
         (
             (of(1.0, drift=(0.9, 0)),),
@@ -141,11 +141,11 @@ def test_explanation_in_words_names_sensors_vehicle_and_findings(database: Vehic
     )
     for part in (
         "V7: corrected (confidence 0.97)",
-        "battery: gain error (drift) +10.00%, offset +4.00 A: corrected",
-        "motor: gain error (drift) +20.00% +- 1.00%, offset +0.00 A: not corrected\n",
+        "battery: gain error (drift) +10.00 %, offset +4.00 A: corrected",
+        "motor: gain error (drift) +20.00 % +- 1.00 %, offset +0.00 A: not corrected\n",
         "\n  motor not corrected, because the correction might do harm\n",
-        "differs from its fleet, probability 0.90: hardware: all currents -6.00%; hardware: motor +2.00 A",
-        "0.600  battery sensor: drift +10.00%; motor sensor: drift +20.00%",
+        "differs from its fleet, probability 0.90: hardware: all currents -6.00 %; hardware: motor +2.00 A",
+        "0.600  battery sensor: drift +10.00 %; motor sensor: drift +20.00 %",
         "0.400  no fault",
         "0.80  the motor gain stepped",
         "\na check would decide\n",

@@ -120,7 +120,7 @@ def before(*arguments: object) -> dict[str, Any]:
 def require_sum(found: dict[str, Any]) -> None:
     assert found["battery"]["max_a"] == pytest.approx(100.0, abs=0.5)
     assert found["sum"]["max_a"] == pytest.approx(2.0, abs=0.15)  # two rates are interpolated
-    assert found["full_scale_a"] == 100.0
+    assert found["full_scale_a"] == 200.0
     assert found["valid"] >= ROWS - 3
 
 
