@@ -5,6 +5,8 @@ All that takes time is imported inside a function, so that Ctrl-C and a closed p
 
 import signal
 import sys
+from collections.abc import Callable
+from importlib import import_module
 
 from calibrator.processes.interrupts import ending_at_sigterm, importing, interrupted_message
 from ecu_node.errors import UserError
@@ -37,7 +39,7 @@ def _run() -> int:
     try:
         with importing():
             load_python_can()
-            from calibrator.cli import main as run  # noqa: PLC0415
+            run: Callable[[], int] = import_module("calibrator.cli").main
     except ModuleNotFoundError as error:
         say_error(f"calibrator: {error.name} is not installed; pip install 'hv-current-correction[calibrator]'")
         return 1

@@ -5,13 +5,14 @@ in place and are labelled, so that what was left out can always be counted.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Channel", "Complex", "Drive", "DriveFile", "Equipment", "Mask", "Samples"]
+__all__ = ["Array", "Channel", "Complex", "Drive", "DriveFile", "Equipment", "FleetSource", "Mask", "Samples"]
 
 Array = NDArray[np.floating[Any]]
 """Real numbers; always double precision in practice."""
@@ -137,3 +138,33 @@ class Equipment:
     inputs: tuple[str, ...]
     fleet_inputs: tuple[str, ...]
     notices: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetSource:
+    """A fleet that can be loaded.
+
+    Attributes
+    ----------
+    place : str
+        Path or URL, as the user named it.
+    vehicles : mapping of str to tuple of DriveFile
+        Drives by vehicle, sorted.
+    left_out : mapping of str to str
+        Why a vehicle, or a file where its vehicle is unclear, was left out.
+    sizes : mapping of str to int
+        Size of the drives of each vehicle. [byte]
+    fleet_ids : frozenset of str
+        Artificial fleets that the drives come from, see :mod:`calibrator.drives.fleet_id`; empty if unknown.
+    """
+
+    place: str
+    vehicles: Mapping[str, tuple[DriveFile, ...]]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    fleet_ids: frozenset[str] = frozenset()
+
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        return self.place.rstrip("/").rpartition("/")[2] if "://" in self.place else Path(self.place).resolve().name

@@ -14,6 +14,35 @@ import msgspec
 from ecu_node.documents import field_error, read_user_file, text_digest
 from ecu_node.errors import LayoutError, printable
 
+__all__ = [
+    "LONGEST_PERIOD_S",
+    "MAX_LAYOUT_BYTES",
+    "AutosarProfile",
+    "Branch",
+    "Contactor",
+    "CounterCrc8",
+    "E2EWindow",
+    "EndToEnd",
+    "Input",
+    "Layout",
+    "LayoutKeys",
+    "ProfileP01",
+    "ProfileP02",
+    "ProfileP04",
+    "ProfileP05",
+    "ProfileP06",
+    "ProfileP07",
+    "ProfileP11",
+    "SignalName",
+    "StatusMessage",
+    "UnmeasuredLoad",
+    "file_digest",
+    "joint_digest",
+    "layout_of",
+    "read_layout",
+    "split_signal",
+]
+
 Name = Annotated[str, msgspec.Meta(pattern=r"^[_A-Za-z][_A-Za-z0-9]*\Z", description="a name of letters, digits and _")]
 """A name without blanks."""
 SignalName = Annotated[

@@ -21,7 +21,9 @@ import pyarrow.parquet as pq
 from calibrator.drive import Channel, Drive, DriveFile
 from calibrator.errors import DriveError
 from calibrator.files.storage import Storage, StorageError, open_storage
+from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
+from ecu_node.summary import SummaryFile, decode_summary
 
 __all__ = [
     "DRIVES_FOLDER",
@@ -32,6 +34,7 @@ __all__ = [
     "list_drives",
     "name_problem",
     "read_drive_file",
+    "read_onboard_record",
     "recording_digest",
     "require_plain_name",
     "write_drive",
@@ -240,3 +243,20 @@ def _values(table: pa.Table, column: str, row: int) -> "np.ndarray[tuple[int], n
         zero_copy_only=False
     )
     return values
+
+
+def read_onboard_record(path: Path, database: VehicleDatabase) -> SummaryFile:
+    """Read the record of a node; DriveError if it is damaged, or was made with another layout or DBC."""
+    try:
+        record = decode_summary(path.read_bytes())
+    except OSError as error:
+        raise DriveError(f"{path}: cannot be read: {error.strerror}; copy it again from the vehicle") from None
+    except ValueError as error:
+        raise DriveError(f"{path}: not a node's summary, or damaged: {error}; copy it again") from None
+    for what, its, mine in (
+        ("layout", record.layout_sha256, database.layout.digest),
+        ("DBC", record.dbc_sha256, database.digest),
+    ):
+        if its != mine:
+            raise DriveError(f"{path}: made with another {what} than {database.layout.path}; use the vehicle's own")
+    return record

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from calibrator.compiled import compiled_with_notice
 from calibrator.drive import Array, Mask
 from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces
-from calibrator.estimator.learning import FaultModel, explain, weigh_draws
-from calibrator.estimator.posterior import Draws
+from calibrator.estimator.posterior import Draws, FaultModel, explain, weigh_draws
 from calibrator.score import TOLERANCE
 from ecu_node.parameters import Explanation, SensorFinding
 

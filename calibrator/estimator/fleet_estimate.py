@@ -27,7 +27,8 @@ from calibrator.estimator.evidence import (
     reported_evidence,
     stack_summaries,
 )
-from calibrator.estimator.learning import LEAST_SHARED, FaultModel, centre_rows, learn_fault_models
+from calibrator.estimator.learning import LEAST_SHARED, centre_rows, learn_fault_models
+from calibrator.estimator.posterior import FaultModel
 from calibrator.estimator.prior import Prior
 from calibrator.estimator.readings import FEWEST_TRUSTED, untrusted_vehicles, with_knowledge
 from calibrator.estimator.settings import FEWEST_VEHICLES, HARM_LIMIT

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Equipment, FleetSource
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
 from calibrator.processes.run_many import Workers
 from calibrator.published.state_space import pooled_poles, snr_from_power, solve_scaled
-from calibrator.sources.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment, read_vehicles
+from calibrator.sources.fleet_source import find_fleet, probe_equipment, read_vehicles
 from calibrator.summaries.filter_bank import FilterBank, Poles, low_pass_bank, low_passes
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summarise_fleet import read_samples, read_vehicle_summary

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from calibrator.drive import Array, Channel, Drive
+from calibrator.drive import Array, Channel, Drive, Equipment
 from calibrator.drives.align import base_inputs, choose_inputs
 from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import DriveError, FleetError
@@ -25,7 +25,6 @@ from calibrator.estimator.settings import FEWEST_VEHICLES
 from calibrator.files.layout_files import vehicle_database
 from calibrator.files.storage import open_storage
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S
-from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore

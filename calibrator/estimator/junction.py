@@ -23,7 +23,7 @@ from scipy.linalg import block_diag
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.stats import norm, qmc
 
-from calibrator.drive import Array, Drive, DriveFile, Mask
+from calibrator.drive import Array, Drive, DriveFile, Equipment, FleetSource, Mask
 from calibrator.drives.align import Samples, align, at_pace
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
@@ -47,7 +47,7 @@ from calibrator.estimator.settings import CalibrationSettings
 from calibrator.estimator.vehicle_report import parameters_of, sensor_texts
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.processes.run_many import Workers
-from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, probe_equipment, read_vehicles
+from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import summarise_samples
 from calibrator.summaries.vehicle_summary import VehicleSummary, most_moving_first, require_possible

@@ -14,7 +14,7 @@ each is a model of its own.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -25,9 +25,10 @@ from calibrator.estimator.posterior import (
     GAIN,
     OFFSET,
     Draws,
-    draw_explanations,
+    FaultModel,
+    Spread,
     evidence_of,
-    fit_explanations,
+    explain,
     row_residuals,
     size_evidence,
     weigh,
@@ -44,7 +45,7 @@ from calibrator.estimator.prior import (
     with_slabs,
 )
 
-__all__ = ["LEAST_SHARED", "FaultModel", "Spread", "centre_rows", "explain", "learn_fault_models", "weigh_draws"]
+__all__ = ["LEAST_SHARED", "centre_rows", "learn_fault_models"]
 
 MOST_LEARNT, MOST_STARTED = 200, 60
 """Vehicles that a model is learnt from, and that decide between its starts; more change it less than the faults. [1]"""
@@ -80,8 +81,6 @@ COUNT_VEHICLES = 2.5
 """Weight of the distribution (20) of sparse faults against the fleet's own numbers of faults, in vehicles."""
 USED_FITS = 16
 """Explanations of each vehicle that the model spread is learnt from, the most probable ones."""
-MISFIT_SD = 4.0
-"""Standard deviations of chi square from which on a vehicle's evidence is widened. [1]"""
 LEAST_GROUP, MOST_GROUPS, GROUP_GAIN = 2.0, 2, 5.0
 """Vehicles of a group, number of groups, and what one must gain in log evidence: three vehicles that agree do."""
 LEAST_SHARED_GAIN = (0.3, 0.004)
@@ -94,55 +93,6 @@ TAILS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Shares of faults beyond the bounds that are tried. [1]"""
 SIZE_STARTS = ((0.004, 1.0), (0.03, 0.4), (0.1, 0.2))
 """Bounds from which the prior is climbed again: small faults that combine can stand for large ones that do not."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spread:
-    """What vehicles without any fault differ by in the rows of the evidence: the model spread.
-
-    Attributes
-    ----------
-    mean : ndarray of shape (5K,)
-        Centre of the fleet in each row: what is left of the error of the reference, and the mean unmeasured load. [1]
-    covariance : ndarray of shape (5K, 5K)
-        Over vehicles. [1]
-    dispersion : ndarray of shape (K,)
-        Variance of each intercept over what its blocks show, at least 1: a model errs alike for longer than a block.
-    shared : ndarray of shape (2K + 1,)
-        See :class:`calibrator.estimator.posterior.Evidence`.
-    """
-
-    mean: Array
-    covariance: Array
-    dispersion: Array
-    shared: Array
-
-
-@dataclass(frozen=True, kw_only=True)
-class FaultModel:
-    """One fault model that explains a fleet.
-
-    Attributes
-    ----------
-    probability : float
-        Of this model, over all that are kept.
-    spread : Spread
-        Of vehicles without faults.
-    priors : tuple of (float, Prior)
-        Priors of the faults that explain the fleet about as well, with their probabilities; the first is the best.
-    log_evidence : float
-        Of the vehicles that it was learnt from.
-    """
-
-    probability: float = 1.0
-    spread: Spread
-    priors: tuple[tuple[float, Prior], ...]
-    log_evidence: float = field(default=-np.inf)
-
-    @property
-    def prior(self) -> Prior:
-        """The best prior."""
-        return self.priors[0][1]
 
 
 def centre_rows(branches: int) -> Mask:
@@ -198,40 +148,6 @@ def learn_fault_models(
     best = max((learner.climb(model, ROUNDS, begun=True) for model in climbed), key=lambda model: model.log_evidence)
     models = learner.variants(best)
     return [learner.with_modes(model) for model in sorted(models, key=lambda model: -model.probability)]
-
-
-def explain(rows: EvidenceRows, model: FaultModel, *, feed: int) -> Draws:
-    """Explain vehicles under the best prior and the model spread of a model; their draws are not weighed yet.
-
-    A vehicle that even its best explanation leaves too much of has a wider covariance, in proportion to its chi square
-    (Birge ratio): something about it is not in the model, and nothing about it is known as well as it seems.
-    """
-    prior, spread = model.prior, model.spread
-    n_h, n_s = np.indices(prior.counts.shape)
-    rough = prior.log_supports + 0.5 * (n_h + n_s)  # a slab is about that much denser than the wide Gaussian
-    log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
-    covariance = rows.dispersed(spread.dispersion)[0] + spread.covariance
-
-    def fitted(covariance: Array) -> Draws:
-        evidence = evidence_of(rows.values, covariance, rows.means, centre=spread.mean, shared=spread.shared, feed=feed)
-        return draw_explanations(fit_explanations(evidence, rough, log_load), evidence)
-
-    draws = fitted(covariance)
-    fits = draws.fits
-    score = fits.log_evidence + rough[fits.hardware, fits.sensor] + log_load * fits.support[:, :, -1]
-    best = np.argmax(np.where(np.arange(score.shape[1]) < fits.number[:, None], score, -np.inf), axis=1)
-    picked = (np.arange(len(rows)), best)
-    free = np.maximum(rows.known.sum(axis=1) - fits.support[picked].sum(axis=1), 1.0)
-    bad = fits.chi2[picked] > free + MISFIT_SD * np.sqrt(2.0 * free)
-    if not bad.any():
-        return draws
-    wider = (fits.chi2[picked] / free)[:, None, None]
-    return fitted(np.where(bad[:, None, None], wider, 1.0) * covariance)
-
-
-def weigh_draws(draws: Draws, model: FaultModel) -> Array:
-    """Weights of draws averaged over the priors of a model; see :func:`calibrator.estimator.posterior.weigh`."""
-    return np.asarray(sum(share * weigh(draws, prior)[0] for share, prior in model.priors))
 
 
 class _Learner:

@@ -29,6 +29,7 @@ A vehicle has some ten thousand residuals to evaluate in a millisecond, so the l
 and parameters go by these numbers.
 """
 
+from dataclasses import dataclass, field
 from functools import cache
 from math import exp, expm1, log
 from typing import NamedTuple
@@ -39,13 +40,29 @@ from scipy.stats import norm, qmc
 
 from calibrator.compiled import compiled_with_notice, inner
 from calibrator.drive import Array, Mask
-from calibrator.estimator.evidence import ParameterPlaces, RowPlaces
+from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces, RowPlaces
 from calibrator.estimator.prior import GRID, Prior
 
 __all__ = [
-    "DRAWS", "GAIN", "OFFSET", "WIDE_SD", "Draws", "Evidence", "Fits", "draw_explanations", "evidence_of",
-    "fit_explanations", "residual", "row_residuals", "size_evidence", "weigh",
-]  # fmt: skip
+    "DRAWS",
+    "GAIN",
+    "OFFSET",
+    "WIDE_SD",
+    "Draws",
+    "Evidence",
+    "FaultModel",
+    "Fits",
+    "Spread",
+    "draw_explanations",
+    "evidence_of",
+    "explain",
+    "fit_explanations",
+    "residual",
+    "row_residuals",
+    "size_evidence",
+    "weigh",
+    "weigh_draws",
+]
 
 Integers = NDArray[np.int64]
 
@@ -75,6 +92,9 @@ GAIN, OFFSET, LOAD = 0, 1, 2
 """Rows of ``Prior.log_density``."""
 LOG_FIRST, LOG_STEP = float(np.log(GRID[0])), float(np.log(GRID[1] / GRID[0]))
 LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
+
+MISFIT_SD = 4.0
+"""Standard deviations of chi square from which on a vehicle's evidence is widened. [1]"""
 
 
 class Evidence(NamedTuple):
@@ -634,3 +654,86 @@ def _size_evidence(draws: Draws, prior: _Tables, kind: int, candidates: Array, e
                             total[c] += exp(value[c] - peak[c])
         for c in range(C):
             evidence[c] += peak[c] + log(total[c])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """What vehicles without any fault differ by in the rows of the evidence: the model spread.
+
+    Attributes
+    ----------
+    mean : ndarray of shape (5K,)
+        Centre of the fleet in each row: what is left of the error of the reference, and the mean unmeasured load. [1]
+    covariance : ndarray of shape (5K, 5K)
+        Over vehicles. [1]
+    dispersion : ndarray of shape (K,)
+        Variance of each intercept over what its blocks show, at least 1: a model errs alike for longer than a block.
+    shared : ndarray of shape (2K + 1,)
+        See :class:`calibrator.estimator.posterior.Evidence`.
+    """
+
+    mean: Array
+    covariance: Array
+    dispersion: Array
+    shared: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultModel:
+    """One fault model that explains a fleet.
+
+    Attributes
+    ----------
+    probability : float
+        Of this model, over all that are kept.
+    spread : Spread
+        Of vehicles without faults.
+    priors : tuple of (float, Prior)
+        Priors of the faults that explain the fleet about as well, with their probabilities; the first is the best.
+    log_evidence : float
+        Of the vehicles that it was learnt from.
+    """
+
+    probability: float = 1.0
+    spread: Spread
+    priors: tuple[tuple[float, Prior], ...]
+    log_evidence: float = field(default=-np.inf)
+
+    @property
+    def prior(self) -> Prior:
+        """The best prior."""
+        return self.priors[0][1]
+
+
+def explain(rows: EvidenceRows, model: FaultModel, *, feed: int) -> Draws:
+    """Explain vehicles under the best prior and the model spread of a model; their draws are not weighed yet.
+
+    A vehicle that even its best explanation leaves too much of has a wider covariance, in proportion to its chi square
+    (Birge ratio): something about it is not in the model, and nothing about it is known as well as it seems.
+    """
+    prior, spread = model.prior, model.spread
+    n_h, n_s = np.indices(prior.counts.shape)
+    rough = prior.log_supports + 0.5 * (n_h + n_s)  # a slab is about that much denser than the wide Gaussian
+    log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
+    covariance = rows.dispersed(spread.dispersion)[0] + spread.covariance
+
+    def fitted(covariance: Array) -> Draws:
+        evidence = evidence_of(rows.values, covariance, rows.means, centre=spread.mean, shared=spread.shared, feed=feed)
+        return draw_explanations(fit_explanations(evidence, rough, log_load), evidence)
+
+    draws = fitted(covariance)
+    fits = draws.fits
+    score = fits.log_evidence + rough[fits.hardware, fits.sensor] + log_load * fits.support[:, :, -1]
+    best = np.argmax(np.where(np.arange(score.shape[1]) < fits.number[:, None], score, -np.inf), axis=1)
+    picked = (np.arange(len(rows)), best)
+    free = np.maximum(rows.known.sum(axis=1) - fits.support[picked].sum(axis=1), 1.0)
+    bad = fits.chi2[picked] > free + MISFIT_SD * np.sqrt(2.0 * free)
+    if not bad.any():
+        return draws
+    wider = (fits.chi2[picked] / free)[:, None, None]
+    return fitted(np.where(bad[:, None, None], wider, 1.0) * covariance)
+
+
+def weigh_draws(draws: Draws, model: FaultModel) -> Array:
+    """Weights of draws averaged over the priors of a model; see :func:`calibrator.estimator.posterior.weigh`."""
+    return np.asarray(sum(share * weigh(draws, prior)[0] for share, prior in model.priors))

@@ -14,7 +14,7 @@ from itertools import compress
 
 import numpy as np
 
-from calibrator.drive import Array, DriveFile
+from calibrator.drive import Array, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import align
 from calibrator.errors import FleetError
 from calibrator.estimator.results import encode_chunk
@@ -25,7 +25,7 @@ from calibrator.processes.run_many import Workers
 from calibrator.published.classify import ExpectedFaults
 from calibrator.published.recovery import Recovery, calibrate_published
 from calibrator.published.state_space import VehicleModel, identify_vehicle
-from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, probe_equipment, read_vehicles
+from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase

@@ -419,10 +419,7 @@ class CalibrationReport:
         by_branch = {
             "simulation SNR, median, {} [dB]": (details.get("simulation_snr_db", {}), "{:.1f}"),
             "vehicles that agree, {} [%]": (details.get("reference", {}).get("agreeing_share", {}), "{:.0%}"),
-            "faultless vehicles differ by, {} [%]": (
-                details.get("hyperparameters", {}).get("model_spread", {}),
-                "{:.1%}",
-            ),
+            "faultless vehicles differ by, {} [%]": (spread, "{:.1%}"),
         }
         rows = [
             ("vehicles calibrated", f"{run.vehicles}"),

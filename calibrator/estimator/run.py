@@ -19,6 +19,7 @@ from typing import TypeAlias
 import msgspec
 from threadpoolctl import threadpool_limits
 
+from calibrator.drive import Equipment, FleetSource
 from calibrator.drives.store import DRIVES_FOLDER
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
@@ -44,13 +45,7 @@ from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import Storage, open_storage
 from calibrator.options import Method
 from calibrator.processes.run_many import Workers, run_many
-from calibrator.sources.fleet_source import (
-    LOGS_FOLDER,
-    Equipment,
-    FleetSource,
-    find_fleet,
-    probe_equipment,
-)
+from calibrator.sources.fleet_source import LOGS_FOLDER, find_fleet, probe_equipment
 from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore, open_store

@@ -97,7 +97,7 @@ class Experiment:
     note : str
         What is to be known of the settings.
     picture : str
-        Kind of its picture, see :mod:`calibrator.experiments.picture`.
+        Kind of its picture, see :mod:`calibrator.experiments.pages`.
     shown : tuple of str
         Figures, besides the recovery rate, that its table shows of the default, by the names of
         :data:`calibrator.experiments.figures.FIGURES`.

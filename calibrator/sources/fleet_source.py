@@ -9,16 +9,23 @@ vehicles whose name stands for two folders, and drives that two files claim, are
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TypeVar
 
-from calibrator.drive import Drive, DriveFile, Equipment
+from calibrator.drive import Drive, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.fleet_id import read_fleet_ids
-from calibrator.drives.store import DRIVES_FOLDER, is_drive_file, is_plain_name, name_problem, read_drive_file
+from calibrator.drives.store import (
+    DRIVES_FOLDER,
+    is_drive_file,
+    is_plain_name,
+    name_problem,
+    read_drive_file,
+    read_onboard_record,
+)
 from calibrator.errors import DriveError, FleetError, LogError
 from calibrator.files.storage import Entry, Storage, is_url, local_copy, open_storage, walk
 from calibrator.processes.run_many import Failed, Workers, try_many, try_many_shown
@@ -29,17 +36,15 @@ from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import few, few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
-from ecu_node.summary import SUFFIX, SummaryFile, decode_summary
+from ecu_node.summary import SUFFIX
 
 __all__ = [
     "Equipment",
-    "FleetSource",
     "find_fleet",
     "find_logs",
     "is_onboard",
     "load_drive",
     "probe_equipment",
-    "read_onboard_record",
     "read_vehicles",
 ]
 
@@ -47,36 +52,6 @@ _Vehicle = TypeVar("_Vehicle")
 LOGS_FOLDER = "logs"
 PROBED_VEHICLES = 7
 """How many vehicles are looked at to learn which branches and inputs the fleet has."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FleetSource:
-    """A fleet that can be loaded.
-
-    Attributes
-    ----------
-    place : str
-        Path or URL, as the user named it.
-    vehicles : mapping of str to tuple of DriveFile
-        Drives by vehicle, sorted.
-    left_out : mapping of str to str
-        Why a vehicle, or a file where its vehicle is unclear, was left out.
-    sizes : mapping of str to int
-        Size of the drives of each vehicle. [byte]
-    fleet_ids : frozenset of str
-        Artificial fleets that the drives come from, see :mod:`calibrator.drives.fleet_id`; empty if unknown.
-    """
-
-    place: str
-    vehicles: Mapping[str, tuple[DriveFile, ...]]
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    sizes: Mapping[str, int] = field(default_factory=dict)
-    fleet_ids: frozenset[str] = frozenset()
-
-    @property
-    def name(self) -> str:
-        """Name of its folder."""
-        return self.place.rstrip("/").rpartition("/")[2] if is_url(self.place) else Path(self.place).resolve().name
 
 
 _Place = Storage | list[DriveFile]
@@ -280,23 +255,6 @@ def _by_name(drives: Iterable[DriveFile]) -> dict[str, list[DriveFile]]:
 def is_onboard(entry: DriveFile) -> bool:
     """Whether a file is the record of a node's own summary, which has no samples."""
     return entry.place.endswith(SUFFIX)
-
-
-def read_onboard_record(path: Path, database: VehicleDatabase) -> SummaryFile:
-    """Read the record of a node; DriveError if it is damaged, or was made with another layout or DBC."""
-    try:
-        record = decode_summary(path.read_bytes())
-    except OSError as error:
-        raise DriveError(f"{path}: cannot be read: {error.strerror}; copy it again from the vehicle") from None
-    except ValueError as error:
-        raise DriveError(f"{path}: not a node's summary, or damaged: {error}; copy it again") from None
-    for what, its, mine in (
-        ("layout", record.layout_sha256, database.layout.digest),
-        ("DBC", record.dbc_sha256, database.digest),
-    ):
-        if its != mine:
-            raise DriveError(f"{path}: made with another {what} than {database.layout.path}; use the vehicle's own")
-    return record
 
 
 def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:

@@ -6,8 +6,8 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
+from calibrator.drives.store import read_onboard_record
 from calibrator.errors import DriveError
-from calibrator.sources.fleet_source import read_onboard_record
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.moments import LEVEL_EDGES_A, DriveSummary, FitSums
 from calibrator.summaries.vehicle_summary import VehicleSummary

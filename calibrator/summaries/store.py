@@ -13,11 +13,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrator.drive import Equipment
+from calibrator.drive import Equipment, FleetSource
 from calibrator.drives.store import is_plain_name
 from calibrator.errors import FleetError
 from calibrator.files.storage import Storage, open_storage
-from calibrator.sources.fleet_source import FleetSource
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity, bucket_of, read_identity, store_identity, write_identity
 from calibrator.summaries.record import Outline, Record, decode_records, encode_records

@@ -13,18 +13,12 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from calibrator.drive import Drive, DriveFile, Equipment
+from calibrator.drive import Drive, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import Samples
 from calibrator.drives.store import recording_digest
 from calibrator.files.storage import local_copy, open_storage
 from calibrator.processes.run_many import Failed, Workers, try_many_shown
-from calibrator.sources.fleet_source import (
-    FleetSource,
-    find_fleet,
-    is_onboard,
-    load_drive,
-    probe_equipment,
-)
+from calibrator.sources.fleet_source import find_fleet, is_onboard, load_drive, probe_equipment
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.onboard import read_onboard

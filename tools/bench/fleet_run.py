@@ -28,14 +28,13 @@ from bench.row import LAYOUT, MEBIBYTE, Row
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.simulate import FleetPlan, draw_vehicles, simulate_fleet, trip_of, vehicle_drive
 from calibrator.artificial.trips import BuiltinTrips
-from calibrator.drive import Array, Drive
+from calibrator.drive import Array, Drive, Equipment
 from calibrator.drives.delays import BranchDelays
 from calibrator.drives.store import write_drive
 from calibrator.experiments.recorded_trips import RecordedCase, builtin_fleet, record_vehicles
 from calibrator.faults import Faults
 from calibrator.files.storage import open_storage
 from calibrator.processes.run_many import Workers, run_many
-from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record

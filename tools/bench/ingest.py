@@ -21,11 +21,11 @@ from threadpoolctl import threadpool_limits
 from bench.row import LAYOUT, Row, run
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
-from calibrator.drive import Channel, DriveFile
+from calibrator.drive import Channel, DriveFile, Equipment
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import list_drives, write_drive
 from calibrator.recordings.readers import read_recording
-from calibrator.sources.fleet_source import Equipment, load_drive
+from calibrator.sources.fleet_source import load_drive
 from calibrator.summaries.summarise_fleet import read_vehicle_summary
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout, split_signal

@@ -17,7 +17,8 @@ from bench.row import Row, run
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.estimator.decision import estimate_rows
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces, row_design
-from calibrator.estimator.learning import FaultModel, learn_fault_models
+from calibrator.estimator.learning import learn_fault_models
+from calibrator.estimator.posterior import FaultModel
 from calibrator.published.recovery import BasisPursuit
 
 __all__ = ["rows"]

@@ -11,14 +11,13 @@ from typer.testing import CliRunner, Result
 
 from bench.dynamic_vehicles import PERIOD_S
 from calibrator.cli import app
-from calibrator.drive import Array, Channel, Drive, DriveFile, Mask
+from calibrator.drive import Array, Channel, Drive, DriveFile, Equipment, Mask
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.published_fleet import read_vehicle_model
 from calibrator.faults import corrected_currents
 from calibrator.files.parameter_files import current_moments, junction_residual
 from calibrator.published.state_space import VehicleModel
-from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.filter_bank import low_pass_bank, read_bank
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import read_layout

@@ -8,7 +8,8 @@ import pytest
 from calibrator.drive import Array
 from calibrator.estimator import learning
 from calibrator.estimator.evidence import EvidenceRows, RowPlaces
-from calibrator.estimator.learning import FaultModel, Spread, explain, learn_fault_models
+from calibrator.estimator.learning import learn_fault_models
+from calibrator.estimator.posterior import FaultModel, Spread, explain
 from calibrator.estimator.prior import Prior, first_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults

@@ -16,7 +16,7 @@ from calibrator.drive import Array
 from calibrator.experiments.experiments import EXPERIMENTS, ExperimentResult
 from calibrator.experiments.figures import figure_rows
 from calibrator.experiments.methods import PERFECT, POSTERIOR
-from calibrator.experiments.picture import draw_result
+from calibrator.experiments.pages import draw_result
 from calibrator.experiments.runner import pool_confidences
 
 BIASES = ("0", "0.2", "0.4", "0.5")

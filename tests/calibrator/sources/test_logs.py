@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from calibrator.sources.fleet_source import FleetSource, find_logs
+from calibrator.drive import FleetSource
+from calibrator.sources.fleet_source import find_logs
 
 
 def drives(found: FleetSource) -> list[tuple[str, str]]:

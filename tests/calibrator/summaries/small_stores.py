@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.artificial.random_fleet import draw_faults
+from calibrator.drive import Equipment
 from calibrator.drives.delays import BranchDelays
 from calibrator.faults import Faults
 from calibrator.files.storage import Storage, open_storage
-from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity, store_identity, write_identity
 from calibrator.summaries.moments import BLOCK_S, DriveSummary

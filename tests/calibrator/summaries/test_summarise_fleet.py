@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.drive import Channel, Drive
+from calibrator.drive import Channel, Drive, Equipment
 from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
 from calibrator.files.storage import open_storage
 from calibrator.processes.run_many import Workers
-from calibrator.sources.fleet_source import Equipment, find_fleet
+from calibrator.sources.fleet_source import find_fleet
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore, open_store
 from calibrator.summaries.summarise_fleet import SummariseReport, add_drives

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.drive import Channel, Drive
+from calibrator.drive import Channel, Drive, Equipment
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
-from calibrator.sources.fleet_source import Equipment, find_fleet
+from calibrator.sources.fleet_source import find_fleet
 from calibrator.summaries.summarise_fleet import read_vehicle_summary
 from ecu_node.database import VehicleDatabase
 
