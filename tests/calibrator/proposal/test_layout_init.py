@@ -388,7 +388,7 @@ def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
 
 def test_named_branches_are_written_without_a_guess(table: Path) -> None:
     layout = found(table, "--branches", "-battery=Batteriestrom,-motor=Motorstrom [A]")
-    assert layout.path.read_text().count("# confirm:") == 1  # full scale
+    assert layout.path.read_text().count("# confirm:") == 2  # full scale, voltage
     assert [(b.name, b.source, b.sign) for b in layout.branch] == [
         ("battery", "Batteriestrom [A]", -1),
         ("motor", "Motorstrom [A]", -1),

@@ -176,7 +176,7 @@ def test_whole_numbers_without_a_unit_are_what_makes_a_recording(
 LAYOUT = """
 schema = 1
 name = "car"
-full_scale_a = 100
+full_scale_a = 200
 branch = [
     { name = "battery", signal = "Ibat", sign = 1 },
     { name = "motor", signal = "Imot", sign = -1 },
