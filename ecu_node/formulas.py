@@ -7,14 +7,13 @@ negative(x) = min(x, 0), abs(x), and sqrt(x) of x >= 0. The text is never given 
 import ast
 import math
 import operator
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
 
 from ecu_node.errors import LayoutError
-from ecu_node.layout import LayoutKeys
 
-__all__ = ["FUNCTIONS", "base_inputs", "formula_names", "formula_value", "parse_formula"]
+__all__ = ["FUNCTIONS", "formula_names", "formula_value", "parse_formula"]
 
 
 def _quotient(x: float, y: float) -> float:
@@ -78,16 +77,6 @@ def formula_names(tree: ast.expr) -> list[str]:
     """Names of the inputs that a formula uses, sorted."""
     called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
     return sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and id(node) not in called})
-
-
-def base_inputs(layout: LayoutKeys, names: Collection[str]) -> set[str]:
-    """Recorded inputs that inputs and derived inputs of these names are made of."""
-    found = set(names)
-    for item in reversed(layout.derived):
-        if item.name in found:
-            found.remove(item.name)
-            found.update(formula_names(parse_formula(item.formula)))
-    return found
 
 
 def formula_value(

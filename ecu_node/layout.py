@@ -5,7 +5,7 @@ protected, timeouts and limits. All later steps use the names given here; the DB
 """
 
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +13,7 @@ import msgspec
 
 from ecu_node.documents import field_error, read_user_file, text_digest
 from ecu_node.errors import LayoutError, printable
+from ecu_node.formulas import formula_names, parse_formula
 
 __all__ = [
     "LONGEST_PERIOD_S",
@@ -402,6 +403,15 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
     def protection(self, message: str) -> EndToEnd | None:
         """How a message is protected; None if it is not."""
         return next((entry for _, entry in self.protections if message in entry.messages), None)
+
+    def base_inputs(self, names: Collection[str]) -> set[str]:
+        """Recorded inputs that inputs and derived inputs of these names are made of."""
+        found = set(names)
+        for item in reversed(self.derived):
+            if item.name in found:
+                found.remove(item.name)
+                found.update(formula_names(parse_formula(item.formula)))
+        return found
 
 
 class Layout(LayoutKeys, frozen=True, kw_only=True):

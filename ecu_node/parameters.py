@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.core.status import Reason, UnfitError
 from ecu_node.database import VehicleDatabase
 from ecu_node.documents import UnsuitableFileError, field_error, read_json, read_user_file, write_atomically
@@ -163,6 +164,13 @@ class VehicleParameters(Struct, frozen=True, kw_only=True, forbid_unknown_fields
     findings: Annotated[list[SensorFinding], Meta(max_length=64, description="what a workshop should look at")] = []
     junction_residual: JunctionResidual
     provenance: Provenance
+
+    def fault(self, branch: str) -> SensorFault:
+        """What is corrected on one branch; NO_FAULT where nothing is applied."""
+        found = self.branches.get(branch)
+        return (
+            SensorFault(drift=found.drift, offset_a=found.offset_a) if found is not None and found.apply else NO_FAULT
+        )
 
 
 def read_parameters(path: Path) -> VehicleParameters:

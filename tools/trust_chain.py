@@ -34,7 +34,7 @@ from calibrator.terminal.options import (
 )
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps, table
-from ecu_node.bus.wiring import InForce, Mode, branch_signals, key_of, sensor_fault, wire
+from ecu_node.bus.wiring import Mode, branch_signals, key_of, wire
 from ecu_node.core.signals import Codes, FrameKey
 from ecu_node.core.status import State
 from ecu_node.database import read_database
@@ -244,7 +244,7 @@ def _is_worse(errors_a: Mapping[str, float]) -> bool:
 def _makes_worse(parameters: VehicleParameters, traces: Mapping[str, pd.DataFrame]) -> bool:
     """Whether a set would make a branch worse."""
     for name, trace in traces.items():
-        fault = sensor_fault(InForce(parameters=parameters), name)
+        fault = parameters.fault(name)
         published = (trace["measured"] - fault.offset_a) / (1.0 + fault.drift)
         if fault.applied and _is_worse(_errors_a(trace.assign(published=published))):
             return True

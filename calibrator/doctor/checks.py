@@ -10,7 +10,7 @@ import numpy as np
 
 from calibrator.doctor.facts import Facts
 from calibrator.drive import Drive
-from calibrator.drives.align import base_inputs, choose_inputs
+from calibrator.drives.align import choose_inputs
 from calibrator.estimator.junction import summarise_junction
 from calibrator.findings import Finding, worst_first
 from calibrator.kirchhoff.findings import Findings, error, hint, sum_findings, times, warning
@@ -194,7 +194,7 @@ def _for_fleet(facts: Facts) -> str:
         return "the layout has no model_inputs ([[input]], [[derived]])"
     kept, lacking = choose_inputs(layout, available)
     if not kept:
-        names = ", ".join(sorted(base_inputs(layout, lacking) - available))
+        names = ", ".join(sorted(layout.base_inputs(lacking) - available))
         return f"none of the model_inputs is recorded ({names})"
     if problem := too_slow(facts.junction.database.layout.period_s):
         return problem

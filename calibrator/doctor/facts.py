@@ -11,7 +11,6 @@ import pandas as pd
 from cantools.database.can import Signal
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.align import base_inputs
 from calibrator.errors import LogError
 from calibrator.kirchhoff.junction import Junction, look_at_junction
 from calibrator.kirchhoff.sums import with_voltages
@@ -107,7 +106,7 @@ def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
         If DBC or a log cannot be read at all, or the DBC lacks a signal.
     """
     database = read_database(layout)
-    extended, needed = with_voltages(database), base_inputs(layout, layout.model_inputs)
+    extended, needed = with_voltages(database), layout.base_inputs(layout.model_inputs)
     logs = [_read(path, extended) for path in paths]
     drives = [log.drive for log in logs if isinstance(log.drive, Drive)]
     items: list[Branch | Input] = [*layout.branch, *layout.input]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calibrator.compiled import compiled, inner
 from calibrator.drive import Array, Channel, Drive, Mask, Samples
 from calibrator.errors import DriveError
-from ecu_node.formulas import FUNCTIONS, base_inputs, formula_value, parse_formula
+from ecu_node.formulas import FUNCTIONS, formula_value, parse_formula
 from ecu_node.layout import Layout
 from ecu_node.summary import TIME_RESOLUTION_S
 
@@ -28,7 +28,6 @@ __all__ = [
     "align_channels",
     "at_instants",
     "at_pace",
-    "base_inputs",
     "choose_inputs",
     "evaluate_formula",
 ]
@@ -70,7 +69,7 @@ def choose_inputs(
         Those whose recorded inputs are all available, and the others.
     """
     wanted = layout.model_inputs if names is None else names
-    kept = tuple(name for name in wanted if base_inputs(layout, [name]) <= set(available))
+    kept = tuple(name for name in wanted if layout.base_inputs([name]) <= set(available))
     return kept, tuple(name for name in wanted if name not in kept)
 
 
@@ -127,7 +126,7 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
         If a channel is missing, has no good sample, or the channels have no instant in common.
     """
     names = tuple(layout.model_inputs if inputs is None else inputs)
-    recorded = sorted(base_inputs(layout, names))
+    recorded = sorted(layout.base_inputs(names))
     missing = [name for name in branches if name not in drive.branches]
     missing += [name for name in recorded if name not in drive.inputs]
     if missing:
@@ -143,7 +142,7 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
     )
     recorded_inputs = {name: value for name, value in values.items() if name not in branches}
     for item in layout.derived:
-        if base_inputs(layout, [item.name]) <= recorded_inputs.keys():
+        if layout.base_inputs([item.name]) <= recorded_inputs.keys():
             recorded_inputs[item.name] = evaluate_formula(item.formula, recorded_inputs)
     matrix = np.column_stack([np.zeros((len(time_s), 0)), *(recorded_inputs[name] for name in names)])
     valid = np.all(np.isfinite(matrix), axis=1) & ~(reasons[_STALE] | reasons[_NOT_GOOD])

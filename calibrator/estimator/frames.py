@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive, Equipment
-from calibrator.drives.align import base_inputs, choose_inputs
+from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.settings import FEWEST_VEHICLES
@@ -195,7 +195,7 @@ def summarise_frames(
     """
     recordings = _recordings(frames, fewest=2)
     chosen = _chosen_inputs(recordings, junction, inputs)
-    columns = (*junction.branches, *sorted(base_inputs(junction.layout, chosen) if junction.layout else chosen))
+    columns = (*junction.branches, *sorted(junction.layout.base_inputs(chosen) if junction.layout else chosen))
     drives, database = _drives(recordings, junction, columns, inputs=chosen)
     _require_amperes(drives, junction)
     equipment = Equipment(branches=tuple(junction.branches), inputs=chosen, fleet_inputs=chosen, notices=())
@@ -301,7 +301,7 @@ def _chosen_inputs(
     else:
         usual = tuple(name for name in first.frame.columns if name not in branches)
     chosen = usual if inputs is None else tuple(inputs)
-    needed = [*branches, *(chosen if layout is None else sorted(base_inputs(layout, chosen)))]
+    needed = [*branches, *(chosen if layout is None else sorted(layout.base_inputs(chosen)))]
     for each in recordings:
         more = sorted(set(each.frame.columns) - set(needed))
         if more and layout is None and inputs is None:

@@ -50,8 +50,13 @@ from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import summarise_samples
-from calibrator.summaries.vehicle_summary import VehicleSummary, most_moving_first, require_possible
-from calibrator.summaries.zero_current import weighted_mean, zero_current_offsets
+from calibrator.summaries.vehicle_summary import (
+    VehicleSummary,
+    most_moving_first,
+    require_possible,
+    weighted_mean,
+    zero_current_offsets,
+)
 from calibrator.terminal.progress import progress_bar
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError

@@ -19,8 +19,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
-from calibrator.summaries.vehicle_summary import VehicleSummary
-from calibrator.summaries.zero_current import weighted_mean
+from calibrator.summaries.vehicle_summary import VehicleSummary, weighted_mean
 from calibrator.terminal.text import few
 from ecu_node.layout import UnmeasuredLoad
 

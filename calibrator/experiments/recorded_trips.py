@@ -16,7 +16,7 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.simulate import Vehicle, vehicle_drive
 from calibrator.artificial.trips import GroundTruth, balance_branch, choose_branches, read_recorded_trips, with_branches
 from calibrator.drive import Array
-from calibrator.drives.align import Samples, align, base_inputs, choose_inputs, evaluate_formula
+from calibrator.drives.align import Samples, align, choose_inputs, evaluate_formula
 from calibrator.drives.delays import estimate_delays, without_delays
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
@@ -119,7 +119,7 @@ class RecordedFleet:
         """The same with their values, each of shape (T,)."""
         layout, values = self.database.layout, dict(trip.inputs)
         for item in layout.derived:
-            if base_inputs(layout, [item.name]) <= values.keys():
+            if layout.base_inputs([item.name]) <= values.keys():
                 values[item.name] = evaluate_formula(item.formula, values)
         return {name: values[name] for name in self.input_names(trip.inputs)}
 

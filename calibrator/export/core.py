@@ -26,7 +26,6 @@ from ecu_node.bus.wiring import (
     key_of,
     received,
     rewritten,
-    sensor_fault,
     wire,
 )
 from ecu_node.core.correction import SensorFault, correction_plan
@@ -101,7 +100,7 @@ class Checked:
 
     def fault(self, branch: str) -> SensorFault:
         """What the node corrects on a branch; :data:`~ecu_node.core.correction.NO_FAULT` where it passes it through."""
-        return sensor_fault(InForce(parameters=self.parameters), branch)
+        return self.parameters.fault(branch)
 
 
 def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> Checked:

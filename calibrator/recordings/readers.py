@@ -16,7 +16,7 @@ from cantools.database.can import Message
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.align import at_instants, base_inputs, evaluate_formula
+from calibrator.drives.align import at_instants, evaluate_formula
 from calibrator.errors import LogError
 from calibrator.recordings.decode import decode_signal, message_is_sound, signal_range
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S, EXTENDED_BIT, Frames, frame_key, repaired_time
@@ -250,7 +250,7 @@ class SignalSource(ABC):
         """A branch by its formula, at the instants of what comes most often in it."""
         layout, names = self.database.layout, formula_names(parse_formula(formula))
         signals = {item.name: item.signal for item in layout.input}
-        channels = {name: self.samples(signals.get(name, name))[0] for name in base_inputs(layout, names)}
+        channels = {name: self.samples(signals.get(name, name))[0] for name in layout.base_inputs(names)}
         if not channels or not all(channel.good.any() for channel in channels.values()):
             return _NOTHING
         time_s = max(channels.values(), key=lambda channel: len(channel.time_s)).time_s
@@ -259,7 +259,7 @@ class SignalSource(ABC):
             values[name], known = at_instants(channel, time_s, branch.timeout_s)
             good &= known
         for item in layout.derived:
-            if base_inputs(layout, [item.name]) <= values.keys():
+            if layout.base_inputs([item.name]) <= values.keys():
                 values[item.name] = evaluate_formula(item.formula, values)
         value = branch.sign * evaluate_formula(formula, values)
         return Channel(time_s=time_s, value=value, good=good & np.isfinite(value))

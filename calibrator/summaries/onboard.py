@@ -10,8 +10,7 @@ from calibrator.drives.store import read_onboard_record
 from calibrator.errors import DriveError
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.moments import LEVEL_EDGES_A, DriveSummary, FitSums
-from calibrator.summaries.vehicle_summary import VehicleSummary
-from calibrator.summaries.zero_current import ZeroCurrent
+from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.database import VehicleDatabase
 from ecu_node.summary import SummaryFile, unpacked
 

@@ -23,8 +23,7 @@ from calibrator.drives.store import require_plain_name
 from calibrator.errors import DriveError, FleetError
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.moments import LEVEL_EDGES_A, DriveSummary, FitSums
-from calibrator.summaries.vehicle_summary import VehicleSummary, added_summaries, too_short
-from calibrator.summaries.zero_current import ZeroCurrent
+from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent, added_summaries, too_short
 from calibrator.terminal.text import counted
 
 __all__ = ["SCHEMA", "Outline", "Record", "decode_records", "drives_digest", "encode_records", "joined_records"]

@@ -33,7 +33,7 @@ from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase, codes_of_no_value
 from ecu_node.documents import write_atomically
 from ecu_node.errors import LayoutError, UserError
-from ecu_node.formulas import base_inputs, formula_value, parse_formula
+from ecu_node.formulas import formula_value, parse_formula
 from ecu_node.layout import Layout
 from ecu_node.parameters import VehicleParameters
 from ecu_node.summary import SummaryFile, encode_summary, packed
@@ -337,7 +337,7 @@ class OnBoardSummary:
     def _read_all(self) -> None:
         """Say what is read: inputs, temperature of the sensors, state of the contactors, and the branches."""
         layout, database = self._database.layout, self._database
-        wanted = base_inputs(layout, layout.fleet_inputs or layout.model_inputs)
+        wanted = layout.base_inputs(layout.fleet_inputs or layout.model_inputs)
         for item in layout.input:
             if item.name in wanted:
                 self._channels[item.name] = _Channel(layout.max_age_s)
@@ -382,7 +382,7 @@ class OnBoardSummary:
             return False
         recorded = [name for name in fitted if name not in branches]
         wanted = layout.fleet_inputs or layout.model_inputs
-        inputs = [name for name in wanted if base_inputs(layout, [name]) <= {*recorded}]
+        inputs = [name for name in wanted if layout.base_inputs([name]) <= {*recorded}]
         self._finish_job()
         if (recorded, inputs, branches) != (self._recorded, self._inputs, self._branches):
             self._recorded, self._inputs, self._branches = recorded, inputs, branches
@@ -431,7 +431,7 @@ class OnBoardSummary:
     def _columns(self, instants_s: Sequence[float], samples: Mapping[str, _Samples]) -> list[_Column]:
         """Inputs and currents at each instant, up to the end of a block; NaN in all where one has no value."""
         names, layout = [*self._recorded, *self._branches], self._database.layout
-        derived = [item for item in layout.derived if base_inputs(layout, [item.name]) <= {*self._recorded}]
+        derived = [item for item in layout.derived if layout.base_inputs([item.name]) <= {*self._recorded}]
         rows: list[_Column] = []
         aligned = [_aligned(samples[name], instants_s, self._channels[name].limit_s) for name in names]
         for each in zip(*aligned, strict=True):

@@ -37,7 +37,6 @@ from ecu_node.bus.wiring import (
     received,
     require_fd,
     rewritten,
-    sensor_fault,
     transmitted,
     unpublished,
     wire,
@@ -356,7 +355,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
 
 def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce, mode: Mode) -> dict[str, Any]:
     said = in_force.parameters.branches.get(branch.name) if in_force.parameters is not None else None
-    fault, target = sensor_fault(in_force, branch.name), branch.corrected if mode is Mode.OVERLAY else branch.source
+    fault, target = in_force.fault(branch.name), branch.corrected if mode is Mode.OVERLAY else branch.source
     plan = branch_plan(database, branch, fault, mode) if target is not None else None
     return {
         "drift": said.drift if said is not None else 0.0,

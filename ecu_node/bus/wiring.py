@@ -45,7 +45,7 @@ from ecu_node.errors import BusError, DatabaseError, LayoutError
 from ecu_node.layout import Branch, SignalName, split_signal
 from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
 
-__all__ = ["InForce", "Mode", "branch_plan", "choose_parameters", "open_bus", "put_in_force", "sensor_fault", "wire"]
+__all__ = ["InForce", "Mode", "branch_plan", "choose_parameters", "open_bus", "put_in_force", "wire"]
 
 PARAMETER_SETS = 256
 """The status publishes the number of the parameter set modulo this."""
@@ -218,6 +218,10 @@ class InForce:
     parameters: VehicleParameters | None
     reason: Reason = Reason.NONE
 
+    def fault(self, branch: str) -> SensorFault:
+        """What is corrected on one branch; NO_FAULT where the parameters apply none."""
+        return self.parameters.fault(branch) if self.parameters is not None else NO_FAULT
+
 
 def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None) -> tuple[InForce, str | None]:
     """Read parameters, and decide whether they may be applied here.
@@ -248,17 +252,11 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
     return InForce(parameters=parameters), None
 
 
-def sensor_fault(in_force: InForce, branch: str) -> SensorFault:
-    """What is corrected on one branch; NO_FAULT where the parameters apply none."""
-    found = in_force.parameters.branches.get(branch) if in_force.parameters is not None else None
-    return SensorFault(drift=found.drift, offset_a=found.offset_a) if found is not None and found.apply else NO_FAULT
-
-
 def unpublished(database: VehicleDatabase, in_force: InForce, mode: Mode) -> dict[str, str]:
     """Branches with a fault that is not corrected, as an overlay has no signal for it, and what to say of each."""
     hidden = [branch.name for branch in database.layout.branch if mode is Mode.OVERLAY and branch.corrected is None]
     why = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
-    return {name: f"branch {name} is not published: {why}" for name in hidden if sensor_fault(in_force, name).applied}
+    return {name: f"branch {name} is not published: {why}" for name in hidden if in_force.fault(name).applied}
 
 
 def put_in_force(
@@ -283,7 +281,7 @@ def put_in_force(
     found = parameters.branches if parameters is not None else {}
     changes = []  # all plans before the first is put in force: either all or none
     for branch in database.layout.branch:
-        fault, said = sensor_fault(in_force, branch.name), found.get(branch.name)
+        fault, said = in_force.fault(branch.name), found.get(branch.name)
         is_in_place = mode is Mode.GATEWAY or branch.corrected is None
         change = {
             "fault": fault,

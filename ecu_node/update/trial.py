@@ -17,7 +17,6 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ecu_node.bus.wiring import InForce, sensor_fault
 from ecu_node.core.junction import LiveBranch, aligned_currents
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
@@ -58,7 +57,7 @@ class ParameterTrial:
         layout, residual = database.layout, parameters.junction_residual
         self._branches, self._activation, self._margin_a = branches, layout.activation, layout.watch_margin_a
         self._least_current_a = _LEAST_CURRENT_SHARE * layout.full_scale_a
-        self._faults = {name: sensor_fault(InForce(parameters=parameters), name) for name in layout.branch_names}
+        self._faults = {name: parameters.fault(name) for name in layout.branch_names}
         self._delays_s = {name: branch.delay_s or 0.0 for name, branch in parameters.branches.items()}
         self._expected_a = residual.expected_a
         measured_a, corrected_a = residual.about_expected()

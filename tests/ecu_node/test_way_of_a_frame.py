@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ecu_node.bus.wiring import InForce, Mode, branch_plan, sensor_fault, wire
+from ecu_node.bus.wiring import InForce, Mode, branch_plan, wire
 from ecu_node.core.correction import AS_IT_IS
 from ecu_node.core.e2e import Check, Receiver, protection_of
 from ecu_node.core.signals import AMPERE, placed_signal, read_codes
@@ -92,7 +92,7 @@ class Plain:
         self.branches = []
         for branch in database.layout.branch[:2]:
             signal = database.signal(branch.source)[1]
-            fault = sensor_fault(in_force, branch.name)
+            fault = in_force.fault(branch.name)
             corrects = fault.applied
             is_in_place = mode is Mode.GATEWAY or branch.corrected is None
             plan = AS_IT_IS if is_in_place and not corrects else branch_plan(database, branch, fault, mode)

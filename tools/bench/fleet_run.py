@@ -40,8 +40,7 @@ from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.summariser import summarise_samples
-from calibrator.summaries.vehicle_summary import VehicleSummary
-from calibrator.summaries.zero_current import ZeroCurrent
+from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from calibrator.terminal.progress import shown
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.align import Samples, align, align_channels, base_inputs, choose_inputs
+from calibrator.drives.align import Samples, align, align_channels, choose_inputs
 from calibrator.errors import DriveError
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
@@ -133,7 +133,7 @@ def test_model_inputs_that_no_drive_has_are_left_out_and_named(layout: Layout) -
 
 
 def test_base_inputs_are_found_through_derived_ones(layout: Layout) -> None:
-    assert base_inputs(layout, ["copper_loss", "accelerator"]) == {"torque", "voltage", "accelerator"}
+    assert layout.base_inputs(["copper_loss", "accelerator"]) == {"torque", "voltage", "accelerator"}
     doubled = msgspec.structs.replace(layout.derived[0], name="doubled", formula="2 * copper_loss + speed")
     nested = msgspec.structs.replace(layout, derived=[*layout.derived, doubled])
-    assert base_inputs(nested, ["doubled"]) == {"torque", "speed", "voltage"}
+    assert nested.base_inputs(["doubled"]) == {"torque", "speed", "voltage"}

@@ -18,8 +18,7 @@ from calibrator.estimator.readings import (
     read_bench_table,
     untrusted_vehicles,
 )
-from calibrator.summaries.vehicle_summary import VehicleSummary
-from calibrator.summaries.zero_current import ZeroCurrent
+from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.layout import UnmeasuredLoad
 from tests.calibrator.estimator.simulated_drives import no_faults, summaries_of
 

@@ -16,8 +16,7 @@ from calibrator.summaries.identity import StoreIdentity, store_identity, write_i
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
-from calibrator.summaries.vehicle_summary import VehicleSummary
-from calibrator.summaries.zero_current import ZeroCurrent
+from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, summaries_of
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.summaries.zero_current import zero_current_offsets
+from calibrator.summaries.vehicle_summary import zero_current_offsets
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
