@@ -12,7 +12,7 @@ from cantools.database.can import Signal
 
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import LogError
-from calibrator.kirchhoff.junction import Junction, look_at_junction
+from calibrator.kirchhoff.junction import RecordedJunction, look_at_junction
 from calibrator.kirchhoff.sums import with_voltages
 from calibrator.recordings.frame_arrays import repaired_time
 from calibrator.recordings.frames import read_frames
@@ -86,7 +86,7 @@ class Facts:
         - ``bad``: frames that cannot be used, by reason; ``good``: how many can be used;
         - ``low``, ``high``: least and greatest good value, of branches positive into the junction; NaN without any;
         - ``clipped``: good values at an end of what the signal can show, several in a row.
-    junction : Junction
+    junction : RecordedJunction
         The sum of the branches.
     """
 
@@ -94,7 +94,7 @@ class Facts:
     logs: Sequence[ExaminedLog]
     drives: Sequence[Drive]
     channels: pd.DataFrame
-    junction: Junction
+    junction: RecordedJunction
 
 
 def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:

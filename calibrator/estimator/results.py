@@ -39,7 +39,7 @@ from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters, encode_parameters
 
 __all__ = [
-    "MOST_FILES", "PARTS", "SCHEMA", "CalibrationReport", "RunRecord", "Unfinished", "Written", "copy_summaries",
+    "MOST_FILES", "PARTS", "SCHEMA", "CalibrationReport", "RunRecord", "Unfinished", "WrittenVehicle", "copy_summaries",
     "deployed_rms_a", "encode_chunk", "internal_errors", "join_rows", "left_out_of", "part_file", "read_part",
     "read_results", "read_run", "report_of", "unfinished_run", "write_parameter_files", "write_run", "written_of",
 ]  # fmt: skip
@@ -139,7 +139,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     notices: list[str]
 
 
-class Written(NamedTuple):
+class WrittenVehicle(NamedTuple):
     """Parameters of one vehicle as they were written."""
 
     drives: str
@@ -287,7 +287,7 @@ def part_file(result: Path, number: int) -> Path:
     return result / PARTS / f"{number:05d}.parquet"
 
 
-def read_part(path: Path) -> dict[str, Written]:
+def read_part(path: Path) -> dict[str, WrittenVehicle]:
     """Parameters of a part by vehicle, none if there is no such file; FleetError if it is damaged."""
     try:
         rows = pq.ParquetFile(path).read(["vehicle", *_ONCE], use_threads=False)
@@ -295,7 +295,7 @@ def read_part(path: Path) -> dict[str, Written]:
         for row in rows.filter(pc.field("parameters").is_valid()).to_pylist():
             kept = row["evidence_value"] is not None
             evidence = np.array([row[name] for name in _EVIDENCE], float) if kept else None
-            found[row["vehicle"]] = Written(row["drives"], row["parameters"].encode(), evidence)
+            found[row["vehicle"]] = WrittenVehicle(row["drives"], row["parameters"].encode(), evidence)
         return found
     except FileNotFoundError:
         return {}
@@ -303,7 +303,7 @@ def read_part(path: Path) -> dict[str, Written]:
         raise FleetError(f"{path}: damaged part of a result: {_first_line(error)}; calibrate again") from None
 
 
-def written_of(result: Path, vehicle: str) -> Written:
+def written_of(result: Path, vehicle: str) -> WrittenVehicle:
     """Parameters of one vehicle; FleetError if it is no result, or has none of this vehicle."""
     run = read_run(result)
     found = read_part(part_file(result, bucket_of(vehicle, run.buckets) if run.buckets else 0))

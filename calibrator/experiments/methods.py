@@ -22,7 +22,7 @@ from calibrator.published.classify import Classification, FaultTrees, classify_b
 from calibrator.published.recovery import recover_fleet
 
 __all__ = [
-    "BASELINES", "CEILING", "LEFT_IN", "MEANINGS", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Method",
+    "BASELINES", "CEILING", "LEFT_IN", "MEANINGS", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "MethodRow",
     "require_estimate",
 ]  # fmt: skip
 
@@ -31,7 +31,7 @@ ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Method:
+class MethodRow:
     """A row of the methods.
 
     Attributes
@@ -127,13 +127,13 @@ def _baseline(trial: Trial, *, solve: Callable[[Trial], Faults]) -> Estimate:
     return _all_corrected(faults, faults.has_hardware_fault)
 
 
-THRESHOLD = Method("published/threshold", partial(_published, classify=_by_threshold))
-TREE = Method("published/tree", partial(_published, classify=_by_tree))
-PERFECT = Method("published/perfect", partial(_published, classify=_by_truth))
-POSTERIOR = Method("posterior", _posterior)
-CEILING = Method("posterior/law known", partial(_posterior, known=True))
-LEFT_IN = Method("posterior, delays left in", _posterior)
-BASELINES = tuple(Method(name, partial(_baseline, solve=solve)) for name, (solve, _) in SOLVERS.items())
+THRESHOLD = MethodRow("published/threshold", partial(_published, classify=_by_threshold))
+TREE = MethodRow("published/tree", partial(_published, classify=_by_tree))
+PERFECT = MethodRow("published/perfect", partial(_published, classify=_by_truth))
+POSTERIOR = MethodRow("posterior", _posterior)
+CEILING = MethodRow("posterior/law known", partial(_posterior, known=True))
+LEFT_IN = MethodRow("posterior, delays left in", _posterior)
+BASELINES = tuple(MethodRow(name, partial(_baseline, solve=solve)) for name, (solve, _) in SOLVERS.items())
 MEANINGS = {
     **{name: meaning for name, (_, meaning) in SOLVERS.items()},
     POSTERIOR.name: "the default",

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrator.drives.delays import MAX_DELAY_S
 from calibrator.findings import Finding, Severity, worst_first
-from calibrator.kirchhoff.junction import Junction
+from calibrator.kirchhoff.junction import RecordedJunction
 from calibrator.kirchhoff.signs import SURE
 from calibrator.kirchhoff.sums import SUM
 from calibrator.terminal.text import figure
@@ -49,13 +49,13 @@ Findings = Iterator[Finding]
 error, warning, hint = (partial(Finding, severity) for severity in Severity)
 
 
-def sum_findings(junction: Junction) -> list[Finding]:
+def sum_findings(junction: RecordedJunction) -> list[Finding]:
     """All findings of the sum, errors first."""
     checks = [*CHECKS, *(CHECKS_OF_MOVING if junction.moves else ())]
     return worst_first(each for check in checks for each in check(junction))
 
 
-def enough(junction: Junction) -> Findings:
+def enough(junction: RecordedJunction) -> Findings:
     """Whether there is a sum, whether it is long enough, and whether anything moves in it."""
     names, record, valid_s = junction.branches, "record a minute of driving or more", junction.valid_s
     if len(names) < 2:
@@ -87,7 +87,7 @@ def times(factor: float) -> str:
     return f"{1.0 / factor:g} times too large" if factor < 1.0 else f"{factor:g} times too small"
 
 
-def signs_and_units(junction: Junction) -> Findings:
+def signs_and_units(junction: RecordedJunction) -> Findings:
     """Branches with the wrong sign, or a slip of a unit."""
     multipliers, bands, layout = junction.multipliers, junction.bands, junction.database.layout
     if _exchanged(junction):
@@ -118,7 +118,7 @@ def signs_and_units(junction: Junction) -> Findings:
                 yield error(code, name, text, advice, factor if code == "unit" else before_a / max(after_a, 1e-9))
 
 
-def exchanged(junction: Junction) -> Findings:
+def exchanged(junction: RecordedJunction) -> Findings:
     """Branches of which each has the signal that the other is named after."""
     layout, bands = junction.database.layout, junction.bands
     for one, other in _exchanged(junction):
@@ -136,7 +136,7 @@ def exchanged(junction: Junction) -> Findings:
         yield (error if (ratio or 0.0) > CLEAR else warning)("exchanged", one, text, advice, ratio)
 
 
-def _exchanged(junction: Junction) -> list[tuple[str, str]]:
+def _exchanged(junction: RecordedJunction) -> list[tuple[str, str]]:
     said: dict[str, list[set[str]]] = {}
     for branch in junction.database.layout.branch:
         if branch.name in junction.branches and not branch.computed:
@@ -149,7 +149,7 @@ def _exchanged(junction: Junction) -> list[tuple[str, str]]:
     ]
 
 
-def sum_cancels(junction: Junction) -> Findings:
+def sum_cancels(junction: RecordedJunction) -> Findings:
     """Branches that do not belong to one junction."""
     rest_a = junction.bands.rms_a(junction.multipliers)
     all_a, least_a = (float(np.linalg.norm(junction.multipliers * a)) for a in (junction.rms_a, junction.steps_a))
@@ -165,7 +165,7 @@ def sum_cancels(junction: Junction) -> Findings:
         yield error("sum", SUM, text, advice, rest_a)
 
 
-def cannot_tell(junction: Junction) -> Findings:
+def cannot_tell(junction: RecordedJunction) -> Findings:
     """Small branches of which another sign or unit would do nearly as well."""
     rest_a = junction.bands.rms_a(junction.multipliers)
     for k, (name, rms_a) in enumerate(zip(junction.branches, junction.rms_a.tolist(), strict=True)):
@@ -177,7 +177,7 @@ def cannot_tell(junction: Junction) -> Findings:
             yield hint("cannot tell", name, text, "record a drive in which it carries more current", rms_a)
 
 
-def delays(junction: Junction) -> Findings:
+def delays(junction: RecordedJunction) -> Findings:
     """Branches that come late."""
     found = junction.delays
     if found is None:
@@ -199,7 +199,7 @@ def delays(junction: Junction) -> Findings:
             yield say("delay", found.branches[k], text + found.branches[usual], advice, late_s)
 
 
-def gains(junction: Junction) -> Findings:
+def gains(junction: RecordedJunction) -> Findings:
     """The branch whose gain alone would explain most of how the sum varies."""
     for residual in filter(None, (comparison.residual["before"] for comparison in junction.comparisons[:1])):
         alone: dict[str, dict[str, float]] = residual["alone"]
@@ -217,7 +217,7 @@ def gains(junction: Junction) -> Findings:
             yield (warning if far else hint)("gain", name, text, advice, error_)
 
 
-def mean_of_sum(junction: Junction) -> Findings:
+def mean_of_sum(junction: RecordedJunction) -> Findings:
     """What flows where no branch measures it."""
     load, scale_a = junction.database.layout.unmeasured_load, junction.database.layout.full_scale_a
     if not len(junction.sum_a) or (junction.moves and junction.changed):
@@ -235,7 +235,7 @@ def mean_of_sum(junction: Junction) -> Findings:
     yield (warning if unexplained_a > LARGE_MEAN * scale_a else hint)("mean", SUM, text, advice, mean_a)
 
 
-def stuck(junction: Junction) -> Findings:
+def stuck(junction: RecordedJunction) -> Findings:
     """The longest stretch of each branch in which it stands still though the others move."""
     scale_a, longest = junction.database.layout.full_scale_a, dict[str, Finding]()
     for currents_a in (comparison.stages["before"] for comparison in junction.comparisons):
@@ -261,6 +261,6 @@ def stuck(junction: Junction) -> Findings:
     yield from longest.values()
 
 
-CHECKS: Sequence[Callable[[Junction], Findings]] = (enough, exchanged, mean_of_sum, stuck)
+CHECKS: Sequence[Callable[[RecordedJunction], Findings]] = (enough, exchanged, mean_of_sum, stuck)
 CHECKS_OF_MOVING = (signs_and_units, sum_cancels, cannot_tell, delays, gains)
 """What can be told only where currents move long enough."""

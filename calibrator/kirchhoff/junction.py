@@ -21,7 +21,7 @@ from calibrator.words import is_battery
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-__all__ = ["Junction", "look_at_junction"]
+__all__ = ["RecordedJunction", "look_at_junction"]
 
 CHANGE_PRICE, UNIT_PRICE = 0.7, 0.3
 """Each branch that is changed must halve V / N: its variation must then be above that of the sum's rest. The second is
@@ -51,7 +51,7 @@ _SPEEDS, _SPEED_UNITS = ("speed", "velocity", "geschwindigkeit"), {"km/h", "kph"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Junction:
+class RecordedJunction:
     """The K branches with usable values, over recordings of one vehicle.
 
     Attributes
@@ -160,7 +160,7 @@ class Junction:
 
 def look_at_junction(
     drives: Sequence[Drive], database: VehicleDatabase, *, full_scale_a: float | None = None
-) -> Junction:
+) -> RecordedJunction:
     """Look at the sum of the branches that have usable values in some drives of one vehicle.
 
     Parameters
@@ -198,7 +198,7 @@ def look_at_junction(
             on_time = [without_delays(drive, delays.by_branch()) for drive in whole]
             bands = bands_of([[drive.branches[name] for name in names] for drive in on_time])
             best = _multipliers(bands, price, least_a)
-    return Junction(
+    return RecordedJunction(
         database=database,
         branches=names,
         drives=tuple(whole),

@@ -5,13 +5,13 @@ import pytest
 
 from calibrator.experiments.common_drive import CommonCase, common_trial
 from calibrator.experiments.figures import judge
-from calibrator.experiments.methods import BASELINES, Method
+from calibrator.experiments.methods import BASELINES, MethodRow
 from calibrator.experiments.recorded_trips import RecordedCase, recorded_trial
 from calibrator.experiments.trial import Trial
 from tests.calibrator.experiments.small_trials import small_fleet, smooth_drive
 
 
-def rate(method: Method, trial: Trial) -> float:
+def rate(method: MethodRow, trial: Trial) -> float:
     return float(judge(method.estimate(trial), trial)["recovery_rate"].mean())
 
 
@@ -27,7 +27,7 @@ def test_best_subset_lasso_and_median_recover_single_faults() -> None:
 
 
 @pytest.mark.parametrize("baseline", BASELINES[3:], ids=lambda baseline: baseline.name)
-def test_methods_on_the_junction_law_alone_know_ratios_of_gains(baseline: Method) -> None:
+def test_methods_on_the_junction_law_alone_know_ratios_of_gains(baseline: MethodRow) -> None:
     trial = common_trial(smooth_drive(), CommonCase(vehicles=40, sparsity=80.0), 0)
     found = baseline.estimate(trial)
     np.testing.assert_array_equal(found.hardware, False)
