@@ -183,7 +183,8 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
     source = _source(options, database, mode, say)
     corrector = wire(database, source.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
     if options.dry_run:
-        write_output(_dry_run(bus_settings, database, mode))
+        text = _dry_run(bus_settings, database, mode)
+        write_output(text if source.why_not is None else f"{text}\nwould correct nothing: {source.why_not}")
         return 0
     routes = None
     if is_gateway and options.interface == "socketcan":

@@ -148,6 +148,8 @@ def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
         "  reads Pair (0x100), Heater (0x200), Net (0x102)",
         "  sends PairOut (0x200)",
     ]
+    assert main([*node, *adapter, "--bitrate", "250000", "--dry-run", "--params", "none.json"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].startswith("would correct nothing: none.json: no such parameter")
     assert captured.err == ""
     assert main([*node, *adapter, "--dry-run"]) == 1
     assert "no bitrate" in capsys.readouterr().err
