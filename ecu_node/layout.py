@@ -242,7 +242,7 @@ class Branch(_Table, frozen=True, kw_only=True):
 
 
 class Input(_Table, frozen=True, kw_only=True):
-    """One signal that the vehicle model may be driven by."""
+    """One signal beside the currents: it may drive the vehicle model, or tell contactors, temperature or a watch."""
 
     name: Name
     signal: SignalName

@@ -1,1 +1,1 @@
-"""Drives: their store, their common time base, and the fleet they make up."""
+"""Drives: their store, their common time base, and their delays."""

@@ -205,7 +205,7 @@ def stack_summaries(summaries: Sequence[DriveSummary], order: Sequence[int] | No
     Returns
     -------
     FleetMoments
-        Without extra columns.
+        Of the branches in that order.
 
     Raises
     ------

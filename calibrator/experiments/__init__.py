@@ -1,1 +1,1 @@
-"""Experiments of the paper, run on any method; each is a function that returns a frozen, JSON-able result."""
+"""Experiments of the paper and ours: each is a row of a table, run by one runner with any methods."""

@@ -65,7 +65,7 @@ class RecordedJunction:
     comparisons : tuple of Comparison
         Their currents, each on one time base; none with fewer than two branches.
     steps_a : ndarray of shape (K,)
-        Step of the signal of each branch, at most :data:`COARSEST`. [A]
+        Step of the signal of each branch, at most the share :data:`COARSEST` of full scale. [A]
     bands : Bands
         Comparable currents as the layout has them, but for the delays; of no instant where too little was recorded.
     multipliers : ndarray of shape (K,)

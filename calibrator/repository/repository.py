@@ -199,8 +199,8 @@ class Repository:
 
         Raises
         ------
-        ParameterError
-            If one is no parameter file, or does not fit; nothing is staged then.
+        ParameterError, RepositoryStateError
+            If one is no parameter file, does not fit, or is a second one of its vehicle; nothing is staged then.
         """
         expires = (datetime.now(UTC) + timedelta(days=days)).replace(microsecond=0)
         bins: dict[str, list[_File]] = defaultdict(list)

@@ -306,7 +306,7 @@ class Node:
             self._latency.came(time_s)
 
     def _pass_on(self, message: can.Message, now_s: float, ahead_s: float) -> None:
-        """Gateway: the same."""
+        """Gateway: pass a frame on to the vehicle, the current of a branch corrected in it."""
         key, source = (message.arbitration_id, message.is_extended_id), None
         if not message.is_remote_frame:
             if key in self._own:
@@ -337,7 +337,7 @@ class Node:
             self._corrector.counters.forwarded += sent
 
     def _pass_back(self, stop: Callable[[], bool]) -> None:
-        """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
+        """Pass on what the vehicle sends to the sensors' bus, but for frames that only this side may send."""
         vehicle, own, counters = self._vehicle, self._not_from_vehicle, self._corrector.counters
         while not stop():
             message = vehicle.receive(_LONGEST_WAIT_S)
