@@ -1,6 +1,7 @@
 """The table of experiments, those of the paper [1]_ and ours, and the record of a result.
 
-An experiment is a row of ``TABLE`` (all of them by name: :data:`EXPERIMENTS`): settings (a case of how fleets are made, and where it stands in the
+An experiment is a row of ``TABLE`` (by name: :data:`EXPERIMENTS`).
+It has settings (a case of how fleets are made, and where it stands in the
 table), the methods that are compared on them, and how it is shown. A new one is a new row;
 :func:`~calibrator.experiments.runner.run_experiment` runs them all.
 
