@@ -624,7 +624,7 @@ class EvidenceRows:
 
     @property
     def places(self) -> RowPlaces:
-        """Where :attr:`values`, :attr:`known` and the covariance hold each kind of row."""
+        """Where ``values``, :attr:`known` and the covariance hold each kind of row."""
         return RowPlaces(self.branches)
 
     @property

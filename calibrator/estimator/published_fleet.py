@@ -43,7 +43,7 @@ LEAST_VEHICLES = 20
 
 
 def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleModel:
-    """Read the drives of one vehicle and identify its model, see :func:`identify_vehicle`."""
+    """Read the drives of one vehicle, for :func:`~calibrator.published.state_space.identify_vehicle`."""
     read = (load_drive(entry, database) for entry in entries)
     drives = [align(drive, database.layout, equipment.branches, inputs=equipment.inputs) for drive in read]
     names = tuple(entry.name for entry in entries)
