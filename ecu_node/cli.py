@@ -166,15 +166,26 @@ def _parser() -> argparse.ArgumentParser:
     run = command(
         "run",
         _run,
-        ("--unsigned", "--layout", "--vehicle", *_BUS, "--gateway", "--shadow", "--dry-run", "--metrics-port",
-         "--telemetry", "--summary", "--realtime"),
+        (
+            "--unsigned",
+            "--layout",
+            "--vehicle",
+            *_BUS,
+            "--gateway",
+            "--shadow",
+            "--dry-run",
+            "--metrics-port",
+            "--telemetry",
+            "--summary",
+            "--realtime",
+        ),
         help="correct until SIGTERM or SIGINT",
         description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
         "own on the same bus, or, with --gateway, in place on another bus. With parameters that do not fit it passes "
         "the measured values through and says so in its status message. SIGHUP, or a changed parameter file, makes it "
         "read the parameters again.",
         done=_AT_WORK,
-    )  # fmt: skip
+    )
     source = run.add_mutually_exclusive_group(required=True)
     source.add_argument("--state", type=Path, metavar="FOLDER", help="state of this vehicle, with signed parameters")
     source.add_argument("--params", type=Path, metavar="FILE", help="parameter file that nobody signed; --unsigned")
@@ -245,14 +256,20 @@ def _run(options: argparse.Namespace) -> int:
     from ecu_node.bus.run import run_node  # noqa: PLC0415
 
     for is_wrong, text in (
-        (options.gateway == options.channel,
-         f"--gateway {options.gateway} is the bus of the sensors itself; two buses are expected"),
-        (options.gateway is not None and options.listen_only,
-         "--listen-only sends nothing, and a gateway must pass frames on; leave one of them out"),
+        (
+            options.gateway == options.channel,
+            f"--gateway {options.gateway} is the bus of the sensors itself; two buses are expected",
+        ),
+        (
+            options.gateway is not None and options.listen_only,
+            "--listen-only sends nothing, and a gateway must pass frames on; leave one of them out",
+        ),
         (options.state is not None and options.unsigned, "--state holds signed parameters; leave --unsigned out"),
-        (options.params is not None and not options.unsigned,
-         "--params names a file that nobody signed: give --state with signed parameters, or --unsigned as well"),
-    ):  # fmt: skip
+        (
+            options.params is not None and not options.unsigned,
+            "--params names a file that nobody signed: give --state with signed parameters, or --unsigned as well",
+        ),
+    ):
         if is_wrong:
             say_error(f"ecu-node: {text}")
             return 2

@@ -551,7 +551,7 @@ def _contradictions(layout: LayoutKeys) -> Iterator[str]:
         ([*{*outputs}, *({*outputs} & read)], "{} is both read and written; give the output a signal of its own"),
         ([bus.name for bus in layout.bus], "[[bus]] name: {} stands there twice; each bus needs one of its own"),
         ([bus.channel for bus in layout.bus], "[[bus]] channel: {} stands there twice; each bus needs one of its own"),
-    ):  # fmt: skip
+    ):
         yield from (text.format(name) for name in names if names.count(name) > 1)
     if sum(branch.balance for branch in branches) > 1:
         yield "more than one branch has 'balance = true'; at most one can take what the others leave"
@@ -575,16 +575,24 @@ def _contradictions_of_branch(branch: Branch) -> Iterator[str]:
     ways = [way for way in (branch.signal, branch.power, branch.formula) if way is not None]
     message = branch.corrected and split_signal(branch.corrected)[0]
     for is_wrong, text in (
-        (len(ways) != 1 or (branch.power is None) != (branch.voltage is None),
-         "give either 'signal' (a current), 'power' and 'voltage', or 'formula'"),
-        (branch.formula and (branch.corrected or branch.unit),
-         "'formula' gives A and is not written; leave out 'corrected' and 'unit'"),
-        (not branch.formula and branch.uncertainty,
-         "'uncertainty' is that of a 'formula'; a sensor's is what is estimated"),
+        (
+            len(ways) != 1 or (branch.power is None) != (branch.voltage is None),
+            "give either 'signal' (a current), 'power' and 'voltage', or 'formula'",
+        ),
+        (
+            branch.formula and (branch.corrected or branch.unit),
+            "'formula' gives A and is not written; leave out 'corrected' and 'unit'",
+        ),
+        (
+            not branch.formula and branch.uncertainty,
+            "'uncertainty' is that of a 'formula'; a sensor's is what is estimated",
+        ),
         (branch.quality and not branch.corrected, "'quality' without 'corrected'"),
-        (branch.quality and split_signal(branch.quality)[0] != message,
-         "'quality' and 'corrected' must be signals of one message"),
-    ):  # fmt: skip
+        (
+            branch.quality and split_signal(branch.quality)[0] != message,
+            "'quality' and 'corrected' must be signals of one message",
+        ),
+    ):
         if is_wrong:
             yield text
 

@@ -273,9 +273,16 @@ def _status_view(database: VehicleDatabase, heard: _Heard, now_s: float) -> View
 
 
 _COLUMNS = {
-    "branch": "", "measured": "[A]", "corrected": "[A]", "correction": "[A]", "quality": "",
-    "rate": "[1/s]", "answers": "[1/s]", "age": "[s]", "faults": "",
-}  # fmt: skip
+    "branch": "",
+    "measured": "[A]",
+    "corrected": "[A]",
+    "correction": "[A]",
+    "quality": "",
+    "rate": "[1/s]",
+    "answers": "[1/s]",
+    "age": "[s]",
+    "faults": "",
+}
 """Names and units: "rate" of the measured frames, "answers" of the corrected ones; words stand at the left."""
 
 

@@ -118,13 +118,15 @@ def main(
     else:
         duration_h = sum(trip.drive.duration_s for trip in done.values()) / 3600.0
         write_output(
-            "\n".join([
-                *told_once((name, notice) for name, trip in done.items() for notice in trip.notices),
-                f"{len(done)} trips imported, {duration_h:.1f} h; {len(already_there)} already there; "
-                f"{len(failed)} left out",
-                "motor is minus the sum of battery and auxiliary: not independent of the battery's sensor",
-            ])
-        )  # fmt: skip
+            "\n".join(
+                [
+                    *told_once((name, notice) for name, trip in done.items() for notice in trip.notices),
+                    f"{len(done)} trips imported, {duration_h:.1f} h; {len(already_there)} already there; "
+                    f"{len(failed)} left out",
+                    "motor is minus the sum of battery and auxiliary: not independent of the battery's sensor",
+                ]
+            )
+        )
     for text in failed.values():
         say_error(f"import_bmw_i3: {text}")
     raise typer.Exit(1 if failed else 0)

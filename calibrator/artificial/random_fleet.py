@@ -92,8 +92,12 @@ def draw_faults(
         values[rng.permutation(n) < n // 2, :branches] = 0.0
     faults = Faults.of_parameters(values, full_scale_a)
     if symmetric:  # each vehicle with three others, so that the mean of (21) is the ideal current
-        signs = {"hardware_drift": (1, -1, 1, -1), "hardware_offset_a": (1, -1, 1, -1),
-                 "drift": (1, -1, -1, 1), "offset_a": (1, -1, 1, -1)}  # fmt: skip
+        signs = {
+            "hardware_drift": (1, -1, 1, -1),
+            "hardware_offset_a": (1, -1, 1, -1),
+            "drift": (1, -1, -1, 1),
+            "offset_a": (1, -1, 1, -1),
+        }
         group = {name: np.concatenate([s * getattr(faults, name) for s in own]) for name, own in signs.items()}
         faults = Faults(**group)
     return faults.take(rng.permutation(vehicles))

@@ -21,7 +21,7 @@ from calibrator.artificial.trips import (
     balance_branch,
     choose_branches,
     with_branches,
-)  # fmt: skip
+)
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.fleet_id import write_fleet_ids
 from calibrator.errors import FleetError
@@ -36,9 +36,16 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch, Layout, split_signal
 
 __all__ = [
-    "FleetPlan", "Vehicle", "draw_vehicles", "simulate_fleet", "trip_of", "vehicle_currents", "vehicle_drive",
-    "vehicle_frames", "write_vehicle",
-]  # fmt: skip
+    "FleetPlan",
+    "Vehicle",
+    "draw_vehicles",
+    "simulate_fleet",
+    "trip_of",
+    "vehicle_currents",
+    "vehicle_drive",
+    "vehicle_frames",
+    "write_vehicle",
+]
 
 WRITTEN_DOWN = ("seed", "sparsity", "magnitude", "balanced", "symmetric", "common_drive", "noise")
 """Fields of the plan that stand in the truth, too."""

@@ -35,9 +35,17 @@ from ecu_node.layout import LONGEST_PERIOD_S, Branch, Input, Layout
 from ecu_node.summary import TIME_RESOLUTION_S
 
 __all__ = [
-    "Junction", "column_values", "is_number", "named_columns", "names_of", "path_of", "require", "require_columns",
-    "store_frames", "summarise_frames",
-]  # fmt: skip
+    "Junction",
+    "column_values",
+    "is_number",
+    "named_columns",
+    "names_of",
+    "path_of",
+    "require",
+    "require_columns",
+    "store_frames",
+    "summarise_frames",
+]
 
 MOST_BRANCHES = 16
 MOST_MISSED, LEAST_AGE_S = 2.5, 0.5

@@ -446,8 +446,11 @@ def _estimate(
     S, disagreements = system.sensors, list[str]()
     names = [branches[k] if k < K else f"{known.meter} ({vehicles[k - K + 1].vehicle})" for k in range(S)]
     for s in range(S):
-        readings = [(known.read[r, 0, :, j, k], known.read[r, 1, :, j, k])
-                    for j, k in np.argwhere(places == s).tolist() for r in range(len(known.read))]  # fmt: skip
+        readings = [
+            (known.read[r, 0, :, j, k], known.read[r, 1, :, j, k])
+            for j, k in np.argwhere(places == s).tolist()
+            for r in range(len(known.read))
+        ]
         system = _with_reading(system, s, *weighted_mean(*readings), scale_a)
         disagreements += _disagreements(readings, names[s])
     for name, charge_a in known.charge_a.items():

@@ -24,10 +24,19 @@ from calibrator.terminal.text import few
 from ecu_node.layout import UnmeasuredLoad
 
 __all__ = [
-    "FEWEST_TRUSTED", "TRUSTED_DRIFT_SD", "TRUSTED_OFFSET_SD", "BenchReading", "BenchTable", "bench_readings",
-    "check_bench_table", "merge_readings", "read_bench_table", "untrusted_vehicles", "window_readings",
+    "FEWEST_TRUSTED",
+    "TRUSTED_DRIFT_SD",
+    "TRUSTED_OFFSET_SD",
+    "BenchReading",
+    "BenchTable",
+    "bench_readings",
+    "check_bench_table",
+    "merge_readings",
+    "read_bench_table",
+    "untrusted_vehicles",
+    "window_readings",
     "with_knowledge",
-]  # fmt: skip
+]
 
 TRUSTED_DRIFT_SD = 0.002
 """Accuracy of a bench check of the gain, as of a laboratory shunt. [1]"""

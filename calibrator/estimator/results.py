@@ -39,10 +39,29 @@ from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters, encode_parameters
 
 __all__ = [
-    "MOST_FILES", "PARTS", "SCHEMA", "CalibrationReport", "RunRecord", "Unfinished", "WrittenVehicle", "copy_summaries",
-    "deployed_rms_a", "encode_chunk", "internal_errors", "join_rows", "left_out_of", "part_file", "read_part",
-    "read_results", "read_run", "report_of", "unfinished_run", "write_parameter_files", "write_run", "written_of",
-]  # fmt: skip
+    "MOST_FILES",
+    "PARTS",
+    "SCHEMA",
+    "CalibrationReport",
+    "RunRecord",
+    "Unfinished",
+    "WrittenVehicle",
+    "copy_summaries",
+    "deployed_rms_a",
+    "encode_chunk",
+    "internal_errors",
+    "join_rows",
+    "left_out_of",
+    "part_file",
+    "read_part",
+    "read_results",
+    "read_run",
+    "report_of",
+    "unfinished_run",
+    "write_parameter_files",
+    "write_run",
+    "written_of",
+]
 
 MOST_FILES = 10_000
 """Vehicles whose parameters are files of their own in one folder."""

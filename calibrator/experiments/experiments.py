@@ -41,9 +41,17 @@ from calibrator.experiments.trial import ComparedMethod
 from calibrator.files.layout_files import vehicle_database
 
 __all__ = [
-    "CALIBRATION", "COVERAGE", "EXPERIMENTS", "KEYS", "REAL", "Experiment", "ExperimentResult", "Setting", "fleet_for",
+    "CALIBRATION",
+    "COVERAGE",
+    "EXPERIMENTS",
+    "KEYS",
+    "REAL",
+    "Experiment",
+    "ExperimentResult",
+    "Setting",
+    "fleet_for",
     "read_records",
-]  # fmt: skip
+]
 
 KEYS = ["series", "x", "method"]
 """Columns of a result that say what a row is of."""

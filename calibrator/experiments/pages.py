@@ -236,8 +236,12 @@ def _together(result: ExperimentResult) -> str:
     own = own[own["figure"].isin(["harmed", "sure_wrong"])].method.unique()
     if result.figures[["series", "x"]].drop_duplicates().shape[0] < 2 or not len(own):
         return ""
-    pooled = [pool_figures(result.figures[(result.figures["method"] == name) & (result.figures["series"] != ALL)])
-              .assign(series="", x=0.0, method=name) for name in own]  # fmt: skip
+    pooled = [
+        pool_figures(result.figures[(result.figures["method"] == name) & (result.figures["series"] != ALL)]).assign(
+            series="", x=0.0, method=name
+        )
+        for name in own
+    ]
     table = _figure_table(pd.concat(pooled), ["harmed", "sure_wrong"], ["method"]).fillna(NOTHING)
     return _markdown(table.rename_axis("all settings together").reset_index())
 
@@ -306,9 +310,19 @@ DODGE_PT = 5.0
 FEW = 30
 """With fewer vehicles the share recovered is uncertain by more than about 0.1; their markers are hollow."""
 COLOURS = (
-    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#882255", "#999999", "#332288",
-    "#117733", "#AA4499",
-)  # fmt: skip
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#000000",
+    "#882255",
+    "#999999",
+    "#332288",
+    "#117733",
+    "#AA4499",
+)
 """The first are those of Okabe and Ito, for all eyes."""
 MARKERS, LINES = "os^DvPp<h>Xd", ("-", "--", "-.", ":")
 METHODS = [method.name for method in (POSTERIOR, PERFECT, CEILING, TREE, THRESHOLD, LEFT_IN, *BASELINES)]
@@ -343,9 +357,16 @@ def _bars(rows: pd.DataFrame) -> Array:
 
 
 def _rings(
-    axes: Axes, result: ExperimentResult, rows: pd.DataFrame, places: Iterable[float], *, label: str, colour: str,
-    across: bool = False, **more: Any,
-) -> None:  # fmt: skip
+    axes: Axes,
+    result: ExperimentResult,
+    rows: pd.DataFrame,
+    places: Iterable[float],
+    *,
+    label: str,
+    colour: str,
+    across: bool = False,
+    **more: Any,
+) -> None:
     """Figures of the paper for these rows, where it prints any: rings that hide nothing."""
     paper, keys = result.experiment.paper, zip(rows["x"], rows["method"], rows["figure"], strict=True)
     found = [paper.get((x, method), {}).get(figure) for x, method, figure in keys]
@@ -407,9 +428,17 @@ def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
             aside_pt = DODGE_PT * (number - (len(curves) - 1) / 2.0)
             transform = axes.transData + ScaledTranslation(aside_pt / 72.0, 0.0, figure.dpi_scale_trans)
             axes.errorbar(
-                rows["x"], rows["value"], yerr=_bars(rows), label=label, transform=transform,
-                linestyle=LINES[number % len(LINES)], markersize=5.5, capsize=2.5, elinewidth=1.0, **style,
-            )  # fmt: skip
+                rows["x"],
+                rows["value"],
+                yerr=_bars(rows),
+                label=label,
+                transform=transform,
+                linestyle=LINES[number % len(LINES)],
+                markersize=5.5,
+                capsize=2.5,
+                elinewidth=1.0,
+                **style,
+            )
             _rings(axes, result, rows, rows["x"], label=label, colour=style["color"], transform=transform)
         axes.set(title=f"{TITLES[name]}, {group[0]}" if several else TITLES[name], ylim=SHARES)
         axes.set_xlabel(result.experiment.x_label)

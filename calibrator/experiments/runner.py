@@ -161,13 +161,17 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
         index=[*keys, "drawn"], columns="low", values=["vehicles", "confidence"], sort=False
     )
     once = by_setting.round(12).reset_index(level="drawn").drop_duplicates().index
-    groups = {name: [table[table["experiment"] == name] for table in (figures, tenths)]
-              for name in dict.fromkeys(figures["experiment"])}  # fmt: skip
+    groups = {
+        name: [table[table["experiment"] == name] for table in (figures, tenths)]
+        for name in dict.fromkeys(figures["experiment"])
+    }
     groups[ALL] = [table[table.set_index(keys).index.isin(once)] for table in (figures, tenths)]
     pooled = [_pooled(name, *tables) for name, tables in groups.items()]
     figures, tenths = (pd.concat(some, ignore_index=True) for some in zip(*pooled, strict=True))
-    told = {name: " or ".join(sorted({str(result.settings.get(name, "?")) for result in used}))
-            for name in ("repetitions", "seed")}  # fmt: skip
+    told = {
+        name: " or ".join(sorted({str(result.settings.get(name, "?")) for result in used}))
+        for name in ("repetitions", "seed")
+    }
     settings = {
         "experiments": ", ".join(result.experiment.name for result in used),
         **told,
@@ -181,8 +185,9 @@ def _pooled(series: str, figures: pd.DataFrame, tenths: pd.DataFrame) -> list[pd
     pooled, means = pool_tenths(tenths), pool_figures(figures)
     kept = means[means["figure"].isin(["recovery_rate", "confidence"]) | means["figure"].str.startswith("sure")]
     vehicles = pooled["vehicles"].sum()
-    errors = pd.DataFrame({"figure": ["ece", "ece_by_chance"], "value": calibration_errors(pooled), "sd": 0.0,
-                           "of": vehicles})  # fmt: skip
+    errors = pd.DataFrame(
+        {"figure": ["ece", "ece_by_chance"], "value": calibration_errors(pooled), "sd": 0.0, "of": vehicles}
+    )
     return _keyed((pd.concat([kept, errors]), pooled), series, vehicles, POSTERIOR.name)
 
 

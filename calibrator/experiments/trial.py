@@ -19,8 +19,14 @@ from calibrator.published.evidence import FleetEvidence
 from calibrator.summaries.moments import DriveSummary
 
 __all__ = [
-    "CommonEvidence", "ComparedMethod", "Estimate", "FaultDistribution", "Trial", "UnseenDrive", "drawn_distribution",
-]  # fmt: skip
+    "CommonEvidence",
+    "ComparedMethod",
+    "Estimate",
+    "FaultDistribution",
+    "Trial",
+    "UnseenDrive",
+    "drawn_distribution",
+]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -100,6 +100,8 @@ def _converted(path: Path, name: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="mf4-") as folder:
         result = Path(folder) / name
         limit_s = START_S + path.stat().st_size / BYTES_PER_S
+        if _process(os.getpid()).poll() is not None:  # somebody ended it, as for the memory that it took
+            _process.cache_clear()
         process = _process(os.getpid())
         assert process.stdin is not None
         assert process.stdout is not None
@@ -126,8 +128,13 @@ def _process(_pid: int) -> "subprocess.Popen[str]":
     process = subprocess.Popen(  # noqa: S603
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
-    atexit.register(process.communicate)  # at the end of its input it ends
+    atexit.register(_end, process)
     return process
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    process.kill()
+    process.communicate()
 
 
 def main() -> None:
@@ -139,7 +146,7 @@ def main() -> None:
         try:
             convert(path, result)
             answer = _DONE
-        except Exception as error:  # noqa: BLE001 (asammdf raises anything for a damaged file; the parent says it)
+        except Exception as error:  # noqa: BLE001 (asammdf raises anything for a damaged file)
             answer = " ".join(f"{type(error).__name__}: {error}".split())
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         print(answer, file=answers, flush=True)

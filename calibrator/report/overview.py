@@ -14,8 +14,17 @@ from calibrator.report.fleet_table import FleetTable, ParameterDetails
 from calibrator.terminal.text import few
 from ecu_node.parameters import HeldBack
 
-__all__ = ["FLEET_CAUSES", "SIGMAS", "amperes", "battery_margin"]
-__all__ += ["overview_of", "percent", "probability", "steps_to_take", "workshop_list"]
+__all__ = [
+    "FLEET_CAUSES",
+    "SIGMAS",
+    "amperes",
+    "battery_margin",
+    "overview_of",
+    "percent",
+    "probability",
+    "steps_to_take",
+    "workshop_list",
+]
 
 MOST_REASONS = 20
 """Reasons of vehicles left out that are given one by one."""

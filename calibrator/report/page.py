@@ -290,8 +290,9 @@ def _sensor_figure(table: FleetTable, files: Mapping[int, ParameterDetails]) -> 
                     points.append((k, RIVALS, what, *(value.get(branch, 0.0) for value in values), 0.0, 0.0))
         axis = str(k + 1 if k else "")
         for letter, name, title, factor in (
-            ("x", "drift", f"{branch}: gain error [%]", 100.0), ("y", "offset_a", "" if k else "offset [A]", 1.0),
-        ):  # fmt: skip
+            ("x", "drift", f"{branch}: gain error [%]", 100.0),
+            ("y", "offset_a", "" if k else "offset [A]", 1.0),
+        ):
             largest = 1.1 * max(factor * float(np.abs(table[name][:, k]).max(initial=0.0)), 1.0)
             figure.layout[f"{letter}axis{axis}"] = {"title": {"text": title}, "range": [-largest, largest]}
     frame = pd.DataFrame(points, columns=["k", "label", "vehicle", "drift", "offset_a", "drift_sd", "offset_sd_a"])

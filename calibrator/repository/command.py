@@ -186,22 +186,23 @@ def publish(folder: FolderArgument, key: KeysOption, json: JsonOption = False) -
 
 
 @repository.command("status", epilog=example("calibrator repository status repo"))
-def status(
-    folder: FolderArgument,
-    unstage: Annotated[bool, typer.Option("--unstage", help="Drop what is staged; what is published stays.")] = False,
-    json: JsonOption = False,
-) -> None:
+def status(folder: FolderArgument, json: JsonOption = False) -> None:
     """Show until when vehicles take what is published, and what is staged and lacks signatures."""
     from calibrator.repository.repository import missing_text
 
     found = _open(folder)
-    dropped = found.unstage() if unstage else []
     staged, until = list(found.sign([])), found.valid_until
     words = [f"valid until {until:%Y-%m-%d}" if until else "nothing is published yet"]
-    words += [f"{len(dropped)} staged roles dropped"] if unstage else []
     words += [f"{len(staged)} roles staged" + (f": {missing_text(found.waiting)}" if found.waiting else "")]
-    facts = {"valid_until": until, "staged": staged, "waiting": found.waiting, "dropped": dropped}
+    facts = {"valid_until": until, "staged": staged, "waiting": found.waiting}
     _tell(facts, f"{folder}: {'; '.join(words)}", json=json)
+
+
+@repository.command("unstage", epilog=example("calibrator repository unstage repo"))
+def unstage(folder: FolderArgument, json: JsonOption = False) -> None:
+    """Drop what is staged, as after a mistake; what is published stays."""
+    dropped = _open(folder).unstage()
+    _tell({"dropped": dropped}, f"{folder}: {len(dropped)} staged roles dropped", json=json)
 
 
 @repository.command("rotate", epilog=example("calibrator repository rotate repo timestamp --public keys/new.pub"))

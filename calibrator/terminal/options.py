@@ -11,10 +11,27 @@ from typing import Annotated, Any
 
 import typer
 
-__all__ = ["TIME_LIMIT_S", "BankOption", "BranchesOption", "DbcOption", "FleetArgument", "FleetOrSummariesArgument"]
-__all__ += ["JsonOption", "LayoutOption", "MagnitudeOption", "SchedulerOption", "SeedOption", "SparsityOption"]
-__all__ += ["StoreOption", "SymmetricOption", "TimeLimitOption", "WorkersOption", "given_options", "number_option"]
-__all__ += ["whole_option"]
+__all__ = [
+    "TIME_LIMIT_S",
+    "BankOption",
+    "BranchesOption",
+    "DbcOption",
+    "FleetArgument",
+    "FleetOrSummariesArgument",
+    "JsonOption",
+    "LayoutOption",
+    "MagnitudeOption",
+    "SchedulerOption",
+    "SeedOption",
+    "SparsityOption",
+    "StoreOption",
+    "SymmetricOption",
+    "TimeLimitOption",
+    "WorkersOption",
+    "given_options",
+    "number_option",
+    "whole_option",
+]
 
 MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16

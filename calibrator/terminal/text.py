@@ -11,8 +11,21 @@ import typer
 from calibrator.errors import INTERNAL_ERROR as INTERNAL
 from ecu_node.program import INTERNAL_ERROR, say_error, write_output
 
-__all__ = ["Notice", "counted", "dumps", "end_if_internal", "few", "few_reasons", "figure", "left_out_text"]
-__all__ += ["merged_notices", "print_report", "reasons_text", "table", "told_once"]
+__all__ = [
+    "Notice",
+    "counted",
+    "dumps",
+    "end_if_internal",
+    "few",
+    "few_reasons",
+    "figure",
+    "left_out_text",
+    "merged_notices",
+    "print_report",
+    "reasons_text",
+    "table",
+    "told_once",
+]
 
 MOST_NAMES = 6
 """Names told on one line: half a line of a terminal."""

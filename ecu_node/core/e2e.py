@@ -312,15 +312,23 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
     modulus, data_id = entry.counter_modulus or counter_place.highest + 1, _data_id(entry.data_id, message)
     for is_wrong, text in (
         (crc_place.length != 8 or crc_place.shift, f"signal {entry.crc} must be one whole byte to be a CRC-8"),
-        (counter_place.end - counter_place.first > 1,
-         f"signal {entry.counter} must be within one byte to be a counter"),
-        (counter_place.mask & crc_place.mask,
-         f"signals {entry.counter} and {entry.crc} overlap; each needs bits of its own"),
-        (counter_place.signed or modulus > counter_place.highest + 1,
-         f"signal {entry.counter} cannot count from 0 to {modulus - 1}"),
-        (message.name in entry.data_id and data_id >= 1 << 8 * entry.data_id_bytes,
-         f"data_id {data_id} does not fit into data_id_bytes = {entry.data_id_bytes}"),
-    ):  # fmt: skip
+        (
+            counter_place.end - counter_place.first > 1,
+            f"signal {entry.counter} must be within one byte to be a counter",
+        ),
+        (
+            counter_place.mask & crc_place.mask,
+            f"signals {entry.counter} and {entry.crc} overlap; each needs bits of its own",
+        ),
+        (
+            counter_place.signed or modulus > counter_place.highest + 1,
+            f"signal {entry.counter} cannot count from 0 to {modulus - 1}",
+        ),
+        (
+            message.name in entry.data_id and data_id >= 1 << 8 * entry.data_id_bytes,
+            f"data_id {data_id} does not fit into data_id_bytes = {entry.data_id_bytes}",
+        ),
+    ):
         if is_wrong:
             raise LayoutError(f"{where}: {text}")
     crc8 = _algorithm(entry.algorithm, where)

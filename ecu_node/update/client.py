@@ -279,7 +279,7 @@ def _refusal(error: Exception, source: str, vehicle: str) -> TrustError:
     )
     reason = next(reason for kind, reason in kinds if isinstance(error, kind))
     advice = hint[reason]
-    if source.startswith("http") and isinstance(error, exceptions.DownloadError | HTTPError):
+    if source.startswith(("http://", "https://")) and isinstance(error, exceptions.DownloadError | HTTPError):
         if not isinstance(error, exceptions.DownloadHTTPError):
             advice = "; check address and connection"
         while error.__context__ is not None:  # the innermost says what it was, such as a name that is not known

@@ -546,3 +546,102 @@ def test_a_gateway_goes_on_with_the_intact_frames_of_an_invalid_message(database
         assert (out is None) == bool(number % 2)
         assert out != frame
     assert source.is_invalid
+
+
+def test_a_consumer_is_corrected_with_its_offset_into_the_junction(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, motor=(0.25, 5.0))
+    (answer,) = answers(corrector, motor(database, 0), 0.0)
+    assert decoded(database, "HV_MotorCorrected", answer.data)["MotorCurrentCorrected"] == pytest.approx(
+        -(-100.0 - 5.0) / 1.25
+    )
+
+
+def test_a_branch_that_the_parameters_do_not_name_is_passed_through(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.1, 0.0))
+    (answer,) = answers(corrector, motor(database, 0), 0.0)
+    values = decoded(database, "HV_MotorCorrected", answer.data)
+    assert (values["MotorCurrentCorrected"], values["MotorCurrentQuality"]) == (100.0, Quality.PASSED_THROUGH)
+
+
+def test_parameters_without_any_fault_pass_everything_through(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.0, 0.0))
+    answers(corrector, battery(database, 0), 0.0)
+    assert state_at(corrector, 0.01) == (State.PASSING_THROUGH, Reason.NONE)
+
+
+def test_waiting_for_a_vehicle_that_is_not_awake_yet_is_no_fault(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    for k in range(100):
+        corrector.look(0.1 * k)
+        assert corrector.state() == (State.STARTING, Reason.NONE)
+    drive(database, corrector, 10.0, 11.0)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
+
+
+@pytest.mark.parametrize(("window_s", "fallen_back_s"), [(1.0, 1.5), (10.0, 10.5), (600.0, 600.5)])
+def test_sums_of_any_window_are_judged_at_ten_looks_per_second(
+    make_database: MakeDatabase, database: VehicleDatabase, window_s: float, fallen_back_s: float
+) -> None:
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    text += f"\n[watch]\nwindow_s = {window_s}\n"
+    own = make_database(text, database.layout.dbc_path.read_text())
+    corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
+    for k in range(round(10.0 * fallen_back_s)):
+        answers(corrector, battery(own, k % 15), 0.1 * k)
+        answers(corrector, motor(own, k % 15), 0.1 * k)
+        if 0.1 * k < 0.85 * window_s:
+            assert corrector.state()[1] == Reason.NONE
+        corrector.look(0.1 * k + 0.01)
+    assert corrector.state()[1] == Reason.CORRECTION_WORSE
+
+
+def test_a_set_of_which_the_calibrator_expects_no_better_sum_is_kept(database: VehicleDatabase) -> None:
+    parameters = parameters_for(database, battery=(0.02, 0.0), motor=(0.0, 0.0))
+    expected = replace(parameters, junction_residual=JunctionResidual(measured_a=0.0, corrected_a=3.0))
+    for item, reason in ((parameters, Reason.CORRECTION_WORSE), (expected, Reason.NONE)):
+        corrector = wire(database, InForce(parameters=item), start_s=0.0)
+        drive_balanced(database, corrector, 0.0, 12.0)
+        assert corrector.state()[1] == reason
+
+
+def test_a_branch_that_changes_between_the_parts_of_a_long_window_is_not_stuck(
+    make_database: MakeDatabase, database: VehicleDatabase
+) -> None:
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    own = make_database(text + "\n[watch]\nwindow_s = 600.0\n", database.layout.dbc_path.read_text())
+    corrector = corrector_for(own, battery=(0.1, 0.0), motor=(0.0, 0.0))
+    for k in range(6100):
+        answers(corrector, battery(own, k % 15, 100.0 + 50.0 * math.sin(0.1 * k)), 0.1 * k)
+        answers(corrector, motor(own, k % 15, 60.0 if k % 30 < 28 else 80.0), 0.1 * k)
+        corrector.look(0.1 * k + 0.01)
+    assert corrector.latched is not Reason.BRANCH_STUCK
+
+
+def test_a_motor_at_rest_is_not_stuck(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(-0.2, 0.0), motor=(0.0, 0.0))
+    for k in range(240):
+        answers(corrector, battery(database, k % 15, 10.0 * math.sin(0.1 * k)), 0.05 * k)
+        answers(corrector, motor(database, k % 15, 0.0), 0.05 * k)
+        corrector.look(0.05 * k + 0.01)
+    assert corrector.latched is not Reason.BRANCH_STUCK
+
+
+def test_a_branch_that_is_neither_named_nor_seen_is_not_fitted(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0))
+    answers(corrector, battery(database, 0), 0.0)
+    assert state_at(corrector, 0.05) == (State.CORRECTING, Reason.NONE)
+    assert sums_at(corrector, 0.05)[0] == pytest.approx(100.0)
+
+
+def test_a_voltage_near_zero_is_not_divided_by(make_database: MakeDatabase) -> None:
+    database = make_database()
+    corrector = corrector_for(database, heater=(0.0, 0.0))
+    answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": 0.5})), 0.0)
+    answers(corrector, Frame(HEATER, database.message("Heater").encode({"Power": 4000})), 0.0)
+    assert sums_at(corrector, 0.0) == (None, None)
+
+
+@pytest.mark.parametrize(("old", "new"), [("8 Corrector", "8 Vector__XXX"), ("8 Other", "8 Corrector")])
+def test_messages_of_one_control_unit_or_of_none_may_be_sent(make_database: MakeDatabase, old: str, new: str) -> None:
+    database = make_database(SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER.replace(old, new))
+    assert corrector_for(database).status() is not None

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 
+import fastcrc
 import pytest
 
 from ecu_node.core.e2e import Check, E2EState, Protection, Receiver, protection_of
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import LayoutError
+from ecu_node.errors import DatabaseError, LayoutError
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT
 
 MakeDatabase = Callable[..., VehicleDatabase]
@@ -314,3 +315,121 @@ def test_a_wrong_entry_is_named_by_its_place_as_it_was_written(
         protection_of(database, database.message("Room"))
     assert f"{place}{words}" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_only_the_header_is_written(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    for frame in stream(protection, 20):
+        changed = int.from_bytes(frame, "little") ^ int.from_bytes(b"\xa5" * SIZE, "little")
+        assert changed & ~protection.header_mask == 0
+
+
+def test_wrong_length_or_data_identifier_is_corrupt_though_the_crc_is_right(
+    protect: Callable[[str], Protection],
+) -> None:
+    def is_intact(kind: str, changed: int, crc: Callable[[bytearray], bytes], crc_at: int) -> bool:
+        (frame,) = stream(protect(ENTRIES[kind]), 1)
+        frame[changed] ^= 0x10
+        made = crc(frame)
+        frame[crc_at : crc_at + len(made)] = made
+        return protect(ENTRIES[kind]).is_sound(frame)
+
+    def crc32(frame: bytearray) -> bytes:
+        return fastcrc.crc32.autosar(bytes(frame[:8] + frame[12:])).to_bytes(4)
+
+    def crc16(frame: bytearray) -> bytes:
+        return fastcrc.crc16.ibm_3740(bytes(frame[2:]) + b"\x12\x34").to_bytes(2)
+
+    def crc64(frame: bytearray) -> bytes:
+        return fastcrc.crc64.xz(bytes(frame[8:])).to_bytes(8)
+
+    def crc8_nibble(frame: bytearray) -> bytes:
+        return fastcrc.crc8.gsm_a(bytes([700 & 0xFF, 0]) + bytes(frame[:4] + frame[5:])).to_bytes(1)
+
+    length, counter, identity, content = 1, 3, 7, 20
+    assert [is_intact("P04", byte, crc32, 8) for byte in (length, identity, counter, content)] == [False] * 2 + [
+        True
+    ] * 2
+    assert [is_intact("P06", byte, crc16, 0) for byte in (3, 4, content)] == [False, True, True]
+    assert [is_intact("P07", byte, crc64, 0) for byte in (11, 19, 15, content)] == [False] * 2 + [True] * 2
+    assert [is_intact("P11 nibble", byte, crc8_nibble, 4) for byte in (5, content)] == [False, True]
+
+
+def test_the_largest_data_identifier_of_a_byte_is_covered(protect: Callable[[str], Protection]) -> None:
+    entry = OEM.replace("data_id_bytes = 2", "data_id_bytes = 1\ndata_id = { Room = 255 }")
+    (frame,) = stream(protect(entry), 1)
+    assert frame[7] == crc8(b"\xff" + frame[:7] + frame[8:], 0x1D)
+
+
+def test_a_frame_that_is_all_header_is_read(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    (frame,) = stream(protection, 1, size=len(bytes.fromhex(HEADERS[kind])))
+    assert Receiver(protection).check(frame) is Check.OK
+
+
+@pytest.mark.parametrize("last", [-1, 0])
+def test_gaps_and_jumps_count_on_past_the_last_code(kind: str, protect: Callable[[str], Protection], last: int) -> None:
+    protection = protect(ENTRIES[kind] + "\nmax_delta_counter = 3")
+    last += protection.modulus
+    frames = stream(protection, 9, first=last)
+    for step, found in ((0, Check.REPEATED), (1, Check.OK), (3, Check.LOST), (4, Check.JUMPED), (8, Check.JUMPED)):
+        check = Receiver(protection).check
+        assert [check(frames[0]), check(frames[step])] == [Check.OK, found]
+
+
+def test_message_is_valid_from_its_first_intact_frame(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    receiver, frame, states = Receiver(protection), stream(protection, 1)[0], []
+    for payload in (damaged(frame), frame):
+        receiver.check(payload)
+        states.append(receiver.state)
+    assert states == [E2EState.INIT, E2EState.VALID]
+
+
+def test_repeated_frames_are_no_intact_ones(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind] + "\nvalid = { window = 5, min_ok = 1, max_error = 2 }")
+    receiver = Receiver(protection)
+    frame = stream(protection, 1)[0]
+    states = [receiver.check(frame) and receiver.state for _ in range(6)]
+    assert states[1:] == [E2EState.VALID] * 4 + [E2EState.INVALID]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("56|8@1+", "57|8@1+", "message Room: signal Sum must be one whole byte to be a CRC-8$"),
+        ("56|8@1+", "56|7@1+", "message Room: signal Sum must be one whole byte to be a CRC-8$"),
+        ("36|4@1+", "38|4@1+", "message Room: signal Count must be within one byte to be a counter$"),
+        ("36|4@1+", "36|4@1-", "message Room: signal Count cannot count from 0 to 7$"),
+    ],
+)
+def test_signals_that_can_be_no_counter_or_crc_are_refused(
+    make_database: MakeDatabase, old: str, new: str, words: str
+) -> None:
+    dbc = SMALL_DBC.replace("VAL_", ROOM.replace(old, new) + "VAL_", 1)
+    database = make_database(f"{SMALL_LAYOUT}\n[e2e]\n{OEM}\n", dbc)
+    with pytest.raises(LayoutError, match=words):
+        protection_of(database, database.message("Room"))
+
+
+def test_a_message_has_one_protection(make_database: MakeDatabase) -> None:
+    twice = "".join(f"\n[[e2e]]\n{ENTRIES[kind]}\n" for kind in ("P01", "P05"))
+    words = r"\[\[e2e\]\] entry number 2, messages: Room stands in \[\[e2e\]\] entry number 1 too"
+    with pytest.raises(LayoutError, match=words):
+        make_database(SMALL_LAYOUT + twice, SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1))
+
+
+def test_messages_may_be_protected_in_different_ways(make_database: MakeDatabase) -> None:
+    entries = f'\n[[e2e]]\n{ENTRIES["P05"]}\n\n[[e2e]]\nprofile = "P01"\nmessages = ["Net", "Heater"]\n'
+    database = make_database(SMALL_LAYOUT + entries, SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1))
+    found = {name: protection_of(database, database.message(name)) for name in ("Room", "Net", "Pair")}
+    assert {name: item and item.modulus for name, item in found.items()} == {"Room": 256, "Net": 15, "Pair": None}
+
+
+@pytest.mark.parametrize(("head", "place"), HEADS)
+def test_a_protected_message_that_the_dbc_lacks_is_named_with_its_place(
+    make_database: MakeDatabase, head: str, place: str
+) -> None:
+    with pytest.raises(DatabaseError, match="no message 'Nobody', which") as caught:
+        make_database(f'{SMALL_LAYOUT}\n{head}\nprofile = "P01"\nmessages = ["Nobody"]\n')
+    assert str(caught.value).endswith(f"small.toml names in {place}")

@@ -139,3 +139,22 @@ def test_a_folder_that_is_not_there_is_one_line(
 ) -> None:
     assert main([command, "--state", str(tmp_path / "none")]) == 1
     assert "no such state folder" in capsys.readouterr().err
+
+
+def test_the_same_fault_counts_up(vehicle: Vehicle, capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(3):
+        vehicle.corrector.latch(Reason.BRANCH_STALE, ["motor"])
+        vehicle.memory.look(0.0)
+        vehicle.corrector.release()
+        vehicle.memory.look(0.0)
+    (fault,) = faults(vehicle, capsys)
+    assert fault["count"] == 3
+
+
+def test_another_set_is_tried(vehicle: Vehicle) -> None:
+    vehicle.break_battery()
+    vehicle.run(1)
+    content = (vehicle.state / "faults.json").read_text()
+    (vehicle.state / "faults.json").write_text(content.replace('"parameter_set": 44', '"parameter_set": 43'))
+    vehicle.start()
+    assert vehicle.corrector.latched is Reason.NONE

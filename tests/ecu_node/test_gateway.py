@@ -10,7 +10,7 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import LayoutError
+from ecu_node.errors import DatabaseError, LayoutError
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, decoded, parameters_for, passed_on, protected
 
 MakeDatabase = Callable[..., VehicleDatabase]
@@ -162,3 +162,42 @@ def test_a_branch_that_overlaps_the_header_is_refused(
     layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'
     with pytest.raises(LayoutError, match=rf"branch {branch}: Pair\.{branch.title()} is written twice, or overlaps"):
         gateway_for(make_database(layout, SMALL_DBC.replace("Pair: 8", "Pair: 24")))
+
+
+def test_a_code_that_the_signal_cannot_have_is_refused(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [32768, -5]')
+    with pytest.raises(
+        LayoutError, match=r"branch motor: no_value: Pair\.Motor has no code 32768; it has -32768 to 32767"
+    ):
+        gateway_for(make_database(layout))
+
+
+def test_a_message_that_is_only_read_is_never_held_back(make_database: MakeDatabase) -> None:
+    entry = '\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\n'
+    dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "16|16@1+ (0.01")
+    database = make_database(SMALL_LAYOUT + entry, dbc)
+    corrector = gateway_for(database, heater=(0.25, -2.0))
+    damaged = Frame(NET, b"\x00\x01\x40\x9c")
+    assert passed_on(corrector, damaged, 0.0) == damaged.data
+    assert (corrector.counters.corrupt, corrector.counters.held_back) == (1, 0)
+
+
+def test_what_a_repeated_frame_says_is_not_used(make_database: MakeDatabase, database: VehicleDatabase) -> None:
+    layout = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    own = make_database('on_bad_frame = "invalid"\n' + layout, database.layout.dbc_path.read_text())
+    corrector = gateway_for(own, battery=(0.25, 5.0))
+    frame = battery(own, 3)
+    for k in range(10):
+        out = passed_on(corrector, frame, 0.05 * k)
+        assert out is not None
+        assert decoded(own, "HV_Battery", out)["BatteryCurrent"] == pytest.approx(76.0)
+    assert corrector.branches[0].time_s == 0.0
+
+
+def test_a_name_amid_the_values_of_a_branch_is_refused_where_it_is_written_back(make_database: MakeDatabase) -> None:
+    database = make_database(dbc=SMALL_DBC + 'VAL_ 2147484160 Power 100 "Limit";\n')
+    in_force = InForce(parameters=parameters_for(database, battery=(0.1, 0.0)))
+    wire(database, in_force, start_s=0.0, mode=Mode.OVERLAY)
+    words = r"branch heater: code 100 of signal Power means 'Limit', .* beyond 99 could be .* full scale is 260000"
+    with pytest.raises(DatabaseError, match=words):
+        wire(database, in_force, start_s=0.0, mode=Mode.GATEWAY)

@@ -1,5 +1,6 @@
 """Parameters of a running node: replaced by what fits, kept otherwise."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -105,3 +106,28 @@ def test_after_a_change_all_is_as_after_a_start(
     for live, new in zip(running.corrector.branches, fresh.branches, strict=True):
         assert (live.plan, live.fault) == (new.plan, new.fault)
         assert live.deadline_s == new.deadline_s
+
+
+def test_when_asked_it_is_read_at_once(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    assert running.file.look(running.corrector, 0.1, asked=True)
+
+
+def test_a_new_file_of_the_same_size_and_time_is_noticed(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    found = path.stat()
+    write_parameters(parameters_for(database, battery=(0.75, 5.0)), path)
+    path.write_bytes(path.read_bytes().replace(b"0.75", b"0.15"))
+    os.utime(path, ns=(found.st_atime_ns, found.st_mtime_ns))
+    assert path.stat().st_size == found.st_size
+    assert running.file.look(running.corrector, 2.0)
+    assert running.drift == 0.15
+
+
+def test_at_start_parameters_of_another_vehicle_are_not_used_and_the_reason_is_published(
+    path: Path, database: VehicleDatabase
+) -> None:
+    path.write_bytes(path.read_bytes().replace(b'"v1"', b'"v2"'))
+    running = Running(path, database)
+    assert (running.drift, running.corrector.reason) == (0.0, Reason.WRONG_VEHICLE)
+    assert running.file.why_not == f"{path}: parameters are for vehicle 'v2', this is 'v1'"

@@ -291,3 +291,115 @@ def test_a_signed_file_in_the_place_of_one_that_nobody_signed_is_told(tmp_path: 
     (tmp_path / "p.json").write_bytes(b'{"payload":"","payloadType":"x","signatures":[]}\n')
     with pytest.raises(UnfitError, match=r"this file was signed by version 1\.0; name the parameter file"):
         read_parameters(tmp_path / "p.json")
+
+
+Change = Callable[[dict[str, Any]], object]
+FINDING = {"branch": "battery", "cause": "inverted", "probability": 0.99, "text": "battery: its sign is turned."}
+CHANGES: dict[str, Change] = {
+    "nothing": lambda d: None,
+    "unknown key": lambda d: d.update(extra=1),
+    "vehicle missing": lambda d: d.pop("vehicle"),
+    "vehicle empty": lambda d: d.update(vehicle=""),
+    "vehicle too long": lambda d: d.update(vehicle="x" * 65),
+    "vehicle a number": lambda d: d.update(vehicle=5),
+    "another schema version": lambda d: d.update(schema_version=2),
+    "schema version a text": lambda d: d.update(schema_version="1"),
+    "number 0": lambda d: d.update(number=0),
+    "number with a fraction": lambda d: d.update(number=1.5),
+    "number left out": lambda d: d.pop("number"),
+    "no branches": lambda d: d.update(branches={}),
+    "branches a list": lambda d: d.update(branches=[]),
+    "17 branches": lambda d: d.update(branches={f"b{k}": d["branches"]["battery"] for k in range(17)}),
+    "drift -1": lambda d: d["branches"]["battery"].update(drift=-1),
+    "drift whole": lambda d: d["branches"]["battery"].update(drift=0),
+    "drift a text": lambda d: d["branches"]["battery"].update(drift="0.1"),
+    "drift true": lambda d: d["branches"]["battery"].update(drift=True),
+    "drift null": lambda d: d["branches"]["battery"].update(drift=None),
+    "deviation null": lambda d: d["branches"]["battery"].update(drift_sd=None),
+    "deviation negative": lambda d: d["branches"]["battery"].update(drift_sd=-0.1),
+    "offset missing": lambda d: d["branches"]["battery"].pop("offset_a"),
+    "apply missing": lambda d: d["branches"]["battery"].pop("apply"),
+    "apply a number": lambda d: d["branches"]["battery"].update(apply=1),
+    "unknown verdict": lambda d: d.update(verdict="fine"),
+    "confidence above 1": lambda d: d.update(confidence=1.01),
+    "digest too short": lambda d: d["dbc"].update(sha256="ab"),
+    "digest with more behind": lambda d: d["dbc"].update(sha256="a" * 64 + "b"),
+    "fleet size 0": lambda d: d["provenance"].update(fleet_size=0),
+    "a sensor model of null": lambda d: d["branches"]["battery"].update(sensor_model=None),
+    "a sensor model": lambda d: d["branches"]["battery"].update(sensor_model={"kind": "temperature"}),
+    "a finding": lambda d: d.update(findings=[FINDING]),
+    "a finding without its branch": lambda d: d.update(findings=[{**FINDING, "branch": None}]),
+    "a finding without its cause": lambda d: d.update(findings=[{**FINDING, "cause": ""}]),
+    "a finding of many words": lambda d: d.update(findings=[{**FINDING, "text": "x" * 501}]),
+    "a finding beyond certainty": lambda d: d.update(findings=[{**FINDING, "probability": 1.1}]),
+    "65 findings": lambda d: d.update(findings=65 * [FINDING]),
+}
+
+
+def test_what_the_schema_refuses_is_not_written(database: VehicleDatabase, tmp_path: Path) -> None:
+    parameters = parameters_for(database, battery=(0.1, 0.0))
+    endless = replace(parameters, provenance=replace(parameters.provenance, duration_s=math.nan))
+    empty = replace(parameters, provenance=replace(parameters.provenance, fleet_size=0))
+    (tmp_path / "p.json").write_text("older")
+    for bad, words in ((endless, "duration_s"), (empty, "fleet_size")):
+        with pytest.raises(ParameterError, match=rf"\$\.provenance\.{words}"):
+            write_parameters(bad, tmp_path / "p.json")
+    assert (tmp_path / "p.json").read_text() == "older"
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_schema_and_reader_agree(database: VehicleDatabase, tmp_path: Path, name: str) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, -2.5)))
+    CHANGES[name](document)
+    assert is_readable(tmp_path / "p.json", document) == VALIDATOR.is_valid(document)
+
+
+def test_where_a_text_is_no_json_is_told(tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_text('{"vehicle": v1}')
+    with pytest.raises(
+        UnfitError, match=r"p\.json: not a parameter file: JSON is malformed: .*\(byte 12\); correct it"
+    ):
+        read_parameters(tmp_path / "p.json")
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "9" * 400])
+def test_numbers_beyond_all_bounds_are_refused(database: VehicleDatabase, tmp_path: Path, number: str) -> None:
+    text = json.dumps(as_document(parameters_for(database, battery=(0.1, -2.5)))).replace("-2.5", number)
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(UnfitError, match=r"not a parameter file"):
+        read_parameters(tmp_path / "p.json")
+
+
+def test_parameters_made_for_this_vehicle_fit(database: VehicleDatabase) -> None:
+    for vehicle in ("v1", None):
+        check_fit(parameters_for(database, battery=(0.4, -150.0)), database, vehicle)
+
+
+def test_limits_are_those_of_what_is_applied(database: VehicleDatabase) -> None:
+    passed = {"battery": replace(SOUND, drift=-0.5, apply=False), "motor": replace(SOUND, offset_a=151.0, apply=False)}
+    parameters = replace(parameters_for(database, battery=(0.1, 1.0)), branches=passed)
+    check_fit(parameters, database, "v1")
+    for name, words in (("battery", r"drift -0\.5 is beyond"), ("motor", r"offset \+151 A is beyond")):
+        with pytest.raises(UnfitError, match=f"^branch {name}: {words}"):
+            check_fit(replace(parameters, branches={name: replace(passed[name], apply=True)}), database, "v1")
+
+
+def test_what_is_in_the_way_of_reading_is_told(tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_bytes(b"{}")
+    with pytest.raises(
+        UnfitError, match="/within: cannot read the parameter file: Not a directory; name one"
+    ) as caught:
+        read_parameters(tmp_path / "p.json" / "within")
+    assert caught.value.reason is Reason.NO_PARAMETERS
+    with pytest.raises(UnfitError, match="not a parameter file: it is a ") as caught:
+        read_parameters(tmp_path)
+    assert caught.value.reason is Reason.MALFORMED_PARAMETERS
+
+
+def test_a_file_of_version_1_0_without_sensor_models_is_read(database: VehicleDatabase, tmp_path: Path) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, 1.0)))
+    assert "sensor_model" not in document["branches"]["battery"]
+    document["branches"]["battery"]["sensor_model"] = None
+    del document["findings"]
+    (tmp_path / "p.json").write_text(json.dumps(document))
+    check_fit(read_parameters(tmp_path / "p.json"), database, None)

@@ -1,9 +1,11 @@
 """A sensor that breaks after the calibration: the node no longer says that its values are corrected."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from ecu_node.bus.run import StateChanges
 from ecu_node.core.status import Quality, Reason, State
 from tests.ecu_node.junctions import NAMES, Junction, driving, three_branches
 
@@ -129,3 +131,23 @@ def test_steps_of_loads_are_no_fault(junction: Junction) -> None:
 
     junction.run(60.0, steps)
     assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
+
+
+def test_without_what_the_calibrator_saw_gross_faults_show_all_the_same(tmp_path: Path) -> None:
+    junction = Junction(three_branches(tmp_path), sd_a=None, sd_per_a=None)
+    junction.run(60.0, driving)
+    assert junction.corrector.latched_branches == ()
+    junction.wrong = {"battery": lambda shown_a: 3.0 * shown_a}
+    junction.run(5.0, driving)
+    assert junction.corrector.latched is Reason.SUM_IMPLAUSIBLE
+
+
+def test_the_log_names_the_sensor(junction: Junction, tmp_path: Path) -> None:
+    changes: Callable[[], str | None] = StateChanges(junction.corrector).news
+    junction.run(5.0, driving)
+    changes()
+    junction.wrong = {"battery": lambda shown_a: shown_a - 100.0}
+    junction.run(1.0, driving)
+    text = changes()
+    assert text is not None
+    assert "the sensor of battery is wrong" in text

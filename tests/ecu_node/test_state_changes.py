@@ -6,6 +6,7 @@ import pytest
 
 from ecu_node.bus.run import StateChanges
 from ecu_node.bus.wiring import InForce, Mode, key_of, put_in_force, wire
+from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.vehicles import Frame, answers, parameters_for, protected
 
@@ -67,3 +68,14 @@ def test_a_correction_that_makes_it_worse_and_a_stuck_branch_are_said_and_that_i
     parameters = parameters_for(drive.database, battery=(0.0, 5.0), motor=(0.0, 0.0))
     assert drive.load(InForce(parameters=parameters)) == ["correcting again", None]
     assert drive.go_on(12.0, BOTH, swing_a=40.0) == [f"{FALLS_BACK}motor never changes"]
+
+
+def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(drive: Drive) -> None:
+    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ()) == AGAIN[:1]
+    assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None]
+    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ()) == AGAIN[::-1]
+
+
+def test_parameters_that_are_taken_back_after_a_fall_back_do_not_correct_again(drive: Drive) -> None:
+    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [f"{FALLS_BACK}no frames of motor"]
+    assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None]

@@ -60,7 +60,8 @@ def test_what_waits_for_a_signer_does_not_keep_the_timestamp_from_being_renewed(
     assert repo.updated(state).startswith("nothing new: ")
     assert "timestamp 2, snapshot 2" in repo.node("inspect", "--state", state)[1]
     assert "2 roles staged: " in repo.done("status", repo.path)
-    assert "2 staged roles dropped; 0 roles staged" in repo.done("status", repo.path, "--unstage")
+    assert "2 staged roles dropped" in repo.done("unstage", repo.path)
+    assert "; 0 roles staged" in repo.done("status", repo.path)
     repo.publish()
     assert repo.updated(state).startswith("nothing new: ")
     assert "root 1, timestamp 3" in repo.node("inspect", "--state", state)[1]

@@ -33,9 +33,21 @@ from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters
 
 __all__ = [
-    "CORE", "FLAGS", "GOLDEN_SHA256", "RECORD", "all_codes", "build", "check_frames", "drawn_vehicles", "frames",
-    "fuzz", "golden", "measure", "run", "vehicle",
-]  # fmt: skip
+    "CORE",
+    "FLAGS",
+    "GOLDEN_SHA256",
+    "RECORD",
+    "all_codes",
+    "build",
+    "check_frames",
+    "drawn_vehicles",
+    "frames",
+    "fuzz",
+    "golden",
+    "measure",
+    "run",
+    "vehicle",
+]
 
 CORE = Path(ecu_node.__file__).parent / "c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")

@@ -259,8 +259,12 @@ class FuzzBranch:
 
     def toml(self) -> str:
         """Its part of the layout."""
-        used = {"signal" if self.voltage is None else "power": self.source, "voltage": self.voltage,
-                "corrected": self.target, "quality": self.quality}  # fmt: skip
+        used = {
+            "signal" if self.voltage is None else "power": self.source,
+            "voltage": self.voltage,
+            "corrected": self.target,
+            "quality": self.quality,
+        }
         lines = [f'{key} = "{signal.message.name}.{signal.name}"' for key, signal in used.items() if signal is not None]
         lines += [f'name = "{self.name}"', f"sign = {self.sign}", "timeout_s = 1e6"]
         return "\n".join(["[[branch]]", *lines, f"no_value = {self.source.unnamed}"])
@@ -323,8 +327,12 @@ def _draw(rng: Random) -> FuzzVehicle:
             branches.append(_draw_branch(rng, f"b{number}", source, net, targets))
     for message in sources:  # and signals that are nobody's business
         message.draw_signal(rng, "Other", rng.choice((1, 4, 8)))
-    used = {signal.message.name for branch in branches for signal in (branch.source, branch.voltage, branch.target)
-            if signal is not None}  # fmt: skip
+    used = {
+        signal.message.name
+        for branch in branches
+        for signal in (branch.source, branch.voltage, branch.target)
+        if signal is not None
+    }
     return FuzzVehicle(
         sources=[message for message in sources if message.name in used],
         targets=[message for message in targets if message.name in used],
@@ -402,8 +410,12 @@ _PROFILES: dict[str, tuple[Callable[..., None], int, int, int, int]] = {
     "P11": (p11.e2e_p11_protect, 12, 1, 4, 15),
 }
 """Function of autosar-e2e, bits of the header, byte and bits of the counter, and its codes."""
-_MODES = {"both": p01.E2E_P01_DATAID_BOTH, "alternating": p01.E2E_P01_DATAID_ALT, "low": p01.E2E_P01_DATAID_LOW,
-          "nibble": p01.E2E_P01_DATAID_NIBBLE}  # fmt: skip
+_MODES = {
+    "both": p01.E2E_P01_DATAID_BOTH,
+    "alternating": p01.E2E_P01_DATAID_ALT,
+    "low": p01.E2E_P01_DATAID_LOW,
+    "nibble": p01.E2E_P01_DATAID_NIBBLE,
+}
 
 
 def _draw_protection(rng: Random, identifier: int, size: int) -> Protection | None:

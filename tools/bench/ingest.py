@@ -134,8 +134,12 @@ def _message_by_message(path: Path, database: VehicleDatabase) -> dict[str, tupl
                 for name, signal, sign in wanted[frame.arbitration_id]:
                     values[name].append(sign * decoded[signal])
     start_s = min(stamps[0] for stamps in times.values() if stamps)
-    return {name: (np.array(times[frame_id]) - start_s, np.array(values[name]))
-            for frame_id, items in wanted.items() for name, *_ in items if times[frame_id]}  # fmt: skip
+    return {
+        name: (np.array(times[frame_id]) - start_s, np.array(values[name]))
+        for frame_id, items in wanted.items()
+        for name, *_ in items
+        if times[frame_id]
+    }
 
 
 def _summary_row(name: str, entry: DriveFile, branches: tuple[str, ...], database: VehicleDatabase) -> Row:

@@ -138,8 +138,11 @@ class Oracle:
         self._database, self._branches = database, [_Branch(branch, mode) for branch in vehicle.branches]
         self._voltage = next((branch.voltage for branch in vehicle.branches if branch.voltage is not None), None)
         self._sources = {message.number: (message, _E2E(message)) for message in vehicle.sources}
-        self._targets = {branch.target.message.number: branch.target.message
-                         for branch in vehicle.branches if branch.target is not None}  # fmt: skip
+        self._targets = {
+            branch.target.message.number: branch.target.message
+            for branch in vehicle.branches
+            if branch.target is not None
+        }
         self._counters = dict.fromkeys(self._targets, -1)
         self._volts: Fraction | None = None
 

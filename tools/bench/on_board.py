@@ -60,8 +60,10 @@ def _replayed(folder: Path, database: VehicleDatabase) -> list[Row]:
         told = {name: (float(delay_s), float(sd_s) if known else None) for name, delay_s, sd_s, known in rows}
         summary = OnBoardSummary(folder / "on_board", vehicle, database, delays=told, say=lambda _: None)
         frames = read_frames(Path(entries[0].place))
-        messages = [(FrameKey(item.arbitration_id, item.is_extended_id), item.data, item.timestamp)
-                    for item in frames.messages()]  # fmt: skip
+        messages = [
+            (FrameKey(item.arbitration_id, item.is_extended_id), item.data, item.timestamp)
+            for item in frames.messages()
+        ]
         started_s = time.process_time()
         for number, message in enumerate(messages):
             summary.take(*message)

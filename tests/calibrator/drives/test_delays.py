@@ -197,3 +197,66 @@ def assert_nothing_known(found: BranchDelays) -> None:
     assert found.known.tolist() == [True, False]
     assert found.delay_s.tolist() == [0.0, 0.0]
     assert found.sd_s.tolist() == [0.0, np.inf]
+
+
+def test_without_noise_steps_seen_by_slow_frames_are_exact_to_a_hundredth_of_the_period() -> None:
+    found = estimate_delays([made_up_drive(5, replace(TRIO, noise_a=0.0, duration_s=900.0))], THREE)
+    np.testing.assert_allclose(found.delay_s, [0.0, -0.23, -0.067], atol=5e-4)
+
+
+def test_scaling_a_branch_or_adding_to_it_does_not_move_its_delay() -> None:
+    drive = made_up_drive(1, PAIR)
+    before = estimate_delays([drive], TWO)
+    after = estimate_delays([with_value(drive, "motor", 1.3 * drive.branches["motor"].value - 40.0)], TWO)
+    np.testing.assert_allclose(after.delay_s, before.delay_s, atol=1e-6)
+
+
+def test_the_order_of_the_branches_after_the_first_does_not_matter() -> None:
+    drive = made_up_drive(2, TRIO)
+    found, swapped = estimate_delays([drive], THREE), estimate_delays([drive], ("battery", "auxiliary", "motor"))
+    np.testing.assert_allclose(swapped.delay_s, found.delay_s[[0, 2, 1]], atol=1e-5)
+
+
+def test_the_other_branch_as_reference_turns_the_sign() -> None:
+    drive = made_up_drive(1, PAIR)
+    found, turned = estimate_delays([drive], TWO), estimate_delays([drive], TWO[::-1])
+    assert turned.delay_s[1] == pytest.approx(-found.delay_s[1], abs=2e-4)
+
+
+def test_samples_labelled_as_bad_do_not_count() -> None:
+    drive = made_up_drive(1, PAIR)
+    motor = drive.branches["motor"]
+    bad = np.random.default_rng(9).random(len(motor.time_s)) < 0.1
+    labelled = replace(motor, value=np.where(bad, np.nan, motor.value), good=~bad)
+    found = estimate_delays([with_channel(drive, "motor", labelled)], TWO)
+    assert found.delay_s[1] == pytest.approx(0.187, abs=1e-3)
+
+
+def test_a_load_without_sensor_that_switches_does_not_matter() -> None:
+    drive = made_up_drive(1, PAIR)
+    battery = drive.branches["battery"]
+    load_a = 4.0 * (np.floor(battery.time_s / 17.0) % 2)
+    found = estimate_delays([with_value(drive, "battery", battery.value + load_a)], TWO)
+    assert found.delay_s[1] == pytest.approx(0.187, abs=2e-3)
+
+
+def test_a_sensor_whose_gain_depends_on_the_sign_does_not_matter() -> None:
+    drive = made_up_drive(1, replace(PAIR, offset_a={}))
+    value = drive.branches["motor"].value
+    found = estimate_delays([with_value(drive, "motor", np.where(value > 0.0, 1.15, 0.95) * value)], TWO)
+    assert found.delay_s[1] == pytest.approx(0.187, abs=3e-3)
+
+
+def test_a_constant_drive_tells_nothing() -> None:
+    drive = made_up_drive(1, replace(PAIR, size_a={"motor": 0.0}))
+    assert_nothing_known(estimate_delays([drive], TWO))
+
+
+def test_a_delay_beyond_the_longest_is_flagged() -> None:
+    vehicle = replace(PAIR, delay_s={"motor": 0.8})
+    assert_nothing_known(estimate_delays([made_up_drive(1, vehicle)], TWO))
+
+
+def test_a_branch_of_the_wrong_sign_is_flagged() -> None:
+    drive = made_up_drive(1, PAIR)
+    assert_nothing_known(estimate_delays([with_value(drive, "motor", -drive.branches["motor"].value)], TWO))

@@ -4,9 +4,19 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.decision import Points, best_estimate, harm_probability
+from calibrator.estimator.decision import (
+    Explained,
+    Points,
+    best_estimate,
+    harm_probability,
+    posterior_points,
+)
+from calibrator.estimator.posterior import draw_explanations, fit_explanations, weigh
+from calibrator.estimator.prior import Prior, Slab, first_prior
 from calibrator.faults import Faults
 from calibrator.score import recovered
+from tests.calibrator.estimator.simulated_drives import no_faults
+from tests.calibrator.estimator.simulated_rows import plain_evidence, random_faults, rows_of
 
 K = 2
 LEAST = np.array([0.05, 0.05])
@@ -68,3 +78,106 @@ def test_harm_is_that_of_simulated_currents() -> None:
     worse = ((corrected - true) ** 2).mean(axis=1) > ((measured - true) ** 2).mean(axis=1)
     np.testing.assert_allclose(harm_probability(found, estimate, mean, square), worse.mean(axis=0), atol=1e-9)
     assert 0.0 < worse.mean() < 1.0
+
+
+MEAN, SQUARE = np.array([[0.1, -0.1]]), np.array([[0.05, 0.05]])
+
+
+def test_explanations_within_tolerance_of_each_other_count_together() -> None:
+    found = points([(0.4, [0.2, 0, 0, 0]), (0.3, [0, 0.1, 0, 0]), (0.3, [0, 0.1004, 0, 0])], sd=1e-6)
+    estimate, confidence = best_estimate(found, LEAST)
+    assert estimate[1] == pytest.approx(0.1, abs=1e-3)
+    assert confidence == pytest.approx(0.6)
+
+
+def test_small_faults_are_counted_with_the_smallest_of_the_fleet() -> None:
+    found = points([(0.5, [0, 0, 0, 0]), (0.5, [0.004, 0, 0, 0])])
+    assert best_estimate(found, np.array([0.05, 0.05]))[1] == pytest.approx(1.0)
+    assert best_estimate(found, np.array([0.005, 0.05]))[1] == pytest.approx(0.5)
+
+
+def test_order_of_the_branches_and_the_sign_of_all_faults_do_not_matter() -> None:
+    found, order = points(TWO_EXPLANATIONS, sd=0.004), [1, 0, 3, 2]
+    estimate, confidence = best_estimate(found, LEAST)
+    swapped = best_estimate(found._replace(faults=found.faults[:, order]), LEAST)
+    np.testing.assert_allclose(swapped[0], estimate[order], atol=1e-12)
+    assert swapped[1] == pytest.approx(confidence)
+    mirrored = best_estimate(found._replace(faults=-found.faults), LEAST)
+    np.testing.assert_allclose(mirrored[0], -estimate, atol=1e-12)
+    assert mirrored[1] == pytest.approx(confidence)
+
+
+def test_harm_on_any_drive_counts_once_and_a_branch_without_a_correction_has_none() -> None:
+    found, estimate = points(TWO_EXPLANATIONS, sd=0.05), np.array([0.12, 0.0, 0.0, 0.0])
+    still = np.zeros((1, K)), np.full((1, K), 1e-4)
+    one, other = (harm_probability(found, estimate, *drive) for drive in ((MEAN, SQUARE), still))
+    both = harm_probability(found, estimate, np.concatenate([MEAN, still[0]]), np.concatenate([SQUARE, still[1]]))
+    assert max(one[0], other[0]) <= both[0] <= min(one[0] + other[0], 1.0)
+    assert both[1] == 0.0
+
+
+def explained(truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0) -> Explained:
+    """One model's draws of a fleet."""
+    shared = np.zeros(2 * K + 1) if shared is None else shared
+    centre = np.zeros(5 * K)
+    centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
+    evidence = plain_evidence(rows_of(truth, seed=2, load=load), centre=centre, shared=shared)
+    log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
+    draws = draw_explanations(fit_explanations(evidence, prior.log_supports + 1.0, log_load), evidence)
+    return Explained(1.0, draws, weigh(draws, prior)[0], prior.group_centre)
+
+
+def test_fault_models_are_averaged_by_their_probabilities() -> None:
+    truth = random_faults(3, vehicles=2, branches=K)
+    shared = np.array([0.0, 0.01, 0.0, 0.02, 0.0])
+    models = [
+        explained(truth, first_prior(K))._replace(probability=0.7),
+        explained(truth, first_prior(K), shared=shared)._replace(probability=0.3),
+    ]
+    both, single = (
+        posterior_points(models)[0],
+        [posterior_points([model._replace(probability=1.0)])[0] for model in models],
+    )
+    mean = 0.7 * single[0].weight @ single[0].faults + 0.3 * single[1].weight @ single[1].faults
+    np.testing.assert_allclose(both.weight @ both.faults, mean, atol=1e-12)
+    assert np.bincount(both.model, np.bincount(both.explanation, both.weight)) == pytest.approx([0.7, 0.3], abs=1e-4)
+
+
+def test_what_the_sensors_share_is_part_of_every_fault() -> None:
+    shared = np.array([0.0, 0.02, 0.03, 0.0, 0.0])
+    sound = no_faults(1, K)
+    sound.drift[0, 0], sound.offset_a[0, 1] = np.expm1(0.03), 0.02
+    estimate, confidence = best_estimate(posterior_points([explained(sound, first_prior(K), shared=shared)])[0], LEAST)
+    np.testing.assert_allclose(estimate, [np.expm1(0.03), 0.0, 0.0, 0.02], atol=1e-9)
+    assert confidence > 0.9
+
+
+def group_prior() -> Prior:
+    slab = Slab(low=0.02, high=0.3, tail=0.01)
+    share, centre, sd = np.array([[0.4], [0.03], [0.001]])
+    counts = first_prior(K).counts
+    return Prior(counts=counts, gain=slab, offset=slab, group_share=share, group_centre=centre, group_sd=sd)
+
+
+@pytest.mark.parametrize("of_sensor", [False, True])
+def test_what_a_group_shares_is_an_offset_where_it_is_one_of_the_sensors(of_sensor: bool) -> None:
+    truth, load = no_faults(1, K), 0.0
+    if of_sensor:
+        truth.offset_a[0, 0] = 0.03
+    else:
+        load = 0.03
+    found = posterior_points([explained(truth, group_prior(), shared=np.append(np.zeros(4), of_sensor), load=load)])[0]
+    expected = [0.0, 0.0, 0.03 * of_sensor, 0.0]
+    np.testing.assert_allclose(best_estimate(found, LEAST)[0], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("of_sensor", [False, True])
+def test_offset_beside_what_a_group_shares_is_that_of_the_sensor(of_sensor: bool) -> None:
+    truth = no_faults(1, K)
+    truth.offset_a[0, 0], truth.drift[0, 0] = (0.18 if of_sensor else 0.15), 0.1
+    prior, shared = group_prior(), np.append(np.zeros(4), of_sensor)
+    model = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
+    of_group = model.weight.copy()
+    of_group[..., 0] = 0.0  # of those who belong to the group
+    found = posterior_points([model._replace(weight=of_group / of_group.sum())])[0]
+    np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)

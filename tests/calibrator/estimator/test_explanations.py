@@ -6,10 +6,12 @@ import pytest
 from calibrator.drive import Array
 from calibrator.estimator.posterior import Evidence, Fits, fit_explanations, row_residuals
 from calibrator.estimator.prior import first_prior
+from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_rows import (
     Errors,
     all_supports,
     dense_fit,
+    parameters_of,
     plain_evidence,
     plain_residual,
     random_faults,
@@ -75,3 +77,52 @@ def test_fits_of_two_branches_are_those_of_all_supports_one_by_one(errors: Error
             np.testing.assert_allclose((fits.root[j, q] @ fits.root[j, q].T)[np.ix_(on, on)], covariance, rtol=0.02)
         missed = [value for on, value in score.items() if on not in found]
         assert np.exp(np.array(missed) - max(score.values())).sum() < 1e-3
+
+
+@pytest.mark.parametrize("of_sensor", [False, True])
+@BRANCHES
+def test_what_all_sensors_share_leaves_nothing_either(K: int, of_sensor: bool) -> None:
+    """Offset and gain of every sensor of a branch beside the vehicle's own; what a group shares is offset or load."""
+    own = random_faults(K, vehicles=20, branches=K, sparsity=50.0)
+    group = np.where(np.arange(20) % 2 == 0, 0.02, 0.0)
+    shared, centre = np.zeros(2 * K + 1), np.zeros(5 * K)
+    shared[0], shared[K - 1], shared[K], shared[2 * K - 1], shared[-1] = 0.03, -0.01, 0.05, -0.04, of_sensor
+    centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
+    offset = own.offset_a + shared[:K]
+    offset[:, 0] += group * of_sensor
+    both = Faults(
+        hardware_drift=own.hardware_drift,
+        hardware_offset_a=own.hardware_offset_a,
+        drift=(1.0 + own.drift) * np.exp(shared[K : 2 * K]) - 1.0,
+        offset_a=offset,
+    )
+    theta = parameters_of(own, group)
+    theta[:, 2 * K : 3 * K] = own.offset_a / (1.0 + both.drift)
+    rows = rows_of(both, noise=0.0, load=0.0 if of_sensor else group)
+    left = row_residuals(plain_evidence(rows, centre=centre, shared=shared), theta[:, None])[:, 0]
+    np.testing.assert_allclose(left[rows.known], 0.0, atol=1e-12)
+
+
+def test_offset_of_the_feeding_sensor_and_a_load_are_never_both_fitted() -> None:
+    faults = random_faults(9, vehicles=20, branches=3)
+    faults.offset_a[:, 0] = 0.02
+    fits = fitted(plain_evidence(rows_of(faults, seed=9, load=0.01)))
+    assert fits.support[:, :, 6].any()
+    assert fits.support[:, :, 9].any()
+    assert not (fits.support[:, :, 6] & fits.support[:, :, 9]).any()
+
+
+def test_rows_that_nothing_explains_and_rows_that_say_nothing_are_fitted_without_failing() -> None:
+    rows = rows_of(random_faults(10, vehicles=3, branches=2))
+    rows.relative[0, :2], rows.constant[1, :2] = 3.0, -40.0
+    rows.covariance[2] = 100.0 * np.eye(10)
+    fits = fitted(plain_evidence(rows))
+    assert (fits.number > 0).all()
+    for j in range(3):
+        n = fits.number[j]
+        assert np.isfinite(fits.log_evidence[j, :n]).all()
+        assert np.isfinite(fits.theta[j, :n]).all()
+        assert np.isfinite(fits.root[j, :n]).all()
+    assert () in supports(fits, 2)
+    np.testing.assert_allclose(fits.theta[2], 0.0, atol=0.05)
+    np.testing.assert_allclose(np.einsum("qpp->p", fits.root[2, : fits.number[2]] ** 2).max() > 0.1, True)

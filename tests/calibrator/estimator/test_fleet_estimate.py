@@ -95,3 +95,33 @@ def test_a_wrong_sign_or_unit_in_most_vehicles_is_refused(
     with pytest.raises(FleetError, match=re.escape(f"{told}, expected -1 A; check sign and unit of branch")):
         learn_fleet(most, full_scale_a=SCALE_A, branches=NAMES)
     assert learn_fleet(few, full_scale_a=SCALE_A, branches=NAMES).vehicles == VEHICLES
+
+
+def test_nothing_is_corrected_at_a_harm_limit_of_zero(summaries: list[DriveSummary], reference: FleetReference) -> None:
+    found = estimate_vehicles(summaries, reference, harm_limit=0.0)
+    assert not found.corrected.any()
+    assert "corrected" not in found.verdicts
+
+
+def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_said(truth: Faults) -> None:
+    batch = replace(truth, offset_a=truth.offset_a + np.array([12.0, 0.0]))
+    summaries = list(summaries_of(batch, Conditions(model_error_a=0.3), seed=4))
+    learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=NAMES)
+    assert any("sum to +12" in notice for notice in learnt.notices)
+    found = estimate_vehicles(summaries, learnt)
+    applied = replace(
+        batch,
+        drift=np.where(found.corrected, found.drift, 0.0),
+        offset_a=np.where(found.corrected, found.offset_a, 0.0),
+    )
+    mean_a = np.array([summary.mean_a for summary in summaries])
+    assert not harmed(applied, batch, mean_a=mean_a, mean_square_a2=mean_a**2 + 900.0).any()
+
+
+def test_pit_of_the_truth_lies_between_zero_and_one(
+    truth: Faults, summaries: list[DriveSummary], reference: FleetReference
+) -> None:
+    for pit in estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
+        assert pit.shape == (VEHICLES, K)
+        assert ((pit >= 0.0) & (pit <= 1.0 + 1e-9)).all()
+        assert 0.3 < pit.mean() < 0.7

@@ -340,3 +340,37 @@ def test_wrong_option_is_one_line(table: Path, tmp_path: Path, options: list[str
     assert match in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "r").exists()
+
+
+def test_gain_ratios_are_named_in_the_order_of_the_layout(motor_off: pd.DataFrame) -> None:
+    turned = Junction(branches=["heater", "motor", "battery"], full_scale_a=400.0)
+    (said,) = [each for each in JunctionCalibrator().fit(motor_off, turned).notices_ if "gain ratios" in each]
+    assert "(heater / motor)" in said
+    assert "1.05" in said.partition("(motor / battery)")[0]
+
+
+def test_offset_is_open_where_loads_are_not_known() -> None:
+    frame = recording(offset_a=(0.0, 4.0, 0.0))
+    rows = found(frame, trusted=["battery"]).loc["vehicle"]
+    assert rows.offset_sd_a["motor"] > 2.0
+    assert not rows.corrected.any()
+
+
+def test_right_sensors_are_said_to_be_right() -> None:
+    calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(recording(), JUNCTION)
+    assert set(calibrator.parameters_.verdict) == {"no sensor fault"}
+
+
+def test_bench_reading_is_a_reference() -> None:
+    readings = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
+    rows = found(recording(gain=(0.03, 0.05, 0.0)), readings=readings).loc["vehicle"]
+    assert rows.gain_error["battery"] == pytest.approx(0.03, abs=3.0 * rows.gain_error_sd["battery"])
+
+
+def test_branch_that_is_off_keeps_its_gain_open() -> None:
+    frame = recording().assign(heater=0.0)
+    frame["battery"] = -frame["motor"] + np.random.default_rng(2).normal(0.0, 0.2, len(frame))
+    rows = found(frame, trusted=["battery"]).loc["vehicle"]
+    assert rows.gain_error_sd["heater"] > 0.1
+    assert rows.gain_error_sd["motor"] < 0.01
+    assert not rows.corrected["heater"]

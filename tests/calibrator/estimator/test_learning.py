@@ -13,7 +13,7 @@ from calibrator.estimator.posterior import FaultModel, Spread, explain
 from calibrator.estimator.prior import Prior, first_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
-from tests.calibrator.estimator.simulated_rows import random_faults, rows_of
+from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
 
 
 def moved(rows: EvidenceRows, by: Array) -> EvidenceRows:
@@ -160,3 +160,41 @@ def test_one_vehicle_and_a_branch_that_nobody_used_are_learned_from_without_fail
     model = learned(rows)
     assert np.isfinite(model.spread.covariance).all()
     assert model.spread.mean[K - 1] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> None:
+    K = 2
+    rows = rows_of(random_faults(4, vehicles=60, branches=K), seed=4, errors=Errors(intercept=0.004))
+    stated = rows.covariance.copy()
+    at = RowPlaces(K).intercepts
+    stated[:, at, at] -= np.diag([0.004**2 - 0.001**2] * K)
+    wide, plain = (learned(each).spread for each in (replace(rows, covariance=stated), rows))
+    variance = 0.001**2 * wide.dispersion + np.diag(wide.covariance)[at]
+    np.testing.assert_allclose(variance, 0.004**2, rtol=0.5)
+    assert (wide.dispersion > 2.0 * plain.dispersion).all()
+
+
+def test_share_of_faulty_vehicles_is_as_expected() -> None:
+    rows = rows_of(random_faults(9, vehicles=20, branches=2, sparsity=90.0), seed=9)
+    for share in (0.1, 0.6):
+        assert learned(rows, expected_faults=share).prior.counts[:, 1:].sum() == pytest.approx(share, abs=1e-9)
+
+
+def test_centre_that_trusted_vehicles_carry_is_kept() -> None:
+    K, at = 2, RowPlaces(2)
+    rows, fixed = rows_of(random_faults(10, vehicles=25, branches=K), seed=10), np.full(5 * K, np.nan)
+    trusted = [at.slope(0), at.intercept(0)]
+    fixed[trusted] = 0.001, -0.0005
+    model = learn_fault_models(rows, feed=0, fixed=fixed)[0]
+    np.testing.assert_array_equal(model.spread.mean[trusted], fixed[trusted])
+    assert np.isnan(fixed[at.junction]), "what the caller gave is not changed"
+
+
+@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
+def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors(K: int) -> None:
+    load = np.random.default_rng(15).normal(0.0075, 0.0025, 30).clip(0.0)
+    errors = Errors(intercept=0.0003, junction=0.0001)  # as on recorded trips
+    model = learned(rows_of(random_faults(15, vehicles=30, branches=K), seed=15, errors=errors, load=load))
+    carried = [model.spread.covariance[row, 4 * K - 1] for row in (3 * K - 1, 4 * K - 1)]
+    np.testing.assert_allclose(np.sqrt(carried), load.std(), rtol=0.3)
+    assert not model.spread.shared.any()

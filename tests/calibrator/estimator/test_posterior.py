@@ -16,6 +16,7 @@ from calibrator.estimator.posterior import (
     weigh,
 )
 from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, known_prior, with_slabs
+from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import (
     Errors,
     all_supports,
@@ -128,3 +129,64 @@ def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None
     exact = np.array([weigh(draws, with_slabs(prior, *part))[1].sum() for part in parts])
     np.testing.assert_allclose(found - found[0], exact - exact[0], atol=1e-6 if every == 1 else 3.0)
     assert np.argmax(found) == np.argmax(exact) == 1
+
+
+def test_an_offset_is_known_though_the_gain_of_its_branch_is_not() -> None:
+    """A current that hardly changed: o = (1 + d) omega is exact, so d and omega lie on a narrow curve."""
+    prior, truth = paper_prior(2, 1, 2), no_faults(1, 2)
+    truth.offset_a[0, 1] = 0.19
+    blind = Errors(slope=0.4, ratio=0.4, intercept=1e-4, junction=1e-4)
+    rows = rows_of(truth, errors=blind, currents=np.array([0.001, -0.001]))
+    draws = drawn(rows, prior)
+    found = of_supports(draws, weigh(draws, prior)[0], 0)
+    gain, away = np.meshgrid(np.linspace(-0.4, 0.3, 701), np.linspace(-8e-4, 8e-4, 161))
+    precision = np.linalg.inv(rows.covariance[0])
+    log_evidence = []
+    for on in ((5,), (2, 5)):
+        theta = np.zeros((gain.size, 7))
+        theta[:, 2] = gain.ravel() if 2 in on else 0.0
+        theta[:, 5] = (0.19 + away.ravel()) * np.exp(-theta[:, 2])
+        e = plain_residual(rows, theta)
+        value = log_prior(prior, theta, on) - 0.5 * np.einsum("sa,ab,sb->s", e, precision, e) - theta[:, 2]
+        log_evidence.append(logsumexp(value) + np.log(1e-3 if 2 in on else 1.0 / 701))
+    odds = float(np.exp(log_evidence[1] - log_evidence[0]))
+    assert 0.05 < odds < 20.0  # the recording does not tell
+    assert found[2, 5][0] / found[5,][0] == pytest.approx(odds, rel=0.15)
+
+
+def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
+    prior = Prior(
+        counts=paper_prior(2, 0, 1).counts,
+        gain=Slab(low=0.05, high=0.25, tail=1e-6),
+        offset=Slab(low=0.01, high=0.25, tail=1e-6),
+        load_share=0.3,
+    )
+    rows = rows_of(no_faults(3, 2), errors=Errors(intercept=0.003, junction=0.003), load=np.array([0.01, 0.004, -0.02]))
+    draws = drawn(rows, prior)
+    weight, _ = weigh(draws, prior)
+    supports = [on for on in all_supports(2) if len(on) <= 1]
+    for j in range(3):
+        grid = {on: integrated(rows.take(slice(j, j + 1)), prior, on, 2001)[0] for on in supports}
+        share = np.exp(grid[6,] - logsumexp(list(grid.values())))
+        assert of_supports(draws, weight, j)[6,][0] == pytest.approx(share, abs=0.04)
+    loads = draws.values[..., 6] * draws.fits.support[:, :, None, 6]
+    assert weight[loads < 0.0].max() < 1e-30
+    assert [of_supports(draws, weight, j)[6,][0] > 0.5 for j in range(3)] == [True, False, False]
+
+
+def test_fault_beside_what_a_group_shares_is_found() -> None:
+    prior = Prior(
+        counts=paper_prior(2, 0, 1).counts,
+        gain=Slab(low=0.05, high=0.25, tail=1e-6),
+        offset=Slab(low=0.05, high=0.25, tail=1e-6),
+        group_share=np.array([0.4]),
+        group_centre=np.array([0.02]),
+        group_sd=np.array([0.001]),
+    )
+    truth = no_faults(1, 2)
+    truth.offset_a[0, 0] = 0.12
+    draws = drawn(rows_of(truth, seed=8), prior)
+    weight, _ = weigh(draws, prior)
+    both = weight[0, draws.fits.support[0, :, 4]].sum(axis=(0, 1))
+    assert both.sum() > 0.9
+    assert both[0] / both[1] == pytest.approx((1.0 - 0.4 - prior.load_share) / 0.4, rel=0.02)

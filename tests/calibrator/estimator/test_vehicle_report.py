@@ -9,7 +9,7 @@ from msgspec.structs import replace as changed
 from calibrator.drive import Array
 from calibrator.estimator.evidence import EvidenceRows, evidence_names, reported_evidence
 from calibrator.estimator.fleet_estimate import FleetEstimate
-from calibrator.estimator.vehicle_report import deciding_evidence, explained
+from calibrator.estimator.vehicle_report import deciding_evidence, explained, impossible
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, SensorFinding
 from tests.ecu_node.vehicles import parameters_for
@@ -186,3 +186,8 @@ def test_evidence_is_reported_in_the_units_of_the_sensors() -> None:
     assert made["gain ratio battery / motor"] == pytest.approx(float(gain[0, 0]))
     assert (made["intercept battery"], made["intercept motor"]) == pytest.approx((2.2, 10.0))
     assert made["junction constant"] == pytest.approx(1.1 * (12.0 + 2.0))  # with the load that no branch measures
+
+
+def test_gain_error_of_a_whole_or_more_has_no_parameters() -> None:
+    assert impossible(estimate(of(1.0, drift=(0.9, 0))), 0, NAMES) == ""
+    assert "its motor current does not follow its inputs" in impossible(estimate(of(1.0, drift=(0, 1.2))), 0, NAMES)
