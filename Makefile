@@ -8,6 +8,8 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 PYTHONS ?=
 PIP_QUIET := --quiet --disable-pip-version-check --no-deps
 
+unexport PYTHONDONTWRITEBYTECODE # where it is set, each of some thousand processes compiles anew what it imports
+
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test bus-gateway bus-node check-long coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs \
 	notebook dist package sbom licences schema constraints clean

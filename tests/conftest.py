@@ -7,8 +7,12 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakSet
 
-import can
 import pytest
+
+from ecu_node.program import load_python_can
+
+load_python_can()  # before the first import of it, which would bring pandas into each process of the tests
+import can  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
