@@ -3,6 +3,7 @@
 import fcntl
 import os
 import subprocess
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from tests.calibrator.conftest import LAYOUT, run_command
 
-__all__ = ["calibrator", "made_once"]
+__all__ = ["calibrator", "made_once", "once"]
 
 
 def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -30,12 +31,21 @@ def said(stream: TextIOWrapper) -> str:
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, *arguments: object) -> Path:
-    """Folder that a command writes: the first worker of a test run makes it, and all of them read it."""
+    """Folder that a command writes, for all tests."""
+
+    def make(out: Path) -> None:
+        done = calibrator(*arguments, "--layout", LAYOUT, "--out", out)
+        assert done.returncode == 0, done.stderr
+
+    return once(factory, name, make)
+
+
+def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """Folder that the first worker of a test run makes, and all of them read."""
     base = factory.getbasetemp()
     out = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
     with out.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not out.exists():
-            done = calibrator(*arguments, "--layout", LAYOUT, "--out", out)
-            assert done.returncode == 0, done.stderr
+            make(out)
     return out

@@ -56,13 +56,13 @@ class DelayErrors:
     elapsed_s: Array
 
 
-def import_trips(data: Path, store: Path) -> None:
-    """Make a drive store of the recordings."""
+def import_trips(data: Path, store: Path) -> str:
+    """Make a drive store of the recordings; returns the account of the import as JSON."""
     command = [
         sys.executable, str(ROOT / "tools" / "import_bmw_i3.py"), str(data / "bmw_i3_summer"),
-        "--layout", str(LAYOUT), "--out", str(store),
+        "--layout", str(LAYOUT), "--out", str(store), "--json",
     ]  # fmt: skip
-    subprocess.run(command, capture_output=True, text=True, check=True)
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def delayed_trips(store: Path, *, branches: int, seed: int = 0) -> Iterator[DelayedTrip]:

@@ -16,7 +16,7 @@ from calibrator.faults import measured_currents, true_currents
 from calibrator.files.layout_files import vehicle_database
 from calibrator.summaries.summariser import summarise_samples
 from ecu_node.parameters import SensorFinding
-from tests.real.delay_trips import LAYOUT, import_trips
+from tests.real.delay_trips import LAYOUT
 
 Bend = Callable[[Array, Array], Array]
 """What a sensor shows of its currents [A], given the share of the time that has passed."""
@@ -32,10 +32,8 @@ BENDS: dict[str, Bend] = {
 
 
 @pytest.fixture(scope="module")
-def fleet(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> RecordedFleet:
-    store = tmp_path_factory.mktemp("i3") / "store"
-    import_trips(shared_data, store)
-    return read_fleet(store, vehicle_database(LAYOUT))
+def fleet(i3_store: Path) -> RecordedFleet:
+    return read_fleet(i3_store, vehicle_database(LAYOUT))
 
 
 def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Bend]) -> list[tuple[SensorFinding, ...]]:

@@ -8,24 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.real.delay_trips import DelayErrors, delay_errors, import_trips, rms
+from tests.real.delay_trips import DelayErrors, delay_errors, rms
 
 
 @pytest.fixture(scope="module")
-def store(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("i3") / "store"
-    import_trips(shared_data, path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def three(store: Path) -> DelayErrors:
-    return delay_errors(store, branches=3)
+def three(i3_store: Path) -> DelayErrors:
+    return delay_errors(i3_store, branches=3)
 
 
 @pytest.mark.long
-def test_battery_and_motor_are_told_apart_to_half_a_millisecond_on_all_32_trips(store: Path) -> None:
-    two = delay_errors(store, branches=2)
+def test_battery_and_motor_are_told_apart_to_half_a_millisecond_on_all_32_trips(i3_store: Path) -> None:
+    two = delay_errors(i3_store, branches=2)
     assert two.known.shape == (32, 1)
     assert two.known.all()
     assert rms(two.error_s) < 0.5e-3

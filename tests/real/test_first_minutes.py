@@ -15,8 +15,8 @@ from calibrator.drives.store import iterate_drives
 from calibrator.files.layout_files import vehicle_database
 from calibrator.recordings.canlog import write_drive_log
 from ecu_node.layout import read_layout
+from tests.calibrator.command_here import calibrator as calibrator_here
 from tests.calibrator.doctor.artificial_logs import examined
-from tests.real.delay_trips import import_trips
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "tesla_model3.toml"
@@ -24,9 +24,10 @@ I3_LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 
 
 def calibrator(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "calibrator", *arguments]
-    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(folder)}
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, env=environment)
+    """Run a command in a folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return calibrator_here(*arguments)
 
 
 @pytest.fixture(scope="module")
@@ -219,10 +220,3 @@ def test_trips_of_a_bmw_i3_are_sound_and_an_inverted_motor_is_named(trip: str, i
     changed = re.sub(r'("HV_Motor.MotorCurrent"\nsign = )-1', r"\g<1>1", text)
     (tmp_path / "wrong.toml").write_text(changed)
     assert examined(tmp_path / "wrong.toml", tmp_path / "trip.log.gz").errors == [("sign", "motor")]
-
-
-@pytest.fixture(scope="module")
-def i3_store(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    store = tmp_path_factory.mktemp("i3") / "store"
-    import_trips(shared_data, store)
-    return store

@@ -1,8 +1,5 @@
 """The recorded trips of a BMW i3, as they are and with faults put into them."""
 
-import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,32 +21,17 @@ STUCK_HEATER = {"TripA03", "TripA05", "TripA06", "TripA13", "TripA18"}
 """Known from the energy balance. TripA20, also said to be implausible, agrees with its balance but for the defaults."""
 
 
-@pytest.fixture(scope="module")
-def imported(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, list[str]]]:
-    store = tmp_path_factory.mktemp("i3") / "store"
-    command = [
-        sys.executable, str(ROOT / "tools" / "import_bmw_i3.py"), str(shared_data / "bmw_i3_summer"),
-        "--layout", str(LAYOUT), "--out", str(store), "--json",
-    ]  # fmt: skip
-    account = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-    assert account["failed"] == {}
-    return store, {name: drive["notices"] for name, drive in account["drives"].items()}
-
-
 @pytest.mark.long
-def test_all_32_trips_are_imported_and_the_stuck_heaters_named(imported: tuple[Path, dict[str, list[str]]]) -> None:
-    _, notices = imported
-    assert len(notices) == 32
-    implausible = {name for name, texts in notices.items() if any("implausible" in text for text in texts)}
+def test_all_32_trips_are_imported_and_the_stuck_heaters_named(i3_notices: dict[str, list[str]]) -> None:
+    assert len(i3_notices) == 32
+    implausible = {name for name, texts in i3_notices.items() if any("implausible" in text for text in texts)}
     assert implausible == STUCK_HEATER
-    assert all(any("default of 5.52 kW" in text for text in texts) for texts in notices.values())
+    assert all(any("default of 5.52 kW" in text for text in texts) for texts in i3_notices.values())
 
 
-def test_the_other_trips_give_valid_samples_whose_currents_sum_to_zero(
-    imported: tuple[Path, dict[str, list[str]]],
-) -> None:
+def test_the_other_trips_give_valid_samples_whose_currents_sum_to_zero(i3_store: Path) -> None:
     layout = read_layout(LAYOUT)
-    drives = [drive for drive in iterate_drives(imported[0], layout) if drive.name not in STUCK_HEATER]
+    drives = [drive for drive in iterate_drives(i3_store, layout) if drive.name not in STUCK_HEATER]
     inputs, left_out = choose_inputs(layout, {name for drive in drives for name in drive.inputs})
     assert left_out == ("low_voltage_current",)
     for drive in drives:
@@ -61,8 +43,8 @@ def test_the_other_trips_give_valid_samples_whose_currents_sum_to_zero(
 
 
 @pytest.fixture(scope="module")
-def trips(imported: tuple[Path, dict[str, list[str]]]) -> RecordedFleet:
-    return read_fleet(imported[0], read_database(read_layout(LAYOUT)))
+def trips(i3_store: Path) -> RecordedFleet:
+    return read_fleet(i3_store, read_database(read_layout(LAYOUT)))
 
 
 @pytest.mark.long
