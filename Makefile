@@ -11,7 +11,7 @@ PIP_QUIET := --quiet --disable-pip-version-check --no-deps
 unexport PYTHONDONTWRITEBYTECODE # where it is set, each of some thousand processes compiles anew what it imports
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bus-gateway bus-node check-long coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs \
+.PHONY: help setup demo test suite vcan-fleet bus-gateway bus-node check-long coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs \
 	notebook dist package sbom licences schema constraints clean
 
 help:                    ## this list
@@ -36,18 +36,27 @@ $(VENV)/.compiled: $(VENV)/.installed
 demo: setup              ## a fleet, its calibration, and the Kirchhoff sum before and after (DRIVES=folder: real drives)
 	$(BIN)/python tools/demo.py --drives $(DRIVES) --out $(OUT)
 
-TEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal
+# tests write many files and sync each, which costs nothing in memory: where there are 4 GB of it
+IN_MEMORY := $(shell [ "$$(df --output=avail /dev/shm | tail -n 1)" -gt 4000000 ] 2>/dev/null && echo TMPDIR=/dev/shm)
+TEST := $(IN_MEMORY) $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 VCAN := HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan
 
 test: setup              ## all tests but the long ones; those of SocketCAN on a kernel that has it
+	$(MAKE) --no-print-directory --jobs=3 suite bus-gateway bus-node
+
+suite: setup             # the tests that need no bus
 	$(TEST) -m "not long" --durations 20
-	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
-	$(MAKE) --no-print-directory --jobs=2 --output-sync bus-gateway bus-node
+
+vcan-fleet: setup
+	@mkdir -p build
+	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet >build/vcan_fleet.log 2>&1 || { cat build/vcan_fleet.log; false; }
 
 GATEWAY := tests/vcan/test_kernel_gateway.py
-bus-gateway bus-node:    # each half takes two minutes on a kernel of its own, most of them waiting
-	$(VCAN) --or-skip $(BIN)/python -m pytest -m "not long" \
-		$(if $(filter bus-gateway,$@),$(GATEWAY),tests/vcan --ignore $(GATEWAY))
+bus-gateway bus-node: vcan-fleet # each on a kernel of its own, most of the time waiting, beside the others
+	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(VCAN) --or-skip $(BIN)/python -m pytest -m "not long" \
+		$(if $(filter bus-gateway,$@),$(GATEWAY),tests/vcan --ignore $(GATEWAY)) >build/$@.log 2>&1 \
+		|| { cat build/$@.log; false; }
+	@tail -n 1 build/$@.log
 
 check-long: setup        ## the long tests: whole fleets, soak, power cuts, fuzz of many seeds (half an hour)
 	$(TEST) -m long --durations 20
