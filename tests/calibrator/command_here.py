@@ -34,7 +34,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, *arguments: object) ->
     """Folder that a command writes, for all tests."""
 
     def make(out: Path) -> None:
-        done = calibrator(*arguments, "--layout", LAYOUT, "--out", out)
+        done = calibrator(*arguments, "--layout", LAYOUT, "--out", out, "--workers", 1)
         assert done.returncode == 0, done.stderr
 
     return once(factory, name, make)

@@ -1,3 +1,5 @@
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,13 @@ settings.load_profile("calibrator")
 @pytest.fixture(scope="session")
 def database() -> VehicleDatabase:
     return read_database(read_layout(LAYOUT))
+
+
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """A folder whose path is short, as the names of sockets must be."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
 
 
 def run_command(arguments: list[str]) -> int:

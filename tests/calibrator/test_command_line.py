@@ -5,9 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +15,10 @@ from typer.testing import CliRunner
 from calibrator.cli import app
 from calibrator.processes.interrupts import TERMINATED, interrupted_message, terminated_message
 from ecu_node.program import INTERRUPTED
+from tests.calibrator.command_here import calibrator
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
-
-
-def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "calibrator", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 
 
 @pytest.mark.parametrize(
@@ -178,13 +172,6 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(tmp_path:
         _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (INTERRUPTED, f"{interrupted_message(command[3:])}\n")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.fixture
-def short_folder() -> Iterator[Path]:
-    """A folder whose path is short, as the names of sockets must be."""
-    with tempfile.TemporaryDirectory() as folder:
-        yield Path(folder)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.0])

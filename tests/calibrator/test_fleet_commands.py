@@ -22,13 +22,13 @@ LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twelve vehicles on a common trip with few faults: three groups of four."""
     options = ("--vehicles", 12, "--currents", 2, "--sparsity", 80, "--common-drive", "--symmetric", "--balanced")
-    length = ("--minutes", 4, "--unseen-minutes", 1, "--seed", 3, "--workers", 1)
+    length = ("--minutes", 4, "--unseen-minutes", 1, "--seed", 3)
     return made_once(tmp_path_factory, "symmetric_fleet", "simulate", *options, *length)
 
 
 @pytest.fixture(scope="session")
 def result(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = ("--method", "published", "--classifier", "perfect", "--truth", fleet / "truth.json", "--workers", 1)
+    options = ("--method", "published", "--classifier", "perfect", "--truth", fleet / "truth.json")
     return made_once(tmp_path_factory, "symmetric_result", "calibrate", fleet, *options)
 
 
@@ -262,7 +262,7 @@ def test_truth_of_another_fleet_is_refused(fleet: Path, result: Path, tmp_path: 
 @pytest.fixture(scope="session")
 def other_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Vehicles of the same names and branches as those of `fleet`, with other faults."""
-    options = ("--vehicles", 12, "--common-drive", "--minutes", 1, "--unseen-minutes", 1, "--seed", 4, "--workers", 1)
+    options = ("--vehicles", 12, "--common-drive", "--minutes", 1, "--unseen-minutes", 0.1, "--seed", 4)
     return made_once(tmp_path_factory, "other_fleet", "simulate", *options)
 
 

@@ -19,7 +19,7 @@ DELAY_TOLERANCE_S = 0.005
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = ("--vehicles", 20, "--currents", 2, "--sparsity", 80, "--delay", 150, "--unmeasured", 3, 1)
-    length = ("--minutes", 6, "--unseen-minutes", 1, "--seed", 5)
+    length = ("--minutes", 5, "--unseen-minutes", 0.1, "--seed", 5)
     return made_once(tmp_path_factory, "asymmetric_fleet", "simulate", *options, *length)
 
 
@@ -71,9 +71,9 @@ def test_unmeasured_load_is_estimated_from_the_fleet_and_named(fleet: Path, resu
 
 
 @pytest.fixture(scope="session")
-def strict(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def strict(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nothing may do harm, so nothing is corrected and faulty vehicles stay undecided."""
-    return made_once(tmp_path_factory, "strict_result", "calibrate", fleet, "--harm-limit", 0)
+    return made_once(tmp_path_factory, "strict_result", "calibrate", result / "summaries", "--harm-limit", 0)
 
 
 def test_a_stricter_harm_limit_corrects_no_more_branches(result: Path, strict: Path) -> None:

@@ -2,13 +2,12 @@
 
 import errno
 import json
-import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from calibrator.faults import Faults
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import open_storage
 from calibrator.options import Method
+from calibrator.processes import run_many
 from calibrator.processes.run_many import Workers
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
@@ -40,19 +40,18 @@ from tests.calibrator.summaries.small_stores import BRANCHES, random_faults, rec
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 VEHICLES = 60
 ONE = Workers(processes=1)
-ENVIRONMENT = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000", "OMP_NUM_THREADS": "1"}
 
 
-def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "calibrator", *map(str, arguments)]
+@pytest.fixture(scope="module", autouse=True)
+def environment() -> Iterator[None]:
+    """Results are made at the same time, and by one thread."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        patch.setenv("OMP_NUM_THREADS", "1")
+        yield
 
 
 def calibrate(store: str, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
-    line = command("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
-    return subprocess.run(line, capture_output=True, text=True, check=False, timeout=300, env=ENVIRONMENT)
-
-
-def calibrate_here(store: str, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
     return calibrator("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
 
 
@@ -141,10 +140,10 @@ def test_result_is_the_same_for_any_number_of_workers(store: SummaryStore, resul
 
 def test_killed_run_goes_on_where_it_stopped(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     out, chunks = tmp_path / "out", tmp_path / ".out.unfinished" / "result" / "parameters"
-    line = command("calibrate", store.url, "--layout", LAYOUT, "--out", out, "--workers", 1)
+    words = ("calibrate", store.url, "--layout", LAYOUT, "--out", out, "--workers", "1")
     written: dict[str, int] = {}
     for wanted in (1, 6):
-        with subprocess.Popen(line, stderr=subprocess.PIPE, env=ENVIRONMENT) as process:
+        with subprocess.Popen([sys.executable, "-m", "calibrator", *words], stderr=subprocess.PIPE) as process:
             until = time.monotonic() + 120.0
             while len(list(chunks.glob("[0-9]*.parquet"))) < wanted and time.monotonic() < until:
                 time.sleep(0.002)
@@ -160,7 +159,7 @@ def test_killed_run_goes_on_where_it_stopped(store: SummaryStore, result: Path, 
 
 def test_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: Path) -> None:
     with unfinished_run(tmp_path / "out"):
-        second = calibrate_here(store.url, tmp_path / "out")
+        second = calibrate(store.url, tmp_path / "out")
     assert second.returncode == 1
     assert "another run is writing this result; wait for it or choose another --out" in second.stderr
 
@@ -221,9 +220,10 @@ def test_full_disk_says_what_to_do(tmp_path: Path, error: OSError) -> None:
     ],
 )
 def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
-    store: SummaryStore, tmp_path: Path, options: tuple[str, ...], code: int, message: str
+    store: SummaryStore, tmp_path: Path, options: tuple[str, ...], code: int, message: str, monkeypatch: Any
 ) -> None:
-    done = calibrate_here(store.url, tmp_path / "out", *options)
+    monkeypatch.setattr(run_many, "CONNECT_S", 0.5)
+    done = calibrate(store.url, tmp_path / "out", *options)
     assert done.returncode == code
     assert message in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
@@ -244,12 +244,9 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
         ("", 2, "an empty name; give the path"),
         ("file://", 1, "'file://': names no place"),
     ):
-        done = calibrate_here(str(place), tmp_path / "out")
+        done = calibrate(str(place), tmp_path / "out")
         assert (done.returncode, message in done.stderr.splitlines()[-1]) == (code, True), done.stderr
         assert not (tmp_path / ".out.unfinished").exists()
-
-
-# First pass
 
 
 # Second pass
@@ -342,7 +339,7 @@ def test_internal_error_is_named_and_ends_the_command_with_70(
     store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failing_for("V012", ZeroDivisionError("by nothing"), monkeypatch)
-    done = calibrate_here(store.url, tmp_path / "out", "--workers", 1)
+    done = calibrate(store.url, tmp_path / "out", "--workers", 1)
     assert done.returncode == 70
     last = done.stderr.splitlines()[-1]
     assert last.startswith("calibrator: internal error in 1 vehicle, which are left out: V012: ZeroDivisionError: by")
@@ -371,7 +368,7 @@ def test_only_those_who_drove_since_are_calibrated(store: SummaryStore, result: 
     (new,) = summaries_of(faults_of_vehicle(9, drift=0.08), Conditions(model_error_a=0.5), seed=5)
     before = store.read(store.bucket_of("V009"))["V009"]
     grown = copied(store, tmp_path / "store", "V009", [*before, record_of("V009", new, ("d2",))])
-    done = calibrate_here(grown.url, tmp_path / "out", "--since", result, "--workers", 1)
+    done = calibrate(grown.url, tmp_path / "out", "--since", result, "--workers", 1)
     assert done.returncode == 0, done.stderr
     assert "moved since the earlier result:" in done.stdout
     assert "V009: battery drift" in done.stdout
@@ -394,7 +391,7 @@ def test_since_a_result_of_something_else_is_refused(
     shutil.copytree(result, tmp_path / "earlier")
     run_file = tmp_path / "earlier" / "run.json"
     run_file.write_text(json.dumps({**json.loads(run_file.read_text()), key: value}))
-    done = calibrate_here(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
+    done = calibrate(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
     assert (done.returncode, message in done.stderr.splitlines()[-1]) == (1, True), done.stderr
 
 

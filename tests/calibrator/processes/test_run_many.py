@@ -173,12 +173,11 @@ print(list(try_many(partial(waiting, folder=Path(sys.argv[1])), range(9), Worker
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_nothing_is_left_of_a_parent_that_ends(tmp_path: Path, how: signal.Signals) -> None:
-    script, temporary = tmp_path / "parent.py", tmp_path / "t"  # paths of sockets are short
+def test_nothing_is_left_of_a_parent_that_ends(tmp_path: Path, short_folder: Path, how: signal.Signals) -> None:
+    script = tmp_path / "parent.py"
     script.write_text(PARENT)  # without a guard: workers must not run it once more
-    temporary.mkdir()
     path = os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, str(script), str(tmp_path), str(temporary)]
+    command = [sys.executable, str(script), str(tmp_path), str(short_folder)]
     environment = {**os.environ, "PYTHONPATH": path}
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, start_new_session=True) as parent:
         wait_until((tmp_path / "note").exists)
@@ -189,4 +188,4 @@ def test_nothing_is_left_of_a_parent_that_ends(tmp_path: Path, how: signal.Signa
     wait_until(lambda: not is_running(int((tmp_path / "note").read_text())))
     if how is signal.SIGINT:
         assert errors.count("Traceback") == errors.count("KeyboardInterrupt") == 1
-        assert list(temporary.iterdir()) == []
+        assert list(short_folder.iterdir()) == []

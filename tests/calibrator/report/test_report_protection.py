@@ -80,6 +80,6 @@ def test_gains_are_told_in_kilowatts_where_the_voltage_is_known(margin: Margin) 
 
 
 def test_of_a_large_fleet_one_in_a_thousand_may_need_more(margin: Margin) -> None:
-    usual = [sensor(0.0, 5.0)] * 2998
+    usual = [sensor(0.0, 5.0)] * 1400
     assert margin.known(*usual, sensor(0.0, 300.0))["common_before_a"] == pytest.approx(5.0 + DOUBT_A)
     assert margin.known(*usual[:500], sensor(0.0, 300.0))["common_before_a"] == pytest.approx(300.0 + DOUBT_A)
