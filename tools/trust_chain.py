@@ -262,4 +262,6 @@ def _run(*words: object) -> None:
 
 
 if __name__ == "__main__":
-    run_tool(app, "trust_chain")
+    import trust_chain  # processes of run_many find its functions by this name
+
+    run_tool(trust_chain.app, "trust_chain")

@@ -293,4 +293,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from bench import fleet_run  # processes of run_many find its functions by this name
+
+    fleet_run.main()
