@@ -22,7 +22,6 @@ from ecu_node.bus.adapters import acknowledgement, bus_config, carries_fd, confi
 from ecu_node.bus.faults import FaultMemory
 from ecu_node.bus.kernel_routes import kernel_routes
 from ecu_node.bus.node import Node
-from ecu_node.bus.on_board_summary import on_board_summary
 from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Telemetry, serve_metrics
@@ -222,6 +221,8 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         if options.telemetry is not None:
             looks.append(Telemetry(options.telemetry, corrector, database.layout, latency, buses, say).look)
         if options.summary is not None:
+            from ecu_node.bus.on_board_summary import on_board_summary  # noqa: PLC0415  # the only user of statistics
+
             summing = on_board_summary(options, bus, database, source.in_force.parameters, say)
             looks.append(closed_at_end.enter_context(closing(summing)).look)
         changes = StateChanges(corrector)
