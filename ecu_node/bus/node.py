@@ -147,7 +147,7 @@ class _Job:
 
 
 class Node:
-    """Takes frames as they come, and in between looks, tells the status, and ticks.
+    """Takes frames as they come, and in between looks at the junction and tells the status.
 
     Of these one at a time is done: a frame that comes meanwhile waits for no more than that.
 
@@ -191,7 +191,7 @@ class Node:
         self._time_of_day = TimeOfDay(corrector.counters)
         self._heard_s = self._due_s = self._back_s = float("-inf")
         often_s = min(period_s, _LOOK_EVERY_S)
-        self._jobs = [_Job(often_s, self._look), _Job(period_s, self._tell), _Job(often_s, self._tick)]
+        self._jobs = [_Job(often_s, self._look), _Job(period_s, self._tell)]
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop.
@@ -247,8 +247,9 @@ class Node:
                 self._due_s = min(job.due_s for job in self._jobs)
             self._hear()
 
-    def _look(self, _: float) -> None:
+    def _look(self, now_s: float) -> None:
         self._corrector.look(self._heard_s)  # no branch is stale for what has not been heard yet
+        self._on_tick(now_s, not self._is_gateway or time.monotonic() - self._back_s < _LONGEST_TURN_S)
 
     def _tell(self, _: float) -> None:
         status = self._corrector.status()
@@ -256,9 +257,6 @@ class Node:
             self._own.sent(status.key, status.data)
             self._vehicle.send(_data_frame(status.key, status.data, fd=status.fd))
             self._corrector.counters.send_errors += self._vehicle.flush()[1]
-
-    def _tick(self, now_s: float) -> None:
-        self._on_tick(now_s, not self._is_gateway or time.monotonic() - self._back_s < _LONGEST_TURN_S)
 
     def _hear(self) -> None:
         """Take what comes until there is something else to do, and note up to when the bus was heard.
@@ -341,21 +339,17 @@ class Node:
         vehicle, own, counters = self._vehicle, self._not_from_vehicle, self._corrector.counters
         while not stop():
             message = vehicle.receive(_LONGEST_WAIT_S)
-            while True:
-                if message is not None:
-                    key = (message.arbitration_id, message.is_extended_id)
-                    if key in own and not message.is_remote_frame:
-                        self._refuse(message, vehicle, own)
-                    elif not self._routed or key in own:
-                        self._sensors.send(message)
-                if message is None or not vehicle.at_hand:
-                    self._back_s = time.monotonic()
-                    sent, not_sent = self._sensors.flush()
-                    counters.returned += sent
-                    counters.not_returned += not_sent
-                if message is None or stop():
-                    break
-                message = vehicle.receive(0.0)
+            if message is not None:
+                key = (message.arbitration_id, message.is_extended_id)
+                if key in own and not message.is_remote_frame:
+                    self._refuse(message, vehicle, own)
+                elif not self._routed or key in own:
+                    self._sensors.send(message)
+            if not vehicle.at_hand:
+                self._back_s = time.monotonic()
+                sent, not_sent = self._sensors.flush()
+                counters.returned += sent
+                counters.not_returned += not_sent
 
     def _refuse(self, message: can.Message, bus: SteadyBus, own: OwnFrames) -> None:
         """Drop a frame that only this node may send there: whoever sends it must not stop the branches' frames.

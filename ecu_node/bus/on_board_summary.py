@@ -14,6 +14,7 @@ import time
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
@@ -22,19 +23,18 @@ from pathlib import Path
 from statistics import median, stdev
 from typing import Any, NamedTuple
 
-from cantools.database.can import Message, Signal
-
 from ecu_node import summary as rule
 from ecu_node.bus.adapters import connect, filters_of
 from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.bus.wiring import Mode, branch_signals, key_of, signal_codes
 from ecu_node.core.e2e import protection_of
-from ecu_node.core.signals import AMPERE, VOLT, WATT, FrameKey, placed_signal, unit_factor
+from ecu_node.core.signals import Codes, FrameKey, PlacedSignal, placed_signal
 from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase, codes_of_no_value
 from ecu_node.documents import write_atomically
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.formulas import formula_value, parse_formula
-from ecu_node.layout import Layout
+from ecu_node.layout import Input, Layout
 from ecu_node.parameters import VehicleParameters
 from ecu_node.summary import SummaryFile, encode_summary, packed
 
@@ -57,22 +57,15 @@ _Samples = list[tuple[float, float]]
 _Take = Callable[[float, float], None]
 
 
-def _reader(message: Message, signal: Signal, no_value: frozenset[int]) -> Callable[[bytes | bytearray], float | None]:
+def _reader(placed: PlacedSignal, codes: Codes) -> Callable[[bytearray], float | None]:
     """Make a function that reads a signal from a payload: NaN if it is no value, None if a frame goes without it."""
-    placed, ones = placed_signal(message, signal), (1 << signal.length) - 1
-    none, scale, offset = {code & ones for code in no_value}, float(signal.scale), float(signal.offset)
-    low, high = -math.inf, math.inf
-    if signal.minimum or signal.maximum:
-        slack = abs(scale) * rule.RANGE_SLACK
-        low = low if signal.minimum is None else float(signal.minimum) - slack
-        high = high if signal.maximum is None else float(signal.maximum) + slack
+    scale, offset = float(codes.scale), float(codes.offset)
 
-    def value(payload: bytes | bytearray) -> float | None:
+    def value(payload: bytearray) -> float | None:
         code = placed.code(payload)
         if code is None:
             return None if len(payload) >= placed.end else math.nan
-        found = code * scale + offset
-        return found if low <= found <= high and code & ones not in none else math.nan
+        return code * scale + offset if codes.is_value(code) else math.nan
 
     return value
 
@@ -341,35 +334,38 @@ class OnBoardSummary:
         for item in layout.input:
             if item.name in wanted:
                 self._channels[item.name] = _Channel(layout.max_age_s)
-                self._read(item.signal, self._channels[item.name].put)
+                self._read_input(item, self._channels[item.name].put)
             if item.name == layout.temperature:
-                self._read(item.signal, self._warm.put)
+                self._read_input(item, self._warm.put)
             if layout.contactor is not None and item.name == layout.contactor.input:
-                self._read(item.signal, lambda time_s, value: self._zero.state(time_s, value))  # noqa: PLW0108  # a new one
+                self._read_input(item, lambda time_s, value: self._zero.state(time_s, value))  # noqa: PLW0108  # a new one
         for branch in layout.branch:
-            where, units = f"{layout.path}: branch {branch.name}", AMPERE if branch.power is None else WATT
-            factor = branch.sign * unit_factor(database.signal(branch.source)[1], units, where)
+            signals = branch_signals(database, branch, Mode.GATEWAY)
             channel = self._channels[branch.name] = _Channel(branch.timeout_s, self._delays[branch.name][0])
-            take = partial(self._take_current, branch.name, channel, factor)
-            if branch.voltage is not None:
-                per_volt = unit_factor(database.signal(branch.voltage)[1], VOLT, where)
-                put_voltage, put_power = _power_over_voltage(channel.limit_s, per_volt, take)
-                self._read(branch.voltage, put_voltage)
-                self._read(branch.source, put_power)
-            else:
-                self._read(branch.source, take)
+            take = partial(self._take_current, branch.name, channel, branch.sign)
+            if branch.voltage is not None and signals.voltage is not None:
+                put_voltage, take = _power_over_voltage(channel.limit_s, take)
+                self._read(branch.voltage, signals.voltage, put_voltage)
+            self._read(branch.source, signals.source, take)
 
-    def _read(self, name: str, take: _Take) -> None:
+    def _read_input(self, item: Input, take: _Take) -> None:
+        codes = signal_codes(self._database, item.signal, None, f"input {item.name}")
+        no_value = codes_of_no_value(self._database, item.signal)
+        named = {code: name for code, name in codes.named.items() if code in no_value}
+        self._read(item.signal, replace(codes, named=named), take)
+
+    def _read(self, name: str, codes: Codes, take: _Take) -> None:
         message, signal = self._database.signal(name)
         protection = protection_of(self._database, message)
-        key = FrameKey(message.frame_id, message.is_extended_frame)
-        _, readers = self.messages.setdefault(key, (protection.is_intact if protection else lambda _: True, []))
-        readers.append((_reader(message, signal, codes_of_no_value(self._database, name)), take))
+        _, readers = self.messages.setdefault(
+            key_of(message), (protection.is_intact if protection else lambda _: True, [])
+        )
+        readers.append((_reader(placed_signal(message, signal), codes), take))
 
-    def _take_current(self, branch: str, channel: _Channel, factor: float, time_s: float, value: float) -> None:
+    def _take_current(self, branch: str, channel: _Channel, sign: int, time_s: float, value: float) -> None:
         if not math.isnan(value):
-            channel.put(time_s, factor * value)
-            self._zero.current(branch, time_s, factor * value)
+            channel.put(time_s, sign * value)
+            self._zero.current(branch, time_s, sign * value)
 
     # ---- batches
 
@@ -514,14 +510,14 @@ class OnBoardSummary:
         write_atomically(self._path, encode_summary(record))
 
 
-def _power_over_voltage(limit_s: float, per_volt: float, take: _Take) -> tuple[_Take, _Take]:
+def _power_over_voltage(limit_s: float, take: _Take) -> tuple[_Take, _Take]:
     """Who takes a voltage, and who takes a power and hands it on as a current, by the latest good voltage in time."""
     latest = -math.inf, 0.0
 
     def put_voltage(time_s: float, value: float) -> None:
         nonlocal latest
         if not math.isnan(value):
-            latest = time_s, per_volt * value
+            latest = time_s, value
 
     def put_power(time_s: float, value: float) -> None:
         volt_s, volt = latest

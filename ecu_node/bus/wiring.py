@@ -36,7 +36,6 @@ from ecu_node.core.signals import (
     placed_signal,
     read_codes,
     require_reach,
-    usual_unit,
     writable_range,
 )
 from ecu_node.core.status import Counters, Quality, Reason, State, UnfitError
@@ -168,9 +167,13 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
 
 
 def signal_codes(
-    database: VehicleDatabase, name: SignalName, units: Mapping[str, float], what: str, no_value: tuple[int, ...] = ()
+    database: VehicleDatabase,
+    name: SignalName,
+    units: Mapping[str, float] | None,
+    what: str,
+    no_value: tuple[int, ...] = (),
 ) -> Codes:
-    """Codes of a signal in a base unit, with those that the layout itself says are no value.
+    """Codes of a signal in a base unit (None: its own), with those that the layout itself says are no value.
 
     Raises
     ------
@@ -366,10 +369,10 @@ def wire(
         full_scale_a=layout.full_scale_a,
     )
     for name in (item.signal for item in layout.input if item.name == layout.watch.input):
-        _, signal = database.signal(name)
-        codes = signal_codes(database, name, {usual_unit(signal.unit or ""): 1.0}, "[watch] input")
+        codes = signal_codes(database, name, None, "[watch] input")
         state = HeardSignal(replace(codes, named={}), layout.max_age_s)  # a state's names are no lack of a value
-        watch.judge_only(state, frozenset(int(exact_code(signal, value)) for value in layout.watch.valid))
+        valid = (exact_code(database.signal(name)[1], value) for value in layout.watch.valid)
+        watch.judge_only(state, frozenset(map(int, valid)))
         read(name, state)
     answers = _answers(database, branches) if mode is Mode.OVERLAY else {}
     corrector = Corrector(

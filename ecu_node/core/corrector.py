@@ -115,6 +115,8 @@ class OwnMessage:
 
     Attributes
     ----------
+    key, fd, protection
+        As given.
     data : bytearray
         The message as it was made last; a new one each time.
     branches : dict of LiveBranch to Written
@@ -122,12 +124,10 @@ class OwnMessage:
     """
 
     def __init__(self, key: FrameKey, length: int, *, fd: bool, protection: Protection | None) -> None:
-        self.key, self.fd, self.data = key, fd, bytearray(length)
+        self.key, self.fd, self.data, self.protection = key, fd, bytearray(length), protection
         self.branches: dict[LiveBranch, Written] = {}
-        self.protect = self.identity = None
         if protection is not None:
             protection.before_first(self.data)
-            self.protect, self.identity = protection.protect, protection.identity
 
 
 class _Ways(NamedTuple):
@@ -217,8 +217,8 @@ class Source:
             ways = self._find(0)  # nothing is read from it
         for target, rewrite in ways.answers:
             made = rewrite(payload, target.data, now_s)
-            if target.protect is not None:
-                target.protect(made, target.identity)
+            if target.protection is not None:
+                target.protection.advance(made)
             target.data = made
         self._counters.answers += len(self.targets)
         return self.targets
@@ -439,8 +439,8 @@ class Corrector:
         for key, (codes, missing) in fields.sums.items():
             total_a = None if sums is None else getattr(sums, f"{key.removeprefix('sum_')}_a")
             codes.place.put(payload, missing if total_a is None else codes.nearest(as_written(total_a)))
-        if fields.message.protect is not None:
-            fields.message.protect(payload, fields.message.identity)
+        if fields.message.protection is not None:
+            fields.message.protection.advance(payload)
         fields.message.data = payload
         return fields.message
 

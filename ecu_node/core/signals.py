@@ -347,15 +347,15 @@ def as_written(number: float) -> Fraction:
     return Fraction(repr(number))
 
 
-def read_codes(signal: Signal, units: Mapping[str, float], where: str) -> Codes:
+def read_codes(signal: Signal, units: Mapping[str, float] | None, where: str) -> Codes:
     """Collect what the DBC says of a signal's codes.
 
     Parameters
     ----------
     signal : Signal
         An integer signal of the DBC.
-    units : mapping of str to float
-        One of the tables of :mod:`ecu_node.core.signals`; values come out in its base unit.
+    units : mapping of str to float, or None
+        One of the tables of :mod:`ecu_node.core.signals`, in whose base unit values come out; None: in their own unit.
     where : str
         What the signal is for, for messages of errors.
 
@@ -379,7 +379,7 @@ def read_codes(signal: Signal, units: Mapping[str, float], where: str) -> Codes:
         lowest, highest = max(lowest, math.ceil(ends[0])), min(highest, math.floor(ends[1]))
     if lowest > highest:
         raise DatabaseError(f"{where}: no code of signal {signal.name} lies in its range in the DBC")
-    factor = as_written(unit_factor(signal, units, where))
+    factor = as_written(1.0 if units is None else unit_factor(signal, units, where))
     return Codes(
         name=signal.name,
         place=place,
