@@ -120,7 +120,7 @@ sbom: dist               ## and a bill of materials of what they bring (CycloneD
 	$(PYTHON) -m venv build/sbom
 	grep -oE '^[^ ]+==[^\\]*' constraints.txt > build/sbom/pins.txt # without hashes: the wheel itself has none
 	build/sbom/bin/pip install --quiet --constraint build/sbom/pins.txt \
-		"$$(ls $$PWD/dist/*.whl)[calibrator,cluster,demo,metrics,mf4]"
+		"$$(ls $$PWD/dist/*.whl)[calibrator,cluster,demo,mf4]"
 	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --of JSON -o dist/sbom.cdx.json \
 		build/sbom/bin/python
 

@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
     if options.command is _run:
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it would end the node before it can handle it
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a node outlives the terminal that it was started from
     logging.getLogger("can").addHandler(logging.NullHandler())
     load_python_can()
     return options.command(options) or 0
@@ -72,7 +72,6 @@ def _option(read: Callable[[str], Any], is_right: Callable[[Any], Any], refusal:
 
 
 _NAME = _option(str, str.strip, "a name is expected, such as can0, found {}")
-_PORT = _option(int, range(1, 65536).__contains__, "a TCP port from 1 to 65535 is expected, found {}")
 _SECONDS = _option(float, lambda s: 0.0 < s <= 86400.0, "{}: expected a number of seconds above 0, at most 86400")
 _VEHICLE = _option(
     str,
@@ -122,7 +121,6 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--shadow": {"action": "store_true", "help": "compute and report the corrected sum, but change nothing"},
     "--dry-run": {"action": "store_true", "help": "print what would be opened, read and sent; open nothing"},
-    "--metrics-port": {"type": _PORT, "metavar": "PORT", "help": "let Prometheus ask here (needs prometheus-client)"},
     "--telemetry": {
         "type": _TARGET,
         "metavar": "TARGET",
@@ -174,7 +172,6 @@ def _parser() -> argparse.ArgumentParser:
             "--gateway",
             "--shadow",
             "--dry-run",
-            "--metrics-port",
             "--telemetry",
             "--summary",
             "--realtime",
@@ -182,8 +179,7 @@ def _parser() -> argparse.ArgumentParser:
         help="correct until SIGTERM or SIGINT",
         description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
         "own on the same bus, or, with --gateway, in place on another bus. With parameters that do not fit it passes "
-        "the measured values through and says so in its status message. SIGHUP, or a changed parameter file, makes it "
-        "read the parameters again.",
+        "the measured values through and says so in its status message. Changed parameters are read within a second.",
         done=_AT_WORK,
     )
     source = run.add_mutually_exclusive_group(required=True)

@@ -21,7 +21,7 @@ from typing import Any
 
 from ecu_node.bus.adapters import acknowledgement
 from ecu_node.bus.node import steady_time_s
-from ecu_node.bus.service import Log, Requests
+from ecu_node.bus.service import Log, stopped_by
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.wiring import Mode, branch_signals, key_of, open_bus, received, transmitted
 from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
@@ -421,8 +421,7 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
         If layout, DBC or bus cannot be used.
     """
     database = node_database(layout)
-    stop = Requests().stop
-    signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))  # the terminal was closed
+    stop = stopped_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal was closed
     counters, say, where = Counters(), Log().say, f"{bus['interface']} {bus['channel']}"
     if bus["listen_only"]:
         say(acknowledgement(bus["interface"], bus["channel"]))

@@ -342,7 +342,7 @@ class OnBoardSummary:
         for branch in layout.branch:
             signals = branch_signals(database, branch, Mode.GATEWAY)
             channel = self._channels[branch.name] = _Channel(branch.timeout_s, self._delays[branch.name][0])
-            take = partial(self._take_current, branch.name, channel, branch.sign)
+            take: _Take = partial(self._take_current, branch.name, channel, branch.sign)
             if branch.voltage is not None and signals.voltage is not None:
                 put_voltage, take = _power_over_voltage(channel.limit_s, take)
                 self._read(branch.voltage, signals.voltage, put_voltage)

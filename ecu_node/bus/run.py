@@ -7,6 +7,7 @@ samples of all branches then stand in ``corrector.watch``: ``instant_s`` and ``c
 
 import argparse
 import gc
+import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,9 +23,9 @@ from ecu_node.bus.adapters import acknowledgement, bus_config, carries_fd, confi
 from ecu_node.bus.faults import FaultMemory
 from ecu_node.bus.kernel_routes import kernel_routes
 from ecu_node.bus.node import Node
-from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time
+from ecu_node.bus.service import Log, ServiceManager, be_real_time, stopped_by
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.telemetry import Telemetry, serve_metrics
+from ecu_node.bus.telemetry import Telemetry
 from ecu_node.bus.wiring import (
     InForce,
     Mode,
@@ -61,7 +62,7 @@ class ParameterSource(Protocol):
     why_not: str | None
     """Why it passes measured values through; None if it has parameters."""
 
-    def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
+    def look(self, corrector: Corrector, now_s: float) -> bool:
         """See whether other parameters are to be in force from now on, and put them; to be called now and then."""
 
 
@@ -90,13 +91,13 @@ class ParameterFile:
         self._seen, self._due_s = signature(path), float("-inf")
         self.in_force, self.why_not = self._choose()
 
-    def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
-        """Read the file again if it was changed, or somebody asked; whether new parameters are in force."""
-        if not asked and now_s < self._due_s:
+    def look(self, corrector: Corrector, now_s: float) -> bool:
+        """Read the file again if it was changed; whether new parameters are in force."""
+        if now_s < self._due_s:
             return False
         self._due_s = now_s + _LOOK_EVERY_S
         before, self._seen = self._seen, signature(self._path)
-        if not asked and before == self._seen:
+        if before == self._seen:
             return False
         in_force, why_not = self._choose()
         if in_force.parameters is None:
@@ -199,9 +200,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             for settings in bus_settings
         )
         buses = [closed_at_end.enter_context(closing(bus)) for bus in opened]
-        requests = Requests()
-        if options.metrics_port is not None:
-            serve_metrics(corrector, latency, options.metrics_port)
+        stop = stopped_by(signal.SIGTERM, signal.SIGINT)
         hidden = unpublished(database, source.in_force, mode)
         for text in (*_notes(options, source), *hidden.values()):
             say(text)
@@ -232,7 +231,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
                 manager.alive(now_s)
             for each in buses:
                 each.count_dropped()
-            if source.look(corrector, now_s, asked=requests.take_reload()):
+            if source.look(corrector, now_s):
                 manager.status(f"parameter set {corrector.parameter_set} is in force")
             for look in looks:
                 look(now_s)
@@ -257,7 +256,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         gc.collect()  # what was made at the start is left out of all others, which come only when something grows
         gc.freeze()
         gc.set_threshold(_GARBAGE)
-        node.run(requests.stop, ready)
+        node.run(stop, ready)
     return 0
 
 

@@ -7,10 +7,10 @@ import select
 import signal
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from types import FrameType
 
 from ecu_node.errors import printable
 
@@ -23,29 +23,12 @@ _LONGEST_NOTIFY_S = 0.1
 """A service manager that does not read must not hold up the bus. [s]"""
 
 
-class Requests:
-    """Signals that came: SIGTERM and SIGINT ask to stop, SIGHUP to read the parameters again."""
-
-    def __init__(self) -> None:
-        self._stop = self._reload = False
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._on_stop)
-        signal.signal(signal.SIGHUP, self._on_reload)
-
-    def stop(self) -> bool:
-        """Whether the node is to stop."""
-        return self._stop
-
-    def take_reload(self) -> bool:
-        """Whether the parameters are to be read again; asked once per signal."""
-        asked, self._reload = self._reload, False
-        return asked
-
-    def _on_stop(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self._stop = True
-
-    def _on_reload(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self._reload = True
+def stopped_by(*numbers: signal.Signals) -> Callable[[], bool]:
+    """Handle these signals from now on; returns what tells whether one of them has come."""
+    stopped = threading.Event()
+    for number in numbers:
+        signal.signal(number, lambda _, __: stopped.set())
+    return stopped.is_set
 
 
 class Log:

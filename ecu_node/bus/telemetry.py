@@ -1,4 +1,4 @@
-"""What the node tells beside the bus: a line of JSON per second, metrics for Prometheus, and how long answers take."""
+"""What the node tells beside the bus: a line of JSON per second."""
 
 import errno
 import os
@@ -6,10 +6,9 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.junction import LiveBranch
 from ecu_node.core.status import Latency, Quality
-from ecu_node.errors import UserError
 from ecu_node.layout import Layout
 
 _PERIOD_S = 1.0
@@ -80,6 +78,7 @@ class Telemetry:
             "sum_measured_a": None if sums is None else round(sums.measured_a, 3),
             "sum_corrected_a": None if sums is None else round(sums.corrected_a, 3),
             "latency_us": self.latency.microseconds(),
+            "latency_counts": self.latency.counts,
             "buses": {bus.channel: bus.state for bus in self.buses},
             "counters": corrector.counters,
         }
@@ -126,61 +125,3 @@ def _send(host: str, port: int, line: bytes) -> None:
     family, kind, protocol, _, found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
     with socket.socket(family, kind, protocol) as out:
         out.sendto(line, found)
-
-
-_LATENCY_BITS = 21
-"""Buckets up to 2^20 us = 1 s."""
-
-
-def serve_metrics(corrector: Corrector, latency: Latency, port: int) -> None:
-    """Answer Prometheus in a thread of its own, on this machine's address only.
-
-    Parameters
-    ----------
-    corrector : Corrector
-        Whose counters and state are told.
-    latency : Latency
-        Of its answers.
-    port : int
-        TCP port.
-
-    Raises
-    ------
-    UserError
-        If prometheus-client is not installed, or the port cannot be had.
-    """
-    try:
-        from prometheus_client import CollectorRegistry, core, start_http_server  # noqa: PLC0415
-    except ImportError:
-        raise UserError(
-            "--metrics-port needs prometheus-client; install it with pip install 'hv-current-correction[metrics]'"
-        ) from None
-
-    class Collector:
-        def collect(self) -> Iterator[core.Metric]:
-            for name, value in asdict(corrector.counters).items():
-                words = f"{name.replace('_', ' ')} since the start"
-                yield core.CounterMetricFamily(f"ecu_node_{name}", words, value=value)
-            state, reason = corrector.told
-            gauges: dict[str, tuple[str, float]] = {
-                "state": ("state, as in the status message", int(state)),
-                "reason": ("reason, as in the status message", int(reason)),
-                "parameter_set": ("number in force", corrector.parameter_set),
-            }
-            if (sums := corrector.watch.sums) is not None:
-                gauges["sum_measured_amperes"] = "Kirchhoff sum", sums.measured_a
-                gauges["sum_corrected_amperes"] = "Kirchhoff sum", sums.corrected_a
-            for name, (words, value) in gauges.items():
-                yield core.GaugeMetricFamily(f"ecu_node_{name}", words, value=value)
-            counted = list(accumulate(latency.counts))
-            buckets = [(str(1e-6 * 2**bits), counted[bits]) for bits in range(_LATENCY_BITS)]
-            words = "from when a frame came until its answer was sent"
-            buckets.append(("+Inf", counted[-1]))
-            yield core.HistogramMetricFamily("ecu_node_latency_seconds", words, buckets=buckets)
-
-    registry = CollectorRegistry()
-    registry.register(Collector())
-    try:
-        start_http_server(port, addr="127.0.0.1", registry=registry)
-    except (OSError, OverflowError) as error:
-        raise UserError(f"port {port}: cannot answer there: {error}; give another --metrics-port") from None

@@ -147,7 +147,7 @@ class ParameterStore:
         else:
             self.in_force, self.why_not = self._in_force(self._state)
 
-    def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
+    def look(self, corrector: Corrector, now_s: float) -> bool:
         """See whether a trial has ended, the state was changed, or time has passed; to be called now and then.
 
         Parameters
@@ -156,8 +156,6 @@ class ParameterStore:
             Where new parameters are put in force.
         now_s : float
             Now. [s]
-        asked : bool
-            Read the state whether it was changed or not.
 
         Returns
         -------
@@ -166,11 +164,11 @@ class ParameterStore:
         """
         self._finish_writing(now_s)
         self._try(corrector, now_s)
-        if not asked and now_s < self._due_s:
+        if now_s < self._due_s:
             return False
         self._due_s = now_s + _LOOK_EVERY_S
         if self._writing is None:
-            self._read_again(asked=asked)
+            self._read_again()
         if self._state is None:
             return False
         self._end_expired(self._state, now_s)
@@ -186,16 +184,16 @@ class ParameterStore:
             self._say(f"passing measured values through: {why_not}")
         return True
 
-    def _read_again(self, *, asked: bool) -> None:
+    def _read_again(self) -> None:
         """Read the state if it was changed, or could not be read the last time: it may hold a revocation."""
         seen = signature(state_path(self._folder))
-        if not asked and self._unread is None and seen == self._seen:
+        if self._unread is None and seen == self._seen:
             return
         self._seen = seen
         try:
             self._state, self._unread = read_state(self._folder), None
         except UserError as error:
-            if asked or str(error) != self._unread:
+            if str(error) != self._unread:
                 self._say(f"the state of the vehicle is not read, what was in force stays: {error}")
             self._unread = str(error)
 

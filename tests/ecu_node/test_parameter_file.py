@@ -108,11 +108,6 @@ def test_after_a_change_all_is_as_after_a_start(
         assert live.deadline_s == new.deadline_s
 
 
-def test_when_asked_it_is_read_at_once(path: Path, database: VehicleDatabase) -> None:
-    running = Running(path, database)
-    assert running.file.look(running.corrector, 0.1, asked=True)
-
-
 def test_a_new_file_of_the_same_size_and_time_is_noticed(path: Path, database: VehicleDatabase) -> None:
     running = Running(path, database)
     found = path.stat()

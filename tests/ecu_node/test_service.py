@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.service import Log, Requests, ServiceManager
+from ecu_node.bus.service import Log, ServiceManager, stopped_by
 
 WATCHDOG_S = 4.0
 
@@ -117,23 +117,13 @@ def test_a_log_that_is_gone_does_not_end_the_node(monkeypatch: pytest.MonkeyPatc
         os.dup2(os.open(os.devnull, os.O_WRONLY), gone.fileno())  # what is left in its buffer can be closed
 
 
-@pytest.fixture
-def requests() -> Iterator[Requests]:
-    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_signals_that_ask_to_stop(how: signal.Signals) -> None:
+    numbers = (signal.SIGTERM, signal.SIGINT)
     before = [signal.getsignal(number) for number in numbers]
-    yield Requests()
+    stop = stopped_by(*numbers)
+    assert not stop()
+    os.kill(os.getpid(), how)
+    assert stop()
     for number, handler in zip(numbers, before, strict=True):
         signal.signal(number, handler)
-
-
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
-def test_signals_that_ask_to_stop(requests: Requests, how: signal.Signals) -> None:
-    assert not requests.stop()
-    os.kill(os.getpid(), how)
-    assert requests.stop()
-    assert not requests.take_reload()
-
-
-def test_sighup_asks_once_for_the_parameters(requests: Requests) -> None:
-    os.kill(os.getpid(), signal.SIGHUP)
-    assert [requests.take_reload(), requests.take_reload(), requests.stop()] == [True, False, False]

@@ -2,9 +2,7 @@
 
 import json
 import os
-import socket
 import subprocess
-import urllib.request
 from pathlib import Path
 
 import can
@@ -14,7 +12,7 @@ from tests.package.clean_venv import CleanVenv
 from tests.package.conftest import VEHICLE, Installed
 from tests.package.processes import started, until
 
-EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "metrics", "mf4", "update")
+EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "mf4", "update")
 LAYOUT = ("--layout", "my_car.toml")
 
 
@@ -93,25 +91,6 @@ def test_cluster_calibrates_on_workers(installed: Installed, car: Path, fleet: P
         layout = ("--layout", car / "my_car.toml")
         calibrator(venv, tmp_path, "calibrate", fleet, *layout, "--scheduler", address, "--out", "result")
     assert (tmp_path / "result" / "results.parquet").is_file()
-
-
-def test_metrics_are_answered(installed: Installed, car: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    options = ("--unsigned", "--params", "V001.json", *LAYOUT, "--interface", "virtual", "--channel", "metrics")
-
-    def answer() -> str | None:
-        try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as page:
-                return str(page.read().decode())
-        except OSError:
-            return None
-
-    with started(installed("metrics"), "ecu-node", "run", *options, "--metrics-port", port, folder=car) as process:
-        assert "ecu_node_" in until(answer, "metrics")
-        process.terminate()
-        assert process.wait(timeout=60) == 0
 
 
 def test_mf4_logs_are_read(installed: Installed, car: Path, drive: Path, tmp_path: Path) -> None:

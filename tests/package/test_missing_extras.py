@@ -1,8 +1,7 @@
 """What a command says whose extra is missing is one line, and doing what it says helps."""
 
 import re
-import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import can
@@ -11,8 +10,6 @@ import pytest
 from tests.package.clean_venv import CleanVenv, new_venv
 
 LAYOUT = ("--layout", "my_car.toml")
-BUS = ("--interface", "virtual", "--channel", "c")
-PARAMETERS = ("--unsigned", "--params", "V001.json")
 
 
 def piped(program: str, *arguments: object) -> Callable[[CleanVenv, Path], tuple[int | None, str]]:
@@ -25,16 +22,14 @@ def piped(program: str, *arguments: object) -> Callable[[CleanVenv, Path], tuple
     return run
 
 
-def steps(taken_port: int) -> dict[str, tuple[Callable[[CleanVenv, Path], tuple[int | None, str]], str]]:
+def steps() -> dict[str, tuple[Callable[[CleanVenv, Path], tuple[int | None, str]], str]]:
     """By extra, from the lightest on: what needs it, and what that says without it."""
-    run = ("run", *PARAMETERS, *LAYOUT, *BUS, "--metrics-port", taken_port)  # ends with the extra, too
     small = ("--vehicles", 2, "--minutes", 1)
     cluster = (
         "--scheduler",
         "tcp://127.0.0.1:9",
     )  # what is missing is told before the fleet is read, which takes hours
     return {
-        "metrics": (piped("ecu-node", *run), "ecu-node: --metrics-port needs prometheus-client; install it with "),
         "calibrator": (piped("calibrator", "--version"), "calibrator: typer is not installed; "),
         "demo": (
             piped("calibrator", "simulate", *LAYOUT, *small, "--out", "two"),
@@ -52,14 +47,6 @@ def steps(taken_port: int) -> dict[str, tuple[Callable[[CleanVenv, Path], tuple[
 
 
 @pytest.fixture
-def taken_port() -> Iterator[int]:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        yield int(taken.getsockname()[1])
-
-
-@pytest.fixture
 def mf4(car: Path, drive: Path) -> None:
     with can.Logger(car / "drive.mf4") as log:
         for frame in can.LogReader(drive):
@@ -67,11 +54,9 @@ def mf4(car: Path, drive: Path) -> None:
 
 
 @pytest.mark.usefixtures("mf4")
-def test_doing_what_a_command_without_its_extra_says_makes_it_work(
-    wheel: Path, car: Path, tmp_path: Path, taken_port: int
-) -> None:
+def test_doing_what_a_command_without_its_extra_says_makes_it_work(wheel: Path, car: Path, tmp_path: Path) -> None:
     venv = new_venv(tmp_path / "growing", wheel)
-    for extra, (command, words) in steps(taken_port).items():
+    for extra, (command, words) in steps().items():
         code, said = command(venv, car)
         assert code == 1, (extra, said)
         assert said.startswith(words)

@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 NODE_PACKAGES = {"_typeshed", "can", "cantools", "e2e", "fastcrc", "msgspec"}
 """What the base install has, and what only type checkers see."""
-NODE_EXTRAS = {"telemetry": {"prometheus_client"}, "update": {"cryptography", "tuf", "securesystemslib", "urllib3"}}
+NODE_EXTRAS = {"update": {"cryptography", "tuf", "securesystemslib", "urllib3"}}
 """What rooms or modules of this name may import besides: an extra brings it, and only their commands need it."""
 DOORS = {"__init__", "__main__", "cli"}
 """They import every room, to start it."""
