@@ -244,8 +244,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _bus_settings(options: argparse.Namespace) -> dict[str, Any]:
     """Settings of the bus, as :func:`ecu_node.bus.adapters.bus_config` takes them."""
-    settings = {name: getattr(options, name) for name in ("interface", "channel", "fd", "listen_only")}
-    return {**settings, "bitrates": {"bitrate": options.bitrate, "data_bitrate": options.data_bitrate}}
+    names = ("interface", "channel", "fd", "bitrate", "data_bitrate", "listen_only")
+    return {name: getattr(options, name) for name in names}
 
 
 def _run(options: argparse.Namespace) -> int:

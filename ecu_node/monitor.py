@@ -435,7 +435,7 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
         monitor, view = BusMonitor(database, time.monotonic()), None
         while view is None or (once_s is None and not stop()):
             _listen(steady, monitor, time.monotonic() + period_s, stop)
-            view = monitor.look(time.monotonic()) | {"is_bus_open": steady.is_open}
+            view = monitor.look(time.monotonic()) | {"is_bus_open": steady.state != "gone"}
             steady.count_dropped()
             lines = view_lines(view, where, counters)
             if is_live:

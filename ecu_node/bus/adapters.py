@@ -47,8 +47,9 @@ class Settings(TypedDict, total=False):
     """Whether to use CAN FD."""
     listen_only: bool
     """Whether to send nothing, acknowledgements included where the adapter can do without."""
-    bitrates: Mapping[str, int | None]
-    """``bitrate`` and ``data_bitrate`` of the command line, or None. [bit/s]"""
+    bitrate: int | None
+    data_bitrate: int | None
+    """Of the command line. [bit/s]"""
 
 
 def connect(
@@ -140,9 +141,8 @@ def bus_config(interface: str, channel: str | None, **settings: Unpack[Settings]
     BusError
         If the interface is not known, or the bus's speed is not given, cannot be set, or contradicts itself.
     """
-    given: dict[str, Any] = {"interface": interface, "channel": channel, "fd": settings.get("fd") or None}
-    given |= settings.get("bitrates", {})
-    said = {name: value for name, value in given.items() if value is not None}
+    given: dict[str, Any] = {**settings, "interface": interface, "channel": channel, "fd": settings.get("fd") or None}
+    said = {name: value for name, value in given.items() if value is not None and name != "listen_only"}
     try:
         config: dict[str, Any] = {**load_config(config=said, context=channel)}
     except (can.CanError, ValueError, TypeError, AttributeError, configparser.Error) as error:

@@ -100,13 +100,8 @@ class SteadyBus:
         return link is not None and link.at_hand
 
     @property
-    def is_open(self) -> bool:
-        """Whether it is there; False from when it failed until it is open again."""
-        return self._link is not None
-
-    @property
     def state(self) -> str:
-        """What it is: gone, full for longer than a second, or open."""
+        """What it is: "open", "full" for longer than a second, or "gone" until it is open again."""
         return "gone" if self._link is None else "full" if self._is_full_told else "open"
 
     def receive(self, timeout_s: float) -> can.Message | None:

@@ -211,7 +211,7 @@ class Source:
         is_usable = self._take(payload, now_s, ways) <= _LAST_USABLE
         if not (is_usable or self._pass_on_invalid):
             return ()
-        if not is_usable or (self._receiver is not None and self._receiver.state is _INVALID):
+        if not is_usable or self.is_invalid:
             for branch in self.branches:
                 branch.spoil(now_s)
             ways = self._find(0)  # nothing is read from it

@@ -73,21 +73,21 @@ def test_adapter_without_bit_rate_is_refused(interface: str) -> None:
 @pytest.mark.parametrize("interface", ["kvaser", "vector", "ixxat"])
 def test_data_bit_rate_is_needed_for_can_fd(interface: str) -> None:
     with pytest.raises(BusError, match=r"no data_bitrate: .* --data-bitrate BIT_PER_S"):
-        bus_config(interface, "1", fd=True, bitrates={"bitrate": 500_000})
-    config = bus_config(interface, "1", fd=True, bitrates={"bitrate": 500_000, "data_bitrate": 2_000_000})
+        bus_config(interface, "1", fd=True, bitrate=500_000)
+    config = bus_config(interface, "1", fd=True, bitrate=500_000, data_bitrate=2_000_000)
     assert (config["fd"], config["bitrate"], config["data_bitrate"]) == (True, 500_000, 2_000_000)
 
 
 @pytest.mark.parametrize("interface", ["pcan", "slcan", "nixnet"])
 def test_can_fd_needs_a_bit_timing_where_the_driver_drops_the_data_bit_rate(interface: str) -> None:
     with pytest.raises(BusError, match=r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"):
-        bus_config(interface, "1", fd=True, bitrates={"bitrate": 500_000, "data_bitrate": 2_000_000})
+        bus_config(interface, "1", fd=True, bitrate=500_000, data_bitrate=2_000_000)
 
 
 @pytest.mark.parametrize("interface", ["socketcan", "virtual", "udp_multicast", "serial"])
 def test_bit_rate_that_cannot_be_set_is_refused(interface: str) -> None:
     with pytest.raises(BusError, match=rf"^{interface} c0: the bit rate of {interface} is not set from here"):
-        connect(interface, "c0", bitrates={"bitrate": 250_000})
+        connect(interface, "c0", bitrate=250_000)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_each_channel_has_its_section_and_the_command_line_goes_first(
     (tmp_path / "can.conf").write_text("[default]\nbitrate = 125000\n[1]\nbitrate = 250000\nserial = 1234\n")
     assert bus_config("vector", "1") == {"interface": "vector", "channel": 1, "bitrate": 250_000, "serial": 1234}
     assert bus_config("vector", "2")["bitrate"] == 125_000
-    assert bus_config("vector", "1", bitrates={"bitrate": 500_000, "data_bitrate": None})["bitrate"] == 500_000
+    assert bus_config("vector", "1", bitrate=500_000, data_bitrate=None)["bitrate"] == 500_000
     monkeypatch.setenv("CAN_BITRATE", "100000")
     assert bus_config("vector", "1")["bitrate"] == 100_000
 

@@ -105,7 +105,7 @@ def node_on(folder: Path, database: VehicleDatabase, delays: dict[str, float]) -
         for name, delay_s in delays.items()
     }
     options = argparse.Namespace(summary=folder, vehicle="V1")
-    bus = {"interface": "virtual", "channel": "on_board", "fd": False, "listen_only": False, "bitrates": {}}
+    bus = {"interface": "virtual", "channel": "on_board", "fd": False, "listen_only": False}
     return on_board_summary(options, bus, database, msgspec.structs.replace(parameters, branches=branches), print)
 
 
