@@ -111,13 +111,6 @@ class ParameterFile:
         return True
 
 
-_WHY_LATCHED = {
-    Reason.BRANCH_STALE: "no frames of {}",
-    Reason.BRANCH_STUCK: "{} never changes",
-    Reason.SUM_IMPLAUSIBLE: "the Kirchhoff sum is not what it may be; most likely the sensor of {} is wrong",
-}
-
-
 class StateChanges:
     """Looks for changes of the state; those of the parameters are told by who reads them.
 
@@ -139,8 +132,7 @@ class StateChanges:
         if latched not in {latched_before, Reason.NONE}:
             until = "the bus has slept" if latched in OF_ONE_DRIVE else "other parameters or 'ecu-node clear'"
             names = (" or " if latched is Reason.SUM_IMPLAUSIBLE else ", ").join(corrector.latched_branches)
-            why = _WHY_LATCHED.get(latched, "the corrected Kirchhoff sum is worse than the measured one")
-            return f"passing measured values through until {until}: {why.format(names)}"
+            return f"passing measured values through until {until}: {latched.words}{names and f' ({names})'}"
         if asleep != asleep_before:
             return "the bus sleeps" if asleep else "the bus is awake again"
         corrects_again = latched != latched_before and corrector.reason is Reason.NONE and not asleep
@@ -374,7 +366,6 @@ def report_text(report: dict[str, Any]) -> str:
     lines = [head if report["fit"] else f"NOT FIT ({report['reason']}): {printable(report['message'])}"]
     width = max(map(len, ["branch", *report["branches"]]))
     lines.append(f"{'branch':<{width}}{'drift':>11}{'offset':>13}")
-    formula = ["corrected code = (measured code * gain + bias + 2^(shift - 1)) >> shift"]
     for name, branch in report["branches"].items():
         is_written = branch["target"] is not None
         mark = "not published" if not is_written else "corrected" if branch["applied"] else "passed through"
@@ -383,8 +374,6 @@ def report_text(report: dict[str, Any]) -> str:
         lines.append(f"{name:<{width}}{branch['drift']:>+11.4%}{branch['offset_a']:>+11.3f} A  {mark}")
         lines += [f"  target {branch['target']}"] if is_written else []
         if is_written and branch["applied"]:
-            plan = {key: value for key, value in branch["plan"].items() if value or key != "voltage_gain"}
-            lines.append("  " + ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in plan.items()))
-            if "voltage_gain" in plan:
-                formula = [*formula[:1], "  of a power: + voltage code * voltage gain in the parentheses"]
-    return "\n".join([*lines, *formula, *(f"warning: {text}" for text in report["warnings"])])
+            lines.append("  " + ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in branch["plan"].items()))
+    lines += ["corrected code =", "  (code * gain + voltage code * voltage gain + bias + 2^(shift - 1)) >> shift"]
+    return "\n".join([*lines, *(f"warning: {text}" for text in report["warnings"])])

@@ -56,7 +56,9 @@ def test_every_sleep_and_its_end_is_said_the_first_one_too(drive: Drive) -> None
 
 
 def test_a_sleep_after_a_fall_back_is_said_in_the_same_way(drive: Drive) -> None:
-    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [f"{FALLS_BACK}no frames of motor"]
+    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [
+        f"{FALLS_BACK}{Reason.BRANCH_STALE.words} (motor)"
+    ]
     assert drive.go_on(7.0, ()) + drive.go_on(1.0, BOTH) == AGAIN
 
 
@@ -67,7 +69,7 @@ def test_a_correction_that_makes_it_worse_and_a_stuck_branch_are_said_and_that_i
     ]
     parameters = parameters_for(drive.database, battery=(0.0, 5.0), motor=(0.0, 0.0))
     assert drive.load(InForce(parameters=parameters)) == ["correcting again", None]
-    assert drive.go_on(12.0, BOTH, swing_a=40.0) == [f"{FALLS_BACK}motor never changes"]
+    assert drive.go_on(12.0, BOTH, swing_a=40.0) == [f"{FALLS_BACK}{Reason.BRANCH_STUCK.words} (motor)"]
 
 
 def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(drive: Drive) -> None:
@@ -77,5 +79,7 @@ def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(d
 
 
 def test_parameters_that_are_taken_back_after_a_fall_back_do_not_correct_again(drive: Drive) -> None:
-    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [f"{FALLS_BACK}no frames of motor"]
+    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [
+        f"{FALLS_BACK}{Reason.BRANCH_STALE.words} (motor)"
+    ]
     assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None]
