@@ -43,11 +43,15 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Whether it still keeps the node from correcting."""
 
 
-def read_faults(folder: Path) -> list[Fault]:
-    """Entries of a state folder, the last one first; UserError if they cannot be read."""
-    path = folder / _NAME
+def _file(folder: Path) -> Path:
     if not folder.is_dir():
         raise UserError(f"{folder}: no such state folder; name the one of 'ecu-node run --state'")
+    return folder / _NAME
+
+
+def read_faults(folder: Path) -> list[Fault]:
+    """Entries of a state folder, the last one first; UserError if they cannot be read."""
+    path = _file(folder)
     try:
         return msgspec.json.decode(read_user_file(path, largest_bytes=_LARGEST_BYTES), type=list[Fault])
     except FileNotFoundError:
@@ -59,9 +63,7 @@ def read_faults(folder: Path) -> list[Fault]:
 
 def clear_faults(folder: Path) -> None:
     """Forget all entries; a node that runs corrects again within a second."""
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such state folder; name the one of 'ecu-node run --state'")
-    (folder / _NAME).unlink(missing_ok=True)
+    _file(folder).unlink(missing_ok=True)
 
 
 def faults_text(faults: list[Fault]) -> str:

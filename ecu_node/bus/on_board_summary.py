@@ -95,21 +95,17 @@ class _Channel:
 
 def _aligned(samples: _Samples, instants_s: Sequence[float], limit_s: float) -> _Column:
     """Values at instants, interpolated; NaN where the samples around are too far apart, and behind the last one."""
-    following = iter(samples)
-    before = after = next(following)
-    is_over, found = False, []
+    times_s, found = [time_s for time_s, _ in samples], []
     for instant_s in instants_s:
-        while not is_over and after[0] <= instant_s:
-            before, after = after, next(following, after)
-            is_over = after is before
-        gap_s = after[0] - before[0]
-        if before[0] >= instant_s or (is_over and instant_s - before[0] <= rule.TIME_RESOLUTION_S * limit_s):
-            found.append(before[1])
-        elif is_over or gap_s > limit_s:
-            found.append(math.nan)
+        following = bisect_right(times_s, instant_s)
+        (before_s, before), (after_s, after) = samples[max(following - 1, 0)], samples[min(following, len(samples) - 1)]
+        gap_s, since_s = after_s - before_s, instant_s - before_s  # no gap before the first sample and behind the last
+        if since_s <= (0.0 if gap_s else rule.TIME_RESOLUTION_S * limit_s):
+            found.append(before)
+        elif gap_s and gap_s <= limit_s:
+            found.append(((gap_s - since_s) * before + since_s * after) / gap_s)
         else:
-            share = (instant_s - before[0]) / gap_s
-            found.append((1.0 - share) * before[1] + share * after[1])
+            found.append(math.nan)
     return found
 
 
@@ -481,9 +477,7 @@ class OnBoardSummary:
     def _write(self) -> None:
         """Replace the file as a whole; what could not be written is so again with the next batch."""
         if self._path is None:
-            stem = f"{datetime.now(UTC):%Y-%m-%dT%H%M%S}"
-            names = (f"{stem}{more}{rule.SUFFIX}" for more in ("", *(f"-{n}" for n in range(2, 1000))))
-            self._path = next(path for name in names if not (path := self._folder / name).exists())
+            self._path = self._folder / f"{datetime.now(UTC):%Y-%m-%dT%H%M%S.%f}{rule.SUFFIX}"
         layout, database = self._database.layout, self._database
         readings = [self._zero.reading(name, database.current_step_a(name)) for name in self._branches]
         levels = [sorted(self._levels[name].items()) for name in self._branches]

@@ -537,13 +537,13 @@ class JunctionWatch:
         """Instant at which a jump began [s], instants since, and what it looked like then."""
         self.verdict: Verdict | None = None
 
-    def look(self, now_s: float) -> JunctionSums | None:
-        """Take the sums of now [s]; None while a fitted branch is stale or has no value."""
+    def look(self, now_s: float) -> None:
+        """Take the sums of now [s], and judge them."""
         self.sums = None
         branches = self._branches.values()
         found = aligned_currents([*branches], {branch.name: branch.delay_s for branch in branches}, now_s)
         if found is None:
-            return None
+            return
         self.instant_s, self.currents_a = found
         self.sums = JunctionSums(*map(sum, zip(*self.currents_a.values(), strict=True)))
         if not self.is_whole(now_s):
@@ -552,7 +552,6 @@ class JunctionWatch:
             self._judged_s = self.instant_s
             self._remember(self.sums)
             self.verdict = self._judge()
-        return self.sums
 
     def _remember(self, sums: JunctionSums) -> None:
         """Take one instant into the windows."""

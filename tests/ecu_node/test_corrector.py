@@ -53,7 +53,8 @@ def state_at(corrector: Corrector, now_s: float) -> tuple[State, Reason]:
 
 
 def sums_at(corrector: Corrector, now_s: float) -> tuple[float | None, float | None]:
-    sums = corrector.watch.look(now_s)
+    corrector.watch.look(now_s)
+    sums = corrector.watch.sums
     return (None, None) if sums is None else (sums.measured_a, sums.corrected_a)
 
 
