@@ -1,0 +1,150 @@
+"""Drives summed up by a node: frames in, records out. That they are those of the log: tests/calibrator/summaries."""
+
+import argparse
+import math
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from ecu_node import summary as rule
+from ecu_node.bus import on_board_summary as room
+from ecu_node.bus.on_board_summary import OnBoardSummary, on_board_summary
+from ecu_node.core.signals import FrameKey
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError, UserError
+from ecu_node.summary import SummaryFile, decode_summary, encode_summary, unpacked
+from tests.ecu_node.vehicles import SMALL_LAYOUT
+
+OPEN_S, OFFSET_A, HEATER_W, NET_V = 8.0, 5.0, 2000, 400.0
+WITH_CONTACTOR = f"""{SMALL_LAYOUT}
+input = [{{ name = "net", signal = "Net.Voltage" }}]
+contactor = {{ input = "net", open = [0.0] }}
+"""
+
+
+class Drive:
+    """A vehicle whose battery feeds motor and heater; the sensor of the battery has an offset."""
+
+    def __init__(self, folder: Path, database: VehicleDatabase) -> None:
+        self.said: list[str] = []
+        self.folder = folder / "V1"
+        self.summary = OnBoardSummary(folder, "V1", database, delays={}, say=self.said.append)
+        self.stamp_s = 1000.0
+
+    def go_on(self, duration_s: float, *, battery_only: bool = False) -> None:
+        """Frames at 10 Hz; the contactors are open in the first seconds."""
+        for step in range(round(10.0 * duration_s)):
+            flows = step >= 10.0 * OPEN_S
+            motor_a, heater_a = flows * (50.0 + 30.0 * math.sin(0.37 * step)), flows * HEATER_W / NET_V
+            battery, motor = round((motor_a + heater_a + OFFSET_A) / 0.1), round(-motor_a / 0.05)
+            pair = battery.to_bytes(2, "big", signed=True) + motor.to_bytes(2, "big", signed=True) + bytes(4)
+            if battery_only:
+                pair = pair[:2]
+            else:
+                self.take(258, False, (round(NET_V / 0.01) * flows).to_bytes(2, "little"))
+                self.take(512, True, HEATER_W.to_bytes(4, "little"))
+            self.take(256, False, pair)
+            self.stamp_s += 0.1
+
+    def take(self, identifier: int, extended: bool, payload: bytes) -> None:
+        self.summary.take(FrameKey(identifier, extended), bytearray(payload), self.stamp_s)
+
+    def records(self) -> list[SummaryFile]:
+        return [decode_summary(path.read_bytes()) for path in sorted(self.folder.glob("*.summary"))]
+
+
+@pytest.fixture
+def drive(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> Drive:
+    return Drive(tmp_path / "sums", make_database(WITH_CONTACTOR))
+
+
+def test_means_are_currents_and_open_contactors_show_the_offset(drive: Drive) -> None:
+    drive.go_on(120.0)
+    for battery in (3000, 500):  # of two samples at one instant the last one counts
+        drive.take(256, False, battery.to_bytes(2, "big") + bytes(6))
+    drive.take(999, False, bytes(8))
+    drive.summary.close()
+    (record,) = drive.records()
+    assert record.branches == ["battery", "motor", "heater"]
+    assert record.zero_offset_a == [pytest.approx(OFFSET_A), pytest.approx(0.0), None]
+    battery_a, motor_a, heater_a = unpacked(record.mean)
+    assert heater_a == pytest.approx(-HEATER_W / NET_V)
+    assert battery_a + motor_a + heater_a == pytest.approx(OFFSET_A, abs=0.05)
+    assert record.starts == [True]
+
+
+def test_step_of_the_time_of_day_begins_another_drive(drive: Drive) -> None:
+    drive.go_on(60.0)
+    drive.stamp_s += 3600.0
+    drive.go_on(60.0)
+    drive.summary.close()
+    (record,) = drive.records()
+    assert record.starts == [True, True]
+
+
+def test_silence_of_a_minute_ends_a_drive(drive: Drive) -> None:
+    drive.go_on(60.0)
+    drive.summary.look(0.0)
+    assert drive.records() == []
+    drive.summary.look(room.DRIVE_GAP_S + 1.0)
+    assert len(drive.records()) == 1
+
+
+def test_one_branch_alone_makes_no_record(drive: Drive) -> None:
+    drive.go_on(400.0, battery_only=True)
+    drive.summary.close()
+    assert drive.records() == []
+
+
+def test_full_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "MOST_BATCHES", 1)
+    drive.go_on(400.0)
+    drive.summary.close()
+    records = drive.records()
+    assert len(records) == 3
+    assert [record.starts for record in records] == [[True], [False], [False]]
+
+
+def test_failure_to_write_is_said_once_and_its_end(drive: Drive) -> None:
+    shutil.rmtree(drive.folder)
+    drive.go_on(60.0)
+    drive.summary.end_drive()
+    drive.go_on(60.0)
+    drive.summary.end_drive()
+    drive.folder.mkdir()
+    drive.go_on(60.0)
+    drive.summary.close()
+    assert drive.said == [
+        "--summary: No such file or directory; records are lost until that has changed",
+        "--summary: records are written again",
+    ]
+    (record,) = drive.records()
+    assert record.starts == [True, True, True]
+
+
+def test_record_of_another_version_is_refused(drive: Drive) -> None:
+    drive.go_on(60.0)
+    drive.summary.close()
+    (record,) = drive.records()
+    other = msgspec.structs.replace(record, schema_version=1)
+    with pytest.raises(ValueError, match=f"schema version 1, expected {rule.SCHEMA_VERSION}"):
+        decode_summary(encode_summary(other))
+
+
+def test_what_cannot_be_summed_is_refused(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> None:
+    database = make_database(SMALL_LAYOUT)
+    (tmp_path / "file").touch()
+    options = argparse.Namespace(summary=tmp_path / "file", vehicle="V1")
+    with pytest.raises(UserError, match=r"--summary .*/file: cannot be used: .*; name another folder"):
+        on_board_summary(options, {}, database, None, print)
+    options = argparse.Namespace(summary=tmp_path, vehicle="../V1")
+    with pytest.raises(UserError, match=re.escape("--summary: vehicle '../V1' cannot name a folder; rename it")):
+        on_board_summary(options, {}, database, None, print)
+    computed = SMALL_LAYOUT.replace('power = "Heater.Power", voltage = "Net.Voltage"', 'formula = "2.0 * net"')
+    database = make_database(f'{computed}\ninput = [{{ name = "net", signal = "Net.Voltage" }}]\n')
+    with pytest.raises(LayoutError, match="branch heater is computed by a formula, which --summary does not"):
+        OnBoardSummary(tmp_path, "V1", database, delays={}, say=print)
