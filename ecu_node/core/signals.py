@@ -163,20 +163,15 @@ class BitPlace:
         raw = field & ((1 << self.length) - 1)
         return raw - (1 << self.length) if raw > self.highest else raw
 
-    def put(self, payload: bytearray, raw: int) -> bool:
+    def put(self, payload: bytearray, raw: int) -> None:
         """Write the raw integer in place; all other bits stay as they are.
 
         Parameters
         ----------
         payload : bytearray
-            Data of a frame, changed in place.
+            Data of a frame that holds the signal, changed in place.
         raw : int
             Between :attr:`lowest` and :attr:`highest`.
-
-        Returns
-        -------
-        bool
-            False if the frame is too short to hold the signal; it is then unchanged.
 
         Raises
         ------
@@ -185,13 +180,10 @@ class BitPlace:
         """
         if not self.lowest <= raw <= self.highest:
             raise ValueError(f"raw code {raw} does not fit into {self.length} bits")
-        if len(payload) < self.end:
-            return False
         ones = (1 << self.length) - 1
         field = int.from_bytes(payload[self.first : self.end], self.order)
         field = field & ~(ones << self.shift) | (raw & ones) << self.shift
         payload[self.first : self.end] = field.to_bytes(self.end - self.first, self.order)
-        return True
 
 
 def bit_place(signal: Signal) -> BitPlace:

@@ -111,6 +111,12 @@ def test_speed_that_would_be_another_one_is_refused(
         bus_config("pcan", "PCAN_USBBUS1", fd=fd)
 
 
+def test_bit_timing_that_the_driver_would_drop_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
+    with pytest.raises(BusError, match="python-can cannot set a bit timing there; take f_clock out"):
+        bus_config("ixxat", "0")
+
+
 # ---- python-can's configuration
 
 

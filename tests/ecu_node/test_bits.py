@@ -47,7 +47,7 @@ def test_put_writes_what_cantools_encodes_and_keeps_all_other_bits(
     before = data.draw(st.binary(min_size=message.length, max_size=message.length))
     raw = data.draw(st.integers(place.lowest, place.highest))
     payload = bytearray(before)
-    assert place.put(payload, raw)
+    place.put(payload, raw)
     own = int.from_bytes(message.encode({"S": -1 if signal.is_signed else place.highest}, scaling=False), "little")
     wanted = int.from_bytes(message.encode({"S": raw}, scaling=False), "little")
     assert place.mask == own

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from ecu_node.cli import main
@@ -89,6 +90,22 @@ def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gate
     assert line.endswith("--gateway CHANNEL")
     assert main([*options, "--gateway", "can1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
+
+
+def test_fault_that_is_not_applied_is_said(
+    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parameters = parameters_for(database, battery=(0.25, 5.0))
+    held = msgspec.structs.replace(parameters.branches["battery"], apply=False)
+    write_parameters(msgspec.structs.replace(parameters, branches={"battery": held}), tmp_path / "v1.json")
+    assert main(check(tmp_path / "v1.json")) == 0
+    assert '+5.000 A  passed through, "apply" is false' in capsys.readouterr().out
+
+
+def test_json_of_the_monitor_needs_a_time(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["monitor", "--layout", str(LAYOUT), "--channel", "c", "--json"])
+    assert "--json needs --once SECONDS" in capsys.readouterr().err
 
 
 def test_unfit_parameters_end_in_1_and_say_why(params: Path, capsys: pytest.CaptureFixture[str]) -> None:

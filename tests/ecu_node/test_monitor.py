@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -165,6 +165,21 @@ def test_status_is_read_as_the_node_wrote_it(bus: Bus) -> None:
     status(bus, 4.0, State=14, Reason=Reason.NONE, JunctionSumMeasured=-3276.8, JunctionSumCorrected=-3276.8)
     assert bus.monitor.look(4.0)["node"]["sums"] == {"measured_a": None, "corrected_a": None}
     assert bus.lines(4.0)[0] == "can0: node: state 14, which this version does not know; status 0.0 s ago"
+
+
+def test_what_else_a_reader_should_know_is_said(make_database: Callable[..., VehicleDatabase]) -> None:
+    """A small vehicle without a status message, whose heater is a power."""
+    bus = Bus(make_database())
+    lines = bus.lines(0.1, Counters(bus_errors=2, dropped=3))
+    assert lines[0] == "can0: the layout has no status message: nothing is known of a node"
+    assert "no frame of any branch: is the bus awake, and its bit rate the right one?" in lines
+    assert "error frames of the bus: 2; a wrong bit rate, or a fault in the wiring?" in lines
+    assert "frames that this computer was too slow to read: 3; they count as lost above" in lines
+    bus.monitor.take((258, False), bytearray((40_000).to_bytes(2, "little")), 0.1)
+    bus.monitor.take((512, True), bytearray((2000).to_bytes(4, "little")), 0.1)
+    assert bus.branch(0.1, "heater")["measured_a"] == pytest.approx(-5.0)
+    closed = view_lines(bus.monitor.look(0.1) | {"is_bus_open": False}, "can0", Counters())
+    assert closed[0].startswith("can0: this computer's interface failed or is down; trying to open it again")
 
 
 @contextmanager

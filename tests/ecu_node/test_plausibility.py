@@ -150,4 +150,4 @@ def test_the_log_names_the_sensor(junction: Junction, tmp_path: Path) -> None:
     junction.run(1.0, driving)
     text = changes()
     assert text is not None
-    assert "the sensor of battery is wrong" in text
+    assert "a sensor is wrong (battery)" in text

@@ -67,3 +67,11 @@ def test_a_vehicle_that_no_parameter_file_can_name_is_wrong_use(
         main(["template", "--layout", str(LAYOUT), "--vehicle", vehicle])
     assert caught.value.code == 2
     assert "--vehicle: the identity of the vehicle is expected" in capsys.readouterr().err
+
+
+def test_template_of_a_load_beyond_the_limits_is_refused(
+    make_database: Callable[..., VehicleDatabase], capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = make_database(f"{SMALL_LAYOUT}\nunmeasured_load = {{ mean_a = 200.0, sd_a = 1.0 }}\n")
+    assert main(["template", "--layout", str(database.layout.path), "--vehicle", "v1"]) == 1
+    assert "[unmeasured_load] mean_a = 200 is beyond the layout's limit of 160 A" in capsys.readouterr().err
