@@ -29,7 +29,7 @@ from ecu_node.core.junction import REMEMBERED_FRAMES, Frames, HeardSignal, LiveB
 from ecu_node.core.signals import AMPERE, bit_place, placed_signal, read_codes
 from ecu_node.core.status import Counters, Latency, Quality, Reason, State
 from ecu_node.database import VehicleDatabase, node_database
-from ecu_node.layout import Branch
+from ecu_node.layout import Branch, SignalName
 from ecu_node.program import say_error, write_output
 
 View = dict[str, Any]
@@ -166,24 +166,25 @@ class _BranchOnBus:
     """One branch: the measured current, and the corrected one, of which nothing comes if the layout has none."""
 
     def __init__(self, database: VehicleDatabase, branch: Branch, heard: _Heard) -> None:
-        signals, corrected = branch_signals(database, branch, Mode.OVERLAY), branch.corrected
-        voltage = None
+
+        def follow(part: HeardSignal, name: SignalName, answers: Frames | None = None) -> _HeardMessage:
+            message, signal = database.signal(name)
+            found = heard[key_of(message)]
+            part.follow(placed_signal(message, signal), found.frames if answers is None else answers)
+            return found
+
+        signals, voltage = branch_signals(database, branch, Mode.OVERLAY), None
         if branch.voltage is not None and signals.voltage is not None:
             voltage = HeardSignal(signals.voltage, branch.timeout_s)
-            message, signal = database.signal(branch.voltage)
-            voltage.follow(placed_signal(message, signal), heard[key_of(message)].frames)
+            follow(voltage, branch.voltage)
         make = partial(LiveBranch, name=branch.name, sign=branch.sign, timeout_s=branch.timeout_s, voltage=voltage)
         self.measured, self.corrected = make(codes=signals.source), make(codes=signals.target)
-        message, signal = database.signal(branch.source)
-        self.asking = heard[key_of(message)]
-        self.measured.follow(placed_signal(message, signal), self.asking.frames)
-        message, signal = database.signal(corrected or branch.source)
-        self.answering = heard[key_of(message)] if corrected is not None else None
-        if self.answering is not None and self.answering not in self.asking.answered_by:
-            self.asking.answered_by.append(self.answering)
         self.answers: Frames = deque(maxlen=REMEMBERED_FRAMES)
         """Intact corrected frames, at the times of those that they answer."""
-        self.corrected.follow(placed_signal(message, signal), self.answers)
+        self.asking = follow(self.measured, branch.source)
+        self.answering = follow(self.corrected, branch.corrected, self.answers) if branch.corrected else None
+        if self.answering is not None and self.answering not in self.asking.answered_by:
+            self.asking.answered_by.append(self.answering)
         self._quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
 
     @property
