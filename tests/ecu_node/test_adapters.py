@@ -161,6 +161,18 @@ def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
     assert "no bitrate" in capsys.readouterr().err
 
 
+def test_dry_run_of_a_gateway_prints_both_ways(node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*node, "--interface", "virtual", "--channel", "a", "--gateway", "b", "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "would open virtual a: no settings",
+        "  reads all frames; corrects Pair (0x100), Heater (0x200)",
+        "  sends all other frames of the other bus, as they are",
+        "would open virtual b: no settings",
+        "  reads all frames",
+        "  sends Pair (0x100), Heater (0x200), corrected; nothing; all other frames of the other bus, as they are",
+    ]
+
+
 # ---- listening only
 
 

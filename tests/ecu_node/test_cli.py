@@ -102,6 +102,13 @@ def test_fault_that_is_not_applied_is_said(
     assert '+5.000 A  passed through, "apply" is false' in capsys.readouterr().out
 
 
+def test_can_fd_that_run_would_need_is_said(
+    small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", *small(SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))]) == 0
+    assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
+
+
 def test_json_of_the_monitor_needs_a_time(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["monitor", "--layout", str(LAYOUT), "--channel", "c", "--json"])

@@ -4,6 +4,9 @@ import argparse
 import math
 import re
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +20,7 @@ from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.summary import SummaryFile, decode_summary, encode_summary, unpacked
-from tests.ecu_node.vehicles import SMALL_LAYOUT
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
 
 OPEN_S, OFFSET_A, HEATER_W, NET_V = 8.0, 5.0, 2000, 400.0
 WITH_CONTACTOR = f"""{SMALL_LAYOUT}
@@ -148,3 +151,15 @@ def test_what_cannot_be_summed_is_refused(make_database: Callable[..., VehicleDa
     database = make_database(f'{computed}\ninput = [{{ name = "net", signal = "Net.Voltage" }}]\n')
     with pytest.raises(LayoutError, match="branch heater is computed by a formula, which --summary does not"):
         OnBoardSummary(tmp_path, "V1", database, delays={}, say=print)
+
+
+def test_node_that_sums_up_makes_the_folder_of_its_vehicle(tmp_path: Path) -> None:
+    options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]
+    bus = ["--interface", "virtual", "--channel", "sums", "--summary", str(tmp_path / "sums")]
+    command = [sys.executable, "-m", "ecu_node", "run", *options, *bus]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert any("running on virtual sums" in line for line in iter(process.stderr.readline, ""))
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=60) == 0
+    assert list((tmp_path / "sums" / "V1").iterdir()) == []

@@ -127,6 +127,22 @@ def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
     assert sensors.recv(0.0) is None, "nothing comes back"
 
 
+def test_branch_frame_that_waited_too_long_is_not_passed_on(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    with (
+        gateway(database, request.node.name) as (corrector, _),
+        VirtualBus(f"{request.node.name} a", preserve_timestamps=True) as bus,
+    ):
+        for counter, age_s in enumerate((0.0, 5.0, 0.0)):
+            data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
+            bus.send(can.Message(time.time() - age_s, arbitration_id=0x110, is_extended_id=False, data=data))
+        counters = [
+            decoded(database, "HV_Battery", bytes(frame.data))["AliveCounter"] for frame in received(ends[1], 2)
+        ]
+        assert (counters, corrector.counters.late) == ([0, 2], 1)
+
+
 class BlockingBus(VirtualBus):
     """A bus on which sending waits until it is let go."""
 

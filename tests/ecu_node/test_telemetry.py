@@ -172,6 +172,17 @@ def test_example_takes_the_currents_out_of_a_line(make_outlet: Any, tmp_path: Pa
     assert currents((tmp_path / "node.jsonl").read_text()) == {VSS: -60.0, "motor": -80.0}
 
 
+def test_line_that_fits_in_part_is_taken_back(
+    make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, write = tmp_path / "node.jsonl", os.write
+    outlet = make_outlet(path)
+    monkeypatch.setattr(os, "write", lambda file, line: write(file, line[:7] if line.startswith(b'{"time"') else line))
+    outlet.second()
+    wait_until(partial(lost, outlet, 1))
+    assert path.read_bytes() == b""
+
+
 def test_latency_is_counted_by_bits_of_microseconds(monkeypatch: pytest.MonkeyPatch) -> None:
     latency = Latency()
     monkeypatch.setattr(time, "monotonic", lambda: 100.0)
