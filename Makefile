@@ -7,6 +7,7 @@ OUT ?= build/demo
 TRIPS ?= ../shared/data/bmw_i3_summer
 PYTHONS ?=
 PIP_QUIET := --quiet --disable-pip-version-check --no-deps
+unexport PYTHONDONTWRITEBYTECODE # without cached bytecode each of the many processes starts three times as slowly
 
 unexport PYTHONDONTWRITEBYTECODE # where it is set, each of some thousand processes compiles anew what it imports
 
@@ -24,7 +25,7 @@ $(VENV)/.installed: constraints.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	awk '/^[a-z]/ { wanted = /^uv==/ } wanted' constraints.txt > $(VENV)/uv.txt # uv is four times as fast as pip
 	$(BIN)/pip install $(PIP_QUIET) --require-hashes -r $(VENV)/uv.txt
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet --no-deps --require-hashes -r constraints.txt \
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet --compile-bytecode --no-deps --require-hashes -r constraints.txt \
 		|| $(BIN)/pip install $(PIP_QUIET) --require-hashes -r constraints.txt # its own settings, such as a mirror
 	$(BIN)/pip install $(PIP_QUIET) --no-build-isolation --editable .
 	@touch $@
