@@ -73,10 +73,11 @@ def parse_formula(text: str) -> ast.expr:
     return tree
 
 
-def formula_names(tree: ast.expr) -> list[str]:
+@cache
+def formula_names(tree: ast.expr) -> tuple[str, ...]:
     """Names of the inputs that a formula uses, sorted."""
     called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
-    return sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and id(node) not in called})
+    return tuple(sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and id(node) not in called}))
 
 
 def formula_value(

@@ -49,9 +49,9 @@ class ChargeCurve:
     ----------
     time_s : ndarray of shape (n,)
         Instants of the good samples, strictly increasing, n >= 2. [s]
-    pieces : ndarray of shape (4, n-1)
+    pieces : ndarray of shape (4, n) or wider
         Integral of the charge [A s^2], charge since the first sample [A s] and current [A] at the start of the line
-        after each sample, and the slope of that line [A/s].
+        after each sample but the last one, and the slope of that line [A/s].
     gap_s : ndarray of shape (n,)
         Time spent in gaps before each sample. [s]
     period_s : float
@@ -146,23 +146,33 @@ def charge_curve(channel: Channel) -> ChargeCurve | None:
     ChargeCurve or None
         None with fewer than two good samples at different instants. Of several at one instant the last counts.
     """
-    time_s, current = channel.time_s[channel.good], channel.value[channel.good]
-    last = np.diff(time_s, append=np.inf) > 0.0
-    time_s, current = time_s[last], current[last]
-    if len(time_s) < 2:
+    time_s, pieces = np.empty(len(channel.time_s)), np.zeros((4, len(channel.time_s)))
+    samples = (np.ascontiguousarray(channel.time_s), np.ascontiguousarray(channel.value), channel.good)
+    count = _integrate(samples, time_s, pieces)
+    if count < 2:
         return None
+    time_s = time_s[:count]
     h = np.diff(time_s)
-    slope = np.diff(current) / h
-    charge = _cumulated(h * (current[1:] + current[:-1]) / 2.0)[:-1]
-    integral = _cumulated(h * (charge + h * (current[:-1] / 2.0 + h * slope / 6.0)))[:-1]
     period_s = float(np.median(h))
-    return ChargeCurve(
-        time_s=time_s,
-        pieces=np.stack([integral, charge, current[:-1], slope]),
-        gap_s=_cumulated(np.where(h > GAP_PERIODS * period_s, h, 0.0)),
-        period_s=period_s,
-    )
+    gap_s = np.concatenate([[0.0], np.cumsum(np.where(h > GAP_PERIODS * period_s, h, 0.0))])
+    return ChargeCurve(time_s=time_s, pieces=pieces, gap_s=gap_s, period_s=period_s)
 
 
-def _cumulated(parts: Array) -> Array:
-    return np.concatenate([[0.0], np.cumsum(parts)])
+@compiled
+def _integrate(samples: tuple[Array, Array, Mask], time_s: Array, pieces: Array) -> int:
+    """Good samples at different instants, and the line after each, see :class:`ChargeCurve`; how many samples."""
+    known_s, value, good = samples
+    integral, charge, current = pieces[0], pieces[1], pieces[2]
+    count = 0
+    for j in range(len(known_s)):
+        if good[j]:
+            if count > 0 and known_s[j] <= time_s[count - 1]:
+                count -= 1
+            time_s[count], current[count] = known_s[j], value[j]
+            count += 1
+    for k in range(count - 1):
+        h = time_s[k + 1] - time_s[k]
+        pieces[3, k] = (current[k + 1] - current[k]) / h
+        charge[k + 1] = charge[k] + h * (current[k + 1] + current[k]) / 2.0
+        integral[k + 1] = integral[k] + h * (charge[k] + h * (current[k] / 2.0 + h * pieces[3, k] / 6.0))
+    return count

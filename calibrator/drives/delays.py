@@ -60,7 +60,7 @@ current that was found. [1]"""
 LAG_STEP_S = 0.02
 """Grid of the search, far finer than the windows: the true delay lies in the neighbourhood of the best lag. [s]"""
 SEARCHED_INSTANTS = 1200
-"""Instants at which the search looks at most. [1]"""
+"""Instants at which the search, and what is usual, looks at most. [1]"""
 SWEEPS = 2
 """How many times each pair of branches takes its best lags: the first time those of the rest are still guesses."""
 SINGULAR = 1e-10
@@ -68,10 +68,8 @@ SINGULAR = 1e-10
 
 MOST_STEPS, MOST_STEPS_ON_ALL = 10, 2
 """Five are usual; the delay of a branch that tells nothing wanders for ever. On all drives one is."""
-CONVERGED_S = 1e-6
-"""A shorter step is none: a thousandth of what matters. [s]"""
-CONVERGED_ON_ALL_S = 1e-3
-"""The same for the last step, on all drives: Newton's error is the square of it over the windows, 5 us. [s]"""
+CONVERGED_S = 1e-3
+"""After a shorter step no other is made: Newton's error is the square of it over the windows, 5 us. [s]"""
 LONGEST_STEP_S = 0.02
 """A longer step would leave the neighbourhood that the search found. [s]"""
 MAD_TO_SD = 1.4826
@@ -184,14 +182,14 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
         free=np.ones(len(branches) - 1, np.bool_),
     )
     while True:
-        found = _newton(telling, band, found, MOST_STEPS, CONVERGED_S)
+        found = _newton(telling, band, found, MOST_STEPS)
         hopeless = found.free & ~(found.plausible & (found.sd_s <= HOPELESS * max_sd_s))
         if not hopeless.any():
             break
         worst = np.arange(len(hopeless)) == np.argmax(np.where(hopeless, found.sd_s, -1.0))
         found = replace(found, free=found.free & ~worst, delay_s=np.where(worst, 0.0, found.delay_s))
     if telling is not stretches:
-        found = _newton(stretches, band, found, MOST_STEPS_ON_ALL, CONVERGED_ON_ALL_S)
+        found = _newton(stretches, band, found, MOST_STEPS_ON_ALL)
     delay_s, sd_s = found.delay_s, found.sd_s
     known = np.concatenate([[True], found.free & found.plausible & (sd_s <= max_sd_s)])
     return BranchDelays(
@@ -317,16 +315,17 @@ def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int]
 # ---- Newton's steps
 
 
-def _newton(stretches: Sequence[_Stretch], band: Band, start: _Fit, steps: int, converged_s: float) -> _Fit:
+def _newton(stretches: Sequence[_Stretch], band: Band, start: _Fit, steps: int) -> _Fit:
     """Gains, and those of the delays that are free, from a first guess nearby."""
     others, gain, delay_s = len(start.gain), start.gain, start.delay_s
     block = np.concatenate([stretch.block for stretch in stretches])
     first = _bands(stretches, [0], band, np.zeros(1))
+    some = slice(None, None, -(-len(block) // SEARCHED_INSTANTS))  # of which medians are exact enough
     for _ in range(steps):
         x, slope = _bands(stretches, range(1, others + 1), band, delay_s)
         e = first[0][:, 0] + x @ gain
-        scale = max(MAD_TO_SD * float(np.median(np.abs(e))), LEAST_SCALE * float(np.sqrt(np.mean(e**2))), _TINY)
-        usual = SLOPE_NOISES * MAD_TO_SD * np.median(np.abs(slope), axis=0)
+        scale = max(MAD_TO_SD * float(np.median(np.abs(e[some]))), LEAST_SCALE * float(np.sqrt(np.mean(e**2))), _TINY)
+        usual = SLOPE_NOISES * MAD_TO_SD * np.median(np.abs(slope[some]), axis=0)
         sums = np.zeros((int(block[-1]) + 1, 2 * others, 2 * others + 1))
         _add_products((x, slope), (e, first[1][:, 0] + slope @ gain), gain, usual, HUBER * scale, block, sums)
         rows = np.concatenate([np.ones(others, np.bool_), start.free])
@@ -335,7 +334,7 @@ def _newton(stretches: Sequence[_Stretch], band: Band, start: _Fit, steps: int, 
         step[rows] = -_solve(sums.sum(axis=0)[None])[0]
         step_s = np.clip(step[others:], -LONGEST_STEP_S, LONGEST_STEP_S)
         gain, delay_s = gain + step[:others], np.clip(delay_s + step_s, -MAX_DELAY_S, MAX_DELAY_S)
-        if np.all(np.abs(step_s) < converged_s):
+        if np.all(np.abs(step_s) < CONVERGED_S):
             break
     sd_s = np.full(others, np.inf)
     sd_s[start.free] = _jackknife_sd(sums)[others:]

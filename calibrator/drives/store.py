@@ -173,7 +173,7 @@ def is_drive_file(path: Path) -> bool:
 def read_drive_file(path: Path, layout: Layout) -> Drive:
     """Read one drive of a store; DriveError if it is cut, no drive, or was made with another layout or DBC."""
     with _reading(str(path)):
-        table = pq.read_table(io.BytesIO(path.read_bytes()), use_threads=False)
+        table = pq.ParquetFile(pa.BufferReader(path.read_bytes())).read(use_threads=False)
         about = _about(table.schema)
         _check_identity(about, str(path), layout)
         channels: dict[str, dict[str, Channel]] = {"branch": {}, "input": {}}

@@ -9,12 +9,12 @@ any error: the structure is checked throughout, and damage is refused with its p
 """
 
 import struct
-import zlib
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import BinaryIO
 
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from calibrator.compiled import compiled, inner
@@ -33,6 +33,7 @@ from calibrator.recordings.frame_arrays import (
     Frames,
     concatenate_frames,
 )
+from calibrator.recordings.log_files import UNREADABLE
 
 __all__ = ["read_blf"]
 
@@ -182,10 +183,10 @@ def _container_content(content: bytes, position: int) -> bytes:
         return body
     if method != _DEFLATE:
         raise _DamageError(position, f"a container is compressed by a method {method} that is not known")
-    stream = zlib.decompressobj()
+    stream = isal_zlib.decompressobj()
     try:
-        text = stream.decompress(body, LARGEST_OBJECT)
-    except zlib.error as error:
+        text: bytes = stream.decompress(body, LARGEST_OBJECT)
+    except UNREADABLE as error:
         raise _DamageError(position, f"a container cannot be decompressed ({error})") from None
     if not stream.eof:
         raise _DamageError(position, "a compressed container is not complete")

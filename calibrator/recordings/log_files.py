@@ -4,7 +4,6 @@ A file inside an archive has the path ``fleet.zip/V0001/monday.log``, as if the 
 """
 
 import codecs
-import gzip
 import io
 import mmap
 import re
@@ -19,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TextIO, cast
 
 import pandas as pd
+from isal import igzip, isal_zlib
 
 from calibrator.errors import LogError, naming
 
@@ -42,7 +42,7 @@ __all__ = [
     "text_head",
 ]
 
-UNREADABLE = (OSError, EOFError, zlib.error)
+UNREADABLE = (OSError, EOFError, zlib.error, isal_zlib.error)
 """What opening and unpacking may raise; gzip.BadGzipFile is an OSError."""
 _NO_ARCHIVE = (*UNREADABLE, zipfile.BadZipFile, UnicodeError, RuntimeError, KeyError)
 """What opening and unpacking an archive may raise; RuntimeError where it is encrypted."""
@@ -65,8 +65,8 @@ FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
 _FRAME_CHANNEL = bytes(8) + b"CAN_DataFrame\0"
 """A block of text begins with its count of links, which is 0, then comes the text."""
 _HEAD_BYTES = 1 << 16
-_READ_BYTES = 1 << 17
-"""Asked for at a time: room for all of it is made for each piece that comes. [byte]"""
+_READ_BYTES = 1 << 13
+"""Asked for at a time: room for all of it is made for each piece that comes, and a damage takes it along. [byte]"""
 BLOCK_BYTES = 1 << 23
 """Text parsed at a time: bounds the memory, large enough for calls not to count. [byte]"""
 
@@ -78,7 +78,7 @@ def suffix_of(path: Path) -> str:
 
 def open_log(path: Path) -> BinaryIO:
     """Open a file that is in no archive, gzipped or not."""
-    return cast("BinaryIO", gzip.open(path, "rb") if path.name.lower().endswith(".gz") else path.open("rb"))
+    return cast("BinaryIO", igzip.open(path, "rb") if path.name.lower().endswith(".gz") else path.open("rb"))
 
 
 def read_undamaged(file: BinaryIO, size: int) -> tuple[bytes, Exception | None]:
@@ -226,7 +226,7 @@ def readable(path: Path) -> Iterator[Path]:
                 if archive is not None:
                     source = opened.enter_context(source.open(path.relative_to(archive).as_posix()))
                 if packed:
-                    source = opened.enter_context(gzip.open(source))
+                    source = opened.enter_context(igzip.open(source, "rb"))
                 shutil.copyfileobj(source, opened.enter_context(copy.open("wb")))
         except _NO_ARCHIVE as error:
             raise LogError(f"{path}: cannot be unpacked: {str(error).strip(chr(39))}; copy the file again") from None

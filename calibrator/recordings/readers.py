@@ -282,7 +282,7 @@ class FrameSource(SignalSource):
         super().__init__(database, where)
         self.time = repaired_time(frames.time_ns)
         self.frames = frames.take(self.time.order) if self.time.disordered or self.time.clock_steps else frames
-        self._messages: dict[str, tuple[Frames, Array, Mask]] = {}
+        self._messages: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8], Array, Mask]] = {}
         self.ignored: Counter[str] = Counter()
         self._named = [bus.channel for bus in database.layout.bus]
         if self._named:
@@ -290,9 +290,9 @@ class FrameSource(SignalSource):
 
     def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:  # noqa: D102 (as above)
         message, signal = self.database.signal(signal_name)
-        frames, time_s, unspoilt = self._of_message(signal_name)
+        data, length, time_s, unspoilt = self._of_message(signal_name)
         codes = codes_of_no_value(self.database, signal_name)
-        decoded = decode_signal(message, signal, frames.data, frames.length, codes)
+        decoded = decode_signal(message, signal, data, length, codes)
         kept = slice(None) if decoded.present.all() else decoded.present
         channel = Channel(time_s=time_s[kept], value=decoded.value[kept], good=(decoded.good & unspoilt)[kept])
         return channel, {reason: bad[kept] for reason, bad in {"E2E check failed": ~unspoilt, **decoded.bad}.items()}
@@ -332,16 +332,16 @@ class FrameSource(SignalSource):
             unfit=unfit if lacking else (),
         )
 
-    def _of_message(self, signal_name: str) -> tuple[Frames, Array, Mask]:
-        """Frames of the message of a signal, their times, and whether their end-to-end protection is right."""
+    def _of_message(self, signal_name: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array, Mask]:
+        """Of the message of a signal: payloads, lengths and times, and whether end-to-end protection is right."""
         name = split_signal(signal_name)[0]
         if name not in self._messages:
             message = self.database.message(name)
             index = np.flatnonzero(self.frames.key == np.uint32(_key(message)))
             index = index[self._is_of_bus(name, self.frames.channel[index])]
-            frames = self.frames.take(index)
-            unspoilt = message_is_sound(self.database, message, frames.data, frames.length)
-            self._messages[name] = (frames, self.time.time_s[index], unspoilt)
+            data, length = self.frames.data.take(index, axis=0), self.frames.length.take(index)
+            unspoilt = message_is_sound(self.database, message, data, length)
+            self._messages[name] = (data, length, self.time.time_s.take(index), unspoilt)
         return self._messages[name]
 
     def _is_of_bus(self, name: str, channel: NDArray[np.uint32]) -> Mask:

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import can
 import numpy as np
 import psutil
+from isal import igzip
 from threadpoolctl import threadpool_limits
 
 from bench.row import LAYOUT, Row, run
@@ -73,7 +74,7 @@ def rows(*, quick: bool) -> list[Row]:
             entry = DriveFile(vehicle="V", name="d", place=str(path))
             found.append(_summary_row(f"{name} log to summary", entry, ("battery", "motor", "auxiliary"), database))
         drive = read_recording(log, database, vehicle="V", name="d").drive
-        seconds = _best(lambda: gzip.decompress(packed.read_bytes()), READINGS)[1]
+        seconds = _best(lambda: igzip.decompress(packed.read_bytes()), READINGS)[1]
         found.append(Row(name="candump.gz unpacked, nothing else", value=drive.duration_s / 3600 / seconds, unit="h/s"))
         thin = {name: _thinned(channel) for name, channel in {**drive.branches, **drive.inputs}.items()}
         two = {name: thin[name] for name in ("battery", "motor")}

@@ -2,6 +2,7 @@ import gzip
 import importlib.util
 import io
 import logging
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -17,7 +18,7 @@ from calibrator.errors import LogError
 from calibrator.recordings import mf4
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S, DAMAGED, Frames, repaired_time
 from calibrator.recordings.frames import read_frames
-from calibrator.recordings.log_files import BLOCK_BYTES
+from calibrator.recordings.log_files import _READ_BYTES, BLOCK_BYTES
 from calibrator.recordings.text_logs import parse_candump
 
 PYTHON_CAN_FORMATS = (".log", ".asc", ".blf", ".trc")
@@ -179,13 +180,11 @@ def cut_log(tmp_path: Path, suffix: str, share: float) -> tuple[Path, list[bytes
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
 def test_a_truncated_gzip_names_the_line_and_the_readable_frames(tmp_path: Path, share: float) -> None:
     cut, lines = cut_log(tmp_path, ".log", share)
-    assert len(lines) > 100
-    message = (
-        rf"cut\.log\.gz: truncated or damaged after line {len(lines)}: the compressed file is cut off; "
-        rf"{len(lines)} frames before it are readable; copy the file again"
-    )
-    with pytest.raises(LogError, match=message):
+    with pytest.raises(LogError, match=r"the compressed file is cut off; .* copy the file again") as told:
         read_frames(cut)
+    line, frames = map(int, re.findall(r"after line (\d+).* (\d+) frames before it are readable", str(told.value))[0])
+    assert line == frames
+    assert len(lines) - _READ_BYTES // min(map(len, lines)) <= line <= len(lines)
 
 
 def test_a_blf_with_an_object_of_no_size_ends_in_an_error_not_in_a_loop(tmp_path: Path) -> None:
