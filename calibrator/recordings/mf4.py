@@ -1,25 +1,22 @@
-"""MDF 4 files, read in another process that a time limit ends: frames of a bus, or decoded channels.
+"""MDF 4 files through asammdf: frames of a bus, or decoded channels. Needs the extra ``mf4``.
 
-The format is a graph of binary blocks that point at each other; a damaged one can keep its reader busy for ever.
-Needs the extra ``mf4`` (asammdf).
+The format is a graph of binary blocks that point at each other; a damaged one can keep its reader busy for ever, or
+take all memory: where files of strangers are read, the limits of :func:`.try_many` end that.
 """
 
-import atexit
+import gc
 import importlib.util
-import json
-import os
-import signal
-import subprocess
 import sys
-import tempfile
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
-from functools import cache
+from logging import CRITICAL, getLogger
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import (
@@ -35,16 +32,7 @@ from calibrator.recordings.frame_arrays import (
     concatenate_frames,
 )
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-__all__ = ["convert", "read_mf4", "read_mf4_table"]
-
-START_S = 60.0
-"""Time for the process to start on a slow machine; asammdf imports much. [s]"""
-BYTES_PER_S = 20_000.0
-"""Slowest reading that is still waited for, a tenth of what a slow machine does."""
-_DONE = "done"
+__all__ = ["read_mf4", "read_mf4_table"]
 
 
 def read_mf4(path: Path) -> Frames:
@@ -63,14 +51,13 @@ def read_mf4(path: Path) -> Frames:
     Raises
     ------
     LogError
-        If asammdf is not installed, the file is damaged, or reading takes too long.
+        If asammdf is not installed, or the file is damaged.
     """
-    with _converted(path, "frames.npz") as result, np.load(result, allow_pickle=False) as arrays:
-        columns: dict[str, Any] = {name: value if value.ndim else int(value) for name, value in arrays.items()}
-    return Frames(**{**columns, "channels": tuple(map(str, columns["channels"]))})
+    with _opened(path) as mdf:
+        return _frames(mdf)
 
 
-def read_mf4_table(path: Path) -> "tuple[pd.DataFrame, dict[str, str]]":
+def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
     """Read the decoded channels of an MDF 4 file; raises as :func:`read_mf4`.
 
     Parameters
@@ -85,97 +72,43 @@ def read_mf4_table(path: Path) -> "tuple[pd.DataFrame, dict[str, str]]":
     units : dict of str to str
         By channel.
     """
-    import pandas as pd  # noqa: PLC0415 (the process that reads frames does without)
-
-    with _converted(path, "channels.parquet") as result:
-        frame = pd.read_parquet(result)
-    return frame, frame.attrs["units"]
+    with _opened(path) as mdf:
+        frame: pd.DataFrame = mdf.to_dataframe(use_display_names=True, time_as_date=False, reduce_memory_usage=False)
+        units = {
+            name: channel.unit
+            for group in mdf.groups
+            for channel in group.channels
+            for name in (channel.name, *channel.display_names)
+            if channel.unit
+        }
+    return frame.rename_axis("time [s]"), {name: unit for name in frame if (unit := units.get(name))}
 
 
 @contextmanager
-def _converted(path: Path, name: str) -> Iterator[Path]:
-    """File of this name that another process made of an MDF 4 file."""
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a file; whatever asammdf raises until the block ends is a LogError, and what it prints is not shown."""
     if importlib.util.find_spec("asammdf") is None:
         raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'hv-current-correction[mf4]'")
-    with tempfile.TemporaryDirectory(prefix="mf4-") as folder:
-        result = Path(folder) / name
-        limit_s = START_S + path.stat().st_size / BYTES_PER_S
-        if _process(os.getpid()).poll() is not None:  # somebody ended it, as for the memory that it took
-            _process.cache_clear()
-        process = _process(os.getpid())
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(json.dumps([str(path), str(result), limit_s]) + "\n")
-        process.stdin.flush()
-        answer = process.stdout.readline().strip()
-        if not answer:  # it has ended
-            _process.cache_clear()
-            if process.wait() == -signal.SIGALRM:
-                raise LogError(
-                    f"{path}: reading took more than {limit_s:.0f} s and was ended; the file is damaged, "
-                    f"convert it to .blf with the tool that recorded it"
-                )
-            answer = "the reader ended without a word"
-        if answer != _DONE:
-            raise LogError(f"{path}: not a readable MF4 file: {answer[:200]}; copy the file again")
-        yield result
+    reason, hook = "", sys.unraisablehook
+    with redirect_stdout(sys.stderr), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from asammdf import MDF  # noqa: PLC0415 (an extra, slow to import)
 
-
-@cache
-def _process(_pid: int) -> "subprocess.Popen[str]":
-    """The process that reads files for this one, one after the other: to start it takes longer than most of them."""
-    command = [sys.executable, "-W", "ignore", "-m", "calibrator.recordings.mf4"]
-    process = subprocess.Popen(  # noqa: S603
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    atexit.register(_end, process)
-    return process
-
-
-def _end(process: "subprocess.Popen[str]") -> None:
-    process.kill()
-    process.communicate()
-
-
-def main() -> None:
-    """What the process does: read a line with path, result and time limit, convert, answer with a line."""
-    answers, sys.stdout = sys.stdout, sys.stderr  # what libraries print is no answer
-    for line in sys.stdin:
-        path, result, limit_s = json.loads(line)
-        signal.setitimer(signal.ITIMER_REAL, limit_s)  # ends the process, whatever it is busy with
+        getLogger("asammdf").setLevel(CRITICAL)
+        sys.unraisablehook = lambda _: None  # asammdf cannot close what is left of a damaged file
         try:
-            convert(path, result)
-            answer = _DONE
+            with MDF(path) as mdf:
+                yield mdf
+        except MemoryError:
+            raise
         except Exception as error:  # noqa: BLE001 (asammdf raises anything for a damaged file)
-            answer = " ".join(f"{type(error).__name__}: {error}".split())
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        print(answer, file=answers, flush=True)
-
-
-def convert(path: str, result: str) -> None:
-    """Write frames (.npz) or decoded channels (.parquet) of `path` to `result`."""
-    from asammdf import MDF  # noqa: PLC0415 (only here: the parent needs neither)
-
-    with MDF(path) as mdf:
-        if result.endswith(".parquet"):
-            _decoded_channels(mdf).to_parquet(result)
-        else:
-            frames = _frames(mdf)
-            np.savez(result, **{**vars(frames), "channels": np.array(frames.channels, dtype=np.str_)})
-
-
-def _decoded_channels(mdf: Any) -> "pd.DataFrame":
-    frame: pd.DataFrame = mdf.to_dataframe(use_display_names=True, time_as_date=False, reduce_memory_usage=False)
-    units = {
-        name: channel.unit
-        for group in mdf.groups
-        for channel in group.channels
-        for name in (channel.name, *channel.display_names)
-        if channel.unit
-    }
-    frame = frame.rename_axis("time [s]")
-    frame.attrs["units"] = {name: unit for name in frame if (unit := units.get(name))}
-    return frame
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+        finally:
+            if reason:
+                gc.collect()
+            sys.unraisablehook = hook
+    if reason:
+        raise LogError(f"{path}: not a readable MF4 file: {reason[:200]}; copy the file again")
 
 
 def _frames(mdf: Any) -> Frames:
@@ -216,7 +149,3 @@ def _frames_of_group(signal: Any, start: Any) -> Frames:
     channels, columns.channel[:] = np.unique(field("BusChannel", 0), return_inverse=True)
     columns.length[:] = length
     return columns.frames([str(channel) for channel in channels.tolist()] if "BusChannel" in known else ["None"])
-
-
-if __name__ == "__main__":
-    main()

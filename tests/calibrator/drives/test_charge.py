@@ -85,4 +85,4 @@ def test_of_several_samples_at_one_instant_the_last_counts() -> None:
     time_s, value = np.array([0.0, 1.0, 1.0, 2.0]), np.array([0.0, 9.0, 1.0, 2.0])
     curve = curve_of(time_s, value)
     assert curve.time_s.tolist() == [0.0, 1.0, 2.0]
-    assert curve.pieces[2].tolist() == [0.0, 1.0]
+    assert curve.pieces[2, :2].tolist() == [0.0, 1.0]

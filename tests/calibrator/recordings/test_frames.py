@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from calibrator.errors import LogError
-from calibrator.recordings import mf4
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S, DAMAGED, Frames, repaired_time
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_files import _READ_BYTES, BLOCK_BYTES
@@ -230,17 +229,6 @@ def test_what_python_can_complains_of_is_counted_and_not_printed(
     assert frames.damaged == 1
     assert not caplog.records
     assert capfd.readouterr() == ("", "")
-
-
-def test_reading_mf4_ends_at_its_time_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_log(tmp_path / "drive.mf4", some_messages(20))
-    mf4._process.cache_clear()
-    with monkeypatch.context() as patch:
-        patch.setattr(mf4, "START_S", 1e-5)
-        patch.setattr(mf4, "BYTES_PER_S", 1e9)
-        with pytest.raises(LogError, match="was ended"):
-            read_frames(path)
-    assert len(read_frames(path)) == 20, "the next file finds another process"
 
 
 def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
