@@ -49,7 +49,17 @@ CONNECT_S, RETURN_S = 10.0, 60.0
 """Within which a scheduler must answer at first; within which it and a worker must be there after it was lost. [s]"""
 MEMORY_SHARE, LEAST_MEMORY_BYTES = 0.8, 1 << 30
 """Of the machine's memory for all processes that read; each may use this much at least. [1], [byte]"""
-PRELOADED = ["numba", "numpy", "pandas", "pyarrow.parquet", "threadpoolctl"]
+PRELOADED = [
+    "cantools",
+    "numba",
+    "numpy",
+    "pandas",
+    "pyarrow.parquet",
+    "rich",
+    "scipy.ndimage",
+    "threadpoolctl",
+    "typer",
+]
 """Slow to import, so imported once, for all processes. Not this package: the fork server may find another copy."""
 MEGABYTE = 1_000_000
 REMEDY = "remove the file if it is damaged, cut it if it is long"

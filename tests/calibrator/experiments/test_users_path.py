@@ -38,8 +38,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def calibrated(store: Path, out: Path, *more: str) -> pd.DataFrame:
     """Result of the commands that users run, by vehicle and branch."""
-    layout = ("--layout", str(LAYOUT))
-    drawn = ("--vehicles", str(VEHICLES), "--drives", str(store), "--unseen-minutes", "1", *more)
+    layout = ("--layout", str(LAYOUT), "--workers", "1")
+    drawn = ("--vehicles", str(VEHICLES), "--drives", str(store), "--unseen-minutes", "0.1", *more)
     for command in (
         ("simulate", *layout, *drawn, "--out", str(out / "fleet")),
         ("calibrate", str(out / "fleet"), *layout, "--out", str(out / "result")),

@@ -32,18 +32,24 @@ class DaskCluster:
         self._stack.close()
 
     def start(self) -> None:
-        """Start scheduler and workers, the first time or once more on the same port."""
+        """Start scheduler and workers, the first time or once more on the same port, and wait for both to join.
+
+        A worker that joins later takes items from the other one, and may put the one that a test waits for behind one
+        that waits for the test.
+        """
         options = ["--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard", "--no-jupyter"]
         self.scheduler = self._run("scheduler", *options)
-        until = time.monotonic() + 60.0
-        while time.monotonic() < until:
-            with socket.socket() as attempt:
-                if attempt.connect_ex(("127.0.0.1", self.port)) == 0:
-                    break
-            time.sleep(0.05)
+        before = self._joined()
         self.workers = [
             self._run("worker", self.address, "--nthreads", "1", "--no-nanny", "--no-dashboard") for _ in range(2)
         ]
+        until = time.monotonic() + 60.0
+        while self._joined() < before + 2 and time.monotonic() < until:
+            time.sleep(0.05)
+
+    def _joined(self) -> int:
+        log = self._folder / "worker.log"
+        return log.read_text().count("Registered to") if log.exists() else 0
 
     def _run(self, *arguments: str) -> "subprocess.Popen[bytes]":
         command = [sys.executable, "-m", f"distributed.cli.dask_{arguments[0]}", *arguments[1:]]

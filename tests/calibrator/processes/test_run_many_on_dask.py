@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -20,6 +19,7 @@ from calibrator.processes.run_many import Failed, Workers, run_many, try_many
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.command_here import calibrator
 from tests.calibrator.processes.dask_cluster import DaskCluster, gated
 from tests.calibrator.processes.test_run_many import LIMIT_S, dying_once, hostile
 
@@ -88,8 +88,7 @@ def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
 
 
 def command(*arguments: object) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "calibrator", *map(str, arguments)]
-    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
+    done = calibrator(*arguments)
     assert done.returncode == 0, done.stderr
     return done
 
@@ -117,7 +116,7 @@ def drives(place: str) -> dict[str, bytes]:
 def test_logs_and_stores_in_object_storage_give_the_same_from_cluster_workers(
     tmp_path: Path, database: VehicleDatabase, s3: dict[str, str]
 ) -> None:
-    simulate_fleet(PLAN, BuiltinTrips(seed=0, duration_s=200.0, unseen_s=20.0), database, tmp_path / "fleet", workers=1)
+    simulate_fleet(PLAN, BuiltinTrips(seed=0, duration_s=130.0, unseen_s=10.0), database, tmp_path / "fleet", workers=1)
     logs = tmp_path / "fleet" / "logs"
     for folder, files in walk(open_storage(logs)):
         for file in files:
