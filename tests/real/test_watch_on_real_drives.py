@@ -14,7 +14,7 @@ COLUMNS = (7, 8, 15)
 """Battery voltage [V], battery current [A], heating power [kW]."""
 PERIOD_S = 0.1
 """Of the recordings. [s]"""
-HOURS = float(os.environ.get("HV_WATCH_HOURS", "0.33"))
+HOURS = float(os.environ.get("HV_WATCH_HOURS", "0.2"))
 """Simulated time; ``make soak`` takes 24 h. [h]"""
 
 

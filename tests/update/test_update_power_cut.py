@@ -73,7 +73,9 @@ def cuts(folder: Path, files: list[Path], place: Path) -> Iterator[Path]:
     yield folder
 
 
-@pytest.mark.parametrize("command", ["update", "revoke", "conclude"], indirect=True)
+@pytest.mark.parametrize(
+    "command", ["update", pytest.param("revoke", marks=pytest.mark.long), "conclude"], indirect=True
+)
 def test_power_cut_at_any_moment_leaves_the_state_of_before_or_of_after(
     command: Callable[[Path], list[str]], state: Path, tmp_path: Path
 ) -> None:

@@ -107,7 +107,7 @@ def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(o
 
 
 @pytest.mark.parametrize("gain", [0.08, pytest.param(-0.05, marks=pytest.mark.long)])
-@pytest.mark.parametrize(("K", "branch"), [(3, 0), (3, 2), (2, 1)])
+@pytest.mark.parametrize(("K", "branch"), [(3, 0), pytest.param(3, 2, marks=pytest.mark.long), (2, 1)])
 def test_gain_that_all_sensors_of_a_branch_share_is_found_and_of_two_branches_either_may_have_it(
     K: int, branch: int, gain: float
 ) -> None:

@@ -1,6 +1,7 @@
 """From evidence rows to estimates: right where they are sure, each vehicle by itself, harmless in odd worlds."""
 
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -55,8 +56,14 @@ def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitud
     assert abs(right.sum() - found.confidence.sum()) < 3.0 * spread + 1.0
 
 
-@pytest.mark.parametrize("offset", [0.0125, 0.05, pytest.param(-0.03, marks=pytest.mark.long)])
-@pytest.mark.parametrize("share", [0.6, 1.0])
+@pytest.mark.parametrize(
+    ("offset", "share"),
+    [
+        (0.0125, 1.0),
+        (0.05, 0.6),
+        *(pytest.param(*each, marks=pytest.mark.long) for each in product((-0.03, 0.0125, 0.05), (0.6, 1.0))),
+    ],
+)
 def test_batch_of_sensors_with_a_common_offset_makes_no_vehicle_worse(offset: float, share: float) -> None:
     faults = random_faults(2, vehicles=30, branches=2)
     faults.offset_a[: round(30 * share), 0] += offset
@@ -65,7 +72,9 @@ def test_batch_of_sensors_with_a_common_offset_makes_no_vehicle_worse(offset: fl
     assert np.abs(found.offset_a[:, 1] - faults.offset_a[:, 1]).max() < 0.01
 
 
-@pytest.mark.parametrize(("load", "share"), [(0.0125, 0.3), (0.025, 0.15), (0.0125, 1.0)])
+@pytest.mark.parametrize(
+    ("load", "share"), [pytest.param(0.0125, 0.3, marks=pytest.mark.long), (0.025, 0.15), (0.0125, 1.0)]
+)
 def test_load_without_a_sensor_makes_no_vehicle_worse(load: float, share: float) -> None:
     faults = random_faults(3, vehicles=30, branches=3)
     found, deployed = estimated(faults, seed=3, load=load * (np.arange(30) < 30 * share))

@@ -35,6 +35,7 @@ from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator
 from tests.calibrator.estimator.simulated_drives import Conditions, summaries_of
+from tests.calibrator.processes.dask_cluster import DaskCluster
 from tests.calibrator.summaries.small_stores import BRANCHES, random_faults, record_of, small_store
 
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
@@ -155,6 +156,28 @@ def test_killed_run_goes_on_where_it_stopped(store: SummaryStore, result: Path, 
         written = found
     assert calibrate(store.url, out, "--workers", 1).returncode == 0
     assert contents(out) == contents(result)
+
+
+@pytest.mark.long
+def test_cluster_that_loses_a_worker_gives_the_same_result(database: VehicleDatabase, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    store = small_store(tmp_path / "store", database, random_faults(300))
+    here = calibrate(store.url, tmp_path / "here", "--workers", 2)
+    assert here.returncode == 0, here.stderr
+    chunks = tmp_path / ".there.unfinished" / "result" / "parameters"
+    with DaskCluster(tmp_path) as cluster:
+        there = ("--out", tmp_path / "there", "--scheduler", cluster.address)
+        words = ("calibrate", store.url, "--layout", LAYOUT, *there)
+        with subprocess.Popen([sys.executable, "-m", "calibrator", *words], stderr=subprocess.PIPE) as process:
+            until = time.monotonic() + 300.0
+            while len(list(chunks.glob("[0-9]*.parquet"))) < 2 and process.poll() is None and time.monotonic() < until:
+                time.sleep(0.005)
+            left = len(store.buckets()) - len(list(chunks.glob("[0-9]*.parquet")))
+            cluster.workers[0].send_signal(signal.SIGKILL)
+            _, errors = process.communicate(timeout=300)
+    assert left > 0, "the worker was to be killed in the middle"
+    assert process.returncode == 0, errors.decode()
+    assert contents(tmp_path / "there") == contents(tmp_path / "here")
 
 
 def test_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: Path) -> None:
