@@ -198,50 +198,6 @@ def test_copy_of_a_vehicle_cannot_be_trusted(broken_fleet: Path, tmp_path: Path)
     assert "vehicle other to trust; other: same recording as V002" in run.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (("calibrate", "nowhere", "--layout", LAYOUT, "--out", "x"), 1, "nowhere: no such folder"),
-        (("calibrate", ".", "--layout", "none.toml", "--out", "x"), 1, "none.toml: cannot read the layout"),
-        (("score", "nowhere", "--truth", "none.json"), 1, "none.json: cannot read the truth"),
-        (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--classifier", "perfect"), 2, "is told the truth"),
-        (
-            ("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--time-limit", "0"),
-            2,
-            "0: expected a number from 1 to",
-        ),
-        (
-            ("import", ".", "--layout", LAYOUT, "--out", "x", "--time-limit", "soon"),
-            2,
-            "soon: expected a number from 1",
-        ),
-        (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--symmetric"), 2, "belongs to --method published, not"),
-        (
-            ("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--method", "published", "--trusted", "V001"),
-            2,
-            "belongs to --method posterior, not published",
-        ),
-        (("simulate", "--vehicles", "0", "--layout", LAYOUT, "--out", "x"), 2, "--vehicles"),
-        (("simulate", "--vehicles", "3", "--symmetric", "--layout", LAYOUT, "--out", "x"), 1, "multiple of 4"),
-        (
-            ("simulate", "--vehicles", "3", "--currents", "6", "--layout", LAYOUT, "--out", "x"),
-            1,
-            "2 to 5 are possible",
-        ),
-        (("nonsense",), 2, "nonsense"),
-    ],
-)
-def test_wrong_use_is_answered_in_words(
-    arguments: tuple[object, ...], code: int, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    run = calibrator(*arguments)
-    assert run.returncode == code
-    assert message in " ".join(run.stderr.split())
-    assert "Traceback" not in run.stderr
-    assert not (tmp_path / "x").exists()
-
-
 def test_result_folder_in_use_is_not_touched(fleet: Path, result: Path) -> None:
     before = sorted(path.name for path in result.iterdir())
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", result)
