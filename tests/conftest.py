@@ -14,6 +14,10 @@ from ecu_node.program import load_python_can
 load_python_can()  # before the first import of it, which would bring pandas into each process of the tests
 import can  # noqa: E402
 
+from ecu_node.database import VehicleDatabase, read_database  # noqa: E402
+from ecu_node.layout import read_layout  # noqa: E402
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase  # noqa: E402
+
 ROOT = Path(__file__).parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
 WHEN_ASKED = [ROOT / "tests" / name for name in ("package", "vcan")]
@@ -44,6 +48,24 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"no real recordings in {SHARED_DATA}")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def database() -> VehicleDatabase:
+    """The project's own layout and DBC."""
+    return read_database(read_layout(LAYOUT))
+
+
+@pytest.fixture
+def make_database(tmp_path: Path) -> MakeDatabase:
+    """A database from the texts of layout and DBC."""
+
+    def make(layout: str = SMALL_LAYOUT, dbc: str = SMALL_DBC) -> VehicleDatabase:
+        (tmp_path / "small.toml").write_text(layout)
+        (tmp_path / "small.dbc").write_text(dbc)
+        return read_database(read_layout(tmp_path / "small.toml"))
+
+    return make
 
 
 @pytest.fixture(autouse=True)

@@ -13,8 +13,7 @@ import typer
 from calibrator.cli import app
 from calibrator.terminal.command_line import run_app
 from ecu_node import cli as node_cli
-from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import read_layout
+from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
 from tests.calibrator.export.exports import parameters_for
 from tests.ecu_node.vehicles import LAYOUT
@@ -72,11 +71,6 @@ def test_every_command_stands_in_the_document(command: str) -> None:
 
 def documented() -> set[str]:
     return set(re.findall(r"`([a-z0-9_]+)`", DOCUMENT.read_text()))
-
-
-@pytest.fixture
-def database() -> VehicleDatabase:
-    return read_database(read_layout(LAYOUT))
 
 
 def test_a_life_of_signed_parameters_in_json(

@@ -17,8 +17,7 @@ from selenium.webdriver.support.select import Select
 from selenium.webdriver.support.wait import WebDriverWait
 
 from calibrator.report.page import fleet_report
-from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import read_layout
+from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import Explanation, SensorFinding
 from tests.calibrator.report.results_at_hand import sensor, six_vehicle_result, vehicle, write_result
 
@@ -48,11 +47,6 @@ for (const node of document.querySelectorAll("body *:not(script):not(style)")) {
 }
 return found;
 """
-
-
-@pytest.fixture(scope="module")
-def database() -> VehicleDatabase:
-    return read_database(read_layout(LAYOUT))
 
 
 @pytest.fixture(scope="module")

@@ -6,17 +6,10 @@ import pytest
 from hypothesis import settings
 
 from calibrator.cli import main
-from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import read_layout
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 settings.register_profile("calibrator", deadline=None)  # the first call of some functions compiles them
 settings.load_profile("calibrator")
-
-
-@pytest.fixture(scope="session")
-def database() -> VehicleDatabase:
-    return read_database(read_layout(LAYOUT))
 
 
 @pytest.fixture

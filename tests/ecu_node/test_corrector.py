@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -17,9 +16,17 @@ from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.parameters import JunctionResidual
-from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, answers, decoded, parameters_for, protected
+from tests.ecu_node.vehicles import (
+    SMALL_DBC,
+    SMALL_LAYOUT,
+    Frame,
+    MakeDatabase,
+    answers,
+    decoded,
+    parameters_for,
+    protected,
+)
 
-MakeDatabase = Callable[..., VehicleDatabase]
 BATTERY, MOTOR, STATUS = FrameKey(0x110, False), FrameKey(0x120, False), FrameKey(0x5F0, False)
 PAIR, HEATER, NET = FrameKey(256, False), FrameKey(512, True), FrameKey(258, False)
 

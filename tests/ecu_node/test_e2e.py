@@ -6,11 +6,9 @@ import fastcrc
 import pytest
 
 from ecu_node.core.e2e import Check, E2EState, Protection, Receiver, protection_of
-from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError
-from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT
+from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, MakeDatabase
 
-MakeDatabase = Callable[..., VehicleDatabase]
 SIZE = 24
 ROOM = (
     f'BO_ 700 Room: {SIZE} Node\n SG_ Count : 36|4@1+ (1,0) [0|15] "" Node\n SG_ Sum : 56|8@1+ (1,0) [0|255] "" Node\n'

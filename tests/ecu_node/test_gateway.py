@@ -1,7 +1,5 @@
 """The gateway's core: branch frames rewritten in place, bit by bit, and nothing else."""
 
-from collections.abc import Callable
-
 import pytest
 from e2e.p01 import e2e_p01_check
 
@@ -11,9 +9,17 @@ from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError
-from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, decoded, parameters_for, passed_on, protected
+from tests.ecu_node.vehicles import (
+    SMALL_DBC,
+    SMALL_LAYOUT,
+    Frame,
+    MakeDatabase,
+    decoded,
+    parameters_for,
+    passed_on,
+    protected,
+)
 
-MakeDatabase = Callable[..., VehicleDatabase]
 BATTERY, PAIR, HEATER, NET = FrameKey(0x110, False), FrameKey(256, False), FrameKey(512, True), FrameKey(258, False)
 
 

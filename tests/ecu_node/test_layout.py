@@ -1,16 +1,12 @@
 """Layout and the DBC behind it: good ones are read, bad ones refused with file and place."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import file_digest, read_layout
-from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT
-
-MakeDatabase = Callable[..., VehicleDatabase]
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase
 
 
 def test_the_projects_own_layout_is_read() -> None:

@@ -1,5 +1,6 @@
 """Small vehicles for the node's tests: layouts and DBCs made to measure, parameters, and frames with cantools."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -19,6 +20,8 @@ from ecu_node.parameters import (
 )
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+MakeDatabase = Callable[..., VehicleDatabase]
+"""Makes a database from the texts of layout and DBC; without them, those of the small vehicle."""
 
 SMALL_LAYOUT = """
 schema = 1

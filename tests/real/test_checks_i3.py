@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.estimator.checks import find_misfits, learn_usual_misfits
@@ -16,6 +15,7 @@ from calibrator.faults import measured_currents, true_currents
 from calibrator.files.layout_files import vehicle_database
 from calibrator.summaries.summariser import summarise_samples
 from ecu_node.parameters import SensorFinding
+from tests.calibrator.estimator.simulated_rows import random_faults
 from tests.real.delay_trips import LAYOUT
 
 Bend = Callable[[Array, Array], Array]
@@ -39,15 +39,8 @@ def fleet(i3_store: Path) -> RecordedFleet:
 def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Bend]) -> list[tuple[SensorFinding, ...]]:
     """Findings in a fleet with gain errors and offsets, in which the batteries' sensors of some vehicles are bent."""
     trips, rng, summaries = fleet.with_branches(branches), np.random.default_rng(seed), []
-    faults = draw_faults(
-        rng,
-        vehicles=len(trips),
-        branches=branches,
-        sparsity=70.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=fleet.full_scale_a,
-        balanced=True,
-    )
+    full_scale_a = fleet.full_scale_a
+    faults = random_faults(rng, vehicles=len(trips), branches=branches, sparsity=70.0, full_scale_a=full_scale_a)
     for j, trip in enumerate(trips):
         own, share = faults.take(j), np.arange(len(trip)) / len(trip)
         i_m = measured_currents(true_currents(trip.matrix_a(), own), own)

@@ -12,11 +12,10 @@ from msgspec.structs import replace
 
 from calibrator.cli import main as calibrator_main
 from ecu_node.cli import main as node_main
-from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import read_layout
+from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE
-from tests.ecu_node.vehicles import LAYOUT, parameters_for
+from tests.ecu_node.vehicles import parameters_for
 from tests.update.held import held, new_vehicle
 from tests.update.repo import Repo, pass_trial
 
@@ -49,12 +48,6 @@ def _without_passphrase() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv(PASSPHRASE_VARIABLE, raising=False)
         yield
-
-
-@pytest.fixture(scope="session")
-def database() -> VehicleDatabase:
-    """The project's own layout and DBC."""
-    return read_database(read_layout(LAYOUT))
 
 
 @pytest.fixture(scope="session")

@@ -64,15 +64,7 @@ def test_mean_of_a_symmetric_fleet_is_the_ideal_current() -> None:
 
 @pytest.mark.parametrize(("bias", "positive"), [(0.0, 0.5), (0.2, 0.7), (0.5, 1.0)])
 def test_sign_bias_is_the_excess_of_positive_faults(bias: float, positive: float) -> None:
-    faults = draw_faults(
-        np.random.default_rng(0),
-        vehicles=4000,
-        branches=2,
-        sparsity=40.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=400.0,
-        sign_bias=bias,
-    )
+    faults = draw(vehicles=4000, sparsity=40.0, sign_bias=bias)
     drifts = faults.drift[faults.drift != 0.0]
     assert np.mean(drifts > 0.0) == pytest.approx(positive, abs=0.02)
     assert np.abs(drifts).min() >= 0.05
@@ -81,13 +73,4 @@ def test_sign_bias_is_the_excess_of_positive_faults(bias: float, positive: float
 @pytest.mark.parametrize(("bias", "symmetric"), [(0.6, False), (-0.1, False), (float("nan"), False), (0.2, True)])
 def test_sign_bias_without_meaning_is_refused(bias: float, symmetric: bool) -> None:
     with pytest.raises(FleetError, match=r"expected 0 to 0\.5, and 0 for a symmetric fleet"):
-        draw_faults(
-            np.random.default_rng(0),
-            vehicles=4,
-            branches=2,
-            sparsity=40.0,
-            magnitude=(0.05, 0.25),
-            full_scale_a=400.0,
-            symmetric=symmetric,
-            sign_bias=bias,
-        )
+        draw(vehicles=4, symmetric=symmetric, sign_bias=bias)

@@ -7,6 +7,7 @@ that it is compared with: :func:`rows_of` and :func:`plain_residual`.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -102,18 +103,19 @@ def parameters_of(faults: Faults, load: Array | float = 0.0) -> Array:
 
 
 def random_faults(
-    seed: int, *, vehicles: int, branches: int, sparsity: float = 80.0, magnitude: tuple[float, float] = (0.05, 0.25)
+    seed: int | np.random.Generator,
+    *,
+    vehicles: int,
+    branches: int,
+    sparsity: float = 80.0,
+    magnitude: tuple[float, float] = (0.05, 0.25),
+    full_scale_a: float = SCALE_A,
+    **more: Any,
 ) -> Faults:
     """Faults as in the paper; no hardware faults in half of the vehicles."""
-    return draw_faults(
-        np.random.default_rng(seed),
-        vehicles=vehicles,
-        branches=branches,
-        sparsity=sparsity,
-        magnitude=magnitude,
-        full_scale_a=SCALE_A,
-        balanced=True,
-    )
+    settings: dict[str, Any] = {"sparsity": sparsity, "magnitude": magnitude, "balanced": True, **more}
+    rng = np.random.default_rng(seed)
+    return draw_faults(rng, vehicles=vehicles, branches=branches, full_scale_a=full_scale_a, **settings)
 
 
 def plain_evidence(rows: EvidenceRows, *, centre: Array | None = None, shared: Array | None = None) -> Evidence:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.estimator.checks import find_misfits, learn_usual_misfits
@@ -22,6 +21,7 @@ from tests.calibrator.estimator.simulated_drives import (
     read_out_of,
     samples_of,
 )
+from tests.calibrator.estimator.simulated_rows import random_faults
 
 BRANCHES = ("battery", "motor", "auxiliary")
 FULL_SCALE_A = 400.0
@@ -65,15 +65,7 @@ def a_drive(seed: int, faults: Faults, bend: Bend | None, branch: int = 0, load_
 
 def a_fleet(K: int, bend: Bend | None = None, branch: int = 0, load_a: Array | float = 0.0) -> list[DriveSummary]:
     """Nine vehicles with gain errors and offsets, of which one has a bent sensor or a load without a sensor."""
-    faults = draw_faults(
-        np.random.default_rng(K),
-        vehicles=9,
-        branches=K,
-        sparsity=80.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=FULL_SCALE_A,
-        balanced=True,
-    )
+    faults = random_faults(K, vehicles=9, branches=K, full_scale_a=FULL_SCALE_A)
     drives = [
         a_drive(10 + j, faults.take(j), *((bend, branch, load_a) if j == BAD else (None,))) for j in range(len(faults))
     ]

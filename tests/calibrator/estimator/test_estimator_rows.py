@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.estimator.evidence import (
     EvidenceRows,
@@ -17,6 +16,7 @@ from calibrator.estimator.evidence import (
 )
 from calibrator.faults import Faults
 from calibrator.summaries.moments import DriveSummary
+from tests.calibrator.estimator import simulated_rows
 from tests.calibrator.estimator.simulated_drives import Conditions, read_out_of, summaries_of
 from tests.calibrator.estimator.simulated_rows import parameters_of, plain_residual
 
@@ -28,15 +28,7 @@ BRANCHES = pytest.mark.parametrize("branches", [2, 3, 5])
 
 
 def random_faults(seed: int, vehicles: int) -> Faults:
-    return draw_faults(
-        np.random.default_rng(seed),
-        vehicles=vehicles,
-        branches=K,
-        sparsity=70.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=FULL_SCALE_A,
-        balanced=True,
-    )
+    return simulated_rows.random_faults(seed, vehicles=vehicles, branches=K, sparsity=70.0, full_scale_a=FULL_SCALE_A)
 
 
 def rows_of(

@@ -6,33 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.errors import FleetError
+from calibrator.estimator.decision import FleetEstimate
 from calibrator.estimator.fleet_estimate import FleetReference, estimate_vehicles, learn_fleet
 from calibrator.faults import Faults
 from calibrator.score import harmed, recovered
 from calibrator.summaries.moments import DriveSummary
 from tests.calibrator.estimator.simulated_drives import Conditions, summaries_of
+from tests.calibrator.estimator.simulated_rows import random_faults
 
 SCALE_A, VEHICLES, K = 400.0, 24, 2
 NAMES = ["battery", "motor"]
 
 
-def drawn(seed: int) -> Faults:
-    return draw_faults(
-        np.random.default_rng(seed),
-        vehicles=VEHICLES,
-        branches=K,
-        sparsity=80.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=SCALE_A,
-        balanced=True,
-    )
-
-
 @pytest.fixture(scope="module")
 def truth() -> Faults:
-    return drawn(3)
+    return random_faults(3, vehicles=VEHICLES, branches=K, full_scale_a=SCALE_A)
 
 
 @pytest.fixture(scope="module")
@@ -45,19 +34,21 @@ def reference(summaries: list[DriveSummary]) -> FleetReference:
     return learn_fleet(summaries, full_scale_a=SCALE_A, branches=NAMES)
 
 
+def worse(found: FleetEstimate, truth: Faults, summaries: list[DriveSummary]) -> bool:
+    """Whether a correction does harm on a drive of the same means."""
+    drift, offset_a = (np.where(found.corrected, each, 0.0) for each in (found.drift, found.offset_a))
+    mean_a = np.array([summary.mean_a for summary in summaries])
+    applied = replace(truth, drift=drift, offset_a=offset_a)
+    return bool(harmed(applied, truth, mean_a=mean_a, mean_square_a2=mean_a**2 + 900.0).any())
+
+
 def test_faults_are_recovered_and_no_correction_does_harm(
     truth: Faults, summaries: list[DriveSummary], reference: FleetReference
 ) -> None:
     found = estimate_vehicles(summaries, reference)
     estimate = replace(truth, drift=found.drift, offset_a=found.offset_a)
     assert recovered(estimate, truth, full_scale_a=SCALE_A, smallest_fault=0.05).mean() > 0.9
-    applied = replace(
-        truth,
-        drift=np.where(found.corrected, found.drift, 0.0),
-        offset_a=np.where(found.corrected, found.offset_a, 0.0),
-    )
-    mean_a = np.array([summary.mean_a for summary in summaries])
-    assert not harmed(applied, truth, mean_a=mean_a, mean_square_a2=mean_a**2 + 900.0).any()
+    assert not worse(found, truth, summaries)
     faulty = (truth.drift != 0.0) | (truth.offset_a != 0.0)
     assert (found.corrected & faulty).sum() > 0.7 * faulty.sum()
     assert not (found.corrected & ~faulty).any()
@@ -109,13 +100,7 @@ def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_said(truth
     learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=NAMES)
     assert any("sum to +12" in notice for notice in learnt.notices)
     found = estimate_vehicles(summaries, learnt)
-    applied = replace(
-        batch,
-        drift=np.where(found.corrected, found.drift, 0.0),
-        offset_a=np.where(found.corrected, found.offset_a, 0.0),
-    )
-    mean_a = np.array([summary.mean_a for summary in summaries])
-    assert not harmed(applied, batch, mean_a=mean_a, mean_square_a2=mean_a**2 + 900.0).any()
+    assert not worse(found, batch, summaries)
 
 
 def test_pit_of_the_truth_lies_between_zero_and_one(

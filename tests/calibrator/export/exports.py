@@ -1,7 +1,6 @@
 """Parameter files to export, and the command line."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,11 +12,9 @@ from calibrator.export.core import Checked, read_checked
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.parameters import BranchParameters, VehicleParameters, write_parameters
-from tests.ecu_node.vehicles import LAYOUT, parameters_for
+from tests.ecu_node.vehicles import LAYOUT, MakeDatabase, parameters_for
 
 __all__ = ["MakeDatabase", "checked_with", "export", "held_back", "needs", "parameters_for", "refused"]
-
-MakeDatabase = Callable[..., VehicleDatabase]
 
 
 def needs(*programs: str) -> pytest.MarkDecorator:

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.options import Classifier
@@ -9,6 +8,7 @@ from calibrator.published.classify import ExpectedFaults, expected_features
 from calibrator.published.evidence import collect_evidence
 from calibrator.published.recovery import calibrate_published
 from calibrator.score import f2_score, recovered
+from tests.calibrator.estimator.simulated_rows import random_faults
 
 FULL_SCALE_A = 400.0
 EXPECTED = ExpectedFaults(sparsity=80.0, magnitude=(0.05, 0.25), symmetric=True, seed=0)
@@ -22,16 +22,7 @@ def ideal_currents(samples: int = 400) -> Array:
 
 
 def fleet(vehicles: int, *, symmetric: bool, seed: int = 2) -> Faults:
-    return draw_faults(
-        np.random.default_rng(seed),
-        vehicles=vehicles,
-        branches=3,
-        sparsity=80.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=FULL_SCALE_A,
-        balanced=True,
-        symmetric=symmetric,
-    )
+    return random_faults(seed, vehicles=vehicles, branches=3, full_scale_a=FULL_SCALE_A, symmetric=symmetric)
 
 
 def measured(i_s: Array, faults: Faults, noise_a: float = 0.0) -> Array:

@@ -1,10 +1,12 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.evidence import collect_evidence
+from tests.calibrator.estimator.simulated_rows import random_faults
 
 
 def ideal_currents(samples: int = 600) -> Array:
@@ -14,10 +16,8 @@ def ideal_currents(samples: int = 600) -> Array:
 
 
 def symmetric_fleet(vehicles: int = 40) -> Faults:
-    rng = np.random.default_rng(0)
-    return draw_faults(
-        rng, vehicles=vehicles, branches=3, sparsity=60.0, magnitude=(0.05, 0.25), full_scale_a=400.0, symmetric=True
-    )
+    settings: dict[str, Any] = {"balanced": False, "symmetric": True}
+    return random_faults(0, vehicles=vehicles, branches=3, sparsity=60.0, full_scale_a=400.0, **settings)
 
 
 def simulations(i_s: Array, faults: Faults, noise_a: float) -> Array:

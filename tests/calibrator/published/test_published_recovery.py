@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.classify import Classification, classify_by_truth
@@ -10,6 +9,7 @@ from calibrator.published.recovery import (
     recover_fleet,
 )
 from calibrator.score import recovered
+from tests.calibrator.estimator.simulated_rows import random_faults
 
 FULL_SCALE_A = 400.0
 
@@ -52,10 +52,7 @@ def test_single_faults_are_recovered_exactly_without_noise(branches: int) -> Non
 
 
 def test_fleet_of_sparse_faults_is_recovered_through_noise() -> None:
-    rng = np.random.default_rng(1)
-    truth = draw_faults(
-        rng, vehicles=120, branches=2, sparsity=80.0, magnitude=(0.05, 0.25), full_scale_a=FULL_SCALE_A, balanced=True
-    )
+    truth = random_faults(1, vehicles=120, branches=2, full_scale_a=FULL_SCALE_A)
     evidence = evidence_of(truth, slope_sd=0.001, offset_sd=0.0002)
     found = recover_fleet(evidence, classify_by_truth(truth), full_scale_a=FULL_SCALE_A)
     assert recovered(found.faults, truth, full_scale_a=FULL_SCALE_A, smallest_fault=0.05).mean() > 0.99

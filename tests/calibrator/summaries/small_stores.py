@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Equipment
 from calibrator.drives.delays import BranchDelays
 from calibrator.faults import Faults
@@ -18,6 +17,7 @@ from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.estimator import simulated_rows
 from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, summaries_of
 
 BRANCHES = ("battery", "motor")
@@ -29,15 +29,7 @@ CONDITIONS = Conditions(model_error_a=0.5)
 
 def random_faults(vehicles: int, seed: int = 0) -> Faults:
     """One fault in most vehicles; every third has none."""
-    drawn = draw_faults(
-        np.random.default_rng(seed),
-        vehicles=vehicles,
-        branches=len(BRANCHES),
-        sparsity=80.0,
-        magnitude=(0.05, 0.25),
-        full_scale_a=400.0,
-        balanced=True,
-    )
+    drawn = simulated_rows.random_faults(seed, vehicles=vehicles, branches=len(BRANCHES), full_scale_a=400.0)
     faulty = np.arange(vehicles) % 3 != 0
     return Faults(
         hardware_drift=drawn.hardware_drift * faulty,
