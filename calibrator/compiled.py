@@ -34,11 +34,9 @@ CACHE_VARIABLE = "CALIBRATOR_CACHE"
 """Environment variable that names another folder than the user's cache folder."""
 SOURCES = (
     "compiled.py",
-    "score.py",
     "drives/align.py",
     "drives/charge.py",
     "drives/delays.py",
-    "estimator/decision.py",
     "estimator/posterior.py",
     "estimator/prior.py",
     "recordings/blf.py",

@@ -36,7 +36,7 @@ MISTAKES = [
     ("calibrator simulate --vehicles 1e3 LAYOUT --out x", 2, "'--vehicles': 1e3: expected a whole number from 1 to"),
     ("calibrator repository add r v1.json --days 0", 2, "'--days': 0: expected a whole number from 1 to 3650"),
     ("calibrator experiment snr --repetitions -1", 2, "'--repetitions': -1: expected a whole number from 1 to 1000"),
-    ("calibrator identify logs LAYOUT --poles 0", 2, "'--poles': 0: expected time constants with commas"),
+    ("calibrator identify logs LAYOUT --bank none.json", 1, "none.json: "),
     ("ecu-node monitor LAYOUT --channel c --once 0", 2, "--once: '0': expected a number of seconds above 0"),
     (
         "calibrator simulate --vehicles 1000000000 LAYOUT --out x",

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import t as student_t
 
 from calibrator.drive import Array
-from calibrator.estimator.evidence import MOST_NOISE, NOISE_ROUNDS, FleetMoments, products, stack_summaries
+from calibrator.estimator.evidence import MOST_NOISE, NOISE_ROUNDS, products, stack_summaries
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.parameters import SensorFinding
 
@@ -113,42 +113,21 @@ class UsualMisfits:
     spike_rate: float
 
 
-class _Causes(NamedTuple):
-    """What all C of :data:`CAUSES`, or one (without that axis), explain of the junction law of N vehicles.
+class _Checked:
+    """N vehicles with fit sums: their junction law, their currents over the fleet model, and what each cause explains.
 
-    Attributes
-    ----------
-    explained_a2 : ndarray of shape (N, C)
-        Sum of squares beyond gains and offsets. [A^2]
-    fit : ndarray of shape (N, C)
-        Logarithm of the likelihood over that of linear sensors, less what the parameters cost.
-    size, place : ndarray of shape (N, C)
-        Of causes by level: error at full scale, or change of the gain [1]. Where it is: level at which a bend begins
-        [A], share of the time before a step [1], standard deviation of a temperature [K].
-    level_branch : ndarray of int of shape (N, C)
-        Branch by whose level it is; -1 for causes by time.
-    pattern, square : ndarray of shape (N, C, p), (N, C)
-        Products of the misfit with all columns, and with itself.
-    """
-
-    explained_a2: Array
-    fit: Array
-    size: Array
-    place: Array
-    level_branch: NDArray[np.int64]
-    pattern: Array
-    square: Array
-
-
-class _Residual(NamedTuple):
-    """Residual r = y - g^T z of the junction law of N vehicles: y the branch that moves most, z the others and 1.
+    The residual of the law is r = y - g^T z: y the branch that moves most, z the others and 1.
 
     Attributes
     ----------
     fleet : FleetMoments
         Of the vehicles.
+    fast, levels : ndarray of shape (N, K, K), (N, K, L, p + 1)
+        Sums of the products of second differences [A^2], and of samples by level of each current.
     total : ndarray of shape (N, p, p)
         Moments of (inputs, measured currents, 1) of all blocks of a vehicle.
+    samples : ndarray of shape (N,)
+        Number of samples.
     y, z : int, ndarray of int of shape (K,)
         Columns of the law.
     law, weights : ndarray of shape (N, K)
@@ -160,179 +139,308 @@ class _Residual(NamedTuple):
         Sums of z r, without the product of the noise of z with itself.
     square_a2, n_eff : ndarray of shape (N,)
         Sum of r^2 [A^2], number of samples that do not repeat each other.
+    columns, basis : ndarray of shape (M + 1,), (K, M + 1, 2)
+        Inputs and 1 among the columns of the moments; the fleet model's current and 1, over these.
+    model_gram, model_right : ndarray of shape (N, K, 2, 2), (N, K, 2)
+        Normal equations of each current over the fleet model's and 1.
+    slope, slope_sd, zero_a : ndarray of shape (N, K)
+        Slope and its standard deviation [1], reading where the model has no current [A].
+    variance_a2 : ndarray of shape (N, K)
+        Variance of that residual times the number of neighbouring samples that repeat each other. [A^2]
+    moves_a, error_a : ndarray of shape (N, K)
+        Standard deviations of the model and of that residual. [A]
+    fit : ndarray of shape (N, C)
+        Of each of :data:`CAUSES`: logarithm of the likelihood over that of linear sensors, less what the parameters
+        cost.
+    size, place : ndarray of shape (N, C)
+        Of causes by level: error at full scale, or change of the gain [1]. Where it is: level at which a bend begins
+        [A], share of the time before a step [1], standard deviation of a temperature [K].
+    level_branch : ndarray of int of shape (N, C)
+        Branch by whose level it is; -1 for causes by time.
+    branch_fit : ndarray of shape (N, C, K)
+        Logarithm of the likelihood that the sensor of branch k has it, by the fleet model; 0 without one.
+    misfit_a : ndarray of shape (N, C)
+        Root mean square of what each cause explains beyond gains and offsets. [A]
+    residual_a2 : ndarray of shape (N, C + 1)
+        Mean square of what each cause, or none (last), leaves of the junction law. [A^2]
+    fast_a2 : ndarray of shape (N,)
+        White part of it. [A^2]
+    noise_share : ndarray of shape (N, K)
+        Share of each sensor in the fast part of the residual. [1]
+    spikes : ndarray of shape (N, K, 2)
+        Share of samples that are upward and downward spikes. [1]
     """
 
-    fleet: FleetMoments
-    total: Array
-    y: int
-    z: NDArray[np.int64]
-    law: Array
-    weights: Array
-    noise: Array
-    with_z: Array
-    square_a2: Array
-    n_eff: Array
+    def __init__(self, summaries: Sequence[DriveSummary], read_out: Array, full_scale_a: float) -> None:
+        self.fleet, self.full_scale_a, self.has_fleet = stack_summaries(summaries), full_scale_a, len(read_out) > 1
+        fits = [summary.fit for summary in summaries if summary.fit is not None]
+        self.fast = np.stack([fit.fast_a2.sum(axis=0) for fit in fits])
+        self.levels = np.stack([fit.levels for fit in fits])
+        self.total = self.fleet.blocks.total(self.fleet.moments)
+        self.samples = self.total[:, -1, -1]
+        self._regress_law()
+        self._regress_on_model(read_out)
+        middle = np.concatenate([np.cumsum(n := s.moments[:, -1, -1]) - n / 2.0 for s in summaries])
+        warm_c = np.concatenate([fit.temperature_c for fit in fits])
+        causes = [
+            *self._by_level(),
+            self._step(),
+            self._drifting(middle / self.samples[self.fleet.blocks.vehicle], least=0.0),
+            self._drifting(warm_c, least=WARMING_K),
+        ]
+        stacked = [np.stack(part, axis=1) for part in zip(*causes, strict=True)]
+        explained_a2, self.fit, self.size, self.place, self.level_branch, self.branch_fit = stacked
+        samples, weights = self.samples, self.weights
+        unit = np.sqrt((weights**2).mean(axis=1))  # gain errors of the branches do not scale the residual
+        fast_sum = np.einsum("nkl,nl->nk", self.fast, weights)
+        white = np.einsum("nk,nk->n", weights, fast_sum)
+        left = np.maximum(self.square_a2[:, None] - np.column_stack([explained_a2, np.zeros(len(unit))]), 0.0)
+        self.misfit_a = np.sqrt(explained_a2 / samples[:, None]) / unit[:, None]
+        self.residual_a2 = left / (samples * unit**2)[:, None]
+        self.fast_a2 = white / (WHITE_GAIN * samples * unit**2)
+        self.noise_share = weights * fast_sum / np.maximum(white, TINY)[:, None]
+        self.spikes = np.stack([fit.spikes.sum(axis=0) for fit in fits]) / samples[:, None, None]
 
-    @property
-    def samples(self) -> Array:
-        """Number of samples, shape (N,)."""
-        return self.total[:, -1, -1]
+    def _regress_law(self) -> None:
+        """Junction law of each vehicle.
 
-    @property
-    def gram(self) -> Array:
-        """Moments of z with z, shape (N, K, K)."""
-        return self.total[:, self.z[:, None], self.z]
+        The noise of z draws g towards zero. White noise n_k makes fast changes that the junction law does not balance:
+        with the residual's fast part q = sum w_l q_l, E[q_k q] = 1.5 n_k w_k. It is taken out of the moments.
+        """
+        fleet, total, samples = self.fleet, self.total, self.samples
+        M, K, blocks, variance_a2 = fleet.inputs, fleet.branches, fleet.blocks, fleet.variance_a2
+        self.y = y = M + int(np.argmax(np.median(variance_a2, axis=0)))
+        self.z = z = np.array([i for i in range(M, M + K + 1) if i != y])
+        others = z[:-1] - M
+        noise, self.weights = np.zeros((len(fleet), K)), np.ones((len(fleet), K))
+        for _ in range(NOISE_ROUNDS):
+            clean = total[:, z[:, None], z]
+            clean[:, range(K), range(K)] -= samples[:, None] * noise
+            law = _solve(clean, total[:, z, y])
+            self.weights[:, others] = -law[:, :-1]
+            fast = np.einsum("nkl,nl->nk", self.fast, self.weights)[:, others]
+            unbalanced = fast / -np.where(law[:, :-1], law[:, :-1], 1.0) / (WHITE_GAIN * samples[:, None])
+            noise[:, :-1] = np.clip(unbalanced, 0.0, MOST_NOISE * variance_a2[:, others])
+        sums = np.column_stack([self.weights, -law[:, -1]])[blocks.vehicle]
+        scores = products(fleet.moments[:, M:, M:], sums)  # of (measured currents, 1) with r
+        own = fleet.moments[:, -1, -1]
+        squares = blocks.total(_dot(scores, sums))
+        # Neighbouring samples repeat each other where blocks' sums of r scatter more than white noise's would.
+        scatter = blocks.total(scores[:, -1] ** 2 / own) / blocks.count
+        repeated = max(float(np.median(scatter / np.maximum(squares / samples, TINY))), 1.0)
+        # A block in which a current stands still has no noise of it.
+        varies = np.diagonal(fleet.moments, axis1=1, axis2=2)[:, z] - fleet.moments[:, z, -1] ** 2 / own[:, None]
+        noisy = np.clip(varies, 0.0, own[:, None] * noise[blocks.vehicle])
+        noisy *= (samples[:, None] * noise / np.maximum(blocks.total(noisy), TINY))[blocks.vehicle]
+        self.law, self.noise = law, np.insert((noise * law)[:, :-1], y - M, 0.0, axis=1)
+        self.with_z = scores[:, z - M] + noisy * law[blocks.vehicle]
+        self.square_a2, self.n_eff = np.maximum(squares, TINY), samples / repeated
 
-    @property
-    def of_z(self) -> Array:
-        """Moments of all columns with z in each block, shape (B, p, K)."""
-        return self.fleet.moments[:, :, self.z]
+    def _regress_on_model(self, read_out: Array) -> None:
+        """Regress each measured current on the fleet model's and 1."""
+        fleet, total = self.fleet, self.total
+        M, K, blocks = fleet.inputs, fleet.branches, fleet.blocks
+        self.columns = columns = np.array([*range(M), M + K])
+        self.basis = basis = np.stack([read_out.T, np.tile(np.eye(M + 1)[-1], (K, 1))], axis=-1)
 
-    def cause(
+        def normal_equations(moments: Array) -> tuple[Array, Array]:
+            gram = np.swapaxes(basis, 1, 2) @ moments[:, None, columns[:, None], columns] @ basis
+            return gram, np.einsum("nmk,kma->nka", moments[:, columns, M:-1], basis)
+
+        (gram, right), (each_gram, each_right) = normal_equations(total), normal_equations(fleet.moments)
+        fitted, own = _solve(gram, right), _solve(gram, np.broadcast_to([1.0, 0.0], right.shape))
+        left = np.diagonal(total, axis1=1, axis2=2)[:, M:-1] - _dot(fitted, right)
+        left = np.maximum(left, TINY) / self.samples[:, None]
+        scores = each_right - _dot(each_gram, fitted[blocks.vehicle][:, :, None])
+        self.slope_sd = np.sqrt(blocks.total(_dot(scores, own[blocks.vehicle]) ** 2))
+        repeated = np.maximum(np.median(self.slope_sd**2 / np.maximum(left * own[..., 0], TINY), axis=0), 1.0)
+        determinant = gram[..., 0, 0] * gram[..., 1, 1] - gram[..., 0, 1] ** 2
+        self.model_gram, self.model_right = gram, right
+        self.slope, self.zero_a = fitted[..., 0], fitted[..., 1]
+        self.moves_a = np.sqrt(np.maximum(determinant, 0.0)) / self.samples[:, None]
+        self.variance_a2, self.error_a = repeated * left, np.sqrt(left)
+
+    def _cause(
         self,
         explained_a2: Array,
         parameters: float,
         *,
-        stretch: ArrayLike = 0.0,
-        place: ArrayLike,
         pattern: Array,
         square: Array,
+        place: ArrayLike,
         size: ArrayLike = 0.0,
         level_branch: ArrayLike = -1,
-    ) -> _Causes:
-        """Make a cause whose fit is that with noise of unknown size, less what its parameters cost (BIC).
+        stretch: ArrayLike = 0.0,
+    ) -> tuple[Array, ...]:
+        """What a cause explains, and its part of :attr:`fit` to :attr:`branch_fit`.
 
-        `stretch` is the mean logarithm of what a transformed variable is stretched by.
+        The fit is that with noise of unknown size, less what the parameters cost (BIC). ``pattern`` (N, p) and
+        ``square`` (N,) are products of the misfit with all columns and with itself; ``stretch`` is the mean logarithm
+        of what a transformed variable is stretched by.
         """
         explained_a2, N = np.maximum(explained_a2, 0.0), len(explained_a2)
         left = np.maximum(1.0 - explained_a2 / self.square_a2, RIDGE)
         fit = self.n_eff * (np.asarray(stretch) - 0.5 * np.log(left)) - 0.5 * parameters * np.log(self.n_eff)
         size, place, level_branch = (np.broadcast_to(each, N) for each in (size, place, level_branch))
-        return _Causes(explained_a2, fit, size, place, level_branch, pattern, square)
+        return explained_a2, fit, size, place, level_branch, self._whose(pattern, square)
 
-
-class _OverModel(NamedTuple):
-    """Each measured current of N vehicles regressed on the fleet model's and 1.
-
-    Attributes
-    ----------
-    columns : ndarray of int of shape (M + 1,)
-        Inputs and 1 among the columns of the moments.
-    basis : ndarray of shape (K, M + 1, 2)
-        The fleet model's current and 1, over these.
-    gram, right : ndarray of shape (N, K, 2, 2), (N, K, 2)
-        Normal equations.
-    slope, slope_sd, zero_a : ndarray of shape (N, K)
-        Slope and its standard deviation [1], reading where the model has no current [A].
-    variance_a2 : ndarray of shape (N, K)
-        Variance of the residual times the number of neighbouring samples that repeat each other. [A^2]
-    moves_a, error_a : ndarray of shape (N, K)
-        Standard deviations of the model and of the residual. [A]
-    """
-
-    columns: NDArray[np.int64]
-    basis: Array
-    gram: Array
-    right: Array
-    slope: Array
-    slope_sd: Array
-    zero_a: Array
-    variance_a2: Array
-    moves_a: Array
-    error_a: Array
-
-    def whose(self, pattern: Array, square: Array, weights: Array) -> Array:
-        """Logarithm of the likelihood that each branch's sensor makes the misfit of each cause, shape (N, C, K).
+    def _whose(self, pattern: Array, square: Array) -> Array:
+        """Logarithm of the likelihood that each branch's sensor makes a misfit, shape (N, K).
 
         The misfit is regressed out of each branch's residual over the fleet model: where it is this branch's, all of it
         is found there, and nothing in the others.
         """
-        M, K = self.basis.shape[1] - 1, len(self.basis)
-        cross = np.einsum("ncm,kma->ncka", pattern[..., self.columns], self.basis)
-        base = _solve(self.gram[:, None], cross)
-        alone = np.maximum(square[..., None] - _dot(base, cross), TINY)
-        share = weights[:, None] * (pattern[..., M:-1] - _dot(base, self.right[:, None])) / alone
-        sd = np.hypot(weights[:, None] * np.sqrt(self.variance_a2[:, None] / alone), SHARE_SD)
-        off = np.sum(((share[..., None, :] - np.eye(K)) / sd[..., None, :]) ** 2, axis=-1)
+        if not self.has_fleet:
+            return np.zeros_like(self.weights)
+        M, K, weights = self.fleet.inputs, self.fleet.branches, self.weights
+        cross = np.einsum("nm,kma->nka", pattern[:, self.columns], self.basis)
+        base = _solve(self.model_gram, cross)
+        alone = np.maximum(square[:, None] - _dot(base, cross), TINY)
+        share = weights * (pattern[:, M:-1] - _dot(base, self.model_right)) / alone
+        sd = np.hypot(weights * np.sqrt(self.variance_a2 / alone), SHARE_SD)
+        off = np.sum(((share[:, None] - np.eye(K)) / sd[:, None]) ** 2, axis=-1)
         return np.asarray(-0.5 * (K - 1) / K * off)  # the shares of all branches add up to one
 
+    @property
+    def _of_z(self) -> Array:
+        """Moments of all columns with z in each block, shape (B, p, K)."""
+        return self.fleet.moments[:, :, self.z]
 
-class _Misfits(NamedTuple):
-    """What each cause explains of the junction law of N vehicles with K branches.
+    @property
+    def _gram(self) -> Array:
+        """Moments of z with z, shape (N, K, K)."""
+        return self.total[:, self.z[:, None], self.z]
 
-    Attributes
-    ----------
-    causes : _Causes
-        All of them.
-    model : _OverModel
-        The currents over the fleet model.
-    misfit_a : ndarray of shape (N, C)
-        Root mean square of what each cause explains beyond gains and offsets. [A]
-    branch_fit : ndarray of shape (N, C, K)
-        Logarithm of the likelihood that the sensor of branch k has it, by the fleet model; 0 without one.
-    residual_a2 : ndarray of shape (N, C + 1)
-        Mean square of what each cause, or none (last), leaves of the junction law. [A^2]
-    fast_a2 : ndarray of shape (N,)
-        White part of it. [A^2]
-    mean_a : ndarray of shape (N, K)
-        Mean measured currents. [A]
-    noise_share : ndarray of shape (N, K)
-        Share of each sensor in the fast part of the residual. [1]
-    spikes : ndarray of shape (N, K, 2)
-        Share of samples that are upward and downward spikes. [1]
-    samples : ndarray of shape (N,)
-        Number of samples.
-    """
+    def _by_level(self) -> list[tuple[Array, ...]]:
+        """Quadratic, cubic, two gains by sign, a bend: a column h that depends on the level of one of the currents.
 
-    causes: _Causes
-    model: _OverModel
-    misfit_a: Array
-    branch_fit: Array
-    residual_a2: Array
-    fast_a2: Array
-    mean_a: Array
-    noise_share: Array
-    spikes: Array
-    samples: Array
+        The current at which h is taken has noise n in it, which is in r, too: E[h n] = var(n) E[h'] if normal (Stein).
+        Of y everything is noise that z does not explain, as the current of a branch without a sensor: the likelihood of
+        y - b h(y) = g^T z has the factor prod |1 - b h'(y)| of a transformed variable, which a straight h leaves alone.
+        In a fleet what noise makes is part of what is usual, and counted there.
+        """
+        fleet, z, levels, full_scale_a, (N, K) = self.fleet, self.z, self.levels, self.full_scale_a, self.zero_a.shape
+        count = levels[..., -2]
+        x = np.stack([levels[:, k, :, fleet.inputs + k] for k in range(K)], axis=1) / np.maximum(count, 1.0)
+        from_zero = x - self.zero_a[:, :, None]
+        above, below = (
+            np.stack([np.maximum(sign * x - bend, 0.0) for bend in BENDS_A], axis=2) for sign in (1.0, -1.0)
+        )
+        bent_there = 1.0 * (np.concatenate([above, below, above + below], axis=2) > 0.0)
+        shapes = {  # h and its derivative
+            "quadratic": ((from_zero**2 / full_scale_a)[:, :, None], (2.0 * from_zero / full_scale_a)[:, :, None]),
+            "cubic": ((from_zero**3 / full_scale_a**2)[:, :, None], (3.0 * from_zero**2 / full_scale_a**2)[:, :, None]),
+            "sign": (np.maximum(from_zero, 0.0)[:, :, None], 1.0 * (from_zero > 0.0)[:, :, None]),
+            "bend": (np.concatenate([above, -below, above - below], axis=2), bent_there),
+        }
+        moving = fleet.variance_a2[:, :, None] > (MOVING * full_scale_a) ** 2
+        reach_a = np.max(np.abs(x) * (count >= FEWEST), axis=2)
+        least_a = np.min(reach_a, axis=1, where=moving[..., 0], initial=np.inf)[:, None, None]
+        greatest_a = np.max(reach_a, axis=1)[:, None, None]
+        gram, found, own = self._gram[:, None, None], [], self.y - fleet.inputs
+        for cause, (h, slope) in shapes.items():  # (N, K, S, L), constant within a level
+            bent = cause == "bend"
+            with_all = np.einsum("nksl,nkli->nksi", h, levels[..., :-1])
+            square = np.einsum("nksl,nkl->nks", h**2, count)
+            alone = square - _dot(_solve(gram, with_all[..., z]), with_all[..., z])
+            with_r = with_all[..., self.y] - np.einsum("nksi,ni->nks", with_all[..., z], self.law)
+            if not self.has_fleet:
+                with_r += self.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count)
+            beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
+            usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)
+            size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)
+            stretch = np.zeros(size.shape)
+            if not self.has_fleet:
+                if bent:  # a clipped sensor reads no more than that, others do; else a ramp's delay
+                    beyond_a = OVERSHOOT * np.tile(BENDS_A, 3)
+                    reached = (least_a <= beyond_a) & (beyond_a <= greatest_a)
+                    size = np.where((abs(size) < CLIPPED) | reached, size, 0.0)
+                factor = np.maximum(np.abs(1.0 - size[:, own, :, None] * slope[:, own]), LEAST_STRETCH)
+                stretch[:, own] = np.minimum(np.einsum("nsl,nl->ns", np.log(factor), count[:, own]), 0.0)
+                stretch /= self.samples[:, None, None]
+            explained_a2 = size * with_r
+            left = 1.0 - explained_a2 / self.square_a2[:, None, None]
+            best = (stretch - 0.5 * np.log(np.maximum(left, RIDGE))).reshape(N, -1).argmax(axis=1)
+            at = (np.arange(N), *np.unravel_index(best, size.shape[1:]))
+            weight = self.weights[at[:2]]
+            found.append(
+                self._cause(
+                    explained_a2[at],
+                    2.0 if bent else 1.0,
+                    pattern=with_all[at] * size[at][:, None],
+                    square=square[at] * size[at] ** 2,
+                    place=BENDS_A[at[2] % len(BENDS_A)] if bent else 0.0,
+                    size=size[at] / np.where(weight, weight, 1.0),
+                    level_branch=at[1],
+                    stretch=stretch[at],
+                )
+            )
+        return found
 
+    def _step(self) -> tuple[Array, ...]:
+        """Another law from some block on; the block in which it changes has one of its own."""
+        z, blocks, gram, right = self.z, self.fleet.blocks, self._of_z[:, self.z], self.with_z
+        last = np.cumsum(blocks.count)
+        first, vehicle = last - blocks.count, blocks.vehicle
 
-def _measure_misfits(summaries: Sequence[DriveSummary], read_out: Array, full_scale_a: float) -> _Misfits:
-    """Measure what each cause explains in each of N vehicles with fit sums."""
-    fleet = stack_summaries(summaries)
-    fits = [summary.fit for summary in summaries if summary.fit is not None]
-    fast = np.stack([fit.fast_a2.sum(axis=0) for fit in fits])
-    levels = np.stack([fit.levels for fit in fits])
-    spikes = np.stack([fit.spikes.sum(axis=0) for fit in fits])
-    middle = np.concatenate([np.cumsum(n := s.moments[:, -1, -1]) - n / 2.0 for s in summaries])
-    warm_c = np.concatenate([fit.temperature_c for fit in fits])
-    residual = _junction_residual(fleet, fast)
-    model = _over_fleet_model(residual, read_out)
-    samples, weights = residual.samples, residual.weights
-    causes = [
-        *_by_level(residual, levels, zero_a=model.zero_a, full_scale_a=full_scale_a, has_fleet=len(read_out) > 1),
-        _step(residual),
-        _drifting(residual, middle / samples[fleet.blocks.vehicle], least=0.0),
-        _drifting(residual, warm_c, least=WARMING_K),
-    ]
-    found = _Causes(*(np.stack(part, axis=1) for part in zip(*causes, strict=True)))
-    unit = np.sqrt((weights**2).mean(axis=1))  # gain errors of the branches do not scale the residual
-    fast_sum = np.einsum("nkl,nl->nk", fast, weights)
-    white = np.einsum("nk,nk->n", weights, fast_sum)
-    explained_a2 = np.column_stack([found.explained_a2, np.zeros(len(fleet))])
-    left = np.maximum(residual.square_a2[:, None] - explained_a2, 0.0)
-    branch_fit = np.zeros((len(weights), len(CAUSES), len(read_out[0])))
-    return _Misfits(
-        causes=found,
-        model=model,
-        misfit_a=np.sqrt(found.explained_a2 / samples[:, None]) / unit[:, None],
-        branch_fit=model.whose(found.pattern, found.square, weights) if len(read_out) > 1 else branch_fit,
-        residual_a2=left / (samples * unit**2)[:, None],
-        fast_a2=white / (WHITE_GAIN * samples * unit**2),
-        mean_a=fleet.mean_a,
-        noise_share=weights * fast_sum / np.maximum(white, TINY)[:, None],
-        spikes=spikes / samples[:, None, None],
-        samples=samples,
-    )
+        def before(values: Array) -> Array:
+            """Sums over the earlier blocks of the same vehicle."""
+            sums = np.cumsum(values, axis=0) - values
+            return np.asarray(sums - sums[first][vehicle])
+
+        earlier = before(gram), before(right)
+        later = self._gram[vehicle] - earlier[0] - gram, blocks.total(right)[vehicle] - earlier[1] - right
+        parts = (earlier, (gram, right), later)
+        laws = [_solve(*part) for part in parts]
+        number = np.arange(len(vehicle)) - first[vehicle]
+        inside = (number >= 2) & (number <= blocks.count[vehicle] - 3)
+        explained_a2 = np.where(inside, sum(_dot(law, part[1]) for law, part in zip(laws, parts, strict=True)), 0.0)
+        best = np.array([a + np.argmax(explained_a2[a:b]) for a, b in zip(first, last, strict=True)])
+        change = laws[2][best] - laws[0][best]
+        late = blocks.total(self._of_z * (np.arange(len(vehicle)) > best[vehicle])[:, None, None])
+        return self._cause(
+            explained_a2[best],
+            len(z) + 2.0,
+            pattern=np.einsum("nij,nj->ni", late, change),
+            square=np.einsum("ni,nij,nj->n", change, late[:, z], change),
+            place=(earlier[0][best, -1, -1] + 0.5 * gram[best, -1, -1]) / self.samples,
+        )
+
+    def _drifting(self, course: Array, *, least: float) -> tuple[Array, ...]:
+        """A law that changes in proportion to a course (B,), as time or temperature; NaN where that is not known."""
+        z, blocks, own = self.z, self.fleet.blocks, self.fleet.moments[:, -1, -1]
+        known = np.isfinite(course)
+        course = np.where(known, course, 0.0)
+        course = course - (blocks.total(course * own) / self.samples)[blocks.vehicle]
+        deviation = np.sqrt(blocks.total(course**2 * own) / self.samples)
+        usable = (deviation > least) & (blocks.total(known * 1.0) == blocks.count)
+        first = blocks.total(course[:, None, None] * self._of_z)
+        second = blocks.total(course[:, None, None] ** 2 * self._of_z[:, z])
+        gram = np.block([[self._gram, first[:, z]], [first[:, z], second]])
+        right = blocks.total(np.column_stack([self.with_z, course[:, None] * self.with_z]))
+        fitted = _solve(gram, right)
+        change = np.where(usable[:, None], fitted[:, len(z) :], 0.0)
+        return self._cause(
+            np.where(usable, _dot(fitted, right), 0.0),
+            len(z),
+            pattern=np.einsum("nij,nj->ni", first, change),
+            square=np.einsum("ni,nij,nj->n", change, second, change),
+            place=deviation,
+        )
+
+    def of_slopes(self, usual: UsualMisfits) -> tuple[Array, Array]:
+        """Probabilities that each sensor is inverted, and that it is dead, shape (N, K)."""
+
+        def density(about: float, sd: Array) -> Array:
+            return np.asarray(np.exp(-0.5 * ((self.slope - about) / sd) ** 2) / sd)
+
+        # What the model misses may follow it by chance, and hides it where the current hardly moves.
+        chance = CHANCE * usual.model_error_a / np.maximum(self.moves_a, TINY)
+        sd = np.hypot(self.slope_sd, np.minimum(chance, 100.0))
+        wide = np.hypot(np.hypot(GAIN_SD, usual.slope_spread), sd)
+        inverted, dead = PRIOR * density(-1.0, wide), PRIOR * density(0.0, np.hypot(DEAD_SD, sd))
+        whole = (1.0 - PRIOR) * density(1.0, wide) + inverted + dead + TINY
+        return inverted / whole, dead / whole
 
 
 def _solve(gram: Array, right: Array) -> Array:
@@ -344,187 +452,6 @@ def _solve(gram: Array, right: Array) -> Array:
 
 def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.sum(a * b, axis=-1))
-
-
-def _junction_residual(fleet: FleetMoments, fast: Array) -> _Residual:
-    """Junction law of each vehicle.
-
-    The noise of z draws g towards zero. White noise n_k makes fast changes that the junction law does not balance: with
-    the residual's fast part q = sum w_l q_l, E[q_k q] = 1.5 n_k w_k. It is taken out of the moments.
-    """
-    M, K, blocks, variance_a2 = fleet.inputs, fleet.branches, fleet.blocks, fleet.variance_a2
-    total = blocks.total(fleet.moments)
-    samples = total[:, -1, -1]
-    y = M + int(np.argmax(np.median(variance_a2, axis=0)))
-    z = np.array([i for i in range(M, M + K + 1) if i != y])
-    others = z[:-1] - M
-    noise, weights = np.zeros((len(fleet), K)), np.ones((len(fleet), K))
-    for _ in range(NOISE_ROUNDS):
-        clean = total[:, z[:, None], z]
-        clean[:, range(K), range(K)] -= samples[:, None] * noise
-        law = _solve(clean, total[:, z, y])
-        weights[:, others] = -law[:, :-1]
-        unbalanced = np.einsum("nkl,nl->nk", fast, weights)[:, others] / -np.where(law[:, :-1], law[:, :-1], 1.0)
-        noise[:, :-1] = np.clip(unbalanced / (WHITE_GAIN * samples[:, None]), 0.0, MOST_NOISE * variance_a2[:, others])
-    sums = np.column_stack([weights, -law[:, -1]])[blocks.vehicle]
-    scores = products(fleet.moments[:, M:, M:], sums)  # of (measured currents, 1) with r
-    own = fleet.moments[:, -1, -1]
-    squares = blocks.total(_dot(scores, sums))
-    # Neighbouring samples repeat each other where blocks' sums of r scatter more than white noise's would.
-    scatter = blocks.total(scores[:, -1] ** 2 / own) / blocks.count
-    repeated = max(float(np.median(scatter / np.maximum(squares / samples, TINY))), 1.0)
-    # A block in which a current stands still has no noise of it.
-    varies = np.diagonal(fleet.moments, axis1=1, axis2=2)[:, z] - fleet.moments[:, z, -1] ** 2 / own[:, None]
-    noisy = np.clip(varies, 0.0, own[:, None] * noise[blocks.vehicle])
-    noisy *= (samples[:, None] * noise / np.maximum(blocks.total(noisy), TINY))[blocks.vehicle]
-    shared = np.insert((noise * law)[:, :-1], y - M, 0.0, axis=1)
-    with_z = scores[:, z - M] + noisy * law[blocks.vehicle]
-    return _Residual(fleet, total, y, z, law, weights, shared, with_z, np.maximum(squares, TINY), samples / repeated)
-
-
-def _over_fleet_model(residual: _Residual, read_out: Array) -> _OverModel:
-    """Regress each measured current on the fleet model."""
-    fleet, total = residual.fleet, residual.total
-    M, K, blocks = fleet.inputs, fleet.branches, fleet.blocks
-    columns = np.array([*range(M), M + K])
-    basis = np.stack([read_out.T, np.tile(np.eye(M + 1)[-1], (K, 1))], axis=-1)
-
-    def normal_equations(moments: Array) -> tuple[Array, Array]:
-        gram = np.swapaxes(basis, 1, 2) @ moments[:, None, columns[:, None], columns] @ basis
-        return gram, np.einsum("nmk,kma->nka", moments[:, columns, M:-1], basis)
-
-    (gram, right), (each_gram, each_right) = normal_equations(total), normal_equations(fleet.moments)
-    fitted, own = _solve(gram, right), _solve(gram, np.broadcast_to([1.0, 0.0], right.shape))
-    left = np.maximum(np.diagonal(total, axis1=1, axis2=2)[:, M:-1] - _dot(fitted, right), TINY) / total[:, -1, -1:]
-    scores = each_right - _dot(each_gram, fitted[blocks.vehicle][:, :, None])
-    slope_sd = np.sqrt(blocks.total(_dot(scores, own[blocks.vehicle]) ** 2))
-    repeated = np.maximum(np.median(slope_sd**2 / np.maximum(left * own[..., 0], TINY), axis=0), 1.0)
-    determinant = gram[..., 0, 0] * gram[..., 1, 1] - gram[..., 0, 1] ** 2
-    moves_a = np.sqrt(np.maximum(determinant, 0.0)) / total[:, -1, -1:]
-    slope, zero_a = fitted[..., 0], fitted[..., 1]
-    return _OverModel(
-        columns, basis, gram, right, slope, slope_sd, zero_a, repeated * left, moves_a, error_a=np.sqrt(left)
-    )
-
-
-def _by_level(
-    residual: _Residual, levels: Array, *, zero_a: Array, full_scale_a: float, has_fleet: bool
-) -> list[_Causes]:
-    """Quadratic, cubic, two gains by sign, a bend: a column h that depends on the level of one of the currents.
-
-    The current at which h is taken has noise n in it, which is in r, too: E[h n] = var(n) E[h'] if normal (Stein).
-    Of y everything is noise that z does not explain, as the current of a branch without a sensor: the likelihood of
-    y - b h(y) = g^T z has the factor prod |1 - b h'(y)| of a transformed variable, which a straight h leaves alone.
-    In a fleet what noise makes is part of what is usual, and counted there.
-    """
-    fleet, z, (N, K) = residual.fleet, residual.z, zero_a.shape
-    count = levels[..., -2]
-    x = np.stack([levels[:, k, :, fleet.inputs + k] for k in range(K)], axis=1) / np.maximum(count, 1.0)
-    from_zero = x - zero_a[:, :, None]
-    above, below = (np.stack([np.maximum(sign * x - bend, 0.0) for bend in BENDS_A], axis=2) for sign in (1.0, -1.0))
-    bent_there = 1.0 * (np.concatenate([above, below, above + below], axis=2) > 0.0)
-    shapes = {  # h and its derivative
-        "quadratic": ((from_zero**2 / full_scale_a)[:, :, None], (2.0 * from_zero / full_scale_a)[:, :, None]),
-        "cubic": ((from_zero**3 / full_scale_a**2)[:, :, None], (3.0 * from_zero**2 / full_scale_a**2)[:, :, None]),
-        "sign": (np.maximum(from_zero, 0.0)[:, :, None], 1.0 * (from_zero > 0.0)[:, :, None]),
-        "bend": (np.concatenate([above, -below, above - below], axis=2), bent_there),
-    }
-    moving = fleet.variance_a2[:, :, None] > (MOVING * full_scale_a) ** 2
-    reach_a = np.max(np.abs(x) * (count >= FEWEST), axis=2)
-    least_a = np.min(reach_a, axis=1, where=moving[..., 0], initial=np.inf)[:, None, None]
-    greatest_a = np.max(reach_a, axis=1)[:, None, None]
-    gram, found, own = residual.gram[:, None, None], [], residual.y - fleet.inputs
-    for cause, (h, slope) in shapes.items():  # (N, K, S, L), constant within a level
-        with_all = np.einsum("nksl,nkli->nksi", h, levels[..., :-1])
-        square = np.einsum("nksl,nkl->nks", h**2, count)
-        alone = square - _dot(_solve(gram, with_all[..., z]), with_all[..., z])
-        with_r = with_all[..., residual.y] - np.einsum("nksi,ni->nks", with_all[..., z], residual.law)
-        if not has_fleet:
-            with_r += residual.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count)
-        beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
-        usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)
-        size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)
-        if (
-            cause == "bend" and not has_fleet
-        ):  # a clipped sensor reads no more than that, others do; else a ramp's delay
-            beyond_a = OVERSHOOT * np.tile(BENDS_A, 3)
-            size = np.where((abs(size) < CLIPPED) | ((least_a <= beyond_a) & (beyond_a <= greatest_a)), size, 0.0)
-        explained_a2 = size * with_r
-        stretch = np.zeros((N, K, h.shape[2]))
-        if not has_fleet:
-            factor = np.maximum(np.abs(1.0 - size[:, own, :, None] * slope[:, own]), LEAST_STRETCH)
-            stretch[:, own] = np.minimum(np.einsum("nsl,nl->ns", np.log(factor), count[:, own]), 0.0)
-            stretch /= residual.samples[:, None, None]
-        left = 1.0 - explained_a2 / residual.square_a2[:, None, None]
-        best = (stretch - 0.5 * np.log(np.maximum(left, RIDGE))).reshape(N, -1).argmax(axis=1)
-        at = (np.arange(N), *np.unravel_index(best, size.shape[1:]))
-        weight, bent = residual.weights[at[:2]], cause == "bend"
-        found.append(
-            residual.cause(
-                explained_a2[at],
-                2.0 if bent else 1.0,
-                stretch=stretch[at],
-                size=size[at] / np.where(weight, weight, 1.0),
-                place=BENDS_A[at[2] % len(BENDS_A)] if bent else 0.0,
-                level_branch=at[1],
-                pattern=with_all[at] * size[at][:, None],
-                square=square[at] * size[at] ** 2,
-            )
-        )
-    return found
-
-
-def _step(residual: _Residual) -> _Causes:
-    """Another law from some block on; the block in which it changes has one of its own."""
-    z, blocks, gram, right = residual.z, residual.fleet.blocks, residual.of_z[:, residual.z], residual.with_z
-    last = np.cumsum(blocks.count)
-    first, vehicle = last - blocks.count, blocks.vehicle
-
-    def before(values: Array) -> Array:
-        """Sums over the earlier blocks of the same vehicle."""
-        sums = np.cumsum(values, axis=0) - values
-        return np.asarray(sums - sums[first][vehicle])
-
-    earlier = before(gram), before(right)
-    later = residual.gram[vehicle] - earlier[0] - gram, blocks.total(right)[vehicle] - earlier[1] - right
-    parts = (earlier, (gram, right), later)
-    laws = [_solve(*part) for part in parts]
-    number = np.arange(len(vehicle)) - first[vehicle]
-    inside = (number >= 2) & (number <= blocks.count[vehicle] - 3)
-    explained_a2 = np.where(inside, sum(_dot(law, part[1]) for law, part in zip(laws, parts, strict=True)), 0.0)
-    best = np.array([a + np.argmax(explained_a2[a:b]) for a, b in zip(first, last, strict=True)])
-    change = laws[2][best] - laws[0][best]
-    late = blocks.total(residual.of_z * (np.arange(len(vehicle)) > best[vehicle])[:, None, None])
-    return residual.cause(
-        explained_a2[best],
-        len(z) + 2.0,
-        place=(earlier[0][best, -1, -1] + 0.5 * gram[best, -1, -1]) / residual.samples,
-        pattern=np.einsum("nij,nj->ni", late, change),
-        square=np.einsum("ni,nij,nj->n", change, late[:, z], change),
-    )
-
-
-def _drifting(residual: _Residual, course: Array, *, least: float) -> _Causes:
-    """A law that changes in proportion to a course (B,), as time or temperature; where it is not known it is NaN."""
-    z, blocks, own = residual.z, residual.fleet.blocks, residual.fleet.moments[:, -1, -1]
-    known = np.isfinite(course)
-    course = np.where(known, course, 0.0)
-    course = course - (blocks.total(course * own) / residual.samples)[blocks.vehicle]
-    deviation = np.sqrt(blocks.total(course**2 * own) / residual.samples)
-    usable = (deviation > least) & (blocks.total(known * 1.0) == blocks.count)
-    first = blocks.total(course[:, None, None] * residual.of_z)
-    second = blocks.total(course[:, None, None] ** 2 * residual.of_z[:, z])
-    gram = np.block([[residual.gram, first[:, z]], [first[:, z], second]])
-    right = blocks.total(np.column_stack([residual.with_z, course[:, None] * residual.with_z]))
-    fitted = _solve(gram, right)
-    change = np.where(usable[:, None], fitted[:, len(z) :], 0.0)
-    return residual.cause(
-        np.where(usable, _dot(fitted, right), 0.0),
-        len(z),
-        place=deviation,
-        pattern=np.einsum("nij,nj->ni", first, change),
-        square=np.einsum("ni,nij,nj->n", change, second, change),
-    )
 
 
 def learn_usual_misfits(
@@ -549,18 +476,18 @@ def learn_usual_misfits(
     known = [summary for summary in summaries if summary.fit is not None]
     if not known:
         return None
-    misfits = _measure_misfits(known, read_out, full_scale_a)
-    model, left = misfits.model, np.log(np.maximum(misfits.residual_a2[:, -1], TINY))
+    found = _Checked(known, read_out, full_scale_a)
+    left = np.log(np.maximum(found.residual_a2[:, -1], TINY))
     centre = np.median(left)
     return UsualMisfits(
         # The size of a misfit has half of a symmetric distribution, whose median is 0.67 standard deviations.
-        misfit_a=np.maximum(MAD_TO_SD * np.median(misfits.misfit_a, axis=0), LEAST_MISFIT * full_scale_a),
+        misfit_a=np.maximum(MAD_TO_SD * np.median(found.misfit_a, axis=0), LEAST_MISFIT * full_scale_a),
         residual_a2=float(np.exp(centre)),
-        fast_a2=float(np.median(misfits.fast_a2)),
+        fast_a2=float(np.median(found.fast_a2)),
         residual_spread=max(MAD_TO_SD * float(np.median(np.abs(left - centre))), LEAST_NOISE_SPREAD),
-        slope_spread=MAD_TO_SD * np.median(np.abs(model.slope - np.median(model.slope, axis=0)), axis=0),
-        model_error_a=np.median(model.error_a, axis=0),
-        spike_rate=max(float(np.median(misfits.spikes.sum(axis=2))), SPIKE_RATE),
+        slope_spread=MAD_TO_SD * np.median(np.abs(found.slope - np.median(found.slope, axis=0)), axis=0),
+        model_error_a=np.median(found.error_a, axis=0),
+        spike_rate=max(float(np.median(found.spikes.sum(axis=2))), SPIKE_RATE),
     )
 
 
@@ -598,16 +525,16 @@ def find_misfits(
     places = [j for j, summary in enumerate(summaries) if summary.fit is not None]
     if usual is None or not places:
         return found
-    misfits = _measure_misfits([summaries[j] for j in places], read_out, full_scale_a)
+    misfits = _Checked([summaries[j] for j in places], read_out, full_scale_a)
     # Where there is more noise than usual, larger misfits come by chance.
     noisier = np.sqrt(np.maximum(misfits.residual_a2[:, :-1] / usual.residual_a2, 1.0))
     shape = _probability(misfits.misfit_a, usual.misfit_a * noisier, LARGEST_MISFIT * full_scale_a)
     above = np.log(np.maximum(misfits.residual_a2, TINY) / usual.residual_a2) / usual.residual_spread
     factor = usual.residual_spread / (NOISE_RANGE * np.maximum(student_t.pdf(above, TAIL), TINY))
     unusual = np.where(above > 0.0, _posterior(PRIOR * factor), 0.0)
-    inverted, dead = _of_slopes(misfits.model, usual)
+    inverted, dead = misfits.of_slopes(usual)
     for i, j in enumerate(places):
-        vehicle = _Vehicle(misfits, usual, i, tuple(branches), NEAR_ZERO * full_scale_a)
+        vehicle = _Vehicle(misfits, usual, i, branches)
         mine = vehicle.of_slopes(inverted[i], dead[i])
         if not any(each.cause == "dead" for each in mine):  # without its current the junction law tells nothing
             mine += vehicle.of_law(shape[i], unusual[i])
@@ -629,21 +556,6 @@ def _probability(misfit_a: Array, usual_a: Array, largest_a: float) -> Array:
     return _posterior(PRIOR * alternative / np.maximum(2.0 * student_t.pdf(z, TAIL), 1e-300))
 
 
-def _of_slopes(model: _OverModel, usual: UsualMisfits) -> tuple[Array, Array]:
-    """Probabilities that each sensor is inverted, and that it is dead, shape (N, K)."""
-
-    def density(about: float, sd: Array) -> Array:
-        return np.asarray(np.exp(-0.5 * ((model.slope - about) / sd) ** 2) / sd)
-
-    # What the model misses may follow it by chance, and hides it where the current hardly moves.
-    chance = CHANCE * usual.model_error_a / np.maximum(model.moves_a, TINY)
-    sd = np.hypot(model.slope_sd, np.minimum(chance, 100.0))
-    wide = np.hypot(np.hypot(GAIN_SD, usual.slope_spread), sd)
-    inverted, dead = PRIOR * density(-1.0, wide), PRIOR * density(0.0, np.hypot(DEAD_SD, sd))
-    whole = (1.0 - PRIOR) * density(1.0, wide) + inverted + dead + TINY
-    return inverted / whole, dead / whole
-
-
 def _finding(branch: str | None, cause: str, probability: float, text: str) -> SensorFinding:
     # Rounded, as vehicles that are checked together change the last digits.
     return SensorFinding(branch=branch, cause=cause, probability=min(round(float(probability), 4), 1.0), text=text)
@@ -656,15 +568,14 @@ def _who(name: str | None) -> str:
 class _Vehicle(NamedTuple):
     """Vehicle j of some misfits; its methods word what is found in it."""
 
-    misfits: _Misfits
+    misfits: _Checked
     usual: UsualMisfits
     j: int
-    branches: tuple[str, ...]
-    near_zero_a: float
+    branches: Sequence[str]
 
     def of_slopes(self, inverted: Array, dead: Array) -> list[SensorFinding]:
         """Sensors that are inverted or dead, by their slope over the fleet model."""
-        found, slope, mean_a = [], self.misfits.model.slope[self.j], self.misfits.mean_a[self.j]
+        found, slope, mean_a = [], self.misfits.slope[self.j], self.misfits.fleet.mean_a[self.j]
         for k, name in enumerate(self.branches):
             reversed_ = (
                 f"reads with the wrong sign, {slope[k]:+.2f} A per ampere of the fleet's; turn it round, or correct "
@@ -681,7 +592,7 @@ class _Vehicle(NamedTuple):
     def of_law(self, shape: Array, unusual: Array) -> list[SensorFinding]:
         """The cause that explains most of the junction law's residual; noise and switched loads by what is left."""
         misfits, usual, j = self.misfits, self.usual, self.j
-        fit, level, left = misfits.causes.fit[j], misfits.causes.level_branch[j], misfits.residual_a2[j]
+        fit, level, left = misfits.fit[j], misfits.level_branch[j], misfits.residual_a2[j]
         c = int(fit.argmax())
         weight = np.exp(fit - fit[c])
         alike = level == level[c] if level[c] >= 0 else fit == fit[c]  # the shapes of one curve are one cause
@@ -705,14 +616,20 @@ class _Vehicle(NamedTuple):
 
     def _worded(self, c: int, probability: float) -> SensorFinding:
         """One of :data:`CAUSES`, with its sensor and figures."""
-        misfits, causes, j, cause = self.misfits, self.misfits.causes, self.j, CAUSES[c]
+        misfits, j, cause = self.misfits, self.j, CAUSES[c]
         weight = np.exp(misfits.branch_fit[j, c] - misfits.branch_fit[j, c].max())
         k = int(weight.argmax())
         name = self.branches[k] if weight[k] >= NAMED * weight.sum() else None
-        size, place, level = causes.size[j, c], causes.place[j, c], causes.level_branch[j, c]
+        size, place, level = misfits.size[j, c], misfits.place[j, c], misfits.level_branch[j, c]
         percent = f"{100.0 * abs(size):.0f} %"
         if cause in {"bend", "sign"}:
-            cause = "clipped" if abs(size) >= CLIPPED else "sign" if place <= self.near_zero_a else "saturating"
+            cause = (
+                "clipped"
+                if abs(size) >= CLIPPED
+                else "sign"
+                if place <= NEAR_ZERO * misfits.full_scale_a
+                else "saturating"
+            )
         text = {
             "quadratic": f"its error grows with the square of the current, {percent} at full scale",
             "cubic": f"its error grows with the cube of the current, {percent} at full scale",

@@ -2,7 +2,6 @@
 
 import math
 import shlex
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,11 +40,8 @@ if TYPE_CHECKING:
 __all__ = ["calibrate", "identify", "params"]
 
 OF_POSTERIOR = ("harm_limit", "trusted", "readings", "load", "charge", "meter", "expected_faults", "scheduler", "since")
-OF_PUBLISHED = ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed")
+OF_PUBLISHED = ("classifier", "truth", "sparsity", "magnitude", "symmetric", "seed")
 """What only one method heeds."""
-SHORTEST_POLE_S, LONGEST_POLE_S = 0.01, 600.0
-"""Time constants of low-passes: from below the time base of any layout to ten minutes. [s]"""
-POLES_HELP = f"Low-passes to use: time constants with commas, each {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} [s]."
 
 
 def calibrate(
@@ -112,9 +108,6 @@ def calibrate(
         list[str] | None,
         typer.Option("--hold-out", metavar="NAME", help="Vehicle to calibrate, but to learn nothing from for others."),
     ] = None,
-    unity: Annotated[
-        str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
-    ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 2,
     scheduler: SchedulerOption = None,
@@ -128,7 +121,7 @@ def calibrate(
     """Estimate the sensor faults of every vehicle and write its parameter file.
 
     The default method, posterior, says how sure it is and corrects a branch only if that hardly harms. The options
-    classifier, truth, sparsity, magnitude, symmetric, unity and seed are for the published method, which is kept as a
+    classifier, truth, sparsity, magnitude, symmetric and seed are for the published method, which is kept as a
     reference: its classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
     """
     with importing():
@@ -160,7 +153,6 @@ def calibrate(
         symmetric=symmetric,
         branches=tuple(branches.split(",")) if branches else None,
         hold_out=_named(hold_out),
-        unity=unity,
         seed=seed,
         time_limit_s=time_limit,
     )
@@ -261,33 +253,18 @@ def _truth_of(fleet: str, path: Path) -> "FleetTruth":
     return truth
 
 
-def _time_constants_s(value: str) -> list[float]:
-    """Read the option ``--poles``."""
-    with suppress(ValueError):
-        numbers = [float(number) for number in value.split(",")]
-        if all(SHORTEST_POLE_S <= number <= LONGEST_POLE_S for number in numbers):  # nor is not-a-number
-            return numbers
-    expected = f"time constants with commas, each from {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} s"
-    raise typer.BadParameter(f"{value}: expected {expected}", param_hint="'--poles'")
-
-
 def identify(
     fleet: FleetArgument,
     layout: LayoutOption,
     bank: BankOption = None,
-    poles: Annotated[str | None, typer.Option("--poles", help=POLES_HELP)] = None,
     out: Annotated[Path | None, typer.Option("--out", help="File to write the filter bank to (JSON).")] = None,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:
     """Choose the filter bank that a fleet's vehicles share, and tell how well it simulates each of them.
 
-    Without --bank or --poles it is chosen from some vehicles, by how well it simulates blocks of their drives that were
-    held out.
+    Without --bank it is chosen from some vehicles, by how well it simulates blocks of their drives that were held out.
     """
-    if bank is not None and poles is not None:
-        raise typer.BadParameter("a bank has its own poles; give --bank or --poles", param_hint="--poles")
-    time_constants_s = [] if poles is None else _time_constants_s(poles)
     if out is not None:
         require_possible_file(out)
     with importing():
@@ -300,7 +277,6 @@ def identify(
         fleet,
         vehicle_database(layout),
         bank=given,
-        time_constants_s=time_constants_s,
         workers=Workers(processes=workers),
     )
     if out is not None:

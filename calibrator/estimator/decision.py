@@ -13,13 +13,11 @@ with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled_with_notice
 from calibrator.drive import Array, Mask
 from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces
 from calibrator.estimator.posterior import Draws, FaultModel, explain, weigh_draws
@@ -182,27 +180,14 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
     ndarray of shape (C,)
         Probability that both are within 10 % of the truth in the Euclidean norm.
     """
-    covered = np.zeros(len(candidates))
-    _cover(points.faults, points.weight, candidates, np.asarray(smallest), covered)
-    return covered
-
-
-@compiled_with_notice
-def _cover(faults: Array, weight: Array, candidates: Array, smallest: Array, covered: Array) -> None:
-    K = faults.shape[1] // 2
-    for c in range(len(candidates)):
-        for i in range(len(faults)):
-            near = True
-            for part in range(2):
-                distance, size = 0.0, 0.0
-                for k in range(part * K, (part + 1) * K):
-                    distance += (faults[i, k] - candidates[c, k]) ** 2
-                    size += faults[i, k] ** 2
-                if distance > (TOLERANCE * max(sqrt(size), smallest[part])) ** 2:
-                    near = False
-                    break
-            if near:
-                covered[c] += weight[i]
+    K = candidates.shape[1] // 2
+    near = np.ones((len(points.faults), len(candidates)), bool)
+    for part, least in zip((slice(0, K), slice(K, 2 * K)), smallest, strict=True):
+        faults, tried = points.faults[:, part], candidates[:, part]
+        size2 = np.sum(faults**2, axis=1)
+        distance2 = size2[:, None] - 2.0 * faults @ tried.T + np.sum(tried**2, axis=1)
+        near &= distance2 <= (TOLERANCE * np.maximum(np.sqrt(size2), least))[:, None] ** 2
+    return np.asarray(points.weight @ near)
 
 
 def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: Array) -> Array:
@@ -222,27 +207,14 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
     ndarray of shape (K,)
         That it does so on any of the drives; 0 where nothing would be corrected.
     """
-    harm = np.zeros(len(estimate) // 2)
-    _harm(points.faults, points.weight, estimate, mean, mean_square, harm)
-    return np.minimum(harm, 1.0)
-
-
-@compiled_with_notice
-def _harm(faults: Array, weight: Array, estimate: Array, mean: Array, square: Array, harm: Array) -> None:
-    K = len(harm)
-    for k in range(K):
-        d_hat, o_hat = estimate[k], estimate[K + k]
-        if d_hat == 0.0 and o_hat == 0.0:
-            continue
-        for i in range(len(faults)):
-            d, o = faults[i, k], faults[i, K + k]
-            alpha, beta = (1.0 + d) / (1.0 + d_hat) - 1.0, (o - o_hat) / (1.0 + d_hat)
-            for s in range(len(mean)):
-                with_it = alpha * alpha * square[s, k] + 2.0 * alpha * beta * mean[s, k] + beta * beta
-                without = d * d * square[s, k] + 2.0 * d * o * mean[s, k] + o * o
-                if with_it > without:
-                    harm[k] += weight[i]
-                    break
+    K = len(estimate) // 2
+    d, o, d_hat, o_hat = points.faults[:, :K], points.faults[:, K:], estimate[:K], estimate[K:]
+    alpha, beta = (1.0 + d) / (1.0 + d_hat) - 1.0, (o - o_hat) / (1.0 + d_hat)
+    worse = np.zeros(d.shape, bool)
+    for m, square in zip(mean, mean_square, strict=True):
+        worse |= alpha**2 * square + 2.0 * alpha * beta * m + beta**2 > d**2 * square + 2.0 * d * o * m + o**2
+    harm = points.weight @ (worse & ((d_hat != 0.0) | (o_hat != 0.0)))
+    return np.asarray(np.minimum(harm, 1.0))
 
 
 NOTHING: Any = None

@@ -23,7 +23,7 @@ import pandas as pd
 
 from calibrator.drive import Drive
 from calibrator.drives.align import align, choose_inputs
-from calibrator.errors import ContradictionError, FleetError
+from calibrator.errors import INTERNAL_ERROR, ContradictionError, FleetError
 from calibrator.estimator.frames import (
     Junction,
     column_values,
@@ -37,7 +37,7 @@ from calibrator.estimator.frames import (
     summarise_frames,
 )
 from calibrator.estimator.results import FILES as NODE_FILES
-from calibrator.estimator.results import PARTS, ROWS, internal_errors, read_part
+from calibrator.estimator.results import PARTS, ROWS, read_part
 from calibrator.estimator.run import calibrate_fleet, require_fleet
 from calibrator.estimator.settings import CalibrationSettings
 from calibrator.estimator.vehicle_report import explained
@@ -314,7 +314,7 @@ class _Calibrator:
             report = calibrate_fleet(place, database, out, self._settings(alone=alone), workers=workers)
             files = {str(path.relative_to(out)): path for path in sorted(out.rglob("*")) if path.is_file()}
             parts = [read_part(path) for path in files.values() if path.parent.name == PARTS]
-            rows, failed = pd.read_parquet(out / ROWS), internal_errors(out)
+            rows = pd.read_parquet(out / ROWS)
             self._files = {
                 name: path.read_bytes() for name, path in files.items() if has_layout or path.parent.name != NODE_FILES
             }
@@ -329,9 +329,10 @@ class _Calibrator:
         self.parameters_ = rows[rows["branch"].notna()].rename(columns=NAMES)[list(COLUMNS)].reset_index(drop=True)
         self.parameters_["corrected"] = self.parameters_["corrected"].astype(bool)
         self.notices_ = [_in_python(notice) for notice in report.run.notices]
+        failed = {name: why for name, why in self.left_out_.items() if why.startswith(INTERNAL_ERROR)}
         if failed:
             said = "; ".join(told_once(failed.items()))
-            warnings.warn(f"internal error, left out: {said}", RuntimeWarning, stacklevel=3)
+            warnings.warn(f"left out: {said}", RuntimeWarning, stacklevel=3)
 
     def _require_fitted(self) -> None:
         if not hasattr(self, "parameters_"):

@@ -25,7 +25,7 @@ from calibrator.errors import DriveError
 from calibrator.processes.run_many import Workers
 from calibrator.published.state_space import pooled_poles, snr_from_power, solve_scaled
 from calibrator.sources.fleet_source import find_fleet, probe_equipment, read_vehicles
-from calibrator.summaries.filter_bank import FilterBank, Poles, low_pass_bank, low_passes
+from calibrator.summaries.filter_bank import FilterBank, Poles, low_passes
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summarise_fleet import read_samples, read_vehicle_summary
 from calibrator.summaries.summariser import summarise_samples
@@ -235,7 +235,6 @@ def identify_fleet(
     database: VehicleDatabase,
     *,
     bank: FilterBank | None,
-    time_constants_s: Sequence[float],
     workers: Workers,
 ) -> IdentificationReport:
     """Choose the filter bank of a fleet, or take one that is given, and judge it by every vehicle.
@@ -247,9 +246,7 @@ def identify_fleet(
     database : VehicleDatabase
         DBC and layout.
     bank : FilterBank or None
-        A bank that is given.
-    time_constants_s : sequence of float
-        Those of low-passes that are given; empty: chosen from some vehicles of the fleet, if no bank is given. [s]
+        A bank that is given; None: one is chosen from some vehicles of the fleet.
     workers : Workers
         Where the drives are read.
 
@@ -265,9 +262,7 @@ def identify_fleet(
     """
     fleet, period_s = find_fleet(path), database.layout.period_s
     equipment = probe_equipment(fleet, database, None)
-    if bank is None and time_constants_s:
-        bank = low_pass_bank(equipment.fleet_inputs, time_constants_s, period_s=period_s)
-    elif bank is None:
+    if bank is None:
         bank = _chosen_bank(fleet, equipment, database, workers=workers)
     if (bank.input_names, bank.period_s) != (equipment.fleet_inputs, period_s):
         raise DriveError(

@@ -12,10 +12,10 @@ Gaussian: no zero is exact) or present, of any size; each choice is one explanat
 with its standard deviation, and is not corrected.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,16 +54,17 @@ from calibrator.summaries.vehicle_summary import (
     VehicleSummary,
     most_moving_first,
     require_possible,
-    weighted_mean,
     zero_current_offsets,
 )
-from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.progress import shown
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout, UnmeasuredLoad
 from ecu_node.parameters import Explanation, SensorFinding, VehicleParameters
 
 __all__ = ["calibrate_junctions", "read_junction", "summarise_junction"]
+
+_Made = TypeVar("_Made")
 
 LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
 """Least valid data, shortest block, number of blocks of a short recording, and least number beyond that of branches:
@@ -99,8 +100,6 @@ STILL = 0.003
 """Standard deviation of all currents, over full scale, up to which the car stands still. [1]"""
 SOUND_GAIN_SD, SOUND_OFFSET_SD = 0.01, 0.0025
 """Standard deviations up to which a sensor without a fault is called right: gain, and offset over full scale. [1]"""
-UNCLEAR = (0.1, 0.9)
-"""Probabilities of an offset between which it may be another sensor's. [1]"""
 SEEN = 3.0
 """Standard deviations from which on a fault is clear. [1]"""
 MOST_SHOWN = 5
@@ -226,72 +225,115 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
     return _Law(order, np.append(np.log(ratio), constant_a / scale_a), covariance, (constant_a, constant_sd_a))
 
 
-class _System(NamedTuple):
-    """Rows y = design x + error of N vehicles, over x = (lambda of S sensors, their offsets, N loads).
+class _Known(NamedTuple):
+    """What is known beside the recordings of N vehicles with K branches."""
 
-    Offsets and loads are in fractions of full scale. Prior of x: as read, or open.
+    read: Array
+    """Values and standard deviations of drifts [1] and offsets [A] by zero-current windows, bench and trust, shape
+    (3, 2, 2, N, K); NaN where there are none."""
+    load: UnmeasuredLoad | None
+    charge_a: Mapping[str, tuple[float, float, float]]
+    meter: str | None
+
+
+class _System:
+    """Rows y = design x + error of N recordings over x = (lambda of S sensors, their offsets, N loads).
+
+    The first rows are the junction laws, and the charges; the last ones what is known of single x. Offsets and loads
+    are in fractions of full scale. Before anything is known, all x are about 0 and open.
+
+    Attributes
+    ----------
+    places : ndarray of int of shape (N, K)
+        Number of the sensor of each vehicle and branch: vehicles share all but meters.
+    names : list of S str
+        Of the sensors.
+    laws : list of N _Law
+        The junction laws.
+    known : list of (int, str)
+        Place in x, and name, of what each of the last rows tells.
     """
 
-    y: Array
-    covariance: Array
-    design: Array
-    mean: Array
-    sd: Array
-    read: Mask
-    """Which of x were read."""
-    sensors: int
+    def __init__(
+        self, vehicles: Sequence[VehicleSummary], branches: Sequence[str], known: _Known, scale_a: float
+    ) -> None:
+        N, K, self.scale_a = len(vehicles), len(branches), scale_a
+        self.places = np.tile(np.arange(K), (N, 1))
+        if known.meter is not None:
+            self.places[1:, branches.index(known.meter)] = K + np.arange(N - 1)
+        self.sensors = S = int(self.places.max()) + 1
+        self.names = [branches[k] if k < K else f"{known.meter} ({vehicles[k - K + 1].vehicle})" for k in range(S)]
+        self.laws = [_law(each.summary, branches, each.vehicle, scale_a) for each in vehicles]
+        load = known.load or UnmeasuredLoad(mean_a=0.0, sd_a=0.0)
+        given = [
+            (int(self.places[j, k]) + what * S, *known.read[r, :, what, j, k].tolist())
+            for r, what, j, k in np.argwhere(np.isfinite(known.read[:, 0])).tolist()
+        ]
+        given += [(2 * S + j, load.mean_a, load.sd_a) for j in range(N) if known.load is not None]
+        self.known = [(p, self._called(p)) for p, _, _ in given]
+        of_gain = np.array([p < S for p, _, _ in given], bool)
+        value, sd = np.array([each[1:] for each in given]).reshape(-1, 2).T
+        design = np.zeros((N * K + len(known.charge_a) + len(given), 2 * S + N))
+        for j, law in enumerate(self.laws):
+            first, *others = self.places[j][law.order].tolist()
+            ratios, constant = range(j * K, (j + 1) * K - 1), (j + 1) * K - 1
+            design[ratios, first], design[ratios, others] = 1.0, -1.0
+            design[constant, [S + first, *(S + s for s in others)]] = np.append(1.0, np.exp(law.value[:-1]))
+            design[constant, 2 * S + j] = 1.0
+            design[constant, first] = load.mean_a / scale_a  # (1 + d_1) l
+        charges = np.array([*known.charge_a.values()]).reshape(-1, 3) / scale_a  # mean measured = (1 + d) true + o
+        for i, name in enumerate(known.charge_a, start=N * K):
+            k = branches.index(name)
+            design[i, [k, S + k]] = charges[i - N * K, 1], 1.0
+        design[range(len(design) - len(given), len(design)), [p for p, _, _ in given]] = 1.0
+        self.design = design
+        self.y = np.concatenate(
+            [
+                *(law.value for law in self.laws),
+                charges[:, 0] - charges[:, 1],
+                np.where(of_gain, np.log1p(np.where(of_gain, value, 0.0)), value / scale_a),
+            ]
+        )
+        self.covariance = block_diag(
+            *(law.covariance for law in self.laws),
+            np.diag(charges[:, 2] ** 2 + LAW_OFFSET_SD**2),
+            np.diag(np.where(of_gain, sd / (1.0 + value), sd / scale_a) ** 2),
+        )
+        self.open_sd = np.repeat([OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD], [S, S, N])
 
+    def _called(self, p: int) -> str:
+        S = self.sensors
+        what = ("gain error of", "offset of")[p // S] if p < 2 * S else ""
+        return f"{what} {self.names[p % S]}" if what else "load that no branch measures"
 
-def _system(laws: Sequence[_Law], places: NDArray[np.int64], load: UnmeasuredLoad | None, scale_a: float) -> _System:
-    """Junction laws of N vehicles whose sensors are at places (N, K); of loads what is declared."""
-    (N, K), S = places.shape, int(places.max()) + 1
-    design, given = np.zeros((N * K, 2 * S + N)), load or UnmeasuredLoad(mean_a=0.0, sd_a=OPEN_LOAD_SD * scale_a)
-    for j, law in enumerate(laws):
-        first, *others = places[j][law.order].tolist()
-        ratios, constant = range(j * K, (j + 1) * K - 1), (j + 1) * K - 1
-        design[ratios, first], design[ratios, others] = 1.0, -1.0
-        design[constant, [S + first, *(S + s for s in others)]] = np.append(1.0, np.exp(law.value[:-1]))
-        design[constant, 2 * S + j] = 1.0
-        design[constant, first] = given.mean_a / scale_a  # (1 + d_1) l
-    return _System(
-        y=np.concatenate([law.value for law in laws]),
-        covariance=block_diag(*(law.covariance for law in laws)),
-        design=design,
-        mean=np.append(np.zeros(2 * S), np.full(N, given.mean_a / scale_a)),
-        sd=np.concatenate([np.repeat([OPEN_GAIN_SD, OPEN_OFFSET_SD], S), np.full(N, given.sd_a / scale_a)]),
-        read=np.arange(2 * S + N) >= 2 * S,
-        sensors=S,
-    )
+    def is_known(self, p: int) -> bool:
+        """Whether anything tells x_p by itself."""
+        return any(place == p for place, _ in self.known)
 
+    def condition(self, sd: Array, without: int | None = None) -> tuple[Array, Array, float]:
+        """Mean (P,), covariance (P, P) and log evidence of x under a prior with these standard deviations (P,).
 
-def _with_reading(system: _System, s: int, value: Array, sd: Array, scale_a: float) -> _System:
-    """The system with gain error [1] and offset [A] of sensor s as read; NaN where they were not."""
-    mean, spread, read, at = system.mean.copy(), system.sd.copy(), system.read.copy(), [s, system.sensors + s]
-    read[at] = np.isfinite(value)
-    mean[at] = np.where(read[at], [np.log1p(value[0]), value[1] / scale_a], mean[at])
-    spread[at] = np.where(read[at], [sd[0] / (1.0 + value[0]), sd[1] / scale_a], spread[at])
-    return system._replace(mean=mean, sd=spread, read=read)
+        ``without`` is a row that is left out.
+        """
+        used = np.arange(len(self.y)) != (len(self.y) if without is None else without)
+        A, prior, y = self.design[used], np.diag(sd**2), self.y[used]
+        rows = A @ prior @ A.T + self.covariance[used][:, used]
+        gain = np.linalg.solve(rows, A @ prior).T
+        log_evidence = -0.5 * (y @ np.linalg.solve(rows, y) + np.linalg.slogdet(2.0 * np.pi * rows)[1])
+        return gain @ y, prior - gain @ A @ prior, float(log_evidence)
 
-
-def _with_charge(system: _System, k: int, charge_a: tuple[float, float, float], scale_a: float) -> _System:
-    """The system with the charge of branch k of one vehicle, see :func:`_charges`: mean measured = (1 + d) true + o."""
-    measured_a, true_a, sd_a = charge_a
-    row = np.zeros(len(system.mean))
-    row[[k, system.sensors + k]] = true_a / scale_a, 1.0
-    return system._replace(
-        y=np.append(system.y, (measured_a - true_a) / scale_a),
-        design=np.vstack([system.design, row]),
-        covariance=block_diag(system.covariance, [[(sd_a / scale_a) ** 2 + LAW_OFFSET_SD**2]]),
-    )
-
-
-def _condition(system: _System, sd: Array) -> tuple[Array, Array, float]:
-    """Mean (P,), covariance (P, P) and log evidence of x under a prior with these standard deviations (P,)."""
-    A, prior, away = system.design, np.diag(sd**2), system.y - system.design @ system.mean
-    rows = A @ prior @ A.T + system.covariance
-    gain = np.linalg.solve(rows, A @ prior).T
-    log_evidence = -0.5 * (away @ np.linalg.solve(rows, away) + np.linalg.slogdet(2.0 * np.pi * rows)[1])
-    return system.mean + gain @ away, prior - gain @ A @ prior, float(log_evidence)
+    def contradictions(self) -> list[str]:
+        """What is known and all other rows deny, whatever the sensors that are not known do."""
+        found = []
+        for row, (p, name) in enumerate(self.known, start=len(self.y) - len(self.known)):
+            mean, covariance, _ = self.condition(self.open_sd, without=row)
+            if abs(mean[p] - self.y[row]) > CONTRADICTION * np.sqrt(covariance[p, p] + self.covariance[row, row]):
+                known, rest = (
+                    f"{np.expm1(value):+z.2%}" if p < self.sensors else f"{value * self.scale_a:+.2f} A"
+                    for value in (self.y[row], mean[p])
+                )
+                found.append(f"the {name} is known as {known}, the rest makes it {rest}")
+        return found
 
 
 class _Posterior(NamedTuple):
@@ -309,15 +351,15 @@ class _Posterior(NamedTuple):
 def _posterior(system: _System) -> _Posterior:
     """Posterior over the explanations: which sensors have an offset, and of which size."""
     S = system.sensors
-    may = [s for s in range(S) if not system.read[S + s]]
+    may = [s for s in range(S) if not system.is_known(S + s)]
     found = []
     for size in range(min(len(may), MOST_OFFSETS) + 1):
         for chosen in combinations(may, size):
             for sizes in product(OFFSET_SIZES, repeat=size):
-                sd = system.sd.copy()
+                sd = system.open_sd.copy()
                 sd[[S + s for s in may]] = TRUSTED_OFFSET_SD
                 sd[[S + s for s in chosen]] = sizes
-                mean, covariance, log_weight = _condition(system, sd)
+                mean, covariance, log_weight = system.condition(sd)
                 log_weight += size * np.log(FAULT_SHARE / len(OFFSET_SIZES))
                 log_weight += (len(may) - size) * np.log(1.0 - FAULT_SHARE)
                 found.append((log_weight, chosen, mean, covariance))
@@ -354,48 +396,6 @@ def _fault_probability(mean: Array, sd: Array, prior_sd: float, sound_sd: float)
     open_, sound = variance + prior_sd**2, variance + sound_sd**2
     log_odds = 0.5 * (np.log(sound / open_) + value**2 * (1.0 / sound - 1.0 / open_))
     return np.asarray(1.0 / (1.0 + (1.0 - FAULT_SHARE) / FAULT_SHARE * np.exp(-np.minimum(log_odds, 700.0))))
-
-
-def _disagreements(readings: Sequence[tuple[Array, Array]], name: str) -> list[str]:
-    """What is known of one sensor twice, and not the same."""
-    found = []
-    for (a, a_sd), (b, b_sd) in combinations(readings, 2):
-        apart = np.abs(a - b) > CONTRADICTION * np.hypot(a_sd, b_sd)
-        texts = (
-            f"gain error of {name} is known as {a[0]:+z.2%} and as {b[0]:+z.2%}",
-            f"offset of {name} is known as {a[1]:+.2f} A and as {b[1]:+.2f} A",
-        )
-        found += [f"the {text}" for text, wrong in zip(texts, apart, strict=True) if wrong]
-    return found
-
-
-def _contradictions(system: _System, names: Sequence[str], scale_a: float) -> list[str]:
-    """Readings and loads that the rows and all other readings deny, whatever the sensors that are not known do."""
-    S, found = system.sensors, []
-    for p in np.flatnonzero(system.read).tolist():
-        sd = system.sd.copy()
-        sd[p] = OPEN_GAIN_SD if p < S else OPEN_OFFSET_SD if p < 2 * S else OPEN_LOAD_SD
-        mean, covariance, _ = _condition(system, sd)
-        if abs(mean[p] - system.mean[p]) > CONTRADICTION * np.hypot(np.sqrt(covariance[p, p]), system.sd[p]):
-            text = f"gain error of {names[p % S]} is known as {np.expm1(system.mean[p]):+z.2%}, the rest makes it "
-            text += f"{np.expm1(mean[p]):+z.2%}"
-            if p >= S:
-                known_a, rest_a = system.mean[p] * scale_a, mean[p] * scale_a
-                what = f"offset of {names[p % S]}" if p < 2 * S else "load that no branch measures"
-                text = f"{what} is known as {known_a:+.2f} A, the rest makes it {rest_a:+.2f} A"
-            found.append(f"the {text}")
-    return found
-
-
-class _Known(NamedTuple):
-    """What is known beside the recordings of N vehicles with K branches."""
-
-    read: Array
-    """Values and standard deviations of drifts [1] and offsets [A] by zero-current windows, bench and trust, shape
-    (3, 2, 2, N, K); NaN where there are none."""
-    load: UnmeasuredLoad | None
-    charge_a: Mapping[str, tuple[float, float, float]]
-    meter: str | None
 
 
 def _estimate(
@@ -438,29 +438,14 @@ def _estimate(
         If currents do not balance as those of a junction: a sign or a unit is wrong.
     """
     N, K, scale_a = len(vehicles), len(branches), layout.full_scale_a
-    places = np.tile(np.arange(K), (N, 1))  # number of the sensor of each vehicle and branch: they share all but meters
-    if known.meter is not None:
-        places[1:, branches.index(known.meter)] = K + np.arange(N - 1)
-    laws = [_law(each.summary, branches, each.vehicle, scale_a) for each in vehicles]
-    system = _system(laws, places, known.load, scale_a)
-    S, disagreements = system.sensors, list[str]()
-    names = [branches[k] if k < K else f"{known.meter} ({vehicles[k - K + 1].vehicle})" for k in range(S)]
-    for s in range(S):
-        readings = [
-            (known.read[r, 0, :, j, k], known.read[r, 1, :, j, k])
-            for j, k in np.argwhere(places == s).tolist()
-            for r in range(len(known.read))
-        ]
-        system = _with_reading(system, s, *weighted_mean(*readings), scale_a)
-        disagreements += _disagreements(readings, names[s])
-    for name, charge_a in known.charge_a.items():
-        system = _with_charge(system, branches.index(name), charge_a, scale_a)
-    contradictions = _contradictions(system, names, scale_a) + disagreements
-    scale_known, posterior = bool(system.read[:S].any()), _posterior(system)
+    system = _System(vehicles, branches, known, scale_a)
+    S, places, contradictions = system.sensors, system.places, system.contradictions()
+    scale_known, posterior = any(p < S for p, _ in system.known), _posterior(system)
     mean, sd, draws, weight = posterior.mean, posterior.sd, posterior.draws, posterior.weight
     gain_fault = _fault_probability(mean[:S], sd[:S], OPEN_GAIN_SD, TRUSTED_DRIFT_SD)
     offset_fault = _fault_probability(mean[S : 2 * S], sd[S : 2 * S], OPEN_OFFSET_SD, TRUSTED_OFFSET_SD)
-    offset_fault = np.where(system.read[S : 2 * S], offset_fault, posterior.offset_probability)
+    offset_read = [system.is_known(S + s) for s in range(S)]
+    offset_fault = np.where(offset_read, offset_fault, posterior.offset_probability)
     fault = (1.0 - (1.0 - gain_fault) * (1.0 - offset_fault))[places]
     drift, offset, gain_sd, offset_sd = np.expm1(mean[places]), mean[S + places], sd[places], sd[S + places]
     harm, harm_of_gain, confidence, points = np.zeros((N, K)), np.zeros((N, K)), np.zeros(N), []
@@ -512,11 +497,16 @@ def _estimate(
         explanations=[_explanations(each, branches, scale_a) for each in points],
         findings=findings,
     )
-    told, deciding = {"scale": scale_known, "load": known.load is not None}, list[str]()
-    for j, mine in enumerate(findings):
-        texts = _deciding(branches, gain_sd[j], offset_sd[j], offset[j] * scale_a, offset_fault[places[j]], **told)
-        deciding.append("; ".join([*(each.text for each in mine[:1]), *texts]))
-    return found, laws, deciding, contradictions
+    deciding = [
+        "; ".join(
+            [
+                *(each.text for each in mine[:1]),
+                *_deciding(branches, gain_sd[j], offset_sd[j], scale=scale_known, load=known.load is not None),
+            ]
+        )
+        for j, mine in enumerate(findings)
+    ]
+    return found, system.laws, deciding, contradictions
 
 
 def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a: float) -> list[list[SensorFinding]]:
@@ -566,17 +556,8 @@ def _explanations(points: Points, branches: Sequence[str], scale_a: float) -> li
     ]
 
 
-def _deciding(
-    branches: Sequence[str],
-    gain_sd: Array,
-    offset_sd: Array,
-    offset_a: Array,
-    probability: Array,
-    *,
-    scale: bool,
-    load: bool,
-) -> list[str]:
-    """What is not known of the sensors, and what would tell; by the probabilities of offsets, and what is known."""
+def _deciding(branches: Sequence[str], gain_sd: Array, offset_sd: Array, *, scale: bool, load: bool) -> list[str]:
+    """What is not known of the sensors, and what would tell; by what is known."""
     if not scale:
         return [
             f"only ratios of gains are known: name a sensor that you trust (--trusted {branches[0]}), or give bench "
@@ -587,14 +568,7 @@ def _deciding(
     texts = []
     if gains := [name for name, sd in zip(branches, gain_sd, strict=True) if sd > KNOWN_GAIN_SD]:
         texts.append(f"the gain of {', '.join(gains)} needs a drive in which that current varies more")
-    unclear = [k for k, p in enumerate(probability) if load and UNCLEAR[0] < p < UNCLEAR[1]]
-    if len(unclear) > 1:
-        whose = " or ".join(branches[k] for k in unclear)
-        texts.append(
-            f"an offset of {offset_a[unclear].sum():+.1f} A is of {whose}: a zero-current window (contactors open), or "
-            f"a bench reading of one of them, would decide"
-        )
-    elif offsets := [name for name, sd in zip(branches, offset_sd, strict=True) if sd > KNOWN_OFFSET_SD]:
+    if offsets := [name for name, sd in zip(branches, offset_sd, strict=True) if sd > KNOWN_OFFSET_SD]:
         more = "" if load else ", or the load that no branch measures (--load)"
         whose = ", ".join(offsets)
         texts.append(f"the offset of {whose} needs a zero-current window (contactors open), a bench reading{more}")
@@ -704,27 +678,26 @@ def _read(
         equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False)
         found = read_vehicles(read_junction, fleet, equipment, database, workers=workers, limit_s=limit_s)
         return equipment, *found, []
-    drives, vehicles, left_out = dict[str, Sequence[Drive]](), list[VehicleSummary](), dict(fleet.left_out)
-    error: UserError | None = None
-    with progress_bar("read drives", len(fleet.vehicles), "vehicles") as progress:
-        for number, (vehicle, entries) in enumerate(fleet.vehicles.items(), start=1):
+    left_out = dict(fleet.left_out)
+
+    def usable(make: Callable[[Any], _Made], items: Iterable[tuple[str, Any]]) -> dict[str, _Made]:
+        """What can be made of some vehicles; why it cannot of the others goes to those left out."""
+        found = dict[str, _Made]()
+        for vehicle, item in items:
             try:
-                drives[vehicle] = [load_drive(entry, database) for entry in entries]
+                found[vehicle] = make(item)
             except UserError as problem:
-                error, left_out[vehicle] = problem, str(problem)
-            progress(number)
-    if error and not drives:
-        raise error
+                left_out[vehicle] = str(problem)
+        if not found:
+            raise FleetError(list(left_out.values())[-1])
+        return found
+
+    entries = shown(fleet.vehicles.items(), "read drives", len(fleet.vehicles), "vehicles")
+    drives = usable(lambda mine: [load_drive(entry, database) for entry in mine], entries)
     first = [mine[0] for mine in drives.values()]
     equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False, drives=first)
-    for vehicle, mine in drives.items():
-        try:
-            vehicles.append(summarise_junction(mine, equipment.branches, database))
-        except DriveError as problem:
-            error, left_out[vehicle] = problem, str(problem)
-    if error and not vehicles:
-        raise error
-    return equipment, vehicles, left_out, list(drives.values())
+    vehicles = usable(lambda mine: summarise_junction(mine, equipment.branches, database), drives.items())
+    return equipment, list(vehicles.values()), left_out, list(drives.values())
 
 
 def _known_readings(

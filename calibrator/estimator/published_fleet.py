@@ -27,11 +27,10 @@ from calibrator.published.recovery import Recovery, calibrate_published
 from calibrator.published.state_space import VehicleModel, identify_vehicle
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.terminal.progress import progress_bar
-from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParameters, Verdict
 
-__all__ = ["calibrate_fleet_published", "few_vehicles_notice", "read_vehicle_model"]
+__all__ = ["calibrate_fleet_published", "read_vehicle_model"]
 
 MISFIT = 5.0
 """Simulation error over the fleet's median from which on a model is not one of the fleet. [1]"""
@@ -90,7 +89,8 @@ def calibrate_fleet_published(
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
     learners = list(compress(vehicles, learning))
-    unity, truth = _unity_vehicle(learners, settings.unity), settings.truth
+    # the vehicle whose held-out inputs are the unity drive has the longest
+    unity, truth = max(learners, key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in), settings.truth
     if truth is not None and tuple(truth.branches) != branches:
         raise FleetError(f"the truth is of branches {truth.branches}, the fleet has {branches}")
     with progress_bar("estimate the faults", None):
@@ -117,19 +117,14 @@ def calibrate_fleet_published(
         "unity_duration_s": layout.period_s * (len(unity.held_out_inputs) - unity.lead_in),
         "simulation_snr_db": by_branch(branches, np.nanmedian([vehicle.snr_db for vehicle in vehicles], axis=0)),
     }
-    notices = () if settings.symmetric else few_vehicles_notice(len(learners))
+    notices: tuple[str, ...] = ()
+    if len(learners) < LEAST_VEHICLES and not settings.symmetric:
+        notices = (
+            f"{len(learners)} vehicles are few for the published method, which takes the mean of the fleet for the "
+            f"truth: with faults of 5 to 25 % in one of five parameters it is off by about "
+            f"{SLOPE_SPREAD / len(learners) ** 0.5:.0%}; give it {LEAST_VEHICLES} or more, or leave --method out",
+        )
     return equipment, encode_chunk(parameters, left_out), details, notices
-
-
-def few_vehicles_notice(learning: int) -> tuple[str, ...]:
-    """Say so if the mean of the fleet (3) is of so few vehicles that it is hardly a reference: at most one notice."""
-    if learning >= LEAST_VEHICLES:
-        return ()
-    return (
-        f"{learning} vehicles are few for the published method, which takes the mean of the fleet for the truth: with "
-        f"faults of 5 to 25 % in one of five parameters it is off by about {SLOPE_SPREAD / learning**0.5:.0%}; give it "
-        f"{LEAST_VEHICLES} or more, or leave --method out",
-    )
 
 
 def _without_misfits(
@@ -153,17 +148,6 @@ def _without_misfits(
 def _median_error_a(vehicles: Sequence[VehicleModel]) -> Array:
     """Median over vehicles of each branch's simulation error on held-out data, shape (K,). [A]"""
     return np.asarray(np.median([vehicle.simulation_error_a for vehicle in vehicles], axis=0))
-
-
-def _unity_vehicle(vehicles: Sequence[VehicleModel], wanted: str | None) -> VehicleModel:
-    """The vehicle whose held-out inputs become the unity drive: the one asked for, or the one with the longest."""
-    if wanted is None:
-        return max(vehicles, key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in)
-    for vehicle in vehicles:
-        if vehicle.vehicle == wanted:
-            return vehicle
-    there = few([vehicle.vehicle for vehicle in vehicles])
-    raise FleetError(f"no usable vehicle {wanted!r} to take the unity drive from; there are {there}")
 
 
 def _parameters(

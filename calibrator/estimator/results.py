@@ -4,17 +4,10 @@
 without branch for each vehicle that was left out. ``parameters/NNNNN.parquet`` has the same rows by bucket of the
 vehicle, and in the first of each vehicle the text of its parameter file; for up to :data:`MOST_FILES` vehicles each is
 also a file ``params/VEHICLE.json``, as a folder of a million files is of no use.
-
-While it is made, the folder stands in a hidden one beside it, ``.RESULT.unfinished/`` (:class:`Unfinished`), from which
-a run that was killed goes on.
 """
 
-import fcntl
 import io
-import os
-import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -28,14 +21,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Mask
-from calibrator.errors import INTERNAL_ERROR, FleetError
+from calibrator.errors import FleetError
 from calibrator.files.parameter_files import held_back_lines
-from calibrator.files.storage import DISK_FULL
 from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 from ecu_node.documents import write_atomically
 from ecu_node.errors import ParameterError
-from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters, encode_parameters
 
 __all__ = [
@@ -44,12 +35,9 @@ __all__ = [
     "SCHEMA",
     "CalibrationReport",
     "RunRecord",
-    "Unfinished",
     "WrittenVehicle",
-    "copy_summaries",
     "deployed_rms_a",
     "encode_chunk",
-    "internal_errors",
     "join_rows",
     "left_out_of",
     "part_file",
@@ -57,7 +45,6 @@ __all__ = [
     "read_results",
     "read_run",
     "report_of",
-    "unfinished_run",
     "write_parameter_files",
     "write_run",
     "written_of",
@@ -345,12 +332,6 @@ def left_out_of(result: Path) -> dict[str, str]:
     return {row["vehicle"]: row["reason"] for row in found.filter(pc.field("branch").is_null()).to_pylist()}
 
 
-def internal_errors(result: Path) -> dict[str, str]:
-    """Vehicles of a result that errors of the program itself left out, and which errors."""
-    found = left_out_of(result).items()
-    return {name: why.removeprefix(INTERNAL_ERROR) for name, why in found if why.startswith(INTERNAL_ERROR)}
-
-
 def read_results(result: Path) -> Rows:
     """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
     path = result / ROWS
@@ -528,156 +509,3 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
 def _counts(column: "pd.Series[str]") -> dict[str, int]:
     """How often each text stands there, in the order in which they come."""
     return {str(text): len(rows) for text, rows in column.groupby(column, sort=False)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Unfinished:
-    """The hidden folder of a run that is not finished.
-
-    It holds the summaries of drives read so far, a plan (a digest of all that decides what is computed), and the result
-    as far as it is there. Parts of it count only for their plan: with other settings or summaries they are made anew.
-
-    Attributes
-    ----------
-    folder : Path
-        Where it is.
-    out : Path
-        Where the result will be.
-    shown : Path
-        The same, as the user named it.
-    """
-
-    folder: Path
-    out: Path
-    shown: Path
-
-    @property
-    def summaries(self) -> Path:
-        """Store of the summaries of drives that this run reads itself."""
-        return self.folder / "summaries"
-
-    @property
-    def result(self) -> Path:
-        """Folder of the result."""
-        return self.folder / "result"
-
-    @property
-    def _since(self) -> Path:
-        """Which earlier result's summaries were copied; comes with them, and is not copied on."""
-        return self.summaries / ".since"
-
-    def put(self, number: int, part: bytes) -> None:
-        """Keep the vehicles of a bucket."""
-        write_atomically(part_file(self.result, number), part)
-
-    def done(self) -> list[int]:
-        """Numbers of the parts that are there."""
-        return [int(path.stem) for path in _parts(self.result)]
-
-    def begin(self, plan: str | None, created: str) -> str:
-        """Keep the parts that are there if they were computed by the same plan, else remove them.
-
-        ``plan`` is a digest of what the run computes and from what, None to begin anew; ``created`` the time of this
-        run. Returned is the time of the first run of this plan.
-        """
-        path = self.folder / "plan"
-        before, _, noted = path.read_text().partition("\n") if path.exists() else ("", "", "")
-        if plan is not None and before == plan:
-            return noted
-        path.unlink(missing_ok=True)  # first, so that no other plan is ever taken for that of the parts
-        shutil.rmtree(self.result, ignore_errors=True)
-        (self.result / PARTS).mkdir(parents=True)
-        write_atomically(path, f"{plan or ''}\n{created}".encode())
-        return created
-
-    def summaries_since(self, earlier: Path | None) -> None:
-        """Begin the store of summaries with those of an earlier result, unless this was done before, or with none."""
-        mark = "" if earlier is None else f"{earlier.absolute()} {file_digest(earlier / 'run.json')}"
-        if (self._since.read_text() if self._since.exists() else "") == mark:
-            return
-        shutil.rmtree(self.summaries, ignore_errors=True)
-        if earlier is not None:
-            copy = self.folder / "summaries.copy"
-            copy_summaries(earlier / "summaries", copy)
-            (copy / self._since.name).write_text(mark)
-            copy.rename(self.summaries)
-
-    def worth_keeping(self) -> bool:
-        """Whether anything was computed: a part, or summaries of drives besides those of an earlier result."""
-        copied = self._since.stat().st_mtime_ns if self._since.exists() else 0
-        buckets = self.summaries.glob("buckets/[0-9]*.parquet")
-        return bool(self.done()) or any(path.stat().st_mtime_ns >= copied for path in buckets)
-
-    def finish(self) -> None:
-        """Put the result where it belongs, and remove the rest."""
-        try:
-            if self.out.exists():
-                self.out.rmdir()
-            self.result.rename(self.out)
-        except OSError as error:
-            why = f"cannot be replaced: {error.strerror}; what was made stands in {self.result}"
-            raise FleetError(f"{self.out}: {why}") from None
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def copy_summaries(store: Path, copy: Path) -> None:
-    """Copy a store of summaries without its hidden files, over what a killed run has left."""
-    shutil.rmtree(copy, ignore_errors=True)
-    shutil.copytree(store, copy, ignore=shutil.ignore_patterns(".*"))
-
-
-@contextmanager
-def unfinished_run(out: Path) -> Iterator[Unfinished]:
-    """Open the folder of a run; it is made if there is none, and removed if nothing worth keeping is in it.
-
-    Parameters
-    ----------
-    out : Path
-        New or empty folder of the result.
-
-    Yields
-    ------
-    Unfinished
-        Locked against a second run to the same place.
-
-    Raises
-    ------
-    FleetError
-        If another run writes there, the folder cannot be made, or the disk is full.
-    """
-    shown, out = out, out.absolute()
-    folder = out.with_name(f".{out.name}.unfinished")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise FleetError(f"{out}: cannot be made: {error.strerror}; choose another folder") from None
-    try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            why = "another run is writing this result; wait for it or choose another --out"
-            raise FleetError(f"{out}: {why}") from None
-        unfinished = Unfinished(folder=folder, out=out, shown=shown)
-        try:
-            yield unfinished
-        except OSError as error:
-            raise _full_disk(error, folder) or error from None
-        finally:
-            if not unfinished.worth_keeping():
-                shutil.rmtree(folder, ignore_errors=True)
-    finally:
-        os.close(lock)
-
-
-def _full_disk(error: OSError, folder: Path) -> FleetError | None:
-    """What to say of a disk without room; libraries leave out the name of the file. None: it is another error."""
-    where, reason = error.filename or folder, os.strerror(error.errno or 0)
-    if isinstance(error, shutil.Error):  # of a folder that was copied: the first of its files that was not
-        (_, where, reason), *_ = error.args[0]
-    elif error.errno not in DISK_FULL:
-        return None
-    return FleetError(
-        f"{where}: cannot write it: {reason}; make room, and run the same command again to go on, or choose another "
-        f"--out"
-    )

@@ -1,22 +1,20 @@
 """One run of a calibration: from drives, or a store of their summaries, to a result folder.
 
-The first pass learns the reference of the fleet from a fixed sample of the vehicles; the second estimates every vehicle
-by itself, bucket by bucket of the store. Buckets that are done are kept: a run that was killed goes on from there. With
-an earlier result (``since``), vehicles that have not driven since keep its parameters; of the others a sensor that has
-moved is calibrated from the new drives alone.
+Drives are summarised first, into a store that goes when the run ends. The first pass over a store learns the
+reference of the fleet from a fixed sample of the vehicles; the second estimates every vehicle by itself, bucket by
+bucket. With an earlier result (``since``), vehicles that have not driven since keep its parameters; of the others a
+sensor that has moved is calibrated from the new drives alone.
 
 Faults of the program in single vehicles (:mod:`calibrator.estimator.fleet_task`) end the command with exit code 70.
 """
 
-import hashlib
-import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
-import msgspec
 from threadpoolctl import threadpool_limits
 
 from calibrator.drive import Equipment, FleetSource
@@ -29,24 +27,22 @@ from calibrator.estimator.results import (
     PARTS,
     CalibrationReport,
     RunRecord,
-    Unfinished,
-    copy_summaries,
     join_rows,
     left_out_of,
+    part_file,
     read_run,
     report_of,
-    unfinished_run,
     write_parameter_files,
     write_run,
 )
 from calibrator.estimator.settings import CalibrationSettings, require_learning
-from calibrator.files.folders import require_new_folder
+from calibrator.files.folders import require_new_folder, whole_folder
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import Storage, open_storage
 from calibrator.options import Method
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.sources.fleet_source import LOGS_FOLDER, find_fleet, probe_equipment
-from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity
+from calibrator.summaries.identity import StoreIdentity, read_identity
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore, open_store
 from calibrator.summaries.summarise_fleet import add_drives
@@ -54,9 +50,9 @@ from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.terminal.progress import numbered_passes, progress_bar
 from calibrator.terminal.text import few, few_reasons
 from calibrator.time_of_run import time_of_run
-from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
-from ecu_node.layout import Layout, file_digest
+from ecu_node.documents import write_atomically
+from ecu_node.layout import Layout
 
 __all__ = ["Census", "calibrate_fleet", "read_sample", "require_fleet", "take_census"]
 
@@ -94,8 +90,8 @@ def calibrate_fleet(
     workers : Workers
         Where it is computed.
     since : Path or None
-        Earlier result to go on from: vehicles without new drives keep its parameters. A store must hold the earlier
-        drives as well; of a folder of drives, those that the earlier result has are not read again.
+        Earlier result to go on from: vehicles without new drives keep its parameters. The fleet is then a store of
+        summaries that holds the earlier drives as well.
 
     Returns
     -------
@@ -115,19 +111,44 @@ def calibrate_fleet(
     calibrate: Calibrate | None = None
     if identity is not None:
         _require_summaries_enough(storage, settings)
+        name, fleet_ids = identity.fleet, list(identity.fleet_ids)
+    elif since is not None:
+        raise FleetError(
+            f"{place}: drives, and --since goes on with summaries; add the new drives to the store that {since} was "
+            f"made from, with 'calibrator summarise', and give that store"
+        )
     else:
         fleet = find_fleet(storage.url)
-        calibrate = _at_once(fleet, settings, database.layout, since)
+        name, fleet_ids = fleet.name, sorted(fleet.fleet_ids)
+        calibrate = _at_once(fleet, settings, database.layout)
         passes = 5 if calibrate is None else 3 if settings.method is Method.PUBLISHED else 2
-        if since is None and (calibrate is None or settings.method is Method.PUBLISHED):
-            _require_named(settings, set(fleet.vehicles), fleet.left_out, str(fleet.place))
+        if calibrate is None or settings.method is Method.PUBLISHED:
+            _require_named(settings, set(fleet.vehicles), fleet.left_out, f"fleet {name}")
             require_learning(list(fleet.vehicles), settings, fleet.left_out)
-    with unfinished_run(out) as unfinished, numbered_passes(passes):
-        run = _Run(unfinished=unfinished, database=database, settings=settings, workers=workers, since=since)
+    run_identity = RunIdentity(database=database, method=settings.method, fleet=name, created=time_of_run())
+    with whole_folder(out) as result, TemporaryDirectory(dir=result) as summaries, numbered_passes(passes):
+        (result / PARTS).mkdir()
+        run = _Run(
+            result=result,
+            shown=out,
+            identity=run_identity,
+            fleet_ids=fleet_ids,
+            settings=settings,
+            workers=workers,
+        )
         if identity is not None:
-            return run.summaries(SummaryStore(storage=storage, identity=identity), identity, {})
+            return run.summaries(SummaryStore(storage=storage, identity=identity), {}, since)
         assert fleet is not None
-        return run.drives(fleet) if calibrate is None else run.at_once(fleet, calibrate)
+        if calibrate is not None:
+            equipment, part, details, notices = calibrate(fleet, run_identity, settings, workers=workers)
+            write_atomically(part_file(result, 0), part)
+            return run.finished(equipment, {}, details=details, notices=notices)
+        found = probe_equipment(fleet, database, settings.branches, limit_s=settings.time_limit_s)
+        store = open_store(open_storage(summaries), found, database, fleet)
+        # a slip in the table is reported before the drives are read
+        run.check(run.bench_table(store), fleet.vehicles, fleet.left_out)
+        add_drives(store, fleet, database, workers=workers, time_limit_s=settings.time_limit_s)
+        return run.summaries(store, fleet.left_out, None)
 
 
 def require_fleet(storage: Storage, place: str | Path, database: VehicleDatabase) -> StoreIdentity | None:
@@ -153,11 +174,10 @@ def _require_summaries_enough(storage: Storage, settings: CalibrationSettings) -
         raise FleetError(f"{storage.url}: a store of summaries, and {option} needs the drives; give the drive store")
 
 
-def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout, since: Path | None) -> Calibrate | None:
+def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) -> Calibrate | None:
     """What calibrates a whole fleet in one piece: the published method, or one junction after the other; None: neither.
 
-    Each vehicle is calibrated by itself if there is but one, or what is known is of branches. With an earlier result of
-    a fleet, one vehicle may be the only one that has driven since.
+    Each vehicle is calibrated by itself if there is but one, or what is known is of branches.
     """
     if settings.method is Method.PUBLISHED:
         from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second)
@@ -166,13 +186,9 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout, 
     of_branches = bool(settings.trusted) and not settings.trusted & fleet.vehicles.keys()
     of_branches = of_branches and settings.trusted <= set(layout.branch_names)
     alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
-    if not (alone or of_branches or (len(fleet.vehicles) == 1 and since is None)):
+    if not (alone or of_branches or len(fleet.vehicles) == 1):
         return None
-    fleets = {
-        "--hold-out": settings.hold_out,
-        "--expected-faults": settings.expected_faults is not None,
-        "--since": since is not None,
-    }
+    fleets = {"--hold-out": settings.hold_out, "--expected-faults": settings.expected_faults is not None}
     for option in (option for option, given in fleets.items() if given):
         raise ContradictionError(f"{option} is for a fleet that is compared with itself, not for single junctions")
     from calibrator.estimator.junction import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
@@ -274,152 +290,100 @@ def read_sample(
 
 @dataclass(frozen=True, kw_only=True)
 class _Run:
-    """One run: where it keeps what is done, and how it computes."""
+    """One run: of which fleet, how and where it is computed, and the folder of its result."""
 
-    unfinished: Unfinished
-    database: VehicleDatabase
+    result: Path
+    shown: Path
+    identity: RunIdentity
+    fleet_ids: list[str]
     settings: CalibrationSettings
     workers: Workers
-    since: Path | None
 
-    def at_once(self, fleet: FleetSource, calibrate: Calibrate) -> CalibrationReport:
-        """Calibrate all vehicles in one piece, which is the only part of the result."""
-        identity = self._identity(fleet.name, None)
-        equipment, part, details, notices = calibrate(fleet, identity, self.settings, workers=self.workers)
-        self.unfinished.put(0, part)
-        return self._result(self._about(fleet, equipment), identity, {}, details=details, notices=notices)
+    def bench_table(self, store: SummaryStore) -> BenchTable:
+        """Bench readings, if there are any."""
+        given, scale_a = self.settings.readings, self.identity.database.layout.full_scale_a
+        return {} if given is None else read_bench_table(given, store.identity.branches, full_scale_a=scale_a)
 
-    def drives(self, fleet: FleetSource) -> CalibrationReport:
-        """Summarise drives, and calibrate from the summaries."""
-        store, limit_s, everyone = self._own_store(fleet), self.settings.time_limit_s, self.since is None
-        if everyone:  # a slip in the table is reported before the drives are read
-            self._check(self._bench_table(store), fleet.vehicles, fleet.left_out)
-        add_drives(store, fleet, self.database, workers=self.workers, time_limit_s=limit_s, exactly=everyone)
-        return self.summaries(store, self._about(fleet, store.identity.equipment), fleet.left_out)
+    def check(self, bench: BenchTable, vehicles: Collection[str], left_out: Mapping[str, str]) -> None:
+        """Refuse bench readings of vehicles that there are not, or against the trust in one."""
+        scale_a = self.identity.database.layout.full_scale_a
+        check_bench_table(bench, vehicles, left_out=left_out, trusted=self.settings.trusted, full_scale_a=scale_a)
 
-    def _own_store(self, fleet: FleetSource) -> SummaryStore:
-        """Store of the summaries read so far; one that was begun with other branches or another layout is made anew."""
-        folder, since = self.unfinished.summaries, self.since
-        if since is not None and not (since / folder.name).is_dir():
-            read_run(since)
-            raise FleetError(
-                f"{since}: holds no summaries; add the new drives to the store it was made from, with 'calibrator "
-                f"summarise', and give that store"
-            )
-        self.unfinished.summaries_since(since)
-        storage = open_storage(folder)
+    def summaries(self, store: SummaryStore, others: Mapping[str, str], since: Path | None) -> CalibrationReport:
+        """Calibrate every vehicle of a store; ``others`` are not in it, and why."""
+        previous = None if since is None else since.absolute()
         if since is not None:
-            identity = read_identity(storage, self.database)
-            assert identity is not None
-            return SummaryStore(storage=storage, identity=identity)
-        equipment = probe_equipment(fleet, self.database, self.settings.branches, limit_s=self.settings.time_limit_s)
-        try:
-            return open_store(storage, equipment, self.database, fleet)
-        except FleetError:
-            shutil.rmtree(folder, ignore_errors=True)
-            return open_store(storage, equipment, self.database, fleet)
-
-    def _about(self, fleet: FleetSource, equipment: Equipment) -> StoreIdentity:
-        """What a result says of a fleet of drives."""
-        name, vehicles = fleet.name, len(fleet.vehicles)
-        about = store_identity(equipment, self.database, vehicles=vehicles, fleet=name, fleet_ids=fleet.fleet_ids)
-        return msgspec.structs.replace(about, notices=equipment.notices)
-
-    def summaries(self, store: SummaryStore, about: StoreIdentity, left_out: Mapping[str, str]) -> CalibrationReport:
-        """Calibrate every vehicle of a store; summaries that were read by this run become part of its result."""
-        previous = None if self.since is None else self.since.absolute()
-        if self.since is not None:
-            _require_previous(self.since, self.database, store.identity)
-        versions = store.versions()
-        identity = self._identity(about.fleet, self._plan(store, versions, previous))
-        bench = self._bench_table(store)
+            _require_previous(since, self.identity.database, store.identity)
+        versions, settings, bench = store.versions(), self.settings, self.bench_table(store)
         checked = {vehicle for vehicle, _ in bench}
-        census = take_census(store, self.workers, self.settings.hold_out | self.settings.trusted | checked)
-        _require_named(self.settings, census.named, census.reasons, f"fleet {about.fleet}")
-        self._check(bench, census.named, census.reasons)
+        census = take_census(store, self.workers, settings.hold_out | settings.trusted | checked)
+        _require_named(settings, census.named, census.reasons, f"fleet {self.identity.fleet}")
+        self.check(bench, census.named, census.reasons)
         with progress_bar("learn the fleet", None), threadpool_limits(1):  # one: the reference is the same anywhere
-            sample = read_sample(store, census, self.settings, checked)
             task, notices = learn_task(
-                sample, self.settings, bench, branches=about.branches, identity=identity, fleet_size=census.size
+                read_sample(store, census, settings, checked),
+                settings,
+                bench,
+                branches=store.identity.branches,
+                identity=self.identity,
+                fleet_size=census.size,
             )
-        done = self.unfinished.done()
-        todo = [bucket for bucket in census.usable if bucket not in done]
-        calibrate = partial(calibrate_bucket, store=store, task=task, previous=previous)
-        seen = census.size - sum(census.usable[bucket] for bucket in todo)
-        with progress_bar("calibrate", census.size, "vehicles", begun=seen) as progress:
-            progress(seen)
-            for bucket, part in zip(todo, run_many(calibrate, todo, self.workers), strict=True):
-                self.unfinished.put(bucket, part)
+        calibrate, seen = partial(calibrate_bucket, store=store, task=task, previous=previous), 0
+        with progress_bar("calibrate", census.size, "vehicles") as progress:
+            found = run_many(calibrate, list(census.usable), self.workers)
+            for bucket, part in zip(census.usable, found, strict=True):
+                write_atomically(part_file(self.result, bucket), part)
                 seen += census.usable[bucket]
                 progress(seen)
         if store.versions() != versions:
             raise FleetError(f"{store.url}: the summaries were changed during the run; run the same command again")
-        return self._result(about, identity, left_out, details=task.reference.details(), notices=notices, store=store)
+        return self.finished(
+            store.identity.equipment,
+            others,
+            details=task.reference.details(),
+            notices=notices,
+            buckets=store.identity.buckets,
+        )
 
-    def _plan(self, store: SummaryStore, versions: Mapping[str, str], previous: Path | None) -> str:
-        """Digest of all that decides what is computed; the store's identity holds the digests of layout and DBC."""
-        earlier = None if previous is None else (str(previous), file_digest(previous / "run.json"))
-        decides = (__version__, store.identity, versions, self.settings.record(), earlier)
-        return hashlib.blake2b(msgspec.json.encode(decides, order="sorted"), digest_size=16).hexdigest()
-
-    def _identity(self, fleet: str, plan: str | None) -> RunIdentity:
-        created = self.unfinished.begin(plan, time_of_run())
-        return RunIdentity(database=self.database, method=self.settings.method, fleet=fleet, created=created)
-
-    def _bench_table(self, store: SummaryStore) -> BenchTable:
-        given, scale_a = self.settings.readings, self.database.layout.full_scale_a
-        return {} if given is None else read_bench_table(given, store.identity.branches, full_scale_a=scale_a)
-
-    def _check(self, bench: BenchTable, vehicles: Collection[str], left_out: Mapping[str, str]) -> None:
-        """Refuse bench readings of vehicles that there are not, or against the trust in one."""
-        scale_a = self.database.layout.full_scale_a
-        check_bench_table(bench, vehicles, left_out=left_out, trusted=self.settings.trusted, full_scale_a=scale_a)
-
-    def _result(
+    def finished(
         self,
-        about: StoreIdentity,
-        identity: RunIdentity,
+        equipment: Equipment,
         others: Mapping[str, str],
         *,
         details: Mapping[str, object],
         notices: Sequence[str],
-        store: SummaryStore | None = None,
+        buckets: int = 0,
     ) -> CalibrationReport:
         """Put the parts together to the result; ``others`` are in none of them."""
-        unfinished, layout = self.unfinished, self.database.layout
-        folder = unfinished.result
+        identity, layout, folder = self.identity, self.identity.database.layout, self.result
         vehicles, left_out = join_rows(folder, others), left_out_of(folder)
         if not vehicles:
             why = next(iter(left_out.values()), "there is none")
-            raise FleetError(f"{about.fleet}: no vehicle can be calibrated; the first: {why}")
+            raise FleetError(f"{identity.fleet}: no vehicle can be calibrated; the first: {why}")
         with progress_bar("write the result", None):
             where = write_parameter_files(folder, vehicles=vehicles)
-        if unfinished.summaries.exists():
-            copy_summaries(unfinished.summaries, folder / unfinished.summaries.name)
         run = RunRecord(
             tool=identity.tool,
             method=identity.method.value,
-            fleet=about.fleet,
-            fleet_ids=list(about.fleet_ids),
+            fleet=identity.fleet,
+            fleet_ids=self.fleet_ids,
             layout=layout.name,
-            branches=list(about.branches),
-            model_inputs=list(about.inputs),
+            branches=list(equipment.branches),
+            model_inputs=list(equipment.inputs),
             settings=self.settings.record(),
             created=identity.created,
             details=dict(details),
             vehicles=vehicles,
-            buckets=0 if store is None else store.identity.buckets,
+            buckets=buckets,
             left_out=dict(list(left_out.items())[:MOST_NAMED]),
             left_out_count=len(left_out),
             full_scale_a=layout.full_scale_a,
             layout_sha256=layout.digest,
-            dbc_sha256=self.database.digest,
-            notices=[*about.notices, *notices],
+            dbc_sha256=identity.database.digest,
+            notices=[*equipment.notices, *notices],
         )
         write_run(folder, run)
-        report = report_of(folder, run, parameters=where, shown=unfinished.shown)
-        unfinished.finish()
-        return report
+        return report_of(folder, run, parameters=where, shown=self.shown)
 
 
 def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:

@@ -61,8 +61,6 @@ class CalibrationSettings:
         Of the same: range of drifts [1] and of offsets in fractions of full scale.
     symmetric : bool
         Whether the fleet is symmetric as in the paper, so that its mean has no error of its own.
-    unity : str or None
-        Vehicle whose held-out inputs are the unity drive; None: the one with the longest.
     seed : int
         Seed of the training fleet.
     time_limit_s : float
@@ -90,7 +88,6 @@ class CalibrationSettings:
     sparsity: float = 80.0
     magnitude: tuple[float, float] = (0.05, 0.25)
     symmetric: bool = False
-    unity: str | None = None
     seed: int = 0
     time_limit_s: float = TIME_LIMIT_S
 
@@ -104,7 +101,7 @@ class CalibrationSettings:
         """What the method in use heeds, for the record of a run."""
         found: dict[str, Any] = {"branches": self.branches, "hold_out": sorted(self.hold_out)}
         if self.method is Method.PUBLISHED:
-            names = ("classifier", "sparsity", "magnitude", "symmetric", "unity", "seed")
+            names = ("classifier", "sparsity", "magnitude", "symmetric", "seed")
             return found | {name: getattr(self, name) for name in names}
         return found | {
             "harm_limit": self.harm_limit,

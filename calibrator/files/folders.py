@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from calibrator.errors import FleetError
+from calibrator.files.storage import DISK_FULL
 from ecu_node.errors import UserError
 
 __all__ = ["require_new_folder", "require_possible_file", "require_possible_folder", "whole_folder", "write_files"]
@@ -84,7 +85,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
     Raises
     ------
     FleetError
-        If the folder is not empty or cannot be made.
+        If the folder is not empty or cannot be made, or the disk is full.
     """
     require_new_folder(out)
     out, partial = out.absolute(), _partial(out)
@@ -98,8 +99,11 @@ def whole_folder(out: Path) -> Iterator[Path]:
         raise FleetError(f"{out}: cannot be made: {error.strerror}; choose another folder") from None
     try:
         yield partial
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno in DISK_FULL:  # libraries leave out the name of the file
+            where, reason = error.filename or out, os.strerror(error.errno)
+            raise FleetError(f"{where}: cannot write it: {reason}; make room, or choose another --out") from None
         raise
     try:
         if out.exists():

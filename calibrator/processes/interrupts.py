@@ -20,7 +20,7 @@ TERMINATED = 143
 """Exit code that shells give to a program ended by SIGTERM."""
 SHOW_CURSOR = "\x1b[?25h"
 """A bar hides the cursor of a terminal."""
-GO_ON = ("import", "summarise", "calibrate")
+GO_ON = ("import", "summarise")
 """Commands that go on where they were."""
 KEEP_NOTHING = ("experiment", "kirchhoff", "replay")
 """Commands of which nothing is left but what they have printed, sent, or written as a whole."""
@@ -40,7 +40,7 @@ def _afterwards(arguments: Sequence[str]) -> str:
     command = next((argument for argument in arguments if not argument.startswith("-")), "")
     if command in KEEP_NOTHING:
         return "nothing is kept of what was under way"
-    return f"run the same command again{'; it goes on with what it had read or computed' if command in GO_ON else ''}"
+    return f"run the same command again{'; it goes on with what it had read' if command in GO_ON else ''}"
 
 
 def ending_at_sigterm() -> None:

@@ -425,7 +425,7 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
 def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
     from distributed import Client  # noqa: PLC0415
 
-    again = "; the same command, run again, goes on where it stopped"
+    again = ", and run the same command again"
     try:
         client = Client(address, timeout=patience_s, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -13,7 +13,6 @@ gone. A bank without poles has nothing to settle: its columns are the plain inpu
 """
 
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -24,7 +23,7 @@ from calibrator.compiled import compiled
 from calibrator.drive import Array, Complex, Mask
 from calibrator.errors import DriveError
 
-__all__ = ["FilterBank", "low_pass_bank", "low_passes", "plain_bank", "read_bank"]
+__all__ = ["FilterBank", "low_passes", "plain_bank", "read_bank"]
 
 LONGEST_HOLD_S = 1.0
 """Time that an input may keep its last valid value: currents of a drive seldom change more within. [s]"""
@@ -168,12 +167,6 @@ def low_passes(time_constants_s: Array, *, period_s: float) -> Poles:
         As :class:`FilterBank` has them.
     """
     return tuple((float(pole), 0.0) for pole in np.exp(-period_s / np.asarray(time_constants_s)))
-
-
-def low_pass_bank(input_names: tuple[str, ...], time_constants_s: Sequence[float], *, period_s: float) -> FilterBank:
-    """Bank of the inputs and of first-order low-passes of each, by their time constants. [s]"""
-    poles = low_passes(np.array(time_constants_s), period_s=period_s)
-    return FilterBank(input_names=input_names, period_s=period_s, poles=poles)
 
 
 def read_bank(path: Path) -> FilterBank:

@@ -133,7 +133,6 @@ def add_drives(
     *,
     workers: Workers,
     time_limit_s: float = TIME_LIMIT_S,
-    exactly: bool = False,
 ) -> SummariseReport:
     """Summarise the drives of a fleet that a store does not have yet.
 
@@ -147,20 +146,15 @@ def add_drives(
         Where the drives are read.
     time_limit_s : float
         Longest time for the drives of one vehicle. [s]
-    exactly : bool
-        Whether the store is to hold these drives alone: what it has of others is removed.
 
     Returns
     -------
     SummariseReport
         What was read. A vehicle whose drives cannot be used has a record that says why.
     """
-    if exactly:
-        for bucket in store.buckets():
-            store.change(bucket, partial(_without_others, fleet=fleet))
     report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
     read = partial(_read_record, store=store.identity, database=database)
-    tasks = _tasks(store, fleet, owners, retry=not exactly)
+    tasks = _tasks(store, fleet, owners)
     outcomes = try_many_shown(
         read,
         tasks,
@@ -228,7 +222,7 @@ def _key(digest: str) -> int:
     return int(digest[:16], 16)
 
 
-def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners, *, retry: bool) -> Iterator[_Task]:
+def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator[_Task]:
     """Drives to read, bucket by bucket; owners are told of those that the store has."""
     size = 0
     for bucket, names in store.by_bucket(fleet.vehicles).items():
@@ -236,7 +230,7 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners, *, retry: b
         for name in names:
             drives = fleet.vehicles[name]
             versions = {drive.name: drive.version for drive in drives}
-            kept = [k for k in records.get(name, ()) if _stays(k, versions) and not _is_tried_again(k, retry=retry)]
+            kept = [k for k in records.get(name, ()) if _stays(k, versions) and not k.problem]
             digests = frozenset(digest for record in kept for digest in record.digests)
             owners.add(name, digests)
             size += fleet.sizes.get(name, 0)
@@ -246,26 +240,10 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners, *, retry: b
                 size = 0
 
 
-def _is_tried_again(record: Record, *, retry: bool) -> bool:
-    """Whether a record without a summary is to be made anew, though its drives did not change."""
-    return bool(record.problem) and (retry or record.problem.startswith(COPY))
-
-
 def _stays(record: Record, versions: Mapping[str, str]) -> bool:
     """Whether a record is still right, or cannot be made anew as not all of its drives are given."""
     known = zip(record.drives, record.sources, strict=True)
     return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
-
-
-def _without_others(record: Record, *, fleet: FleetSource) -> Record | None:
-    """A record, but not of drives that are not, or no longer, those of the fleet."""
-    versions = (
-        {drive.name: drive.version for drive in fleet.vehicles[record.vehicle]}
-        if record.vehicle in fleet.vehicles
-        else {}
-    )
-    known = zip(record.drives, record.sources, strict=True)
-    return record if all(versions.get(drive) == source for drive, source in known) else None
 
 
 def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase) -> Record:

@@ -58,7 +58,7 @@ def one_pass(number: int, total: int) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def progress_bar(label: str, total: int | None, unit: str = "", *, begun: int = 0) -> Iterator[Callable[[float], None]]:
+def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Callable[[float], None]]:
     """Show how far a long step is.
 
     Parameters
@@ -69,8 +69,6 @@ def progress_bar(label: str, total: int | None, unit: str = "", *, begun: int = 
         How many units there are; None for a step of which nobody knows how long it is.
     unit : str
         What is counted, in the plural.
-    begun : int
-        Units that were done before, by a run that was stopped.
 
     Yields
     ------
@@ -83,12 +81,12 @@ def progress_bar(label: str, total: int | None, unit: str = "", *, begun: int = 
     label, console = f"{_number.get()()}{label}", Console(stderr=True)
     if console.is_terminal and not console.is_dumb_terminal:
         with _bars(console) as bars:
-            yield _moving(bars, label, total, unit, begun)
+            yield _moving(bars, label, total, unit)
     elif total is None:
         print(label, file=sys.stderr, flush=True)
         yield lambda _: None
     else:
-        yield _writing(label, total, unit, begun)
+        yield _writing(label, total, unit)
 
 
 @contextmanager
@@ -107,10 +105,10 @@ def _bars(console: Console) -> Iterator[Progress]:
         yield bars
 
 
-def _moving(bars: Progress, label: str, total: int | None, unit: str, begun: int) -> Callable[[float], None]:
+def _moving(bars: Progress, label: str, total: int | None, unit: str) -> Callable[[float], None]:
     """A bar on the terminal; a narrow terminal gets no unit."""
     unit = "" if bars.console.width < NARROW else f" {unit}"
-    task = bars.add_task(label, total=total, completed=begun, count="")
+    task = bars.add_task(label, total=total, count="")
 
     def move(done: float) -> None:
         bars.update(task, completed=done, count="" if total is None else f"{done:.0f}/{total}{unit}")
@@ -129,7 +127,7 @@ def shown(items: Iterable[_Item], label: str, total: int, unit: str) -> Iterator
             progress(done)
 
 
-def _writing(label: str, total: int, unit: str, begun: int) -> Callable[[float], None]:
+def _writing(label: str, total: int, unit: str) -> Callable[[float], None]:
     """A line now and then, for a log."""
     started_s = printed_s = time.monotonic()
 
@@ -140,8 +138,8 @@ def _writing(label: str, total: int, unit: str, begun: int) -> Callable[[float],
         if now_s - since_s < due_s or printed_s == math.inf:  # nothing is said after the last line
             return
         printed_s = math.inf if finished else now_s
-        elapsed_s, new = now_s - started_s, done - begun
-        left = f"{elapsed_s * (total - done) / new:.0f} s left" if new > 0 else "time left unknown"
+        elapsed_s = now_s - started_s
+        left = f"{elapsed_s * (total - done) / done:.0f} s left" if done > 0 else "time left unknown"
         print(f"{label}: {done:.0f} of {total} {unit}, {elapsed_s:.0f} s, {left}", file=sys.stderr, flush=True)
 
     return write

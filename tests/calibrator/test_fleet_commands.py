@@ -161,12 +161,18 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
 
 
 def test_only_vehicle_that_drove_since_is_one_of_its_fleet(fleet: Path, tmp_path: Path) -> None:
-    first = calibrator(*("calibrate", fleet / "logs", "--layout", LAYOUT, "--out", tmp_path / "first", "--workers", 1))
+    layout, store, one = ("--layout", LAYOUT), tmp_path / "store", ("--workers", 1)
+    assert calibrator("summarise", fleet / "logs", *layout, "--out", store, *one).returncode == 0
+    first = calibrator("calibrate", store, *layout, "--out", tmp_path / "first", *one)
     assert first.returncode == 0, first.stderr
     new = sorted((fleet / "unseen").iterdir())[0]
     shutil.copytree(new, tmp_path / "new" / new.name)
-    since = ("--since", tmp_path / "first", "--workers", 1)
-    run = calibrator("calibrate", tmp_path / "new", "--layout", LAYOUT, "--out", tmp_path / "second", *since)
+    second = ("--out", tmp_path / "second", "--since", tmp_path / "first", *one)
+    run = calibrator("calibrate", tmp_path / "new", *layout, *second)
+    assert run.returncode == 1
+    assert "drives, and --since goes on with summaries; add the new drives to the store" in run.stderr
+    assert calibrator("summarise", tmp_path / "new", *layout, "--out", store, *one).returncode == 0
+    run = calibrator("calibrate", store, *layout, *second)
     assert run.returncode == 0, run.stderr
     assert {row["vehicle"] for row in read_results(tmp_path / "second")} == {
         row["vehicle"] for row in read_results(tmp_path / "first")

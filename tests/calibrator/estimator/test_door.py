@@ -221,7 +221,7 @@ def test_script_without_main_guard_reads_logs_in_processes(logs: Path, tmp_path:
 
 def test_fault_of_the_program_in_one_vehicle_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     failing_for("V2", ZeroDivisionError("by nothing"), monkeypatch)
-    with pytest.warns(RuntimeWarning, match="internal error, left out: V2: ZeroDivisionError: by nothing"):
+    with pytest.warns(RuntimeWarning, match="left out: V2: internal error: ZeroDivisionError: by nothing"):
         found = FleetCalibrator().fit(Fleet.from_frames(frames(), JUNCTION))
     assert sorted(found.vehicles_) == ["V1", "V3"]
 

@@ -102,7 +102,7 @@ def test_offset_of_one_of_two_has_two_explanations() -> None:
     (motor,) = [text for text in calibrator.notices_ if "motor: gain" in text]
     assert re.search(r"offset (\+5\.\d|\+6\.\d) or 0 A: not corrected|offset 0 or \+[56]\.\d A: not corrected", motor)
     deciding = calibrator.vehicles_["vehicle"].parameters.deciding_evidence
-    assert "A is of motor or heater: a zero-current window" in deciding
+    assert "the offset of motor, heater needs a zero-current window" in deciding
 
 
 def test_gain_is_corrected_alone_where_it_is_open_whose_an_offset_is() -> None:

@@ -1,6 +1,5 @@
 """Whole runs, as a user types them and bucket by bucket: every vehicle by itself, and none stops the others."""
 
-import errno
 import json
 import shutil
 import signal
@@ -8,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ import pytest
 
 from calibrator.errors import FleetError
 from calibrator.estimator.fleet_task import FleetTask, calibrate_bucket, learn_task
-from calibrator.estimator.results import read_results, read_run, unfinished_run
+from calibrator.estimator.results import read_results, read_run
 from calibrator.estimator.run import read_sample, take_census
 from calibrator.estimator.settings import CalibrationSettings
 from calibrator.faults import Faults
@@ -130,7 +128,8 @@ def test_result_has_every_vehicle_once_in_order(result: Path) -> None:
     assert [row["vehicle"] for row in found[::2]] == [f"V{j:03d}" for j in range(VEHICLES)]
     assert sorted(path.stem for path in (result / "params").iterdir()) == [f"V{j:03d}" for j in range(VEHICLES)]
     assert read_run(result).vehicles == VEHICLES
-    assert not (result.parent / ".result.unfinished").exists()
+    assert [path.name for path in result.parent.iterdir() if path.name.startswith(".result")] == []
+    assert {path.name for path in result.iterdir()} == {"params", "parameters", "results.parquet", "run.json"}
 
 
 def test_result_is_the_same_for_any_number_of_workers(store: SummaryStore, result: Path, tmp_path: Path) -> None:
@@ -139,91 +138,29 @@ def test_result_is_the_same_for_any_number_of_workers(store: SummaryStore, resul
     assert contents(tmp_path / "two") == contents(result)
 
 
-def test_killed_run_goes_on_where_it_stopped(store: SummaryStore, result: Path, tmp_path: Path) -> None:
-    out, chunks = tmp_path / "out", tmp_path / ".out.unfinished" / "result" / "parameters"
-    words = ("calibrate", store.url, "--layout", LAYOUT, "--out", out, "--workers", "1")
-    written: dict[str, int] = {}
-    for wanted in (1, 6):
-        with subprocess.Popen([sys.executable, "-m", "calibrator", *words], stderr=subprocess.PIPE) as process:
-            until = time.monotonic() + 120.0
-            while len(list(chunks.glob("[0-9]*.parquet"))) < wanted and time.monotonic() < until:
-                time.sleep(0.002)
-            process.send_signal(signal.SIGKILL)
-        found = {path.name: path.stat().st_mtime_ns for path in chunks.glob("[0-9]*.parquet")}
-        assert len(found) >= wanted
-        assert written.items() <= found.items(), "chunks that are done are not made again"
-        assert not out.exists()
-        written = found
-    assert calibrate(store.url, out, "--workers", 1).returncode == 0
-    assert contents(out) == contents(result)
-
-
 @pytest.mark.long
 def test_cluster_that_loses_a_worker_gives_the_same_result(database: VehicleDatabase, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     store = small_store(tmp_path / "store", database, random_faults(300))
     here = calibrate(store.url, tmp_path / "here", "--workers", 2)
     assert here.returncode == 0, here.stderr
-    chunks = tmp_path / ".there.unfinished" / "result" / "parameters"
+
+    def chunks() -> int:
+        return len(list(tmp_path.glob(".there.*/parameters/[0-9]*.parquet")))
+
     with DaskCluster(tmp_path) as cluster:
         there = ("--out", tmp_path / "there", "--scheduler", cluster.address)
         words = ("calibrate", store.url, "--layout", LAYOUT, *there)
         with subprocess.Popen([sys.executable, "-m", "calibrator", *words], stderr=subprocess.PIPE) as process:
             until = time.monotonic() + 300.0
-            while len(list(chunks.glob("[0-9]*.parquet"))) < 2 and process.poll() is None and time.monotonic() < until:
+            while chunks() < 2 and process.poll() is None and time.monotonic() < until:
                 time.sleep(0.005)
-            left = len(store.buckets()) - len(list(chunks.glob("[0-9]*.parquet")))
+            left = len(store.buckets()) - chunks()
             cluster.workers[0].send_signal(signal.SIGKILL)
             _, errors = process.communicate(timeout=300)
     assert left > 0, "the worker was to be killed in the middle"
     assert process.returncode == 0, errors.decode()
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
-
-
-def test_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: Path) -> None:
-    with unfinished_run(tmp_path / "out"):
-        second = calibrate(store.url, tmp_path / "out")
-    assert second.returncode == 1
-    assert "another run is writing this result; wait for it or choose another --out" in second.stderr
-
-
-def test_only_computed_work_is_kept(store: SummaryStore, tmp_path: Path) -> None:
-    out, folder = tmp_path / "out", tmp_path / ".out.unfinished"
-    for name, kept in (
-        ("result/parameters/00003.parquet", True),
-        ("summaries/buckets/00003.parquet", True),
-        ("plan", False),
-    ):
-        with suppress(FleetError), unfinished_run(out):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).touch()
-            raise FleetError("a slip")
-        assert folder.exists() == kept
-        shutil.rmtree(folder, ignore_errors=True)
-    (tmp_path / "earlier").mkdir()
-    (tmp_path / "earlier" / "run.json").touch()
-    shutil.copytree(store.url, tmp_path / "earlier" / "summaries")
-    for new in (False, True):
-        with suppress(FleetError), unfinished_run(out) as unfinished:
-            unfinished.summaries_since(tmp_path / "earlier")
-            if new:
-                (unfinished.summaries / "buckets" / "00003.parquet").touch()
-            raise FleetError("a slip")
-        assert folder.exists() == new, "copies of earlier summaries are nothing new"
-
-
-@pytest.mark.parametrize(
-    "error",
-    [
-        OSError(errno.ENOSPC, "Error writing bytes to file. Detail: [errno 28] No space left on device"),
-        shutil.Error([("a", "b", "[Errno 28] No space left on device: 'b'")]),
-    ],
-)
-def test_full_disk_says_what_to_do(tmp_path: Path, error: OSError) -> None:
-    where = "b" if isinstance(error, shutil.Error) else rf"{tmp_path}/\.out\.unfinished"
-    message = rf"^{where}: cannot write it: .*No space left on device.*; make room, and run the same command again"
-    with pytest.raises(FleetError, match=message), unfinished_run(tmp_path / "out"):
-        raise error
 
 
 # What is refused
@@ -269,7 +206,7 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
     ):
         done = calibrate(str(place), tmp_path / "out")
         assert (done.returncode, message in done.stderr.splitlines()[-1]) == (code, True), done.stderr
-        assert not (tmp_path / ".out.unfinished").exists()
+        assert not list(tmp_path.glob(".out.*"))
 
 
 # Second pass

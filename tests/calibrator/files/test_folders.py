@@ -1,3 +1,4 @@
+import errno
 import subprocess
 import sys
 from collections.abc import Callable
@@ -35,6 +36,13 @@ def test_folder_in_use_is_refused_untouched(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match="exists and is not empty"), whole_folder(tmp_path / "out"):
         pass
     assert (tmp_path / "out" / "mine").read_text() == "1"
+
+
+def test_full_disk_says_what_to_do_and_leaves_nothing(tmp_path: Path) -> None:
+    message = rf"^{tmp_path}/out: cannot write it: No space left on device; make room, or choose another --out"
+    with pytest.raises(FleetError, match=message), whole_folder(tmp_path / "out"):
+        raise OSError(errno.ENOSPC, "Error writing bytes to file. Detail: [errno 28] No space left on device")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_a_killed_process_left_is_removed_and_that_of_a_running_one_stays(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypat
         next(results)
         monkeypatch.setattr(module, "RETURN_S", 1.0)
         cluster.scheduler.kill()
-        with pytest.raises(FleetError, match=r"the scheduler is gone; start it .* goes on where it stopped"):
+        with pytest.raises(FleetError, match=r"the scheduler is gone; start it .*, and run the same command again"):
             list(results)
 
 
