@@ -130,12 +130,17 @@ def calibrate(
         from calibrator.estimator.settings import CalibrationSettings
         from calibrator.processes.run_many import Workers
 
-    _require_truth_where_used(classifier, truth, method)
     other, names = (Method.PUBLISHED, OF_PUBLISHED) if method is Method.POSTERIOR else (Method.POSTERIOR, OF_POSTERIOR)
     if given := given_options(context, names):  # without a word, it would be ignored
         raise typer.BadParameter(
             f"belongs to --method {other.value}, not {method.value}; leave it out or change the method",
             param_hint=given[0],
+        )
+    if (classifier is Classifier.PERFECT) != (truth is not None):
+        raise typer.BadParameter(
+            "the perfect classifier is told the truth: give both --classifier perfect and --truth FILE, the truth.json "
+            "of this artificial fleet, or neither",
+            param_hint="--truth" if truth else "--classifier",
         )
     settings = CalibrationSettings(
         method=method,
@@ -221,23 +226,6 @@ def _charge(text: str) -> tuple[str, tuple[float, float]]:
     if not sd:
         raise typer.BadParameter(f"{text!r}: give its standard deviation as well, {text}:0.1", param_hint="--charge")
     return branch.strip(), (mean, sd)
-
-
-def _require_truth_where_used(classifier: Classifier, truth: Path | None, method: Method) -> None:
-    """Refuse a truth that nothing uses, and the perfect classifier without one."""
-    if (classifier is Classifier.PERFECT) == (truth is not None):
-        return
-    with_method = "" if method is Method.PUBLISHED else "--method published "
-    if truth is not None:
-        raise typer.BadParameter(
-            f"used by the perfect classifier alone, not by {classifier.value}; "
-            f"add {with_method}--classifier perfect, or leave it out",
-            param_hint="--truth",
-        )
-    raise typer.BadParameter(
-        f"perfect is told the truth; add {with_method}--truth FILE, the truth.json of this artificial fleet",
-        param_hint="--classifier",
-    )
 
 
 def _truth_of(fleet: str, path: Path) -> "FleetTruth":

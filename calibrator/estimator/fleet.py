@@ -58,29 +58,22 @@ __all__ = ["CalibratedVehicle", "Fleet", "FleetCalibrator", "JunctionCalibrator"
 Frames: TypeAlias = pd.DataFrame | Sequence[pd.DataFrame]
 Recordings: TypeAlias = Frames | Mapping[str, Frames] | str | Path
 
-NAMES = {
+COLUMNS = {
+    "vehicle": "vehicle",
+    "branch": "branch",
     "drift": "gain_error",
     "drift_sd": "gain_error_sd",
+    "offset_a": "offset_a",
+    "offset_sd_a": "offset_sd_a",
+    "fault_probability": "fault_probability",
+    "harm_probability": "harm_probability",
     "applied": "corrected",
     "held_back": "reason_not_corrected",
+    "verdict": "verdict",
+    "confidence": "confidence",
+    "hardware_probability": "hardware_probability",
 }
-"""Columns of ``results.parquet`` that the door names otherwise: a drift is a change over time to most."""
-COLUMNS = (
-    "vehicle",
-    "branch",
-    "gain_error",
-    "gain_error_sd",
-    "offset_a",
-    "offset_sd_a",
-    "fault_probability",
-    "harm_probability",
-    "corrected",
-    "reason_not_corrected",
-    "verdict",
-    "confidence",
-    "hardware_probability",
-)
-"""Of ``parameters_``."""
+"""Columns of ``results.parquet`` and their names in ``parameters_``: a drift is a change over time to most."""
 NO_NODE_FILES = (
     "no parameter files for the node are written: they belong to a layout; make the junction by Junction.from_layout"
 )
@@ -326,7 +319,7 @@ class _Calibrator:
         }
         left_out = rows[rows["branch"].isna()]
         self.left_out_ = dict(zip(left_out["vehicle"], left_out["reason"], strict=True))
-        self.parameters_ = rows[rows["branch"].notna()].rename(columns=NAMES)[list(COLUMNS)].reset_index(drop=True)
+        self.parameters_ = rows[rows["branch"].notna()][list(COLUMNS)].rename(columns=COLUMNS).reset_index(drop=True)
         self.parameters_["corrected"] = self.parameters_["corrected"].astype(bool)
         self.notices_ = [_in_python(notice) for notice in report.run.notices]
         failed = {name: why for name, why in self.left_out_.items() if why.startswith(INTERNAL_ERROR)}
