@@ -102,22 +102,18 @@ MISTAKES = [
     (
         "calibrator calibrate logs LAYOUT --out x --truth t PUBLISHED",
         2,
-        "alone, not by tree; add --classifier perfect, or",
+        "--truth: the perfect classifier is told the truth: give both",
     ),
-    (
-        "calibrator calibrate logs LAYOUT --out x --truth t --classifier threshold",
-        2,
-        "alone, not by threshold; add --meth",
-    ),
+    ("calibrator calibrate logs LAYOUT --out x --truth t", 2, "--truth: belongs to --method published, not posterior"),
     (
         "calibrator calibrate logs LAYOUT --out x PUBLISHED --classifier perfect",
         2,
-        "is told the truth; add --truth FILE",
+        "--classifier: the perfect classifier is told the truth",
     ),
     (
         "calibrator calibrate logs LAYOUT --out x --classifier perfect",
         2,
-        "is told the truth; add --method published --tr",
+        "--classifier: belongs to --method published, not posterior",
     ),
     (
         "calibrator experiment sparsity --drives store --out x",
