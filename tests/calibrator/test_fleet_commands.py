@@ -22,7 +22,7 @@ LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twelve vehicles on a common trip with few faults: three groups of four."""
     options = ("--vehicles", 12, "--currents", 2, "--sparsity", 80, "--common-drive", "--symmetric", "--balanced")
-    length = ("--minutes", 4, "--unseen-minutes", 1, "--seed", 3)
+    length = ("--minutes", 3, "--unseen-minutes", 1, "--seed", 3)
     return made_once(tmp_path_factory, "symmetric_fleet", "simulate", *options, *length)
 
 

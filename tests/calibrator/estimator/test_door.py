@@ -189,7 +189,7 @@ def test_frames_of_a_layout_have_derived_inputs_limits_and_files_for_the_node(tm
 @pytest.fixture(scope="session")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fleet of two vehicles with a log each."""
-    options = ("--vehicles", 2, "--currents", 2, "--minutes", 4, "--unseen-minutes", 1, "--seed", 5)
+    options = ("--vehicles", 2, "--currents", 2, "--minutes", 2.5, "--unseen-minutes", 0.1, "--seed", 5)
     return made_once(tmp_path_factory, "two_vehicles", "simulate", *options)
 
 

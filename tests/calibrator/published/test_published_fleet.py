@@ -15,7 +15,7 @@ FILES = ("--layout", LAYOUT, "--workers", 1)
 def small_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("small") / "fleet"
     calibrator(
-        "simulate", "--vehicles", 3, "--minutes", 3, "--unseen-minutes", 0.1, "--common-drive", *FILES, "--out", out
+        "simulate", "--vehicles", 3, "--minutes", 2.2, "--unseen-minutes", 0.1, "--common-drive", *FILES, "--out", out
     )
     return out
 
