@@ -14,7 +14,7 @@ import pytest
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
-from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, parameters_for
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, parameters_for
 
 
 @pytest.fixture
@@ -53,19 +53,6 @@ def test_the_same_as_text(params: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert lines[dcdc].endswith("passed through")
     assert lines[dcdc + 1] == "  target HV_DcdcCorrected.DcdcCurrentCorrected"
     assert max(map(len, lines)) <= 80
-
-
-@pytest.fixture
-def small(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> Callable[..., list[str]]:
-    """Options for a small vehicle whose parameters apply a fault to the heater, a power branch."""
-
-    def make(dbc: str = SMALL_DBC) -> list[str]:
-        database = make_database(dbc=dbc)
-        path = tmp_path / "small.json"
-        write_parameters(parameters_for(database, battery=(0.1, 1.0), heater=(0.1, 0.0)), path)
-        return ["--params", str(path), "--layout", str(database.layout.path), "--vehicle", "v1"]
-
-    return make
 
 
 def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[str]) -> None:

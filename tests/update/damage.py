@@ -19,11 +19,6 @@ def a_pipe(path: Path) -> None:
     os.mkfifo(path)
 
 
-def a_loop(path: Path) -> None:
-    path.unlink()
-    path.symlink_to(path)
-
-
 def cut(path: Path) -> None:
     os.truncate(path, path.stat().st_size // 2)
 

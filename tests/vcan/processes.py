@@ -70,10 +70,10 @@ class NodeProcess:
         """Wait until it ends by itself; its exit code."""
         return self.process.wait(timeout=LONGEST_WAIT_S)
 
-    def stop(self, how: signal.Signals = signal.SIGTERM) -> int:
-        """End the node within a second and return its exit code; what is traced writes down what it reached."""
+    def stop(self, how: signal.Signals = signal.SIGTERM, *, within_s: float = LONGEST_WAIT_S) -> int:
+        """End the node and return its exit code; one whose coverage is traced takes as long as it likes."""
         self.process.send_signal(how)
-        return self.process.wait(timeout=1.0 if sys.gettrace() is None else LONGEST_WAIT_S)
+        return self.process.wait(timeout=within_s if sys.gettrace() is None else LONGEST_WAIT_S)
 
     @property
     def messages(self) -> str:

@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from collections import Counter
 from fractions import Fraction
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from ecu_node.parameters import VehicleParameters, read_parameters
 from tests.vcan.calibrated_fleet import make_calibrated_fleet
 from tests.vcan.conftest import StartNode
 from tests.vcan.patient_layout import LAYOUT
-from tests.vcan.processes import Recording, play
+from tests.vcan.processes import Recording, frames_of, play
 
 SECONDS = 8.0
 BRANCHES = {"battery": ("HV_Battery", "BatteryCurrent", 1), "motor": ("HV_Motor", "MotorCurrent", -1)}
@@ -64,8 +65,10 @@ def test_kirchhoff_sum_of_a_calibrated_vehicle_falls_tenfold_on_an_unseen_drive(
     write_start_of_unseen_drive(fleet, vehicle, drive)
     with start_node(fleet.parent / "result" / "params" / f"{vehicle}.json", "--vehicle", vehicle) as node:
         play(drive)
+        played = Counter(frame.identifier for frame in frames_of(drive))
         for name, (message, signal, sign) in BRANCHES.items():
-            measured = recording.data_of(database.message(message).frame_id)
+            identifier = database.message(message).frame_id
+            measured = recording.wait_for(identifier, played[f"{identifier:03X}"])
             corrected = recording.wait_for(database.message(f"{message}Corrected").frame_id, len(measured))
             branch = parameters.branches[name]
             quality = Quality.CORRECTED if branch.drift or branch.offset_a else Quality.PASSED_THROUGH

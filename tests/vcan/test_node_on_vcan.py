@@ -133,7 +133,7 @@ def test_frames_of_the_node_that_another_one_sends_end_it(
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_node_within_a_second(params: Path, start_node: StartNode, how: signal.Signals) -> None:
     with start_node(params) as node:
-        assert node.stop(how) == 0
+        assert node.stop(how, within_s=1.0) == 0
     assert node.messages.splitlines()[-1] == "ecu-node: ended: no frames"
 
 
