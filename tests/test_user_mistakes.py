@@ -142,6 +142,9 @@ MISTAKES = [
     ("calibrator calibrate a LAYOUT --out x --method both", 2, "'both' is not one of 'posterior', 'published'"),
     ("calibrator score folder --truth", 2, "--truth"),
     ("ecu-node fly", 2, "invalid choice: 'fly'"),
+    ("ecu-node", 2, "; see 'ecu-node --help'"),
+    ("ecu-node check", 2, "; see 'ecu-node check --help'"),
+    ("ecu-node run --nonsense", 2, "; see 'ecu-node run --help'"),
     ("ecu-node run LAYOUT", 2, "required: --channel; see 'ecu-node run --help'"),
     ("ecu-node run LAYOUT --channel c --params v1.json", 2, "--params names a file that nobody signed"),
     # places for results
@@ -221,6 +224,8 @@ MISTAKES = [
     ("ecu-node update v1.json --state none LAYOUT", 1, "none: cannot be used as state: No such file or"),
     ("ecu-node inspect --state none", 1, "none: no state of a vehicle there; make one with 'ecu-node provision'"),
     ("ecu-node run LAYOUT --channel c --interface pigeon --params v1.json --unsigned", 1, "pigeon c: cannot open"),
+    ("ecu-node run LAYOUT --channel nobus0 --params v1.json --unsigned", 1, "socketcan nobus0: cannot open the bus: "),
+    ("ecu-node run NONE --channel nobus0 --params v1.json --unsigned", 1, "none.toml: cannot read the layout: No such"),
 ]
 """Command, exit code, and some of the words."""
 

@@ -117,56 +117,6 @@ def test_the_vehicle_can_come_from_the_environment(
     assert capsys.readouterr().out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
 
 
-@pytest.mark.parametrize(
-    "arguments", [[], ["fly"], ["check"], ["run", "--params", "p", "--layout", "l"], ["run", "--nonsense"]]
-)
-def test_wrong_use_ends_in_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("ecu-node")
-    assert line.endswith(" --help'")
-
-
-def run_node(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "ecu_node", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        env={**os.environ, **environment},
-    )
-
-
-@pytest.mark.parametrize(
-    ("layout", "interface", "words"),
-    [
-        ("missing.toml", "socketcan", "ecu-node: missing.toml: cannot read the layout: No such file or directory"),
-        (str(LAYOUT), "socketcan", "ecu-node: socketcan nobus0: cannot open the bus: "),
-        (str(LAYOUT), "carrier_pigeon", "ecu-node: carrier_pigeon nobus0: cannot open the bus: "),
-    ],
-)
-def test_what_keeps_the_node_from_running_is_one_line(params: Path, layout: str, interface: str, words: str) -> None:
-    result = run_node(
-        "run",
-        "--unsigned",
-        "--params",
-        str(params),
-        "--layout",
-        layout,
-        "--interface",
-        interface,
-        "--channel",
-        "nobus0",
-    )
-    assert result.returncode == 1
-    assert result.stdout == ""
-    assert result.stderr.startswith(words)
-    assert result.stderr.count("\n") == 1
-
-
 @pytest.mark.parametrize("command", ["check", "schema", "--help"])
 def test_a_reader_that_leaves_early_gets_no_traceback(params: Path, command: str) -> None:
     arguments = check(params) if command == "check" else [command]
