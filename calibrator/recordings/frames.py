@@ -7,6 +7,7 @@ used, because nobody can tell what else is missing. Text logs written by hand-ma
 in candump and GVRET logs such lines are counted and left out, up to :data:`.MAX_DAMAGED_SHARE`.
 """
 
+import csv
 import io
 import re
 import sys
@@ -25,8 +26,8 @@ import can
 from calibrator.errors import LogError
 from calibrator.recordings.blf import read_blf
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, Frames, concatenate_frames, frames_of
-from calibrator.recordings.gvret import read_gvret
 from calibrator.recordings.log_files import (
+    MAX_DAMAGED_SHARE,
     TABLE_SUFFIXES,
     UNREADABLE,
     exists,
@@ -129,7 +130,37 @@ def _read_csv(path: Path) -> Frames:
         return read_candump(path)
     if "arbitration_id" in head.partition("\n")[0]:
         return _read_by_python_can(path, _csv_messages)
-    return read_gvret(path)
+    return _read_by_python_can(path, partial(_gvret_messages, where=str(path)))
+
+
+def _gvret_messages(text: TextIO, where: str) -> Iterator[can.Message]:
+    """Messages of a CSV of GVRET: microseconds, identifier and bytes in hexadecimal digits; few may be damaged."""
+    rows = csv.DictReader(text, quoting=csv.QUOTE_NONE, skipinitialspace=True)
+    rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
+    for name in ("Time Stamp", "ID", "Extended", "Bus", "LEN", "D1"):
+        if name not in rows.fieldnames:
+            raise LogError(f"{where}: a CSV of frames without the column {name!r}; save it with SavvyCAN again")
+    count, damaged = 0, list[int]()
+    for row in rows:
+        count += 1
+        try:
+            if any(row.get(None, ())):
+                raise ValueError  # there are cells beyond those of the header
+            data = bytes(int(row[f"D{k}"], 16) for k in range(1, int(row["LEN"]) + 1))
+            yield can.Message(
+                timestamp=1e-6 * int(row["Time Stamp"]),
+                arbitration_id=int(row["ID"], 16),
+                is_extended_id=row["Extended"].lower() == "true",
+                channel=row["Bus"],
+                data=data,
+                is_fd=len(data) > CLASSIC_BYTES,
+                check=True,
+            )
+        except (ValueError, TypeError, KeyError, AttributeError):
+            damaged.append(rows.line_num)
+            yield can.Message(timestamp=-1.0)  # which counts as damaged
+    if len(damaged) > MAX_DAMAGED_SHARE * count:
+        raise LogError(f"{where}: line {damaged[0]} is damaged, and {len(damaged)} of {count} are; save the log again")
 
 
 def _csv_messages(text: TextIO) -> Iterator[can.Message]:
@@ -158,6 +189,8 @@ def _read_by_python_can(path: Path, reader: Callable[[TextIO], Iterable[can.Mess
                 if len(messages) == _AT_A_TIME:
                     parts.append(frames_of(messages))
                     messages.clear()
+        except LogError:
+            raise
         except Exception as error:  # noqa: BLE001 (python-can lets through whatever its parsing meets)
             before = sum(map(len, parts)) + len(frames_of(messages))
             raise LogError(
