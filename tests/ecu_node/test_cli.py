@@ -14,7 +14,7 @@ import pytest
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
-from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, parameters_for
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, parameters_for
 
 
 @pytest.fixture
