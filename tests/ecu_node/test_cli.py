@@ -89,6 +89,19 @@ def test_fault_that_is_not_applied_is_said(
     assert '+5.000 A  passed through, "apply" is false' in capsys.readouterr().out
 
 
+@pytest.fixture
+def small(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> Callable[..., list[str]]:
+    """Options for a small vehicle whose parameters apply a fault to the heater, a power branch."""
+
+    def make(dbc: str = SMALL_DBC) -> list[str]:
+        database = make_database(dbc=dbc)
+        path = tmp_path / "small.json"
+        write_parameters(parameters_for(database, battery=(0.1, 1.0), heater=(0.1, 0.0)), path)
+        return ["--params", str(path), "--layout", str(database.layout.path), "--vehicle", "v1"]
+
+    return make
+
+
 def test_can_fd_that_run_would_need_is_said(
     small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
