@@ -282,16 +282,20 @@ def put_in_force(
     """
     parameters = in_force.parameters
     found = parameters.branches if parameters is not None else {}
-    for branch, live in zip(database.layout.branch, corrector.branches, strict=True):
+    changes = []  # all plans before the first is put in force: either all or none
+    for branch in database.layout.branch:
         fault, said = in_force.fault(branch.name), found.get(branch.name)
         is_in_place = mode is Mode.GATEWAY or branch.corrected is None
-        live.put_in_force(
-            fault=fault,
-            plan=branch_plan(database, branch, fault, mode),
-            passing=AS_IT_IS if is_in_place else branch_plan(database, branch, NO_FAULT, mode),
-            delay_s=(said and said.delay_s) or 0.0,
-            expected_since_s=now_s if said is not None else None,
-        )
+        change = {
+            "fault": fault,
+            "plan": branch_plan(database, branch, fault, mode),
+            "passing": AS_IT_IS if is_in_place else branch_plan(database, branch, NO_FAULT, mode),
+            "delay_s": (said and said.delay_s) or 0.0,
+            "expected_since_s": now_s if said is not None else None,
+        }
+        changes.append(change)
+    for change, live in zip(changes, corrector.branches, strict=True):
+        live.put_in_force(**change)  # type: ignore[arg-type]
     number = parameters.number % PARAMETER_SETS if parameters is not None else 0
     expected = parameters.junction_residual if parameters is not None else None
     corrector.put_in_force(reason=in_force.reason, parameter_set=number, expected=expected)
