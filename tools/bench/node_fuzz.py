@@ -187,8 +187,8 @@ class Oracle:
             for item in own:
                 item.spoil()
         wanted = {item.branch.target.message.number for item in own if item.branch.target is not None}
-        if [number for number, _ in sent] != [number for number in self._targets if number in wanted]:
-            return f"{len(sent)} frames were sent, must be {len(wanted)}"
+        if sorted(number for number, _ in sent) != sorted(wanted):
+            return f"frames {[f'{number:X}' for number, _ in sent]} were sent, must be {sorted(map(hex, wanted))}"
         answers = (self._wrong_answer(self._targets[number], answer) for number, answer in sent)
         return next((text for text in answers if text is not None), None)
 
