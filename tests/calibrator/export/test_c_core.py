@@ -69,7 +69,7 @@ def test_random_vehicles_are_the_same_and_nothing_is_undefined(tmp_path: Path) -
 
 @needs("clang")
 def test_fuzzing_finds_nothing(tmp_path: Path) -> None:
-    fuzz(tmp_path, 4)
+    fuzz(tmp_path, 60)
 
 
 @needs("gcc", "clang", "nm")
