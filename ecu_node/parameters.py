@@ -7,16 +7,18 @@ made from them, which stands in ``ecu_node/parameters.schema.json``. Currents ar
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
 from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.core.status import Reason, UnfitError
-from ecu_node.database import VehicleDatabase
 from ecu_node.documents import UnsuitableFileError, field_error, read_json, read_user_file, write_atomically
 from ecu_node.errors import ParameterError, printable, shown_name
+
+if TYPE_CHECKING:
+    from ecu_node.database import VehicleDatabase
 
 __all__ = [
     "BranchParameters",
@@ -298,7 +300,7 @@ _LARGEST_DELAY_S = 5.0
 """Branches of one vehicle do not lag each other by more. [s]"""
 
 
-def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
+def check_fit(parameters: VehicleParameters, database: "VehicleDatabase", vehicle: str | None) -> None:
     """Check that parameters were made for this vehicle, layout and DBC, decided on, and within the layout's limits.
 
     A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Limits are those of
