@@ -24,8 +24,13 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def result(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_once(tmp_path_factory, "asymmetric_result", "calibrate", fleet)
+def summaries(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once(tmp_path_factory, "asymmetric_summaries", "summarise", fleet)
+
+
+@pytest.fixture(scope="session")
+def result(summaries: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once(tmp_path_factory, "asymmetric_result", "calibrate", summaries)
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +76,9 @@ def test_unmeasured_load_is_estimated_from_the_fleet_and_named(fleet: Path, resu
 
 
 @pytest.fixture(scope="session")
-def strict(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def strict(summaries: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nothing may do harm, so nothing is corrected and faulty vehicles stay undecided."""
-    return made_once(tmp_path_factory, "strict_result", "calibrate", result / "summaries", "--harm-limit", 0)
+    return made_once(tmp_path_factory, "strict_result", "calibrate", summaries, "--harm-limit", 0)
 
 
 def test_a_stricter_harm_limit_corrects_no_more_branches(result: Path, strict: Path) -> None:
