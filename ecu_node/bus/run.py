@@ -193,18 +193,27 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         )
         buses = [closed_at_end.enter_context(closing(bus)) for bus in opened]
         stop = stopped_by(signal.SIGTERM, signal.SIGINT)
-        hidden = unpublished(database, source.in_force, mode)
-        for text in (*_notes(options, source), *hidden.values()):
+        for text in _notes(options, source):
             say(text)
-        applied = [branch.name for branch in corrector.branches if branch.fault.applied and branch.name not in hidden]
-        correcting = f"correcting {', '.join(applied) or 'nothing'}"
+
+        def correcting() -> str:
+            """Which branches are corrected; says which are not, though they have a fault."""
+            hidden = unpublished(database, source.in_force, mode)
+            for text in hidden.values():
+                say(text)
+            faulty = [
+                branch.name for branch in corrector.branches if branch.fault.applied and branch.name not in hidden
+            ]
+            return f"correcting {', '.join(faulty) or 'nothing'}"
+
+        at_start = correcting()
 
         def ready() -> None:
             if routes is not None:
                 routes.set()
             to, shadow = f" to {options.gateway}" if is_gateway else "", ", shadow mode" if options.shadow else ""
-            say(f"running on {options.interface} {options.channel}{to}{shadow}, {correcting}")
-            manager.ready(correcting)
+            say(f"running on {options.interface} {options.channel}{to}{shadow}, {at_start}")
+            manager.ready(at_start)
 
         looks: list[Callable[[float], None]] = [] if routes is None else [routes.look]
         if options.state is not None:
@@ -224,9 +233,16 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             for each in buses:
                 each.count_dropped()
             if source.look(corrector, now_s):
-                manager.status(f"parameter set {corrector.parameter_set} is in force")
-            for look in looks:
-                look(now_s)
+                manager.status(f"parameter set {corrector.parameter_set} is in force, {correcting()}")
+            for look in [*looks]:
+                try:
+                    look(now_s)
+                except Exception as error:  # noqa: BLE001  # a fault of what only records must not end the correction
+                    looks.remove(look)
+                    what = type(look.__self__).__name__  # type: ignore[attr-defined]
+                    say(
+                        f"internal error in {what}, which is off now; please report it: {type(error).__name__}: {error}"
+                    )
             if text := changes.news():
                 say(text)
                 manager.status(text)

@@ -173,7 +173,7 @@ class SteadyBus:
             except _ERRORS as error:
                 is_full = _number(error) not in _GONE | _OF_FRAME
                 if is_full and not attempts_left:
-                    self._stays_full()
+                    self._stays_full(error)
                 if not (is_full and attempts_left):
                     raise
             time.sleep(_SEND_PAUSE_S)
@@ -182,13 +182,14 @@ class SteadyBus:
         self._full_since_s, self._is_full_told = None, False
         return taken
 
-    def _stays_full(self) -> None:
+    def _stays_full(self, error: Exception) -> None:
         now_s = time.monotonic()
         if self._full_since_s is None:
             self._full_since_s = now_s
         elif not self._is_full_told and now_s - self._full_since_s > _FULL_S:
             self._is_full_told = True
-            self.say(f"{self.channel}: the send queue stays full, frames are lost: is anybody else on this bus?")
+            why = f"({error_text(error)}); is anybody else on this bus?"
+            self.say(f"{self.channel}: the send queue stays full, frames are lost {why}")
 
     def count_dropped(self) -> None:
         """Count the frames that the kernel dropped since the last time, because they were not read in time."""

@@ -20,6 +20,7 @@ from ecu_node.core.junction import LiveBranch
 from ecu_node.core.status import Latency, Quality
 from ecu_node.layout import Layout
 
+_WITHOUT_VALUE = frozenset({Quality.NOT_AVAILABLE, Quality.INVALID})
 _PERIOD_S = 1.0
 
 
@@ -68,7 +69,7 @@ class Telemetry:
 
     def _record(self, now_s: float) -> dict[str, Any]:
         corrector, sums = self.corrector, self.corrector.watch.sums
-        state, reason = corrector.told
+        state, reason = corrector.state()
         return {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "state": state.name,
@@ -102,11 +103,12 @@ class Telemetry:
 
 def _branch(branch: LiveBranch, now_s: float) -> dict[str, Any]:
     """Measured current and what is published of it, positive into the junction. [A]"""
-    currents_a = None if branch.is_old(now_s) else branch.currents_at(branch.time_s)
+    quality = branch.published(now_s)[1]
+    currents_a = None if quality in _WITHOUT_VALUE else branch.currents_at(branch.time_s)
     if currents_a is None:
-        return {"measured_a": None, "corrected_a": None, "quality": branch.published(now_s)[1].name}
-    published_a = currents_a[branch.quality is Quality.CORRECTED]
-    return {"measured_a": round(currents_a[0], 3), "corrected_a": round(published_a, 3), "quality": branch.quality.name}
+        return {"measured_a": None, "corrected_a": None, "quality": quality.name}
+    published_a = currents_a[quality is Quality.CORRECTED]
+    return {"measured_a": round(currents_a[0], 3), "corrected_a": round(published_a, 3), "quality": quality.name}
 
 
 def _append(path: Path, line: bytes) -> None:

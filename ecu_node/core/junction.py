@@ -418,6 +418,8 @@ _UNKNOWN_SD_SHARE, _UNKNOWN_SD_PER_A = 0.02, 0.05
 throughput. [1]"""
 _NEARLY_AS_GOOD = 1.25
 """Branches that leave so many times what the best one leaves of the sum explain it as well."""
+_ROUNDING = 1e-9
+"""Share of the squares of the sums that rounding may leave where a branch explains all of it. [1]"""
 _NOTHING_EXPECTED = JunctionResidual(measured_a=0.0, corrected_a=0.0)
 
 
@@ -630,14 +632,20 @@ class JunctionWatch:
         residual = [moment.corrected_a for moment in moments]
         rows = {name: [moment.currents_a.get(name, (0.0, 0.0))[1] for moment in moments] for name in self.currents_a}
         still = [name for name, row in rows.items() if min(row) == max(row)]
-        if frozen := self._frozen(still):
-            lines = [_line(row, residual) for name, row in rows.items() if name not in still]
+        if frozen := self._frozen(still):  # a single step of another one may as well be a jump of its own sensor
+            lines = [_line(row, residual) for name, row in rows.items() if name not in still and not _is_step(row)]
             if any(explains and abs(slope) >= _LARGEST_SLOPE for slope, explains in lines):
                 return Reason.BRANCH_STUCK, frozen
         left = {name: _left_of_gain(row, residual) for name, row in rows.items()}
         of_offset, best = len(residual) * _covariance(residual, residual), min(left.values())
-        near = [name for name in left if left[name] <= _NEARLY_AS_GOOD * best or of_offset <= best]
+        enough = _NEARLY_AS_GOOD * best + _ROUNDING * math.fsum(map(mul, residual, residual))
+        near = [name for name in left if left[name] <= enough or of_offset <= enough]
         return Reason.SUM_IMPLAUSIBLE, tuple(sorted(near, key=left.__getitem__))
+
+
+def _is_step(current: Sequence[float]) -> bool:
+    """Whether one step makes half of all that a current moves, or more."""
+    return 2.0 * max(abs(b - a) for a, b in pairwise(current)) >= max(current) - min(current)
 
 
 def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:

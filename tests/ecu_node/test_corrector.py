@@ -523,17 +523,17 @@ def test_half_of_the_frames_corrupt_is_a_state_and_none_of_them_is_used(database
     corrector = corrector_for(database, battery=(0.02, 3.0))
     assert set(battery_stream(database, corrector, 0.0, 30, 0)) == {Quality.CORRECTED}
     found = battery_stream(database, corrector, 0.6, 40, 2)
-    assert corrector.told == (State.PARTLY_CORRECTING, Reason.E2E_INVALID)
+    assert corrector.state() == (State.PARTLY_CORRECTING, Reason.E2E_INVALID)
     assert set(found[5:]) == {Quality.INVALID}
     assert battery_stream(database, corrector, 1.4, 30, 0)[-1] == Quality.CORRECTED
-    assert corrector.told == (State.CORRECTING, Reason.NONE)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
 def test_a_tenth_of_the_frames_corrupt_costs_these_only(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.02, 3.0))
     found = battery_stream(database, corrector, 0.0, 60, 10)
     assert found == [Quality.CORRECTED] * 54
-    assert corrector.told == (State.CORRECTING, Reason.NONE)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
 def test_after_a_silence_the_third_frame_is_the_first_that_is_used(database: VehicleDatabase) -> None:

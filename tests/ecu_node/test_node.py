@@ -226,7 +226,7 @@ def test_a_pause_of_the_process_makes_no_branch_stale(
     bus = DrivingBus(request.node.name, database)
     with node_on(database, "", lambda: bus) as corrector:
         wait_until(lambda: corrector.counters.frames_in > 20)
-        bus.pause_s = 0.18
+        bus.pause_s = 0.13
         before = corrector.counters.frames_in
         wait_until(lambda: corrector.counters.frames_in > before + 60)
         assert corrector.latched is Reason.NONE

@@ -67,6 +67,23 @@ def test_an_offset_that_creeps_is_told_of_all_branches_that_may_have_it(junction
     assert "motor" in junction.corrector.latched_branches
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("jump_a", [10.0, 18.0])
+def test_a_jump_at_constant_currents_without_noise_is_told_of_whoever_may_have_it(
+    tmp_path: Path, name: str, jump_a: float
+) -> None:
+    def charging(_: float) -> dict[str, float]:
+        return {"battery": -80.0, "motor": -92.0, "heater": 12.0}
+
+    junction = Junction(three_branches(tmp_path), noise_a=0.0)
+    junction.run(15.0, charging)
+    junction.wrong = {name: lambda shown_a: shown_a + jump_a}
+    junction.run(10.0, charging)
+    assert junction.corrector.latched is Reason.SUM_IMPLAUSIBLE, "a still branch may be right, and the other one jump"
+    assert name in junction.corrector.latched_branches
+    assert junction.qualities[name] == Quality.IMPLAUSIBLE
+
+
 @pytest.mark.parametrize("forged_a", [50.0, -120.0])
 def test_forged_frames_before_each_real_one_end_the_correction(junction: Junction, forged_a: float) -> None:
     junction.run(15.0, driving)

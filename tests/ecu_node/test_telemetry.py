@@ -4,6 +4,7 @@ import json
 import os
 import re
 import runpy
+import signal
 import socket
 import subprocess
 import sys
@@ -93,6 +94,17 @@ def test_line_has_currents_by_vss_name_sums_state_and_counters(make_outlet: Any,
     assert line["counters"]["frames_in"] == 1
     assert list(line["buses"].values()) == ["open"]
     assert abs((datetime.now(UTC) - datetime.fromisoformat(line["time"])).total_seconds()) < 60.0
+
+
+def test_spoilt_frame_has_no_value_as_on_the_bus(make_outlet: Any, tmp_path: Path) -> None:
+    outlet = make_outlet(tmp_path / "node.jsonl")
+    outlet.second()
+    lines_of(tmp_path / "node.jsonl", 1)
+    for data in (bytes.fromhex("0320f9c000000000"), bytes(1)):
+        answers(outlet.corrector, Frame(FrameKey(256, False), data), outlet.now_s + 0.9)
+    outlet.telemetry.look(outlet.now_s + 1.0)
+    _, line = lines_of(tmp_path / "node.jsonl", 2)
+    assert line["branches"][VSS] == {"measured_a": None, "corrected_a": None, "quality": "INVALID"}
 
 
 def test_lines_come_by_udp(make_outlet: Any) -> None:
@@ -241,6 +253,22 @@ def test_nothing_leaks_and_no_garbage_is_collected_in_100000_frames(tmp_path: Pa
     assert 0 < lines[1]["latency_us"]["p50"] <= lines[-1]["latency_us"]["p99.9"] <= lines[-1]["latency_us"]["max"]
     assert sum(lines[-1]["latency_counts"]) > sum(lines[1]["latency_counts"]) > 0
     assert lines[0]["counters"]["frames_in"] < lines[-1]["counters"]["frames_in"] <= FRAMES + 5_000
+
+
+def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: Path) -> None:
+    broken = "from ecu_node.bus.telemetry import Telemetry; Telemetry._record = lambda *_: 1 / 0"
+    code = f"import sys; from ecu_node.cli import main; {broken}; sys.exit(main(sys.argv[1:]))"
+    options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]
+    bus = ["--interface", "virtual", "--channel", "records", "--telemetry", str(tmp_path / "node.jsonl")]
+    command = [sys.executable, "-c", code, "run", *options, *bus]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        said = next(line for line in iter(process.stderr.readline, "") if "internal error" in line)
+        is_alive = process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=60) == 0
+    assert is_alive
+    assert "internal error in Telemetry, which is off now; please report it: ZeroDivisionError" in said
 
 
 def test_real_time_says_what_was_not_allowed_and_goes_on() -> None:
