@@ -1,0 +1,91 @@
+"""Commands that read logs, as users type them: hostile logs, kills, lost workers, a scheduler that is restarted."""
+
+import gzip
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bench.fleet_run import killed_runs
+from calibrator.artificial.simulate import FleetPlan, simulate_fleet
+from calibrator.artificial.trips import BuiltinTrips
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.processes.dask_cluster import DaskCluster
+
+LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+ENVIRONMENT = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
+HUGE_BYTES = 100 * 10**9
+
+
+def started(command: str, given: Path, out: Path, *options: object) -> "subprocess.Popen[str]":
+    line = [sys.executable, "-m", "calibrator", command, given, "--layout", LAYOUT, "--out", out, *options]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(list(map(str, line)), stdout=pipe, stderr=pipe, text=True, env=ENVIRONMENT)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def fleet_of(vehicles: int, folder: Path, database: VehicleDatabase) -> Path:
+    plan = FleetPlan(vehicles=vehicles, currents=2, sparsity=80.0, magnitude=(0.05, 0.25))
+    simulate_fleet(plan, BuiltinTrips(seed=0, duration_s=200.0, unseen_s=20.0), database, folder / "fleet", workers=1)
+    return folder / "fleet" / "logs"
+
+
+@pytest.mark.long
+def test_hostile_log_is_left_out_with_its_reason_within_its_limits(tmp_path: Path, database: VehicleDatabase) -> None:
+    logs = fleet_of(1, tmp_path, database)
+    lines = b"(1.000000) can0 123#\n" * 900_000
+    bombs = {"blank lines": b"\n" * (1 << 24), "one line": b"0" * (1 << 24), "frames": lines}
+    for name, text in bombs.items():
+        (logs / name).mkdir()
+        (logs / name / "bomb.log.gz").write_bytes(gzip.compress(text) * 4000)
+    for suffix in (".log", ".blf", ".csv", ".mf4"):
+        (logs / f"huge {suffix[1:]}").mkdir()
+        with (logs / f"huge {suffix[1:]}" / f"huge{suffix}").open("wb") as file:
+            file.truncate(HUGE_BYTES)
+    start_s = time.monotonic()
+    with started("import", logs, tmp_path / "out", "--json", "--time-limit", 20) as run:
+        report = json.loads(run.communicate()[0])
+    assert time.monotonic() - start_s < 600.0, "seven limits of 20 s in two processes, on a machine that does much else"
+    assert (run.returncode, len(report["drives"]), len(report["left_out"])) == (0, 1, 7)
+    for reason in report["left_out"].values():
+        assert reason.count("\n") == 0
+        assert "internal error" not in reason
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", ["import", "summarise", "calibrate"])
+def test_command_killed_at_any_moment_gives_the_identical_result_when_run_again(tmp_path: Path, command: str) -> None:
+    assert killed_runs(tmp_path, 20 if command == "calibrate" else 4, 4, command) == 4
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", ["import", "summarise"])
+def test_lost_worker_and_restarted_scheduler_change_nothing(
+    tmp_path: Path, database: VehicleDatabase, command: str
+) -> None:
+    logs = fleet_of(24, tmp_path, database)
+    with started(command, logs, tmp_path / "here", "--workers", 1) as here:
+        here.communicate()
+    with (
+        DaskCluster(tmp_path) as cluster,
+        started(command, logs, tmp_path / "there", "--scheduler", cluster.address) as there,
+    ):
+        for files, lost in ((2, cluster.workers[:1]), (8, [cluster.scheduler, *cluster.workers])):
+            while len(contents(tmp_path / "there")) < files:
+                assert there.poll() is None
+                time.sleep(0.02)
+            for process in lost:
+                process.send_signal(signal.SIGKILL)
+                process.wait()
+        cluster.start()
+        said = there.communicate()[1]
+    assert (here.returncode, there.returncode) == (0, 0), said
+    assert contents(tmp_path / "there") == contents(tmp_path / "here")
