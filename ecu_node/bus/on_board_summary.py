@@ -21,7 +21,7 @@ from itertools import pairwise
 from operator import mul
 from pathlib import Path
 from statistics import median, stdev
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from ecu_node import summary as rule
 from ecu_node.bus.adapters import connect, filters_of
@@ -34,7 +34,7 @@ from ecu_node.database import VehicleDatabase, codes_of_no_value
 from ecu_node.documents import write_atomically
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.formulas import formula_value, parse_formula
-from ecu_node.layout import Input, Layout
+from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
 from ecu_node.summary import SummaryFile, encode_summary, packed
 
@@ -121,10 +121,15 @@ class _Window(NamedTuple):
     """Number, sum and sum of squares of the distances from the median."""
 
 
+_Reading: TypeAlias = tuple[float, float] | tuple[None, None]
+
+
 class _ZeroCurrent:
     """What the sensors show while the contactors are open."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, database: VehicleDatabase) -> None:
+        layout = database.layout
+        self._steps_a = {name: database.current_step_a(name) for name in layout.branch_names}
         self._open = [] if layout.contactor is None else layout.contactor.open
         self._max_age_s = layout.max_age_s
         self._samples: dict[str, _Samples] | None = None
@@ -161,8 +166,15 @@ class _ZeroCurrent:
                 far = [value - middle for _, value in inside]
                 windows.append(_Window(middle, [*map(median, pieces.values())], len(far), sum(far), _product(far, far)))
 
-    def reading(self, branch: str, step_a: float) -> tuple[float, float] | tuple[None, None]:
-        """Offset of a branch and its standard deviation [A]; None if the windows are too short."""
+    def forget(self) -> None:
+        """Begin anew, but for a window that is open."""
+        self._windows = {name: [] for name in self._windows}
+
+    def readings(self, branches: Sequence[str]) -> list[_Reading]:
+        """Offset of each branch and its standard deviation [A]; None if the windows are too short."""
+        return [self._reading(name, self._steps_a[name]) for name in branches]
+
+    def _reading(self, branch: str, step_a: float) -> _Reading:
         windows = self._windows[branch]
         count = sum(window.samples for window in windows)
         if count < rule.FEWEST_ZERO_SAMPLES:
@@ -227,7 +239,7 @@ class OnBoardSummary:
         self._length = max(round(rule.BLOCK_S / layout.period_s), 1)
         self._batch = self._length * max(rule.BATCH_SAMPLES // self._length, 1)
         self._bus: SteadyBus | None = None
-        self._zero = _ZeroCurrent(layout)
+        self._zero = _ZeroCurrent(database)
         self.messages: dict[
             FrameKey, tuple[Callable[[bytearray], bool], list[tuple[Callable[[bytearray], float | None], _Take]]]
         ] = {}
@@ -239,7 +251,7 @@ class OnBoardSummary:
         self._wait_s += max(abs(delay_s) for delay_s, _ in self._delays.values())
         self._background = ThreadPoolExecutor(1, "summary")
         self._job: Future[None] | None = None
-        """Sums and writes a batch; what stands below is its own meanwhile."""
+        """Sums and writes a batch; what :meth:`_begin_file` makes, and ``_drive_starts``, is its own meanwhile."""
         self._has_failed = False
         self._zero_s: float | None = None
         """When the drive began, by the time of day. [s]"""
@@ -334,7 +346,7 @@ class OnBoardSummary:
             if item.name == layout.temperature:
                 self._read_input(item, self._warm.put)
             if layout.contactor is not None and item.name == layout.contactor.input:
-                self._read_input(item, lambda time_s, value: self._zero.state(time_s, value))  # noqa: PLW0108  # a new one
+                self._read_input(item, self._zero.state)
         for branch in layout.branch:
             signals = branch_signals(database, branch, Mode.GATEWAY)
             channel = self._channels[branch.name] = _Channel(branch.timeout_s, self._delays[branch.name][0])
@@ -404,7 +416,7 @@ class OnBoardSummary:
         warm = self._warm.until(last * self._period_s)
         self._next, self._due_s = last, (last + self._batch) * self._period_s + self._wait_s
         self._finish_job()
-        self._job = self._background.submit(self._sum, instants_s, samples, warm)
+        self._job = self._background.submit(self._sum, instants_s, samples, warm, self._zero.readings(self._branches))
 
     def _finish_job(self) -> None:
         """Say when writing fails, and when it does no more."""
@@ -413,6 +425,9 @@ class OnBoardSummary:
         try:
             self._job.result()
             failed, news = False, "records are written again"
+            if len(self._count) >= MOST_BATCHES:
+                self._zero.forget()
+                self._begin_file()
         except OSError as error:
             failed, news = True, f"{error.strerror}; records are lost until that has changed"
         if failed != self._has_failed:
@@ -435,7 +450,9 @@ class OnBoardSummary:
         rows += [[math.nan] * len(rows[0])] * (-len(rows) % self._length)
         return [[*column] for column in zip(*rows, strict=True)]
 
-    def _sum(self, instants_s: Sequence[float], samples: Mapping[str, _Samples], warm: _Samples) -> None:
+    def _sum(
+        self, instants_s: Sequence[float], samples: Mapping[str, _Samples], warm: _Samples, readings: list[_Reading]
+    ) -> None:
         """Add the blocks of a batch to the file, and write it."""
         columns, K, length = self._columns(instants_s, samples), len(self._branches), self._length
         M = len(columns) - K
@@ -469,17 +486,13 @@ class OnBoardSummary:
         self._starts.append(self._drive_starts)
         self._drive_starts = False
         self._count.append(count)
-        self._write()
-        if len(self._count) == MOST_BATCHES:
-            self._zero = _ZeroCurrent(self._database.layout)
-            self._begin_file()
+        self._write(readings)
 
-    def _write(self) -> None:
+    def _write(self, readings: list[_Reading]) -> None:
         """Replace the file as a whole; what could not be written is so again with the next batch."""
         if self._path is None:
             self._path = self._folder / f"{datetime.now(UTC):%Y-%m-%dT%H%M%S.%f}{rule.SUFFIX}"
         layout, database = self._database.layout, self._database
-        readings = [self._zero.reading(name, database.current_step_a(name)) for name in self._branches]
         levels = [sorted(self._levels[name].items()) for name in self._branches]
         record = SummaryFile(
             schema_version=rule.SCHEMA_VERSION,
