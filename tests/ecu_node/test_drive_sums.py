@@ -110,6 +110,7 @@ def test_full_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.Monk
     records = drive.records()
     assert len(records) == 3
     assert [record.starts for record in records] == [[True], [False], [False]]
+    assert [record.zero_offset_a[0] for record in records] == [pytest.approx(OFFSET_A), None, None]
 
 
 def test_failure_to_write_is_said_once_and_its_end(drive: Drive) -> None:
