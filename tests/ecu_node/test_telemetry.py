@@ -250,8 +250,8 @@ def test_nothing_leaks_and_no_garbage_is_collected_in_100000_frames(tmp_path: Pa
     assert seen["collections"] == 0
     assert "ecu-node: real time" in done.stderr
     lines = [json.loads(line) for line in (tmp_path / "telemetry.jsonl").read_text().splitlines()]
-    assert 0 < lines[1]["latency_us"]["p50"] <= lines[-1]["latency_us"]["p99.9"] <= lines[-1]["latency_us"]["max"]
-    assert sum(lines[-1]["latency_counts"]) > sum(lines[1]["latency_counts"]) > 0
+    assert 0 < lines[-1]["latency_us"]["p50"] <= lines[-1]["latency_us"]["p99.9"] <= lines[-1]["latency_us"]["max"]
+    assert sum(lines[-1]["latency_counts"]) > sum(lines[0]["latency_counts"])
     assert lines[0]["counters"]["frames_in"] < lines[-1]["counters"]["frames_in"] <= FRAMES + 5_000
 
 

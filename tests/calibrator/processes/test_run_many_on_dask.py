@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,6 @@ from calibrator.processes.run_many import Failed, Workers, run_many, try_many
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.command_here import calibrator
 from tests.calibrator.processes.dask_cluster import DaskCluster, gated
 from tests.calibrator.processes.test_run_many import LIMIT_S, dying_once, hostile
 
@@ -88,7 +88,9 @@ def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
 
 
 def command(*arguments: object) -> subprocess.CompletedProcess[str]:
-    done = calibrator(*arguments)
+    """Run a command in a process of its own, which takes its sockets of cluster and storage with it."""
+    line = [sys.executable, "-m", "calibrator", *map(str, arguments)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     return done
 
