@@ -216,15 +216,16 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             manager.ready(at_start)
 
         looks: list[Callable[[float], None]] = [] if routes is None else [routes.look]
+        records: list[Callable[[float], None]] = []
         if options.state is not None:
             looks.append(FaultMemory(corrector, options.state, say, ThreadPoolExecutor(1, "faults")).look)
         if options.telemetry is not None:
-            looks.append(Telemetry(options.telemetry, corrector, database.layout, latency, buses, say).look)
+            records.append(Telemetry(options.telemetry, corrector, database.layout, latency, buses, say).look)
         if options.summary is not None:
             from ecu_node.bus.on_board_summary import on_board_summary  # noqa: PLC0415  # the only user of statistics
 
             summing = on_board_summary(options, bus, database, source.in_force.parameters, say)
-            looks.append(closed_at_end.enter_context(closing(summing)).look)
+            records.append(closed_at_end.enter_context(closing(summing)).look)
         changes = StateChanges(corrector)
 
         def tick(now_s: float, works: bool) -> None:
@@ -234,11 +235,13 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
                 each.count_dropped()
             if source.look(corrector, now_s):
                 manager.status(f"parameter set {corrector.parameter_set} is in force, {correcting()}")
-            for look in [*looks]:
+            for look in looks:
+                look(now_s)
+            for look in [*records]:
                 try:
                     look(now_s)
                 except Exception as error:  # noqa: BLE001  # a fault of what only records must not end the correction
-                    looks.remove(look)
+                    records.remove(look)
                     what = type(look.__self__).__name__  # type: ignore[attr-defined]
                     say(
                         f"internal error in {what}, which is off now; please report it: {type(error).__name__}: {error}"
