@@ -5,10 +5,9 @@ BIN := $(VENV)/bin
 DRIVES ?= builtin
 OUT ?= build/demo
 TRIPS ?= ../shared/data/bmw_i3_summer
+SEED ?= 1100
 PYTHONS ?=
 PIP_QUIET := --quiet --disable-pip-version-check --no-deps
-unexport PYTHONDONTWRITEBYTECODE # without cached bytecode each of the many processes starts three times as slowly
-
 unexport PYTHONDONTWRITEBYTECODE # where it is set, each of some thousand processes compiles anew what it imports
 
 .DEFAULT_GOAL := help
@@ -76,9 +75,9 @@ bench: setup             ## how long each step takes, beside its peers; also bui
 bench-quick: setup       ## the same at small sizes, within five minutes
 	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --quick
 
-experiments: setup       ## docs/results anew, ten repetitions; TRIPS=folder of the recorded BMW i3 trips (hours)
+experiments: setup       ## docs/results anew, ten repetitions from SEED on; TRIPS=folder of the recorded BMW i3 trips (hours)
 	$(BIN)/python tools/import_bmw_i3.py $(TRIPS) --layout dbc/hv_powertrain.toml --out build/i3
-	$(BIN)/calibrator experiment all --drives build/i3 --layout dbc/hv_powertrain.toml --out docs/results
+	$(BIN)/calibrator experiment all --seed $(SEED) --drives build/i3 --layout dbc/hv_powertrain.toml --out docs/results
 
 soak: setup              ## the node at the full load of a CAN FD bus, 10^7 frames; its watch on 24 h of real drives (hours)
 	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --only node --out build/soak.json

@@ -5,8 +5,11 @@ Every setting is run with the same seeds; all methods of a setting see the same 
 
 import os
 import platform
+import shutil
+import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -192,8 +195,17 @@ def _pooled(series: str, figures: pd.DataFrame, tenths: pd.DataFrame) -> list[pd
 
 
 def made_now() -> str:
-    """Version of the calibrator, machine and day, in words."""
+    """Version of the calibrator, commit if it is a checkout, machine and day, in words."""
     return (
-        f"calibrator {__version__}, Python {platform.python_version()} on {platform.machine()} with "
+        f"calibrator {__version__}{_commit()}, Python {platform.python_version()} on {platform.machine()} with "
         f"{os.cpu_count()} cores, {time_of_run()[:10]}"
     )
+
+
+def _commit() -> str:
+    root, git = Path(__file__).parents[2], shutil.which("git")
+    if git is None or not (root / ".git").exists():
+        return ""
+    command = [git, "-C", str(root), "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty"]
+    told = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - nothing of a user in it
+    return f" of commit {told.stdout.strip()}" if told.returncode == 0 else ""
