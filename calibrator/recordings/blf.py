@@ -11,13 +11,13 @@ any error: the structure is checked throughout, and damage is refused with its p
 import struct
 from collections.abc import Iterator
 from datetime import UTC, datetime
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from isal import isal_zlib
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inner
+from calibrator.compiled import compiled, inlined, inner
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import (
     CLASSIC_BYTES,
@@ -59,7 +59,6 @@ _ERROR, _ERROR_EXT, _ERROR_FD = 2, 73, 104
 _TEN_MICROSECONDS = 1
 """Flag of the unit of time; nanoseconds otherwise."""
 _TEN_MICROSECONDS_NS = 10_000
-_FD_LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64], np.int64)
 _SOUND, _IMPOSSIBLE, _NO_OBJECT, _WIDE = range(4)
 """How taking a batch apart ended; the last one: it has payloads of CAN FD, and the columns are for classic ones."""
 
@@ -98,11 +97,12 @@ def read_blf(file: BinaryIO, name: str) -> Frames:
         tail, fd = b"", False
         for batch in _batches(file):
             contents = [tail, *(content for content, _ in batch)]
-            data = np.frombuffer(b"".join(contents), np.uint8)
+            data = b"".join(contents)
+            numbers = _Numbers.of(data)
             ended = _WIDE
             while ended == _WIDE:
                 columns = FrameColumns.of(len(data) // _OBJECT_HEADER_BYTES + 1, fd=fd)
-                ended, rows, end, wrong_size = _take_apart(data, start_ns, _FD_LENGTHS, columns)
+                ended, rows, end, wrong_size = _take_apart(numbers, start_ns, columns)
                 fd = fd or ended == _WIDE
             parts.append(columns.frames(rows=rows))
             if ended != _SOUND:
@@ -110,7 +110,7 @@ def read_blf(file: BinaryIO, name: str) -> Frames:
                 impossible = f"an object of {wrong_size} bytes, which is impossible for its type"
                 what = impossible if ended == _IMPOSSIBLE else "something that is no object"
                 raise _DamageError(batch[max(container, 0)][1], f"a container holds {what}")
-            tail = data[end:].tobytes()
+            tail = data[end:]
         if tail.strip(b"\0"):
             raise _DamageError(file.tell(), "the last object is cut")
         if size >= file.tell() + _LONGEST_PADDING:
@@ -193,22 +193,35 @@ def _container_content(content: bytes, position: int) -> bytes:
     return text
 
 
+class _Numbers(NamedTuple):
+    """The same bytes as little-endian numbers of 1, 2, 4 and 8 bytes that start at any of them."""
+
+    u8: NDArray[np.uint8]
+    u16: NDArray[np.uint16]
+    u32: NDArray[np.uint32]
+    u64: NDArray[np.uint64]
+
+    @classmethod
+    def of(cls, content: bytes) -> "_Numbers":
+        """View; zeros stand after the end."""
+        padded, n = content + bytes(8), len(content)
+        return cls(*(np.ndarray((n,), kind, padded, strides=(1,)) for kind in ("<u1", "<u2", "<u4", "<u8")))
+
+
 @compiled
-def _take_apart(
-    data: NDArray[np.uint8], start_ns: int, fd_lengths: NDArray[np.int64], columns: FrameColumns
-) -> tuple[int, int, int, int]:
+def _take_apart(data: _Numbers, start_ns: int, columns: FrameColumns) -> tuple[int, int, int, int]:
     """Fill a row per frame: how it ended, rows, where what is left over begins, and the size that is impossible."""
-    here, row = 0, 0
+    here, row, n = 0, 0, len(data.u8)
     while True:
         at = here
-        while at - here <= _LONGEST_PADDING and at + 4 <= len(data) and not _is_signature(data, at):
+        while at - here <= _LONGEST_PADDING and at + 4 <= n and data.u32[at] != _SIGNATURE:
             at += 1
-        if at - here > _LONGEST_PADDING or at + 4 > len(data):
-            lost = here + 2 * _LONGEST_PADDING <= len(data)
+        if at - here > _LONGEST_PADDING or at + 4 > n:
+            lost = here + 2 * _LONGEST_PADDING <= n
             return (_NO_OBJECT if lost else _SOUND), row, here, 0
-        if at + _OBJECT_HEADER_BYTES > len(data):
+        if at + _OBJECT_HEADER_BYTES > n:
             return _SOUND, row, here, 0
-        version, size, kind = _number(data, at + 6, 2), _number(data, at + 8, 4), _number(data, at + 12, 4)
+        version, size, kind = data.u16[at + 6], _integer(data.u32[at + 8]), data.u32[at + 12]
         is_frame = kind in (_CLASSIC, _CLASSIC_2, _FD, _FD_64)
         fields = 8 if kind in (_CLASSIC, _CLASSIC_2) else 20 if kind == _FD else 40
         known = version in (1, 2)
@@ -216,12 +229,12 @@ def _take_apart(
         least = _OBJECT_HEADER_BYTES if not known else body + fields if is_frame else 32
         if size < least or size > LARGEST_OBJECT:
             return _IMPOSSIBLE, row, here, size
-        if at + size > len(data):
+        if at + size > n:
             return _SOUND, row, here, 0
         if is_frame:
             columns.kind[row] = DAMAGED
             if known:
-                columns.kind[row] = _take(data, at, body, fields, start_ns, fd_lengths, row, columns)
+                columns.kind[row] = _take(data, at, body, fields, start_ns, row, columns)
                 if columns.kind[row] == _TOO_LONG:
                     return _WIDE, row, here, 0
             row += 1
@@ -235,54 +248,38 @@ _TOO_LONG = 255
 """For these columns."""
 
 
-@inner
+@inlined
 def _take(  # noqa: PLR0917 (compiled: no keywords)
-    data: NDArray[np.uint8],
-    at: int,
-    body: int,
-    fields: int,
-    start_ns: int,
-    fd_lengths: NDArray[np.int64],
-    row: int,
-    columns: FrameColumns,
+    data: _Numbers, at: int, body: int, fields: int, start_ns: int, row: int, columns: FrameColumns
 ) -> int:
     """Put one object that is a frame into a row; what it is."""
-    size, b = _number(data, at + 8, 4), at + body
+    size, b = _integer(data.u32[at + 8]), at + body
     if fields == 40:  # CAN FD 64
-        channel, code, length = int(data[b]), int(data[b + 1]), int(data[b + 2])
-        flags, extension = _number(data, b + 12, 4), int(data[b + 35])
+        channel, code, length = _integer(data.u8[b]), _integer(data.u8[b + 1]), _integer(data.u8[b + 2])
+        flags, extension = data.u32[b + 12], _integer(data.u8[b + 35])
         remote, fd = flags & 0x10 > 0, flags & 0x1000 > 0
         size = extension if extension > 0 else size
     else:
-        channel, code = _number(data, b, 2), int(data[b + 3])
-        remote, fd = data[b + 2] & 0x80 > 0, fields == 20 and data[b + 13] & 1 > 0
-        length = int(data[b + 14]) if fields == 20 else int(min(fd_lengths[min(code, 15)], CLASSIC_BYTES))
+        channel, code = _integer(data.u16[b]), _integer(data.u8[b + 3])
+        remote, fd = data.u8[b + 2] & 0x80 > 0, fields == 20 and data.u8[b + 13] & 1 > 0
+        length = _integer(data.u8[b + 14]) if fields == 20 else min(code, CLASSIC_BYTES)
     if remote:
         return REMOTE
-    time = np.uint64(_number(data, at + 24, 4)) | np.uint64(_number(data, at + 28, 4)) << np.uint64(32)
-    unit = _TEN_MICROSECONDS_NS if _number(data, at + 16, 4) == _TEN_MICROSECONDS else 1
-    sound = length <= FD_BYTES if fd else length == int(min(fd_lengths[min(code, 15)], CLASSIC_BYTES))
-    if not sound or time > np.uint64(max(LATEST_TIME_STAMP_NS - start_ns, 0) // unit):
+    unit = _TEN_MICROSECONDS_NS if data.u32[at + 16] == _TEN_MICROSECONDS else 1
+    sound = length <= FD_BYTES if fd else length == min(code, CLASSIC_BYTES)
+    if not sound or data.u64[at + 24] > np.uint64(max(LATEST_TIME_STAMP_NS - start_ns, 0) // unit):
         return DAMAGED
     if length > columns.data.shape[1]:
         return _TOO_LONG
     for k in range(min(length, size - fields - body)):
-        columns.data[row, k] = data[b + fields + k]
-    columns.time_ns[row] = start_ns + np.int64(time) * unit
-    columns.key[row] = _number(data, b + 4, 4) & (LARGEST_IDENTIFIER | EXTENDED_BIT)
+        columns.data[row, k] = data.u8[b + fields + k]
+    columns.time_ns[row] = start_ns + np.int64(data.u64[at + 24]) * unit
+    columns.key[row] = data.u32[b + 4] & np.uint32(LARGEST_IDENTIFIER | EXTENDED_BIT)
     columns.channel[row], columns.length[row] = channel, length
     return DATA
 
 
 @inner
-def _is_signature(data: NDArray[np.uint8], at: int) -> bool:
-    return _number(data, at, 4) == _SIGNATURE
-
-
-@inner
-def _number(data: NDArray[np.uint8], at: int, size: int) -> int:
-    """Unsigned little-endian number of up to 4 bytes."""
-    value = 0
-    for k in range(size):
-        value |= int(data[at + k]) << (8 * k)
-    return value
+def _integer(number: np.unsignedinteger) -> int:
+    """Signed, as compiled code makes floating point of unsigned and signed numbers together."""
+    return int(np.int64(number))
