@@ -1,7 +1,7 @@
 """Result of a calibration: a folder, written once and read by the commands that come after.
 
 ``run.json`` says how it was made (:class:`RunRecord`). ``results.parquet`` has one row per vehicle and branch, and one
-without branch for each vehicle that was left out. ``parameters/NNNNN.parquet`` has the same rows by bucket of the
+without branch for each vehicle that was left out. ``buckets/NNNNN.parquet`` has the same rows by bucket of the
 vehicle, and in the first of each vehicle the text of its parameter file; for up to :data:`MOST_FILES` vehicles each is
 also a file ``params/VEHICLE.json``, as a folder of a million files is of no use.
 """
@@ -58,7 +58,7 @@ MOST_NAMED = 1000
 """Vehicles that a report names one by one; all of them stand in ``results.parquet``."""
 CONFIDENT = 0.95
 """Confidence below which a report adds it to what is corrected. [1]"""
-PARTS, FILES, ROWS = "parameters", "params", "results.parquet"
+PARTS, FILES, ROWS = "buckets", "params", "results.parquet"
 LEFT_OUT = "left out"
 """Stands for the verdict of a vehicle, or of a file of unclear vehicle, that has no parameters."""
 REMEDY = "name a folder that 'calibrator calibrate --out' wrote"
@@ -317,33 +317,34 @@ def written_of(result: Path, vehicle: str) -> WrittenVehicle:
         return found[vehicle]
     if not (result / PARTS).is_dir():
         raise FleetError(f"{result / PARTS}: no such folder; give all that 'calibrator calibrate' wrote")
-    try:
-        reason = left_out_of(result).get(vehicle)
-    except (pa.ArrowException, OSError):
-        reason = None
+    reason = left_out_of(result).get(vehicle)
     if reason is None:
         raise FleetError(f"{result}: no vehicle {vehicle!r} in it; {ROWS} names all that are")
     raise FleetError(f"{result}: no parameters of vehicle {vehicle!r}, it was left out: {reason}")
 
 
 def left_out_of(result: Path) -> dict[str, str]:
-    """Vehicles of ``results.parquet`` that have no parameters, and why."""
-    found = pq.read_table(result / ROWS, columns=["vehicle", "branch", "reason"], use_threads=False)
+    """Vehicles of ``results.parquet`` that have no parameters, and why; FleetError if it is none."""
+    found = _read_rows(result, ["vehicle", "branch", "reason"])
     return {row["vehicle"]: row["reason"] for row in found.filter(pc.field("branch").is_null()).to_pylist()}
 
 
 def read_results(result: Path) -> Rows:
     """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
+    rows: Rows = _read_rows(result, SCHEMA.names).to_pylist()
+    return rows
+
+
+def _read_rows(result: Path, columns: list[str]) -> pa.Table:
     path = result / ROWS
     try:
-        found = pq.read_table(path, use_threads=False)
+        found = pq.read_table(path, columns=columns, use_threads=False)
     except (OSError, pa.ArrowInvalid) as error:
-        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {_first_line(error)}; {REMEDY}") from None
-    missing = [name for name in SCHEMA.names if name not in found.column_names]
-    if missing:
+        why = "no such file" if isinstance(error, FileNotFoundError) else _first_line(error)
+        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {why}; {REMEDY}") from None
+    if missing := [name for name in columns if name not in found.column_names]:
         raise FleetError(f"{path}: column {', '.join(missing)} is missing; write the result anew with this version")
-    rows: Rows = found.to_pylist()
-    return rows
+    return found
 
 
 def _first_line(error: Exception) -> str:

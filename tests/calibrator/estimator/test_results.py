@@ -60,6 +60,7 @@ def result(request: pytest.FixtureRequest, tmp_path: Path, database: VehicleData
     (folder / PARTS).mkdir(parents=True)
     for name in ("v1", "v2"):
         part_file(folder, bucket_of(name, BUCKETS)).write_bytes(encode_chunk([vehicle(database, name)], {}))
+    join_rows(folder, {})
     where = write_parameter_files(folder, vehicles=request.param)
     assert where == ("params" if request.param == 2 else PARTS)
     assert (folder / "params").exists() == (where == "params")

@@ -146,7 +146,7 @@ def test_cluster_that_loses_a_worker_gives_the_same_result(database: VehicleData
     assert here.returncode == 0, here.stderr
 
     def chunks() -> int:
-        return len(list(tmp_path.glob(".there.*/parameters/[0-9]*.parquet")))
+        return len(list(tmp_path.glob(".there.*/buckets/[0-9]*.parquet")))
 
     with DaskCluster(tmp_path) as cluster:
         there = ("--out", tmp_path / "there", "--scheduler", cluster.address)
@@ -310,8 +310,8 @@ def test_internal_error_is_named_and_ends_the_command_with_70(
 
 
 def earlier_result(folder: Path, chunk: bytes, bucket: int) -> Path:
-    (folder / "parameters").mkdir(parents=True)
-    (folder / "parameters" / f"{bucket:05d}.parquet").write_bytes(chunk)
+    (folder / "buckets").mkdir(parents=True)
+    (folder / "buckets" / f"{bucket:05d}.parquet").write_bytes(chunk)
     return folder
 
 
