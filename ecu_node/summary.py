@@ -23,6 +23,8 @@ LEAST_SHARE = 0.2
 """Least share of valid samples of a block that is used. [1]"""
 TIME_RESOLUTION_S = 1e-3
 """Logs round time stamps up to this; samples exactly one limit apart must pass. [s]"""
+INSTANT_SLACK = 1e-3
+"""Of a period or limit: an instant that is no farther from a sample, or from the grid, is there. [1]"""
 RANGE_SLACK = 1e-6
 """Rounding of decimal scales must not push a value out of its range. [steps of the signal]"""
 

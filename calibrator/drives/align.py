@@ -20,7 +20,7 @@ from calibrator.drive import Array, Channel, Drive, Mask, Samples
 from calibrator.errors import DriveError
 from ecu_node.formulas import FUNCTIONS, formula_value, parse_formula
 from ecu_node.layout import Layout
-from ecu_node.summary import TIME_RESOLUTION_S
+from ecu_node.summary import INSTANT_SLACK, TIME_RESOLUTION_S
 
 __all__ = [
     "Samples",
@@ -226,7 +226,7 @@ def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array,
 def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:
     """Instants that the good samples of all channels cover."""
     start, stop = max(float(time_s[0]) for time_s in good_s), min(float(time_s[-1]) for time_s in good_s)
-    slack = TIME_RESOLUTION_S * period_s
+    slack = INSTANT_SLACK * period_s
     first, last = int(np.ceil((start - slack) / period_s)), int(np.floor((stop + slack) / period_s))
     if last < first:
         raise DriveError(

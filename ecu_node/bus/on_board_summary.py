@@ -100,7 +100,7 @@ def _aligned(samples: _Samples, instants_s: Sequence[float], limit_s: float) -> 
         following = bisect_right(times_s, instant_s)
         (before_s, before), (after_s, after) = samples[max(following - 1, 0)], samples[min(following, len(samples) - 1)]
         gap_s, since_s = after_s - before_s, instant_s - before_s  # no gap before the first sample and behind the last
-        if since_s <= (0.0 if gap_s else rule.TIME_RESOLUTION_S * limit_s):
+        if since_s <= (0.0 if gap_s else rule.INSTANT_SLACK * limit_s):
             found.append(before)
         elif gap_s and gap_s <= limit_s:
             found.append(((gap_s - since_s) * before + since_s * after) / gap_s)
@@ -314,7 +314,7 @@ class OnBoardSummary:
         self._zero.end_window()
         if self._zero_s is not None and (self._next is not None or self._start()):
             end_s = min(self._channels[name].samples[-1][0] for name in (*self._recorded, *self._branches))
-            end = math.floor(end_s / self._period_s + rule.TIME_RESOLUTION_S) + 1
+            end = math.floor(end_s / self._period_s + rule.INSTANT_SLACK) + 1
             while self._next is not None and self._next < end:
                 self._sum_batch(end)
         self._finish_job()
@@ -394,7 +394,7 @@ class OnBoardSummary:
             if absent := [name for name in channels if name not in fitted]:
                 self._say(f"--summary: no good value of {', '.join(absent)}: left out")
         start_s = max(channels[name].samples[0][0] for name in fitted)
-        self._next = math.ceil(start_s / self._period_s - rule.TIME_RESOLUTION_S)
+        self._next = math.ceil(start_s / self._period_s - rule.INSTANT_SLACK)
         return True
 
     def _begin_file(self) -> None:

@@ -367,7 +367,7 @@ class Corrector:
         if status_fields is not None:
             self.own_keys.add(status_fields.message.key)
 
-    def put_in_force(self, *, reason: Reason, parameter_set: int, expected: JunctionResidual | None = None) -> None:
+    def begin(self, *, reason: Reason, parameter_set: int, expected: JunctionResidual | None = None) -> None:
         """Begin with what the branches were just given; what was latched is released.
 
         Parameters

@@ -112,6 +112,20 @@ class Written(NamedTuple):
             self.quality.put(payload, min(quality, self.quality.highest))
 
 
+class BranchCorrection(NamedTuple):
+    """What parameters say of one branch."""
+
+    fault: SensorFault
+    correcting: IntegerPlan
+    """The same in integers."""
+    passing: IntegerPlan
+    """What is written where nothing is corrected."""
+    delay_s: float
+    """How much later than the junction it is seen. [s]"""
+    expected_since_s: float | None
+    """Since when its frames are waited for; None: not before the first one (a vehicle may lack the branch). [s]"""
+
+
 class LiveBranch(HeardSignal):
     """One branch: state of its sensor, and what is made of it.
 
@@ -155,35 +169,13 @@ class LiveBranch(HeardSignal):
         self._is_named = False
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
 
-    def put_in_force(
-        self,
-        *,
-        fault: SensorFault,
-        plan: IntegerPlan,
-        passing: IntegerPlan,
-        delay_s: float,
-        expected_since_s: float | None,
-    ) -> None:
-        """Take a correction; it is used once :meth:`activate` says so.
-
-        Parameters
-        ----------
-        fault : SensorFault
-            What is corrected.
-        plan : IntegerPlan
-            The same in integers.
-        passing : IntegerPlan
-            What is written where nothing is corrected.
-        delay_s : float
-            How much later than the junction it is seen. [s]
-        expected_since_s : float or None
-            Since when its frames are waited for; None: not before the first one (a vehicle may lack the branch).
-        """
-        self.fault, self.delay_s = fault, delay_s
-        self._passing, self._correcting = passing, plan
-        self._is_named = expected_since_s is not None
-        if expected_since_s is not None:
-            self._waited_s = max(self._waited_s, expected_since_s)
+    def take(self, correction: BranchCorrection) -> None:
+        """Take another correction; it is used once :meth:`activate` says so."""
+        self.fault, self.delay_s = correction.fault, correction.delay_s
+        self._passing, self._correcting = correction.passing, correction.correcting
+        self._is_named = correction.expected_since_s is not None
+        if correction.expected_since_s is not None:
+            self._waited_s = max(self._waited_s, correction.expected_since_s)
 
     def activate(self, *, active: bool, doubted: bool) -> None:
         """Correct, or pass through; a sensor that is in doubt is never said to be right."""
@@ -302,7 +294,7 @@ class LiveBranch(HeardSignal):
         measured_a = (self._scale * code + self._offset) / volts
         return measured_a, self.fault.true_current(measured_a)
 
-    def moved_a(self, instant_s: float, since_s: float, frames: int) -> Movement:
+    def movement(self, instant_s: float, since_s: float, frames: int) -> Movement:
         """How its corrected current moved in the frames before an instant of the junction.
 
         Parameters
@@ -591,7 +583,7 @@ class JunctionWatch:
     def _jumped(self) -> Verdict | None:
         """What a jump looked like when it began; None unless there is one, and it has lasted."""
         instant_s, residual_a = self.instant_s, self._recent.moments[-1].corrected_a
-        moved = {name: self._branches[name].moved_a(instant_s, _MOVING_S, _MOVING_FRAMES) for name in self.currents_a}
+        moved = {name: self._branches[name].movement(instant_s, _MOVING_S, _MOVING_FRAMES) for name in self.currents_a}
         most = max(moved, key=lambda name: moved[name].distance_a)
         others_a = sum(movement.distance_a for movement in moved.values()) - moved[most].distance_a
         limit_a = max(_JUMP_DEVIATIONS * self._sum_sd_a(), _JUMP_SHARE * self._full_scale_a)
