@@ -21,6 +21,8 @@ _NAME = "faults.json"
 _MOST_FAULTS, _LARGEST_BYTES = 64, 1_000_000
 _LOOK_EVERY_S = 1.0
 """Between looks whether somebody cleared the memory. [s]"""
+_TRY_AGAIN_S = 60.0
+"""Between attempts to write what could not be written. [s]"""
 
 
 class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
@@ -41,6 +43,10 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Currents of the last time, positive into the junction. [A]"""
     active: bool = True
     """Whether it still keeps the node from correcting."""
+
+    def __post_init__(self) -> None:
+        if self.reason not in Reason.__members__:
+            raise ValueError(f"unknown reason {self.reason!r}")
 
 
 def _file(folder: Path) -> Path:
@@ -99,7 +105,7 @@ class FaultMemory:
 
     def __init__(self, corrector: Corrector, folder: Path, say: Callable[[str], None], background: Executor) -> None:
         self._corrector, self._folder, self._say, self._background = corrector, folder, say, background
-        self._due_s = float("-inf")
+        self._due_s = self._tried_s = float("-inf")
         self._written: Future[bool] | None = None
         """Whether the file is as the faults are, once that is known; None: as it was read."""
         try:
@@ -115,12 +121,15 @@ class FaultMemory:
     def look(self, now_s: float) -> None:
         """Keep what has changed since the last time."""
         corrector = self._corrector
-        if now_s >= self._due_s and corrector.latched:
+        if now_s >= self._due_s and (self._written is None or self._written.done()):
             self._due_s = now_s + _LOOK_EVERY_S
-            is_kept = self._written is None or (self._written.done() and self._written.result())
-            if self._faults and is_kept and not (self._folder / _NAME).exists():
+            if self._written is not None and not self._written.result():
+                if now_s - self._tried_s >= _TRY_AGAIN_S:
+                    self._keep(now_s)
+            elif self._faults and self._is_cleared():
                 self._faults = []
-                corrector.release()
+                if corrector.latched:
+                    corrector.release()
         found = corrector.latched, corrector.latched_branches
         if found == self._before:
             return
@@ -129,6 +138,16 @@ class FaultMemory:
             fault.active = False
         if corrector.latched:
             self._add(Reason(corrector.latched).name, list(corrector.latched_branches))
+        self._keep(now_s)
+
+    def _is_cleared(self) -> bool:
+        try:
+            return all(path.name != _NAME for path in self._folder.iterdir())
+        except OSError:  # a folder that is gone, or on a broken disk, says nothing
+            return False
+
+    def _keep(self, now_s: float) -> None:
+        self._tried_s = now_s
         content = msgspec.json.format(msgspec.json.encode(self._faults), indent=2) + b"\n"
         self._written = self._background.submit(self._write, content)
 

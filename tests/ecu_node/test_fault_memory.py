@@ -122,6 +122,41 @@ def test_a_disk_that_is_full_is_told_and_ends_nothing(vehicle: Vehicle) -> None:
     assert len([text for text in vehicle.said if "cannot keep the fault" in text]) == 1
 
 
+def test_a_fault_that_could_not_be_kept_is_kept_later(vehicle: Vehicle, capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle.state.rmdir()
+    vehicle.break_battery()
+    vehicle.run(3)
+    vehicle.state.mkdir()
+    vehicle.run(62)
+    (fault,) = faults(vehicle, capsys)
+    assert (fault["reason"], fault["active"]) == ("SUM_IMPLAUSIBLE", True)
+    vehicle.junction.wrong = {}
+    assert main(["clear", "--state", str(vehicle.state)]) == 0
+    vehicle.run(3)
+    assert vehicle.corrector.state() == (State.CORRECTING, Reason.NONE)
+
+
+def test_a_state_folder_that_vanishes_clears_nothing(vehicle: Vehicle) -> None:
+    vehicle.break_battery()
+    vehicle.run(1)
+    vehicle.junction.wrong = {}
+    vehicle.state.rename(vehicle.state.with_name("away"))
+    vehicle.run(3)
+    assert vehicle.corrector.latched is Reason.SUM_IMPLAUSIBLE
+
+
+def test_faults_that_are_over_are_cleared_for_good(vehicle: Vehicle, capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle.corrector.latch(Reason.BRANCH_STALE, ["motor"])
+    vehicle.memory.look(0.0)
+    vehicle.corrector.release()
+    vehicle.memory.look(0.0)
+    assert main(["clear", "--state", str(vehicle.state)]) == 0
+    vehicle.memory.look(2.0)
+    vehicle.corrector.latch(Reason.BRANCH_STUCK, ["battery"])
+    vehicle.memory.look(2.0)
+    assert [fault["reason"] for fault in faults(vehicle, capsys)] == ["BRANCH_STUCK"]
+
+
 def test_a_damaged_memory_is_one_line(vehicle: Vehicle, capsys: pytest.CaptureFixture[str]) -> None:
     (vehicle.state / "faults.json").write_text("{")
     vehicle.start()
@@ -131,6 +166,15 @@ def test_a_damaged_memory_is_one_line(vehicle: Vehicle, capsys: pytest.CaptureFi
     (vehicle.state / "faults.json").unlink()
     (vehicle.state / "faults.json").mkdir()
     assert main(["faults", "--state", str(vehicle.state)]) == 1
+
+
+def test_a_memory_with_an_unknown_reason_is_one_line(vehicle: Vehicle) -> None:
+    vehicle.break_battery()
+    vehicle.run(1)
+    file = vehicle.state / "faults.json"
+    file.write_text(file.read_text().replace("SUM_IMPLAUSIBLE", "OF_A_LATER_VERSION"))
+    vehicle.start()
+    assert "cannot read the fault memory: unknown reason 'OF_A_LATER_VERSION'" in vehicle.said[-1]
 
 
 @pytest.mark.parametrize("command", ["faults", "clear"])
