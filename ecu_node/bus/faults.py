@@ -165,6 +165,6 @@ class FaultMemory:
         try:
             write_atomically(self._folder / _NAME, content)
         except OSError as error:
-            self._say(f"{self._folder / _NAME}: cannot keep the fault: {error.strerror}; see that its disk has room")
+            self._say(f"{self._folder / _NAME}: cannot keep the fault: {error.strerror}; tried again each minute")
             return False
         return True

@@ -118,10 +118,13 @@ class StateChanges:
     ----------
     corrector : Corrector
         The core.
+    has_memory : bool
+        Whether there is a fault memory to be cleared.
     """
 
-    def __init__(self, corrector: Corrector) -> None:
+    def __init__(self, corrector: Corrector, *, has_memory: bool = True) -> None:
         self._corrector = corrector
+        self._released_by = "other parameters or " + ("'ecu-node clear'" if has_memory else "a restart")
         self._before = Reason.NONE, False
 
     def news(self) -> str | None:
@@ -130,11 +133,11 @@ class StateChanges:
         latched_before, asleep_before = self._before
         latched, asleep = self._before = corrector.latched, corrector.is_asleep
         if latched not in {latched_before, Reason.NONE}:
-            until = "the bus has slept" if latched in OF_ONE_DRIVE else "other parameters or 'ecu-node clear'"
+            until = "the bus has slept" if latched in OF_ONE_DRIVE else self._released_by
             names = (" or " if latched is Reason.SUM_IMPLAUSIBLE else ", ").join(corrector.latched_branches)
             return f"passing measured values through until {until}: {latched.words}{names and f' ({names})'}"
         if asleep != asleep_before:
-            return "the bus sleeps" if asleep else "the bus is awake again"
+            return "no branch sends" if asleep else "branches send again"
         corrects_again = latched != latched_before and corrector.reason is Reason.NONE and not asleep
         return "correcting again" if corrects_again else None
 
@@ -226,7 +229,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
 
             summing = on_board_summary(options, bus, database, source.in_force.parameters, say)
             records.append(closed_at_end.enter_context(closing(summing)).look)
-        changes = StateChanges(corrector)
+        changes = StateChanges(corrector, has_memory=options.state is not None)
 
         def tick(now_s: float, works: bool) -> None:
             if works:

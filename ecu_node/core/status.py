@@ -45,7 +45,7 @@ class Reason(_WithWords):
     WRONG_LAYOUT = 4, "the parameters are for another layout"
     WRONG_DBC = 5, "the parameters are for another DBC"
     IMPLAUSIBLE_PARAMETERS = 6, "the parameters are beyond the limits of the layout"
-    BRANCH_STALE = 7, "a branch has sent nothing for longer than its timeout"
+    BRANCH_STALE = 7, "a branch has sent nothing that can be used for longer than its timeout"
     CORRECTION_WORSE = 8, "the corrected Kirchhoff sum is worse than the measured one"
     BRANCH_STUCK = 9, "a branch never changes while the others do"
     INPUT_MISSING = 10, "a voltage, or a value of a branch, is missing; not everything is corrected"

@@ -12,7 +12,7 @@ from tests.ecu_node.vehicles import Frame, answers, parameters_for, protected
 
 STEP_S = 0.02
 BOTH = ("Battery", "Motor")
-AGAIN = ["the bus sleeps", "the bus is awake again"]
+AGAIN = ["no branch sends", "branches send again"]
 FALLS_BACK = "passing measured values through until the bus has slept: "
 
 
@@ -50,12 +50,12 @@ def drive(database: VehicleDatabase) -> Drive:
     return Drive(database)
 
 
-def test_every_sleep_and_its_end_is_said_the_first_one_too(drive: Drive) -> None:
+def test_every_silence_and_its_end_is_said_the_first_one_too(drive: Drive) -> None:
     assert drive.go_on(1.0, BOTH) == []
     assert [line for _ in range(3) for line in drive.go_on(1.0, ()) + drive.go_on(1.0, BOTH)] == 3 * AGAIN
 
 
-def test_a_sleep_after_a_fall_back_is_said_in_the_same_way(drive: Drive) -> None:
+def test_a_silence_after_a_fall_back_is_said_in_the_same_way(drive: Drive) -> None:
     assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [
         f"{FALLS_BACK}{Reason.BRANCH_STALE.words} (motor)"
     ]
@@ -70,6 +70,12 @@ def test_a_correction_that_makes_it_worse_and_a_stuck_branch_are_said_and_that_i
     parameters = parameters_for(drive.database, battery=(0.0, 5.0), motor=(0.0, 0.0))
     assert drive.load(InForce(parameters=parameters)) == ["correcting again", None]
     assert drive.go_on(12.0, BOTH, swing_a=40.0) == [f"{FALLS_BACK}{Reason.BRANCH_STUCK.words} (motor)"]
+
+
+def test_a_node_without_a_fault_memory_says_that_a_restart_releases(drive: Drive) -> None:
+    drive.changes = StateChanges(drive.corrector, has_memory=False)
+    (line,) = drive.go_on(12.0, BOTH, error_a=0.0)
+    assert "until other parameters or a restart: " in line
 
 
 def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(drive: Drive) -> None:
