@@ -312,6 +312,8 @@ def view_lines(view: View, where: str, counters: Counters) -> list[str]:
         table.append(_sum_cells("node's sum", node["sums"]))
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = [f"{where}: {_node_text(view)}"]
+    if node is not None and not node["is_silent"] and node["reason"] not in (None, "NONE"):
+        lines.append(f"because {_words(Reason, node['reason'])}")  # in a line of its own: terminals are narrow
     for cells in table:
         columns = zip(_COLUMNS.values(), cells, widths, strict=True)
         padded = [cell.rjust(width) if unit else cell.ljust(width) for unit, cell, width in columns]
@@ -343,9 +345,8 @@ def _node_text(view: View) -> str:
         return "no node on this bus"
     if node["is_silent"]:
         return f"no node on this bus any more: its last status came {node['age_s']:.1f} s ago"
-    because = f", because {_words(Reason, node['reason'])}" if node["reason"] not in (None, "NONE") else ""
     which = f"; parameter set {node['parameter_set']}" if node["parameter_set"] else ""
-    words = f"node: {_words(State, node['state'])}{because}{which}; status {node['age_s']:.1f} s ago"
+    words = f"node: {_words(State, node['state'])}{which}; status {node['age_s']:.1f} s ago"
     return "; ".join([words, *_fault_texts(node["faults"])])
 
 
