@@ -88,11 +88,11 @@ def show(drives: str, out: Path) -> None:
     run("calibrator", "score", result, "--truth", fleet / "truth.json")
     run("calibrator", "report", result, "--out", out / "report.html")
     step(4, f"vehicle {vehicle} drives a trip that was not used before, with its node on the bus")
-    parameters = result / "params" / f"{vehicle}.json"
+    parameters, unseen = result / "params" / f"{vehicle}.json", fleet / "unseen" / vehicle / "drive.log.gz"
     say(explained(read_parameters(parameters)))
     say(f"put into {vehicle}: {put_in(truth, vehicle)}")
     run("ecu-node", "check", "--params", parameters, "--layout", LAYOUT, "--vehicle", vehicle)
-    record_live_drive(parameters, vehicle, log=fleet / "unseen" / vehicle / "drive.log.gz", recording=out / "live.log")
+    record_live_drive(parameters, vehicle, log=unseen, recording=out / "live.log")
     step(5, "the Kirchhoff sum of its currents on that trip, before and after")
     run(
         *("calibrator", "kirchhoff", out / "live.log"),
@@ -100,6 +100,12 @@ def show(drives: str, out: Path) -> None:
     )
     draw_side_by_side(out / "kirchhoff.csv", out / "before_after.png")
     say(f"pictures: {out / 'before_after.png'}, {out / 'kirchhoff.png'}; report: {out / 'report.html'}")
+    say(
+        f"the same on a virtual bus (ip link add vcan0 type vcan), with .venv/bin in front, each in its own terminal:\n"
+        f"  ecu-node run --unsigned --params {parameters} --layout {LAYOUT} --interface socketcan --channel vcan0\n"
+        f"  ecu-node monitor --layout {LAYOUT} --interface socketcan --channel vcan0\n"
+        f"  calibrator replay {unseen} --interface socketcan --channel vcan0"
+    )
 
 
 def make_empty(out: Path) -> None:
