@@ -109,7 +109,7 @@ class VehicleDatabase:
         if name is None:
             return 0.0
         _, signal = self.signal(name)
-        return 0.0 if signal.is_float else float(signal.scale) * unit_factor(signal, AMPERE, f"branch {branch}")
+        return 0.0 if signal.is_float else abs(float(signal.scale)) * unit_factor(signal, AMPERE, f"branch {branch}")
 
 
 def read_database(layout: Layout) -> VehicleDatabase:

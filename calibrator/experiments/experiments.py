@@ -112,6 +112,11 @@ class Experiment:
         :data:`calibrator.experiments.figures.FIGURES`.
     panels : tuple of str
         Figures that its picture shows.
+    pooled : bool
+        Whether its confidences are among those that ``calibration`` pools: not of worlds that the estimator does not
+        expect.
+    deviations : bool
+        Whether it is about standard deviations, and shows what all else leaves out.
     """
 
     name: str
@@ -127,6 +132,8 @@ class Experiment:
     picture: Literal["lines", "dots", "map", "reliability"] = "lines"
     shown: tuple[str, ...] = ("confidence", "sure_wrong", "ece", "ece_by_chance", "deployed", "harmed", "delay_rmse_ms")
     panels: tuple[str, ...] = ("recovery_rate", "confidence")
+    pooled: bool = True
+    deviations: bool = False
 
     @property
     def recorded(self) -> bool:
@@ -338,6 +345,7 @@ TABLE = (
         picture="dots",
         shown=("corrected", "harmed", "worst_a", "named", "misnamed", "sure_wrong"),
         panels=("harmed", "named"),
+        pooled=False,
     ),
     Experiment(
         name="coverage",
@@ -352,6 +360,7 @@ TABLE = (
         picture="dots",
         shown=COVERAGE,
         panels=("gain_within_1", "offset_within_1"),
+        deviations=True,
     ),
 )
 CALIBRATION = Experiment(
@@ -362,6 +371,7 @@ CALIBRATION = Experiment(
     methods=(POSTERIOR,),
     settings=(),
     picture="reliability",
+    pooled=False,
 )
 """Of the vehicles with a confidence of 0.9, is a share of 0.9 recovered? Pools what the others have found."""
 EXPERIMENTS = {experiment.name: experiment for experiment in (*TABLE, CALIBRATION)}

@@ -183,7 +183,7 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
         File of its picture, as the page is to link it; empty: there is none.
     """
     experiment, figures, owner = result.experiment, result.figures, _owner(result)
-    hidden = ("failed",) if experiment.name == "coverage" else ("failed", *COVERAGE)
+    hidden = ("failed",) if experiment.deviations else ("failed", *COVERAGE)
     names = [name for name in FIGURES if name not in hidden and (figures["figure"] == name).any()]
     written = f"Written by `calibrator experiment {experiment.name} --out FOLDER`. " if result.made else ""
     more = _explained(name for name in names if name not in _shown(result))
@@ -208,7 +208,7 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
             f"chance {chance:.3f}):",
             _markdown(cells.rename(columns={"low": "from", "confidence": "mean confidence"})),
         ]
-    if experiment.name == "coverage" and len(tenths):
+    if experiment.deviations and len(tenths):
         pit = tenths.pivot_table(index=["series", "x"], columns="low", values="pit", sort=False, aggfunc="sum")
         pit.loc[(ALL, np.nan), :] = pit.sum()
         sections += [

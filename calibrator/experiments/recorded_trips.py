@@ -85,7 +85,7 @@ class RecordedFleet:
         """What is needed to make the trips again."""
         return {
             "drive": self.name,
-            "vehicles": len(self.trips),
+            "trips": len(self.trips),
             "driving_minutes": round(sum(map(len, self.trips)) * self.period_s / 60.0, 1),
             "full_scale_a": self.full_scale_a,
             "noise_a": NOISE * self.full_scale_a,

@@ -35,8 +35,6 @@ from ecu_node import __version__
 
 __all__ = ["made_now", "pool_confidences", "run_experiment"]
 
-NOT_POOLED = (CALIBRATION.name, "attacks")
-"""Attacks are worlds that the estimator does not expect; what becomes of confidences there is in their own table."""
 TRIALS: dict[tuple[type, type], Callable[..., Any]] = {
     (CommonCase, CommonDrive): common_trial,
     (RecordedCase, RecordedFleet): recorded_trial,
@@ -84,6 +82,9 @@ def run_experiment(
     names = [method.name for method in usual]
     if twice := [name for name in names if names.count(name) > 1]:
         raise FleetError(f"{len(twice)} methods are called '{twice[0]}'; give each method a name of its own")
+    if isinstance(fleet, RecordedFleet):  # too few branches are said before anything is run
+        for count in {each.case.branches for each in experiment.settings if isinstance(each.case, RecordedCase)}:
+            fleet.with_branches(count)
     rows = [(setting, setting.methods or usual) for setting in experiment.settings]
     tasks = [(setting.case, own, seed + number) for setting, own in rows for number in range(repetitions)]
     judged = run_many(partial(_run_trial, fleet), tasks, Workers(processes=workers))
@@ -123,7 +124,12 @@ def _common(settings: Sequence[Setting]) -> dict[str, Any]:
     """What all cases have in common, without what is not used."""
     cases = [vars(setting.case) for setting in settings]
     common = {key: value for key, value in cases[0].items() if all(case[key] == value for case in cases)}
-    pairs = {key: "{:g} to {:g}".format(*value) for key, value in common.items() if isinstance(value, tuple)}
+    mean_and_sd = {"unmeasured_a"}  # the other pairs are ranges
+    pairs = {
+        key: ("{:g} +- {:g}" if key in mean_and_sd else "{:g} to {:g}").format(*value)
+        for key, value in common.items()
+        if isinstance(value, tuple)
+    }
     told = {key: getattr(value, "name", value) for key, value in (common | pairs).items()}
     return {key: value for key, value in told.items() if value not in {None, ""}}
 
@@ -152,7 +158,7 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
     parts, used = [], []
     for result in results:
         own = [table[table["method"] == POSTERIOR.name] for table in (result.figures, result.tenths)]
-        if result.experiment.name not in NOT_POOLED and own[1]["vehicles"].sum():
+        if result.experiment.pooled and own[1]["vehicles"].sum():
             used.append(result)
             drawn = " ".join(str(result.settings.get(name)) for name in ("drive", "seed", "repetitions"))
             parts.append([table.assign(experiment=result.experiment.name, drawn=drawn) for table in own])

@@ -201,7 +201,7 @@ def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
         return float(abs(float(signal.scale)) * per_volt / volts)
     levels_a = np.unique(np.round(channel.value[channel.good], 9))
     steps_a = [float(np.diff(levels_a).min())] if len(levels_a) >= LEVELS else []
-    return min([*steps_a, *filter(None, [abs(database.current_step_a(name))])], default=0.0)
+    return min([*steps_a, *filter(None, [database.current_step_a(name)])], default=0.0)
 
 
 def compare_kirchhoff(

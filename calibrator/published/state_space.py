@@ -61,7 +61,7 @@ RIDGE = 1e-12
 """Added to standardised second moments: above rounding, far below any signal. [1]"""
 ROWS_PER_COLUMN = 2
 """Least ratio of rows to columns of lagged data for the moments to mean anything. [1]"""
-TRAIN_SHARE = 0.8
+FITTED_SHARE = 0.8
 """Share of the samples that orders are fitted on; they are compared on the rest. [1]"""
 ORDER_TOLERANCE_DB = 0.2
 """An order is large enough if its simulation error is this close to the best. [dB]"""
@@ -171,7 +171,7 @@ def choose_order(inputs: Array, currents: Array, *, valid: Mask | None = None) -
     mean over channels of its power in dB; chosen is the smallest order within 0.2 dB of the smallest error.
     """
     mask = np.ones(len(inputs), bool) if valid is None else valid
-    stop = int(TRAIN_SHARE * len(inputs))
+    stop = int(FITTED_SHARE * len(inputs))
     u, scale = bridged(inputs, mask), _standardised(currents, mask)[2]
     errors_db = []
     for model in _models(inputs[:stop], currents[:stop], mask[:stop], ORDERS):

@@ -22,7 +22,9 @@ _FASTEST = 1e6
 
 def replay(
     *,
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log: .log .asc .blf .trc .mf4 .csv .txt, also .gz.")],
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="Log of CAN frames, of any format that is read; also .gz.")
+    ],
     channel: Annotated[str, typer.Option(help="Channel of the bus, such as vcan0.")],
     interface: Annotated[str, typer.Option(help="Interface of python-can.")] = "socketcan",
     speed: Annotated[

@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pandas as pd
@@ -75,6 +76,16 @@ def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path) -> None
     assert re.search(r"\| 5 \| [01]\.\d{3} \([01]\.\d{3} to [01]\.\d{3}\)", page), "each rate with its interval"
     assert (tmp_path / "results" / "loads.png").read_bytes().startswith(b"\x89PNG")
     assert "(results/loads.md)" in (tmp_path / "results.md").read_text()
+
+
+def test_more_branches_than_the_trips_have_are_refused_before_anything_is_run(fleet: RecordedFleet) -> None:
+    def estimate(_: object) -> NoReturn:
+        pytest.fail("a trial was run")
+
+    settings = tuple(Setting(x=K, case=RecordedCase(branches=K)) for K in (2, 9))
+    row = Experiment(name="many", title="Many branches", x_label="K", methods=(), settings=settings)
+    with pytest.raises(FleetError, match="9"):
+        run_experiment(row, fleet, methods=[replace(POSTERIOR, estimate=estimate)], repetitions=1)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +169,7 @@ def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkey
     assert fleet_for(EXPERIMENTS["snr"], quick=True).full_scale_a == 400.0
     with pytest.raises(FleetError, match=r"hv_powertrain\.toml: not in this folder.*name it with --layout$"):
         fleet_for(EXPERIMENTS["real"], quick=True)
-    assert fleet_for(EXPERIMENTS["real"], quick=True, layout=LAYOUT).record["vehicles"] == 8
+    assert fleet_for(EXPERIMENTS["real"], quick=True, layout=LAYOUT).record["trips"] == 8
 
 
 def test_wrong_fleet_and_no_repetition_are_refused(fleet: RecordedFleet) -> None:
