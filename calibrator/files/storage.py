@@ -5,7 +5,7 @@ import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -119,9 +119,10 @@ class Storage:
                     if item.is_dir(follow_symlinks=False):
                         folders.append(item.name)
                     elif item.is_file():
-                        status = item.stat()
-                        version = f"{status.st_size}-{status.st_mtime_ns}"
-                        files.append(Entry(item.name, status.st_size, version))
+                        with suppress(FileNotFoundError):  # another process has removed it just now
+                            status = item.stat()
+                            version = f"{status.st_size}-{status.st_mtime_ns}"
+                            files.append(Entry(item.name, status.st_size, version))
         except (FileNotFoundError, NotADirectoryError):
             return [], []
         except OSError as error:
@@ -153,13 +154,15 @@ class Storage:
 
     @contextmanager
     def opened(self, name: str) -> Iterator[BinaryIO | None]:
-        """Open a file of which only parts are read; None if there is none."""
+        """Open a file of which only parts are read; None if there is none, StorageError if it cannot be opened."""
         filesystem, root = self._filesystem()
         try:
             file = filesystem.open(f"{root}/{name}", "rb")
         except FileNotFoundError:
             yield None
             return
+        except Exception as error:  # noqa: BLE001
+            raise self._failed(name, "read", error) from None
         with file:
             yield file
 
@@ -191,20 +194,15 @@ class Storage:
             raise self._failed(name, "remove", error) from None
 
     @contextmanager
-    def locked(self, *, wait: bool = True) -> Iterator[None]:
-        """While no other process of this machine does the same; other storage than folders has no locks.
-
-        Raises
-        ------
-        BlockingIOError
-            If another one does, and this is not to wait for it.
-        """
+    def locked(self) -> Iterator[None]:
+        """While no other process of this machine does the same; only folders have locks, and not on every disk."""
         if not self.is_local:
             yield
             return
         handle = os.open(self.url, os.O_RDONLY | os.O_DIRECTORY)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            with suppress(OSError):  # NFS, for one, locks no folders
+                fcntl.flock(handle, fcntl.LOCK_EX)
             yield
         finally:
             os.close(handle)
@@ -248,13 +246,19 @@ def open_storage(place: str | Path) -> Storage:
     return Storage(url=text if is_url(text) else str(Path(text).absolute()))
 
 
-def walk(storage: Storage) -> Iterator[tuple[Storage, list[Entry]]]:
-    """Folders that hold files, at any depth, each listed at its turn: the files of no two are in memory at once."""
+def walk(storage: Storage, problems: list[str]) -> Iterator[tuple[Storage, list[Entry]]]:
+    """Folders that hold files, at any depth, each listed at its turn: the files of no two are in memory at once.
+
+    An inner folder that cannot be read is added to the problems, and the others go on.
+    """
     folders, files = storage.contents()
     if files:
         yield storage, files
     for name in folders:
-        yield from walk(storage.folder(name))
+        try:
+            yield from walk(storage.folder(name), problems)
+        except StorageError as error:
+            problems.append(str(error))
 
 
 @contextmanager

@@ -57,11 +57,14 @@ _RELATIVE = re.compile(r"^base\s+\w+\s+timestamps\s+relative", re.MULTILINE | re
 
 
 def is_log(path: Path) -> bool:
-    """Whether a file is a log or a table: by its suffix, and a ``.txt`` by what is in it."""
+    """Whether a file is a log or a table: by its suffix, and a ``.txt`` by what is in it; a damaged one counts."""
     suffix = suffix_of(path)
     if suffix == ".txt":
-        with readable(path) as file:
-            return exists(path) and (is_candump(text_head(file)[0]) or is_table(file))
+        try:
+            with readable(path) as file:
+                return exists(path) and (is_candump(text_head(file)[0]) or is_table(file))
+        except (LogError, *UNREADABLE):
+            return True
     return suffix in LOG_SUFFIXES or suffix in TABLE_SUFFIXES
 
 

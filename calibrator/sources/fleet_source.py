@@ -129,7 +129,8 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
         The drives, none perhaps, and what is left out; nothing is opened.
     """
     places: dict[str, dict[str, _Place]] = {}
-    sizes, strays, problems = Counter[str](), dict[str, str](), list[str]()
+    usable, sizes = dict[str, bool](), Counter[str]()
+    strays, problems = dict[str, str](), list[str]()
 
     def add(url: str, logs: Sequence[Entry], folder: Storage | None) -> None:
         vehicle = _folder_name(url).removesuffix(".zip")
@@ -147,7 +148,9 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
             return  # the whole folder was given as well
         mine[url] = folder or list(dict.fromkeys([*known, *drives]))
         sizes[vehicle] += sum(entry.size for entry in logs)
-        for name, twins in _by_name(drives if folder else [*known, *drives]).items():
+        by_name = _by_name(drives if folder else [*known, *drives])
+        usable[vehicle] = any(len(set(twins)) == 1 for twins in by_name.values())
+        for name, twins in by_name.items():
             if len(set(twins)) > 1:
                 where = " and ".join(item.place for item in twins)
                 problems.append(f"vehicle {vehicle}: drive {name} is in {where}; remove or rename one")
@@ -155,7 +158,7 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     for argument in arguments:
         try:
             storage, beside, is_found = open_storage(argument), list[Entry](), False
-            for url, logs, folder in _logs_in(storage, str(argument)):
+            for url, logs, folder in _logs_in(storage, str(argument), problems):
                 if folder is not None and url == storage.url:
                     beside = logs
                 else:
@@ -181,26 +184,36 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
         for vehicle, mine in places.items()
         if len(mine) > 1
     ]
-    vehicles = {vehicle: next(iter(mine.values())) for vehicle, mine in places.items() if len(mine) == 1}
+    vehicles = {
+        vehicle: next(iter(mine.values())) for vehicle, mine in places.items() if len(mine) == 1 and usable[vehicle]
+    }
     left_out = {f"problem {k + 1}": text for k, text in enumerate(dict.fromkeys(problems))}
     sizes_ = {vehicle: sizes[vehicle] for vehicle in vehicles}
     return FleetSource(place="", vehicles=_Vehicles(vehicles), left_out=left_out, sizes=sizes_)
 
 
-def _logs_in(storage: Storage, shown: str) -> Iterator[tuple[str, list[Entry], Storage | None]]:
-    """Folders with logs, of a folder, an archive or a single log: path or URL, logs, and the folder if it is one."""
+def _logs_in(
+    storage: Storage, shown: str, problems: list[str]
+) -> Iterator[tuple[str, list[Entry], Storage | None]]:
+    """Folders with logs, of a folder, an archive or a single log: path or URL, logs, and the folder if it is one.
+
+    A folder or archive inside that cannot be read is added to the problems.
+    """
     path = Path(storage.url)
     if storage.is_local and not path.exists():
         raise LogError(f"{shown}: no such file or folder; give logs that are there")
     if storage.is_local and path.is_file():
         yield from _in_archive(path) if path.suffix.lower() == ".zip" else [(str(path.parent), [_entry(path)], None)]
         return
-    for folder, files in walk(storage):
+    for folder, files in walk(storage, problems):
         if logs := [entry for entry in files if _is_log(folder, entry.name)]:
             yield folder.url, logs, folder
         for entry in files:
             if folder.is_local and entry.name.lower().endswith(".zip"):
-                yield from _in_archive(Path(folder.url) / entry.name)
+                try:
+                    yield from _in_archive(Path(folder.url) / entry.name)
+                except LogError as error:
+                    problems.append(str(error))
 
 
 def _in_archive(path: Path) -> Iterator[tuple[str, list[Entry], None]]:

@@ -1,11 +1,13 @@
 """Places that cannot be used are told in one line."""
 
 import errno
+import os
 from pathlib import Path
 
+import fsspec
 import pytest
 
-from calibrator.files.storage import StorageError, open_storage
+from calibrator.files.storage import Storage, StorageError, open_storage, walk
 
 
 @pytest.mark.parametrize("place", ["", " ", "file://", "s3://"])
@@ -27,3 +29,74 @@ def test_full_disk_is_told_with_what_to_do(tmp_path: Path, monkeypatch: pytest.M
 def test_unknown_kind_of_storage_is_refused() -> None:
     with pytest.raises(StorageError, match=r"^nokind://x: no way to reach this kind of storage: "):
         open_storage("nokind://x").names()
+
+
+def test_a_file_that_vanishes_while_its_folder_is_listed_hides_no_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "gone").touch()
+    (tmp_path / "there").touch()
+    status = os.DirEntry.stat
+
+    class Vanishing:
+        """What os.scandir yields, of files that another process removes."""
+
+        def __init__(self, entry: os.DirEntry[str]) -> None:
+            self.name, self.is_dir, self.is_file, self._entry = entry.name, entry.is_dir, entry.is_file, entry
+
+        def stat(self) -> os.stat_result:
+            (tmp_path / "gone").unlink(missing_ok=True)
+            return status(self._entry)
+
+    class Listing:
+        def __enter__(self) -> list[Vanishing]:
+            with scandir(tmp_path) as entries:
+                return [Vanishing(entry) for entry in entries]
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+    scandir = os.scandir
+    monkeypatch.setattr("calibrator.files.storage.os.scandir", lambda _: Listing())
+    assert open_storage(tmp_path).names() == ["there"]
+
+
+def test_an_inner_folder_that_cannot_be_read_is_a_problem_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("V1", "lost+found", "vehicle 2"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.log").touch()
+    contents = Storage.contents
+
+    def denied(storage: Storage, prefix: str = "") -> object:
+        if storage.url.endswith("lost+found"):
+            raise StorageError("lost+found: cannot read it: Permission denied")
+        return contents(storage, prefix)
+
+    monkeypatch.setattr(Storage, "contents", denied)
+    problems: list[str] = []
+    assert [folder.url for folder, _ in walk(open_storage(tmp_path), problems)] == [
+        str(tmp_path / "V1"),
+        str(tmp_path / "vehicle 2"),
+    ]
+    assert problems == ["lost+found: cannot read it: Permission denied"]
+
+
+def test_a_folder_on_a_disk_without_locks_is_used_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(handle: int, operation: int) -> None:
+        raise OSError(errno.EBADF, "Bad file descriptor")
+
+    monkeypatch.setattr("calibrator.files.storage.fcntl.flock", no_locks)
+    with open_storage(tmp_path).locked():
+        pass
+
+
+def test_storage_that_lets_nobody_in_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_credentials(*_: object) -> None:
+        raise RuntimeError("Unable to locate credentials")
+
+    monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "open", no_credentials)
+    expected = r"^memory://x/y: cannot read it: Unable to locate credentials$"
+    with pytest.raises(StorageError, match=expected), open_storage("memory://x").opened("y"):
+        pass

@@ -110,7 +110,7 @@ def summaries(place: str, database: VehicleDatabase) -> dict[str, list[object]]:
 def drives(place: str) -> dict[str, bytes]:
     return {
         f"{folder.url.rpartition('/')[2]}/{file.name}": folder.read(file.name)
-        for folder, files in walk(open_storage(place))
+        for folder, files in walk(open_storage(place), [])
         for file in files
     }
 
@@ -120,7 +120,7 @@ def test_logs_and_stores_in_object_storage_give_the_same_from_cluster_workers(
 ) -> None:
     simulate_fleet(PLAN, BuiltinTrips(seed=0, duration_s=130.0, unseen_s=10.0), database, tmp_path / "fleet", workers=1)
     logs = tmp_path / "fleet" / "logs"
-    for folder, files in walk(open_storage(logs)):
+    for folder, files in walk(open_storage(logs), []):
         for file in files:
             Storage(url=f"s3://fleet/{folder.url.removeprefix(f'{logs.parent}/')}").write(
                 file.name, folder.read(file.name)

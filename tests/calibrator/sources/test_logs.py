@@ -71,3 +71,20 @@ def test_an_argument_that_does_not_exist_or_has_no_logs_is_a_problem(tmp_path: P
     missing, empty = found.left_out.values()
     assert "nothing: no such file or folder" in missing
     assert "empty: no logs in it" in empty
+
+
+def test_what_is_damaged_beside_logs_is_a_problem_or_a_log_and_the_rest_goes_on(tmp_path: Path) -> None:
+    make(tmp_path / "V1" / "a.log", tmp_path / "V1" / "b.log")
+    (tmp_path / "old.zip").write_bytes(b"no archive")
+    (tmp_path / "V1" / "c.txt.gz").write_bytes(b"not packed")
+    found = find_logs([tmp_path])
+    assert drives(found) == [("V1", "a"), ("V1", "b"), ("V1", "c")]
+    (problem,) = found.left_out.values()
+    assert problem.startswith(f"{tmp_path / 'old.zip'}: not a readable archive: ")
+
+
+def test_a_vehicle_all_of_whose_files_are_left_out_is_none(tmp_path: Path) -> None:
+    make(tmp_path / "V1" / "größe.log", tmp_path / "V2" / "a.log", tmp_path / "V2" / "a.blf", tmp_path / "V3" / "a.log")
+    found = find_logs([tmp_path])
+    assert list(found.vehicles) == ["V3"]
+    assert len(found.left_out) == 2
