@@ -24,7 +24,7 @@ from calibrator.drive import Array, Mask
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.errors import LogError
 from calibrator.files.layout_files import check_formulas
-from calibrator.recordings.frame_arrays import repaired_time
+from calibrator.recordings.frame_arrays import LATEST_TIME_STAMP_NS, repaired_time
 from calibrator.recordings.log_files import (
     UNREADABLE,
     exists,
@@ -221,12 +221,24 @@ def read_table(path: Path) -> Table:
     ) as error:
         reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
         raise LogError(f"{path}: not a readable table: {reason[:200]}; save or copy it again") from None
-    frame.columns = [str(name).strip() for name in frame.columns]
-    if frame.index.name is not None or not isinstance(frame.index, pd.RangeIndex):
-        frame = frame.rename_axis(frame.index.name or "time").reset_index()
+    frame = _index_as_columns(frame)
     if len(frame) < 2:
         raise LogError(f"{path}: {len(frame)} rows of values; a header and at least two rows are expected")
     return _table(path, frame, units, found)
+
+
+def _index_as_columns(frame: pd.DataFrame) -> pd.DataFrame:
+    """A frame with a plain index and different headers.
+
+    An index without a name may be the time, or the numbers of the rows that a filter has left: it comes last, so that
+    any column that is called time comes first.
+    """
+    index, frame = frame.index, frame.reset_index(drop=True)
+    if any(name is not None for name in index.names):
+        frame = pd.concat([index.to_frame(index=False), frame], axis=1)
+    elif not isinstance(index, pd.RangeIndex) and "time" not in frame:
+        frame = frame.assign(time=index)
+    return frame.set_axis(_distinct(list(map(str, frame.columns))), axis=1)
 
 
 def layout_from_branches(
@@ -304,6 +316,7 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
     units = {name: unit for name in frame if (unit := usual_unit(units.get(name, "")) or _name_and_unit(name)[1])}
     names, time_s, about = _time(path, frame, units)
     known = np.isfinite(time_s)
+    known &= np.abs(time_s - np.median(time_s[known])) < 1e-9 * LATEST_TIME_STAMP_NS
     order = repaired_time(np.rint(1e9 * (time_s[known] - time_s[known][0])).astype(np.int64))
     rows = np.flatnonzero(known)[order.order]
     columns, bad, texts = {}, {}, {}

@@ -141,6 +141,38 @@ def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
     assert "2 damaged lines or frames left out" in found["notices"]
 
 
+def test_row_numbers_that_a_filter_left_as_index_are_not_the_time(tmp_path: Path) -> None:
+    rows = frame().rename(columns={"time": "time [s]"})
+    rows.drop(index=[3, 7, 8]).to_parquet(tmp_path / "x.parquet")
+    table = read_table(tmp_path / "x.parquet")
+    assert table.time_s == pytest.approx(np.delete(TIME_S, [3, 7, 8]))
+    assert table.found == "time 'time [s]' in s"
+
+
+@pytest.mark.parametrize(
+    "index",
+    [dates(), dates().set_names("time"), pd.MultiIndex.from_arrays([["V1"] * ROWS, TIME_S], names=["vehicle", "time"])],
+    ids=["without a name", "with the name of a column", "of vehicle and time"],
+)
+def test_index_beside_a_column_of_times_is_read(tmp_path: Path, index: pd.Index) -> None:
+    frame().set_axis(index).to_parquet(tmp_path / "x.parquet")
+    table = read_table(tmp_path / "x.parquet")
+    assert table.time_s[-1] == pytest.approx(0.1 * (ROWS - 1))
+    assert table.columns["Ibat [A]"] == pytest.approx(BATTERY_A)
+
+
+def test_headers_that_differ_in_blanks_only_get_numbers(tmp_path: Path) -> None:
+    frame(**{"Ibat [A] ": BATTERY_A}).to_parquet(tmp_path / "x.parquet")
+    assert list(read_table(tmp_path / "x.parquet").columns) == ["Ibat.1 [A]", "Imot (A)", "Iheat_A", "Ibat.2 [A]"]
+
+
+def test_row_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
+    frame(time=np.where(TIME_S == 0.0, 1e300, TIME_S)).to_csv(tmp_path / "x.csv", index=False)
+    table = read_table(tmp_path / "x.csv")
+    assert (table.without_time, table.clock_steps) == (1, 0)
+    assert table.time_s[-1] == pytest.approx(0.1 * (ROWS - 2))
+
+
 def test_times_without_their_fractions_are_said(tmp_path: Path) -> None:
     csv(frame(time=TIME_S.astype(int)))(tmp_path / "x.csv")
     told = " ".join(before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"])
