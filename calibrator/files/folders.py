@@ -1,5 +1,6 @@
 """Files and folders that appear only when they are complete, and what is left of none that could not be written."""
 
+import errno
 import os
 import shutil
 import tempfile
@@ -127,11 +128,13 @@ def write_files(files: Mapping[Path, bytes]) -> None:
         If one cannot be written; it is named, and none of them has changed.
     """
     partial: dict[Path, Path] = {}
-    made: list[Path] = []
+    made: set[Path] = set()
     path = None
     try:
         for path, content in files.items():
-            made += [folder for folder in path.parents if not folder.exists()]
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, "it is a folder")
+            made.update(folder for folder in path.parents if not folder.exists())
             path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
             partial[path] = Path(name)
@@ -145,7 +148,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
     except BaseException as error:
         for left in partial.values():
             left.unlink(missing_ok=True)
-        for folder in made:
+        for folder in sorted(made, reverse=True):  # inner ones first
             with suppress(OSError):
                 folder.rmdir()
         if isinstance(error, OSError):

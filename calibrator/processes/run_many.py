@@ -366,7 +366,10 @@ def _begin(environment: dict[str, str], folder: str, memory_bytes: int | None, f
     with suppress(Exception):  # what it imports is not to count as time of an item; errors come with the first one
         _loaded(function)
     if memory_bytes is not None:
-        resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, resource.RLIM_INFINITY))
+        most = resource.getrlimit(resource.RLIMIT_DATA)[1]  # as of the user's shell
+        resource.setrlimit(
+            resource.RLIMIT_DATA, (memory_bytes if most == resource.RLIM_INFINITY else min(memory_bytes, most), most)
+        )
 
 
 def _call(item: Any) -> Any:

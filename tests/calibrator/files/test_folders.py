@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.files.folders import require_new_folder, require_possible_folder, whole_folder
+from calibrator.files.folders import require_new_folder, require_possible_folder, whole_folder, write_files
+from ecu_node.errors import UserError
 
 
 def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
@@ -93,3 +94,22 @@ def test_new_folder_is_not_made_over_a_mounted_disk(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(Path, "is_mount", lambda _: True)
     with pytest.raises(FleetError, match="a disk is mounted there"):
         require_new_folder(tmp_path)
+
+
+def test_files_that_belong_together_change_together_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "old").write_bytes(b"old")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(UserError, match=f"^{tmp_path}/folder: cannot be written: it is a folder$"):
+        write_files({tmp_path / "old": b"new", tmp_path / "folder": b""})
+
+    def full(handle: int) -> None:
+        if (tmp_path / "made" / "inner").exists():
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("calibrator.files.folders.os.fsync", full)
+    with pytest.raises(UserError, match=f"^{tmp_path}/made/inner/b: cannot be written: No space left on device$"):
+        write_files({tmp_path / "old": b"new", tmp_path / "made/a": b"", tmp_path / "made/inner/b": b""})
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "folder", tmp_path / "old"]
+    assert (tmp_path / "old").read_bytes() == b"old"

@@ -161,6 +161,17 @@ def test_errors_are_raised_at_the_turn_of_their_item(workers: Workers) -> None:
     assert not children()
 
 
+LIMITED = """
+from calibrator.processes.run_many import Workers, try_many
+print(list(try_many(abs, [-1, -2], Workers())))
+"""
+
+
+def test_limit_of_the_shell_for_memory_is_kept() -> None:
+    command = ["bash", "-c", 'ulimit -d 3000000 && exec "$@"', "-", sys.executable, "-c", LIMITED]
+    assert subprocess.run(command, capture_output=True, check=True, text=True).stdout == "[(-1, 1), (-2, 2)]\n"
+
+
 PARENT = """
 import sys, tempfile
 from functools import partial
