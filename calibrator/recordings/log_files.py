@@ -14,7 +14,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, BinaryIO, TextIO, cast
 
 import pandas as pd
@@ -186,7 +186,9 @@ def exists(path: Path) -> bool:
 
 
 def files_in(path: Path) -> list[Path]:
-    """All files in a folder, at any depth, or in an archive, but hidden ones; none for another file.
+    """All files in a folder, at any depth, or in an archive, but hidden ones and those in hidden folders.
+
+    None for another file.
 
     Raises
     ------
@@ -194,7 +196,7 @@ def files_in(path: Path) -> list[Path]:
         If the archive is damaged.
     """
     if path.is_dir():
-        return sorted(inner for inner in path.rglob("[!.]*") if inner.is_file())
+        return sorted(inner for inner in path.rglob("*") if not _is_hidden(inner.relative_to(path)) and inner.is_file())
     if path.suffix.lower() != ".zip" or not path.is_file():
         return []
     try:
@@ -202,9 +204,12 @@ def files_in(path: Path) -> list[Path]:
             names = [PurePosixPath(name) for name in archive.namelist() if not name.endswith("/")]
     except _NO_ARCHIVE as error:
         raise LogError(f"{path}: not a readable archive: {error}; pack or copy it again") from None
-    return sorted(
-        path / name for name in names if name.name[:1] not in {"", "."} and ".." not in name.parts and name.root == ""
-    )
+    return sorted(path / name for name in names if name.name and name.root == "" and not _is_hidden(name))
+
+
+def _is_hidden(name: PurePath) -> bool:
+    """Whether a file or a folder on the way to it is hidden; ``..`` counts as such."""
+    return any(part.startswith(".") for part in name.parts)
 
 
 @contextmanager

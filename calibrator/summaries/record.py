@@ -7,6 +7,7 @@ does not grow with the hours that it is driven between two summaries. Records of
 
 import hashlib
 import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -62,6 +63,7 @@ SCHEMA = pa.schema(
 )
 _ABOUT = ["vehicle", "drives", "sources", "digests", "problem", "duration_s"]
 """Columns without numbers of drives."""
+_DIGEST = re.compile(r"[0-9a-f]{32}")
 _NUMBERS = [field.name for field in SCHEMA if field.type in {_FLOATS, pa.list_(pa.bool_())}]
 
 
@@ -232,11 +234,12 @@ def _records(table: pa.Table, identity: StoreIdentity, *, whole: bool) -> list[R
     bank = identity.bank.identity
     for place, row in enumerate(rows):
         drives, sources, digests = (tuple(x or "" for x in row[n] or ()) for n in ("drives", "sources", "digests"))
+        has_digests = all(map(_DIGEST.fullmatch, digests))
         record = Record(
             vehicle=row["vehicle"] or "",
             drives=drives,
             sources=sources if len(sources) == len(drives) else ("",) * len(drives),
-            digests=digests,
+            digests=digests if has_digests else (),
             found=None,
         )
         if row["problem"] is not None:
@@ -245,7 +248,7 @@ def _records(table: pa.Table, identity: StoreIdentity, *, whole: bool) -> list[R
             continue
         try:
             require_plain_name(record.vehicle, "vehicle")  # its parameter file is named after it
-            if not (0.0 < (row["duration_s"] or 0.0) < np.inf and len(sources) == len(drives)):
+            if not (0.0 < (row["duration_s"] or 0.0) < np.inf and len(sources) == len(drives) and has_digests):
                 raise ValueError
             own = {name: each[place] for name, each in numbers.items()}
             vehicle = _vehicle(row, own, identity, bank) if whole else None

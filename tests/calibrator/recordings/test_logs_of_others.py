@@ -114,6 +114,7 @@ def packed(path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.write(path.with_name("inner.blf"), "car/inner.blf")
         archive.writestr("__MACOSX/car/._inner.blf", b"hidden")
+        archive.writestr(".checkpoints/inner.blf", b"hidden")
         archive.writestr("../outside.blf", b"not in the archive")
 
 
@@ -126,8 +127,9 @@ def gzipped(write: Callable[[Path], None]) -> Callable[[Path], None]:
 
 
 def folder(path: Path) -> None:
-    path.mkdir()
-    write_with_python_can(path / "a.asc")
+    (path / ".checkpoints").mkdir(parents=True)
+    for log in (path / "a.asc", path / ".checkpoints" / "a.asc"):
+        write_with_python_can(log)
 
 
 GVRET = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"

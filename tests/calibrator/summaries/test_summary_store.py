@@ -170,6 +170,8 @@ def own_store(store: SummaryStore, tmp_path: Path) -> SummaryStore:
         {"zero_sd_a": None},
         {"zero_offset_a": [1.0, math.nan], "zero_sd_a": [0.1, 0.1]},
         {"sources": []},
+        {"digests": [None]},
+        {"digests": ["no digest"]},
     ],
 )
 def test_a_vehicle_whose_row_makes_no_sense_is_left_out_and_the_others_stay_as_they_are(
