@@ -284,6 +284,9 @@ class _Process:
                 if self._stopped:
                     self._future.cancel()
                 return self._future.result()
+            except CancelledError:
+                self.join()  # its pool may have begun only after stop
+                raise
             except TimeoutError:
                 if job.limit_s is None:  # one that the function raised
                     raise
@@ -325,10 +328,10 @@ class _Process:
 
     def join(self) -> None:
         """Kill the process."""
-        if self._pool is not None:
-            self._pool.stop()
-            self._pool.join()
-            self._pool = None
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.stop()
+            pool.join()
 
 
 class _ForkedProcess(ForkServerProcess):
