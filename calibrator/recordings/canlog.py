@@ -15,6 +15,7 @@ from ecu_node.core.e2e import Protection, protection_of
 from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.documents import write_atomically
+from ecu_node.errors import DatabaseError
 from ecu_node.layout import split_signal
 
 __all__ = ["FrameSeries", "drive_series", "encode_message", "sent_values", "write_candump", "write_drive_log"]
@@ -136,6 +137,8 @@ def _raw_codes(signal: Signal, physical: Array) -> NDArray[np.int64]:
     missing = named.get("SNA", 0)
     lowest, highest = _valid_codes(signal)
     known = np.isfinite(physical)
+    if signal.is_float and known.any():
+        raise DatabaseError(f"signal {signal.name} is a float; only whole-numbered signals can be written into frames")
     raw = np.rint((np.where(known, physical, 0.0) - signal.offset) / signal.scale)
     return np.where(known, np.clip(raw, lowest, highest), missing).astype(np.int64)
 

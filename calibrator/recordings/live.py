@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 import can
 
 from calibrator.recordings.frame_arrays import Frames, frames_of
+from calibrator.recordings.log_files import reason_of
 from ecu_node.bus.adapters import connect
 from ecu_node.errors import BusError
 
@@ -50,9 +51,8 @@ def record_bus(interface: str, channel: str | None, duration_s: float) -> Frames
         if not messages:
             raise
     except (can.CanError, OSError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise BusError(
-            f"{interface}:{channel}: cannot listen to the bus: {reason}; check --interface and --channel"
+            f"{interface}:{channel}: cannot listen to the bus: {reason_of(error)}; check --interface and --channel"
         ) from None
     frames = frames_of(messages)
     if not len(frames):

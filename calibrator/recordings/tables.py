@@ -33,6 +33,7 @@ from calibrator.recordings.log_files import (
     open_log,
     read_rows,
     readable,
+    reason_of,
     suffix_of,
     text_head,
 )
@@ -219,8 +220,7 @@ def read_table(path: Path) -> Table:
         UnicodeError,
         json.JSONDecodeError,
     ) as error:
-        reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
-        raise LogError(f"{path}: not a readable table: {reason[:200]}; save or copy it again") from None
+        raise LogError(f"{path}: not a readable table: {reason_of(error)[:200]}; save or copy it again") from None
     frame = _index_as_columns(frame)
     if len(frame) < 2:
         raise LogError(f"{path}: {len(frame)} rows of values; a header and at least two rows are expected")

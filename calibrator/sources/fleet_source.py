@@ -192,9 +192,7 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     return FleetSource(place="", vehicles=_Vehicles(vehicles), left_out=left_out, sizes=sizes_)
 
 
-def _logs_in(
-    storage: Storage, shown: str, problems: list[str]
-) -> Iterator[tuple[str, list[Entry], Storage | None]]:
+def _logs_in(storage: Storage, shown: str, problems: list[str]) -> Iterator[tuple[str, list[Entry], Storage | None]]:
     """Folders with logs, of a folder, an archive or a single log: path or URL, logs, and the folder if it is one.
 
     A folder or archive inside that cannot be read is added to the problems.

@@ -6,9 +6,8 @@ tell a bent sensor from a gain error; the :class:`FitSums` beside them can, and 
 them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -131,7 +130,10 @@ class DriveSummary:
             fit=fits
             and FitSums(
                 levels=fits[0].levels + fits[1].levels,
-                **_by_block(lambda name: np.concatenate([getattr(fit, name) for fit in fits])),
+                **{
+                    name: np.concatenate([getattr(fit, name) for fit in fits])
+                    for name in ("fast_a2", "spikes", "temperature_c", "starts")
+                },
             ),
         )
 
@@ -173,11 +175,6 @@ class DriveSummary:
                 starts=np.logical_or.reduceat(fit.starts, first),
             ),
         )
-
-
-def _by_block(value: Callable[[str], Any]) -> dict[str, Any]:
-    """A value for each array of fit sums that has a row per block."""
-    return {name: value(name) for name in ("fast_a2", "spikes", "temperature_c", "starts")}
 
 
 def common_bank(summaries: Sequence[DriveSummary]) -> str:

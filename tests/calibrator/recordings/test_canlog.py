@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from calibrator.recordings.canlog import encode_message, write_candump
 from calibrator.recordings.decode import message_is_sound
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import DatabaseError
 from ecu_node.layout import EndToEnd, ProfileP07, read_layout
 
 BIG_ENDIAN_DBC = """VERSION ""
@@ -60,6 +61,15 @@ def test_values_beyond_the_range_saturate(database: VehicleDatabase) -> None:
     series = encode_message(database, "HV_Motor", np.zeros(2), {"MotorCurrent": np.array([1e6, -1e6])})
     decoded = [database.message("HV_Motor").decode_simple(row.tobytes())["MotorCurrent"] for row in series.data]
     assert decoded == pytest.approx([650.0, -650.0])
+
+
+def test_float_signal_is_not_written_as_whole_number() -> None:
+    database = big_endian_database(
+        BIG_ENDIAN_DBC.replace("M: 8", "M: 16").replace("40|9@1-", "64|32@1-") + "SIG_VALTYPE_ 100 C : 1;\n"
+    )
+    with pytest.raises(DatabaseError, match="^signal C is a float; only whole-numbered signals can be written"):
+        encode_message(database, "M", np.zeros(1), {"C": np.array([1.5])})
+    assert len(encode_message(database, "M", np.zeros(1), {"B": np.array([1.0])}).data) == 1
 
 
 @settings(max_examples=60)
