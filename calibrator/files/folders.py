@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 
 from calibrator.errors import FleetError
@@ -92,7 +93,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
     out, partial = out.absolute(), _partial(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        for left in out.parent.glob(f".{out.name}.partial-*"):
+        for left in out.parent.glob(f".{escape(out.name)}.partial-*"):
             if not Path("/proc", left.name.rpartition("-")[2]).exists():  # its process is gone
                 shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()

@@ -133,7 +133,7 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     strays, problems = dict[str, str](), list[str]()
 
     def add(url: str, logs: Sequence[Entry], folder: Storage | None) -> None:
-        vehicle = _folder_name(url).removesuffix(".zip")
+        vehicle = _without_suffix(_folder_name(url), ".zip")
         what = [name_problem(vehicle, f"{url}: the folder's name, which names the vehicle,")]
         what += [
             name_problem(_drive_name(entry.name), f"{url}/{entry.name}: the file's name, which names the drive,")
@@ -237,7 +237,12 @@ def _folder_name(url: str) -> str:
 
 
 def _drive_name(file: str) -> str:
-    return Path(file.removesuffix(".gz")).stem
+    return Path(_without_suffix(file, ".gz")).stem
+
+
+def _without_suffix(name: str, suffix: str) -> str:
+    """A name without a suffix in small letters or capitals."""
+    return name[: -len(suffix)] if name.lower().endswith(suffix) else name
 
 
 def _drives(vehicle: str, folder: str, logs: Iterable[Entry]) -> list[DriveFile]:

@@ -46,14 +46,15 @@ def test_full_disk_says_what_to_do_and_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_process_left_is_removed_and_that_of_a_running_one_stays(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["out", "out[1]"])
+def test_what_a_killed_process_left_is_removed_and_that_of_a_running_one_stays(tmp_path: Path, name: str) -> None:
     gone = subprocess.Popen([sys.executable, "-c", "pass"])
     gone.wait()
-    (tmp_path / f".out.partial-{gone.pid}").mkdir()
-    (tmp_path / ".out.partial-1").mkdir()
-    with whole_folder(tmp_path / "out"):
+    (tmp_path / f".{name}.partial-{gone.pid}").mkdir()
+    (tmp_path / f".{name}.partial-1").mkdir()
+    with whole_folder(tmp_path / name):
         pass
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".out.partial-1", "out"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f".{name}.partial-1", name]
 
 
 @pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])

@@ -1,5 +1,6 @@
 """Which log belongs to which vehicle; nothing is opened."""
 
+import zipfile
 from pathlib import Path
 
 from calibrator.drive import FleetSource
@@ -88,3 +89,10 @@ def test_a_vehicle_all_of_whose_files_are_left_out_is_none(tmp_path: Path) -> No
     found = find_logs([tmp_path])
     assert list(found.vehicles) == ["V3"]
     assert len(found.left_out) == 2
+
+
+def test_suffixes_in_capitals_are_no_part_of_a_name(tmp_path: Path) -> None:
+    make(tmp_path / "V1" / "DRIVE1.LOG.GZ")
+    with zipfile.ZipFile(tmp_path / "V2.ZIP", "w") as archive:
+        archive.writestr("a.log", "")
+    assert drives(find_logs([tmp_path])) == [("V1", "DRIVE1"), ("V2", "a")]
