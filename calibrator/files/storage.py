@@ -116,7 +116,7 @@ class Storage:
                 for item in items:
                     if item.name.startswith(".") or not item.name.startswith(prefix):
                         continue
-                    if item.is_dir(follow_symlinks=False):
+                    if item.is_dir():
                         folders.append(item.name)
                     elif item.is_file():
                         with suppress(FileNotFoundError):  # another process has removed it just now
@@ -246,17 +246,23 @@ def open_storage(place: str | Path) -> Storage:
     return Storage(url=text if is_url(text) else str(Path(text).absolute()))
 
 
-def walk(storage: Storage, problems: list[str]) -> Iterator[tuple[Storage, list[Entry]]]:
+def walk(
+    storage: Storage, problems: list[str], *, above: frozenset[str] = frozenset()
+) -> Iterator[tuple[Storage, list[Entry]]]:
     """Folders that hold files, at any depth, each listed at its turn: the files of no two are in memory at once.
 
-    An inner folder that cannot be read is added to the problems, and the others go on.
+    An inner folder that cannot be read is added to the problems, and the others go on. Links are followed, but for
+    those that lead back to a folder above.
     """
+    place = os.path.realpath(storage.url) if storage.is_local else storage.url
+    if place in above:
+        return
     folders, files = storage.contents()
     if files:
         yield storage, files
     for name in folders:
         try:
-            yield from walk(storage.folder(name), problems)
+            yield from walk(storage.folder(name), problems, above=above | {place})
         except StorageError as error:
             problems.append(str(error))
 

@@ -96,3 +96,13 @@ def test_suffixes_in_capitals_are_no_part_of_a_name(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "V2.ZIP", "w") as archive:
         archive.writestr("a.log", "")
     assert drives(find_logs([tmp_path])) == [("V1", "DRIVE1"), ("V2", "a")]
+
+
+def test_folder_of_a_vehicle_may_be_a_link(tmp_path: Path) -> None:
+    make(tmp_path / "disk" / "V1" / "a.log")
+    (tmp_path / "fleet").mkdir()
+    (tmp_path / "fleet" / "V1").symlink_to(tmp_path / "disk" / "V1")
+    (tmp_path / "disk" / "V1" / "back").symlink_to(tmp_path / "fleet")
+    found = find_logs([tmp_path / "fleet"])
+    assert drives(found) == [("V1", "a")]
+    assert not found.left_out
