@@ -93,7 +93,7 @@ class Samples:
     valid: Mask
 
     def with_inputs(self, names: Sequence[str]) -> "Samples":
-        """Return the same samples with those of the inputs that are among some names, in their order."""
+        """Keep these inputs, in the order of the names; names that are not there are ignored."""
         kept = [self.input_names.index(name) for name in names if name in self.input_names]
         chosen = tuple(self.input_names[i] for i in kept)
         return replace(self, input_names=chosen, inputs=np.ascontiguousarray(self.inputs[:, kept]))

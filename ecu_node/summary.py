@@ -53,7 +53,7 @@ SPIKE_WINDOW = 9
 FEWEST_FOR_GAINS = 10
 """Samples per branch that tell the gains. [1]"""
 MAD_TO_SD = 1.4826
-"""Of the normal distribution."""
+"""Standard deviation of a Gaussian over its median absolute value. [1]"""
 
 ZERO_SETTLING_S = 2.0
 """After the contactors open and before they close, capacitors still charge and discharge. [s]"""

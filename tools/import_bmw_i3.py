@@ -33,9 +33,9 @@ from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.store import has_drive, require_plain_name, write_drive
 from calibrator.errors import DriveError, LogError
 from calibrator.files.folders import require_possible_folder
-from calibrator.recordings.canlog import write_drive_log
 from calibrator.recordings.decode import SignalRange, signal_range
 from calibrator.recordings.tables import Table, read_table
+from calibrator.recordings.write_logs import write_drive_log
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps, told_once

@@ -30,7 +30,7 @@ from calibrator.files.folders import whole_folder
 from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fleet_id, write_truth
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.random_streams import Purpose, random_stream
-from calibrator.recordings.canlog import FrameSeries, encode_message, sent_values, write_candump
+from calibrator.recordings.write_logs import FrameSeries, encode_message, sent_values, write_candump
 from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch, Layout, split_signal

@@ -28,6 +28,7 @@ from calibrator.compiled import compiled
 from calibrator.drive import Array, Drive, Mask
 from calibrator.drives.charge import Band, ChargeCurve, charge_curve, covered
 from calibrator.errors import DriveError
+from ecu_node.summary import MAD_TO_SD
 
 __all__ = ["BranchDelays", "estimate_delays", "without_delays"]
 
@@ -72,8 +73,6 @@ CONVERGED_S = 1e-3
 """After a shorter step no other is made: Newton's error is the square of it over the windows, 5 us. [s]"""
 LONGEST_STEP_S = 0.02
 """A longer step would leave the neighbourhood that the search found. [s]"""
-MAD_TO_SD = 1.4826
-"""Standard deviation of a Gaussian over its median absolute value. [1]"""
 SLOPE_NOISES = 3.0
 """Slopes of this many standard deviations of a branch's usual slope count by half. [1]"""
 HUBER = 3.0

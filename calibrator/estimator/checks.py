@@ -19,6 +19,7 @@ from calibrator.drive import Array
 from calibrator.estimator.evidence import MOST_NOISE, NOISE_ROUNDS, products, stack_summaries
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.parameters import SensorFinding
+from ecu_node.summary import MAD_TO_SD
 
 __all__ = ["UsualMisfits", "find_misfits", "learn_usual_misfits"]
 
@@ -70,8 +71,6 @@ LEAST_STRETCH = 0.1
 """A gain that falls by more is that of another sensor that is clipped. [1]"""
 ALONE = 1e-6
 """Least share of a column that gains and offsets do not explain. [1]"""
-MAD_TO_SD = 1.4826
-"""Of the normal distribution."""
 WHITE_GAIN = 1.5
 """Variance of the second difference of white noise of variance 1."""
 SHARE_SD = 0.15

@@ -35,6 +35,7 @@ from ecu_node.core.signals import VOLT, WATT, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
+from ecu_node.summary import DIFFERENCE_GAIN, MAD_TO_SD
 
 __all__ = ["BAND", "SUM", "VOLTAGE", "Comparison", "compare_kirchhoff", "step_of", "with_voltages"]
 
@@ -168,7 +169,7 @@ def _noise(value: Array) -> float:
     1.4826 / sqrt(20) times the median of the magnitudes of third differences: what changes smoothly drops out, and so
     do rare jumps; 0 where most values repeat the one before.
     """
-    return float(1.4826 / np.sqrt(20.0) * np.median(np.abs(np.diff(value, 3)))) if len(value) > 3 else 0.0
+    return float(MAD_TO_SD / np.sqrt(DIFFERENCE_GAIN) * np.median(np.abs(np.diff(value, 3)))) if len(value) > 3 else 0.0
 
 
 def with_voltages(database: VehicleDatabase) -> VehicleDatabase:

@@ -56,7 +56,7 @@ CHECKS = frozenset({"crc", "checksum", "crc8", "chk"})
 
 @dataclass(frozen=True, kw_only=True)
 class Proposal:
-    """What was found.
+    """What was found to make a layout of.
 
     Attributes
     ----------

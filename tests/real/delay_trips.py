@@ -21,8 +21,8 @@ from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.delays import estimate_delays
 from calibrator.drives.store import iterate_drives
 from calibrator.random_streams import Purpose, random_stream
-from calibrator.recordings.canlog import FrameSeries
 from calibrator.recordings.decode import decode_signal
+from calibrator.recordings.write_logs import FrameSeries
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 

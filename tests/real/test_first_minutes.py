@@ -13,7 +13,7 @@ import pytest
 
 from calibrator.drives.store import iterate_drives
 from calibrator.files.layout_files import vehicle_database
-from calibrator.recordings.canlog import write_drive_log
+from calibrator.recordings.write_logs import write_drive_log
 from ecu_node.layout import read_layout
 from tests.calibrator.command_here import calibrator as calibrator_here
 from tests.calibrator.doctor.artificial_logs import examined

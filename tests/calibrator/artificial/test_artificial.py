@@ -13,7 +13,7 @@ from calibrator.artificial.simulate import (
 )
 from calibrator.artificial.trips import GroundTruth
 from calibrator.faults import Faults
-from calibrator.recordings.canlog import FrameSeries
+from calibrator.recordings.write_logs import FrameSeries
 from ecu_node.database import VehicleDatabase
 
 SOUND: dict[str, Any] = {"noise_a": 0.0, "delay_s": np.zeros(2), "unmeasured_a": 0.0}

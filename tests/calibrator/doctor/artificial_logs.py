@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.recordings.canlog import write_drive_log
+from calibrator.recordings.write_logs import write_drive_log
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator
 

@@ -361,7 +361,7 @@ def test_right_sensors_are_said_to_be_right() -> None:
     assert set(calibrator.parameters_.verdict) == {"no sensor fault"}
 
 
-def test_bench_reading_is_a_reference() -> None:
+def test_bench_reading_of_one_branch_fixes_the_gain_of_another() -> None:
     readings = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
     rows = found(recording(gain=(0.03, 0.05, 0.0)), readings=readings).loc["vehicle"]
     assert rows.gain_error["battery"] == pytest.approx(0.03, abs=3.0 * rows.gain_error_sd["battery"])

@@ -110,7 +110,7 @@ def test_cdfx_is_read_back_in_the_order_of_the_dtd(checked: Checked) -> None:
         assert item.findtext("SW-FEATURE-REF") in declared
 
 
-def test_texts_say_where_it_comes_from(checked: Checked) -> None:
+def test_dcm_and_cdfx_hold_the_provenance(checked: Checked) -> None:
     checked = renamed(checked, "<Zoë & 1>")
     wanted = {key: value for key, value in checked.provenance.items() if key != "parameter_set"}
     form = r'^TEXTSTRING HV\.(\w+)\n  LANGNAME "[^"\n]*"\n  FUNKTION \w+\n  TEXT "([^"\n]*)"\nEND$'

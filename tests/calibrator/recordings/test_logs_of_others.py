@@ -523,7 +523,7 @@ def test_damaged_database_is_one_line(tmp_path: Path, layout: Path, suffix: str,
         (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
     ],
 )
-def test_node_refuses_what_it_cannot_run_on(layout: Path, text: str, words: str) -> None:
+def test_template_refuses_layouts_without_one_dbc(layout: Path, text: str, words: str) -> None:
     layout.write_text(text)
     command = [sys.executable, "-m", "ecu_node", "template", "--layout", str(layout), "--vehicle", "V1"]
     require_one_line(subprocess.run(command, capture_output=True, text=True, check=False), words)

@@ -5,8 +5,8 @@ import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.errors import LogError
-from calibrator.recordings.canlog import encode_message, write_candump, write_drive_log
 from calibrator.recordings.readers import read_drive, read_recording
+from calibrator.recordings.write_logs import encode_message, write_candump, write_drive_log
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 

@@ -12,8 +12,8 @@ import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.files.storage import open_storage
-from calibrator.recordings.canlog import write_drive_log
 from calibrator.recordings.frames import read_frames
+from calibrator.recordings.write_logs import write_drive_log
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary

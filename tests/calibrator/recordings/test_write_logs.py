@@ -9,8 +9,8 @@ from e2e.p07 import e2e_p07_check
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibrator.recordings.canlog import encode_message, write_candump
 from calibrator.recordings.decode import message_is_sound
+from calibrator.recordings.write_logs import encode_message, write_candump
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError
 from ecu_node.layout import EndToEnd, ProfileP07, read_layout
