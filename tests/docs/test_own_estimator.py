@@ -61,6 +61,6 @@ def test_it_stands_beside_the_published_method_and_the_default_also_on_recorded_
     (recorded,) = RECORDED
     exec(recorded, names)  # the text of the page
     shown = capsys.readouterr().out
-    assert "6 vehicles, 2 repetitions, seed 0, drive 6 drives of i3" in " ".join(shown.split())
+    assert "2 repetitions, seed 0, drive 6 drives of i3" in " ".join(shown.split())
     for name in ("perfect", "posterior", "own"):
         assert name in shown
