@@ -9,7 +9,7 @@ import hashlib
 import io
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ __all__ = [
     "read_drive_file",
     "read_onboard_record",
     "recording_digest",
+    "remove_leftovers",
     "require_plain_name",
     "write_drive",
 ]
@@ -128,6 +129,15 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
     except StorageError as error:
         raise DriveError(f"{error}; choose another folder") from None
     return f"{folder.url}/{drive.name}.parquet"
+
+
+def remove_leftovers(store: str | Path, vehicles: Iterable[str], *, before_s: float) -> None:
+    """Remove what a killed process was just writing of these vehicles, before a time since 1970. [s]"""
+    for folder in (_folder(store, vehicle) for vehicle in vehicles):
+        if folder.is_local:
+            for left in Path(folder.url).glob(".*.parquet.*"):
+                if left.stat().st_mtime < before_s:
+                    left.unlink(missing_ok=True)
 
 
 def has_drive(store: str | Path, vehicle: str, name: str, layout: Layout) -> bool:

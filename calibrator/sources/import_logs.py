@@ -1,5 +1,6 @@
 """Logs of one or many vehicles become drives of a store. One bad log never stops the others."""
 
+import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -8,13 +9,13 @@ from pathlib import Path
 
 from calibrator.drive import DriveFile
 from calibrator.drives.fleet_id import read_fleet_ids, write_fleet_ids
-from calibrator.drives.store import has_drive, write_drive
+from calibrator.drives.store import has_drive, remove_leftovers, write_drive
 from calibrator.files.storage import Storage, local_copy, open_storage
 from calibrator.processes.run_many import Failed, Workers, try_many_shown
 from calibrator.recordings.readers import read_recording
 from calibrator.sources.fleet_source import find_logs
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.text import Notice, dumps, left_out_text, merged_notices, table
+from calibrator.terminal.text import Notice, counted, dumps, left_out_text, merged_notices, table
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["ImportReport", "ImportedDrive", "import_logs"]
@@ -54,7 +55,7 @@ class ImportReport:
             table(("vehicle", "drive", "duration [s]", "branches"), rows) if rows else "",
             "\n".join(["notices:", *notices]) if notices else "",
             left_out_text(self.left_out),
-            f"{len(self.drives)} drives written to {self.store}, {len(self.already_there)} already there, "
+            f"{counted(len(self.drives), 'drive')} written to {self.store}, {len(self.already_there)} already there, "
             f"{len(self.left_out)} left out",
         ]
         return "\n\n".join(part for part in parts if part)
@@ -88,7 +89,7 @@ def import_logs(
     ImportReport
         What was written, what was there already, and what was left out and why.
     """
-    found = find_logs(logs)
+    found, start_s = find_logs(logs), time.time()
     left_out, drives, already_there = dict(found.left_out), list[ImportedDrive](), list[str]()
     read = partial(_import_one, database=database, store=open_storage(store).url)
     entries = (log for vehicle in found.vehicles for log in found.vehicles[vehicle])
@@ -107,6 +108,7 @@ def import_logs(
                 already_there.append(f"{log.vehicle}/{log.name}")
     if drives:
         _note_fleets(open_storage(store), logs)
+        remove_leftovers(store, {drive.vehicle for drive in drives}, before_s=start_s)
     return ImportReport(store=str(store), drives=tuple(drives), already_there=tuple(already_there), left_out=left_out)
 
 

@@ -1,5 +1,6 @@
 import gzip
 import json
+import os
 import re
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def test_what_is_there_is_named_and_what_is_new_is_added(
     both = imported([fleet / "logs"], tmp_path, database)
     assert (len(first.drives), first.already_there) == (1, ())
     assert ([drive.vehicle for drive in both.drives], both.already_there) == (["V002"], ("V001/drive",))
-    assert f"1 drives written to {tmp_path}, 1 already there, 0 left out" in both.as_text()
+    assert f"1 drive written to {tmp_path}, 1 already there, 0 left out" in both.as_text()
 
 
 def test_equal_notices_are_told_once_and_json_keeps_those_of_every_drive(
@@ -62,6 +63,20 @@ def test_a_damaged_drive_in_the_store_is_not_taken_for_imported(
     assert report.already_there == ()
     assert "not a drive" in report.left_out["V001/drive"]
     assert "remove it and import it again" in report.left_out["V001/drive"]
+
+
+def test_what_a_killed_import_was_just_writing_is_removed_by_the_next(
+    fleet: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    folder = tmp_path / "drives" / "V001"
+    folder.mkdir(parents=True)
+    left, other = folder / ".drive.parquet.x1y2", folder / ".drive.parquet.new"
+    left.write_bytes(b"half")
+    os.utime(left, (0, 0))
+    other.write_bytes(b"half")  # of an import that goes on beside this one
+    os.utime(other, (2e9, 2e9))
+    imported([fleet / "logs" / "V001"], tmp_path, database)
+    assert {path.name for path in folder.iterdir()} == {"drive.parquet", other.name}
 
 
 def test_the_store_knows_which_artificial_fleet_its_drives_are_of(
