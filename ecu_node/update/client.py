@@ -216,7 +216,7 @@ def update(
 
 def _verified_offer(state: VehicleState, source: str, now: datetime) -> _Offer:
     """Run TUF's client workflow on a copy of the trusted metadata; the state is not touched."""
-    fetcher, base = open_source(source)
+    fetcher = open_source(source)
     target = target_path(state.vehicle)
     with TemporaryDirectory(prefix="ecu-node-", dir=_WORK) as name:
         work = Path(name)
@@ -224,9 +224,7 @@ def _verified_offer(state: VehicleState, source: str, now: datetime) -> _Offer:
             if text is not None:
                 (work / f"{role}.json").write_text(text)
         try:
-            updater = Updater(
-                name, f"{base}metadata", None, f"{base}targets", fetcher, _CONFIG, bootstrap=state.root.encode()
-            )
+            updater = Updater(name, "metadata", None, "targets", fetcher, _CONFIG, bootstrap=state.root.encode())
             info = updater.get_targetinfo(target)
             for path in work.glob("*.json"):
                 _require_fresh(path, source, now)

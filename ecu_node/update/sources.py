@@ -10,6 +10,7 @@ import lzma
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
+from urllib.parse import quote
 
 import msgspec
 from tuf.api.exceptions import DownloadError, DownloadHTTPError, SlowRetrievalError
@@ -34,7 +35,7 @@ _OF_1_0 = (b'{"payload":', b'{"keys":')
 """How signed files and key sets of version 1.0 begin."""
 
 
-def open_source(text: str) -> tuple[FetcherInterface, str]:
+def open_source(text: str) -> FetcherInterface:
     """Open a source of updates.
 
     Parameters
@@ -45,9 +46,7 @@ def open_source(text: str) -> tuple[FetcherInterface, str]:
     Returns
     -------
     FetcherInterface
-        For TUF's client.
-    str
-        Base of the names that the fetcher takes; ``metadata`` and ``targets`` stand behind it.
+        For TUF's client; takes names such as ``metadata/timestamp.json``.
 
     Raises
     ------
@@ -55,15 +54,15 @@ def open_source(text: str) -> tuple[FetcherInterface, str]:
         If there is no such file or folder, or the file is no whole bundle.
     """
     if text.startswith(("http://", "https://")):
-        return _WebFetcher(), text.rstrip("/") + "/"
+        return _WebFetcher(text.rstrip("/"))
     if "://" in text:
         raise TrustError(Reason.NO_PARAMETERS, f"{text}: only http:// and https:// are known; name a bundle or folder")
     path = Path(text)
     if (path / "metadata").is_dir():
-        return _FolderFetcher(path), ""
+        return _FolderFetcher(path)
     if path.is_dir():
         raise TrustError(Reason.NO_PARAMETERS, f"{text}: no repository: there is no folder 'metadata' in it")
-    return _BundleFetcher(_bundle_files(path)), ""
+    return _BundleFetcher(_bundle_files(path))
 
 
 def bundle_bytes(files: Mapping[str, bytes]) -> bytes:
@@ -128,9 +127,13 @@ class _FolderFetcher(FetcherInterface):
 class _WebFetcher(Urllib3Fetcher):
     """Gives up when a server sends too slowly; TUF's own limit is on each read."""
 
+    def __init__(self, base: str) -> None:
+        super().__init__()
+        self._base = base
+
     def _fetch(self, url: str) -> Iterator[bytes]:
         end_s = time.monotonic() + _LONGEST_DOWNLOAD_S
-        for chunk in super()._fetch(url):
+        for chunk in super()._fetch(f"{self._base}/{quote(url)}"):  # names of files have a % themselves, as V%201.json
             if time.monotonic() > end_s:
                 raise SlowRetrievalError(f"{url} took longer than {_LONGEST_DOWNLOAD_S:g} s")
             yield chunk

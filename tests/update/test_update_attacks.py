@@ -7,9 +7,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 from typing import Any
+from urllib.parse import unquote
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 from tuf.api.metadata import Key, Root, Snapshot, SuccinctRoles, TargetFile, Targets, Timestamp
 
 from ecu_node.parameters import VehicleParameters, encode_parameters
@@ -236,7 +238,7 @@ class _Server(BaseHTTPRequestHandler):
     is_endless = False
 
     def do_GET(self) -> None:
-        path = self.folder / self.path.lstrip("/")
+        path = self.folder / unquote(self.path).lstrip("/")
         if not path.is_file():
             self.send_error(404)
             return
@@ -273,6 +275,18 @@ def test_web_server(repo: Repo, new: Path, server: Any) -> None:
     assert repo.updated(new, url).startswith("on trial: ")
     shutil.rmtree(repo.metadata)
     repo.refused(new, "status 404; is it complete", url)
+
+
+@pytest.mark.parametrize("vehicle", ["V 1", "Ü#1", "a/b", "50%"])
+def test_web_server_has_files_of_vehicles_with_any_name(
+    vehicle: str, repo: Repo, server: Any, parameters: VehicleParameters, tmp_path: Path
+) -> None:
+    path = tmp_path / "parameters.json"
+    path.write_bytes(encode_parameters(replace(parameters, vehicle=vehicle), ""))
+    repo.done("add", repo.path, path)
+    repo.publish()
+    repo.provision(tmp_path / "state", vehicle)
+    assert repo.updated(tmp_path / "state", server[0]).startswith("on trial: ")
 
 
 def test_web_server_that_is_not_there_is_one_line(repo: Repo, new: Path) -> None:
