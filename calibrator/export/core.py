@@ -346,7 +346,7 @@ def intel_hex(address: int, data: bytes) -> str:
 
 def s_records(address: int, data: bytes) -> str:
     """Data at an address as Motorola S-records, of the smallest kind that reaches it: S19, S28 or S37."""
-    size = max(2, ((address + len(data)).bit_length() + 7) // 8)
+    size = max(2, ((address + len(data) - 1).bit_length() + 7) // 8)
 
     def record(kind: int, at: int, content: bytes) -> str:
         line = at.to_bytes(size if kind else 2) + content

@@ -117,7 +117,7 @@ def test_a2l_is_the_same_for_all_vehicles_of_a_layout(vehicles: tuple[Path, Chec
     assert (tmp_path / "none.a2l").read_text() == text
 
 
-@pytest.mark.parametrize("address", [0, 0xFFF0, 0x1FFF0, 0x00FF_FFF0, 0x8000_FFF1])
+@pytest.mark.parametrize("address", [0, 0xFFF0, 0x1FFF0, 0x00FF_FFF0, 0x8000_FFF1, (1 << 32) - 656])
 def test_hex_and_s_records_hold_any_address(address: int) -> None:
     data = Random(1).randbytes(656)
     for text in (intel_hex(address, data), s_records(address, data)):
