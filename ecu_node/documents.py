@@ -137,7 +137,7 @@ def _problem(value: Any, kind: Any) -> tuple[list[str], str] | None:
     if len(structs) > 1:  # told apart by the value of a key
         key = str(structs[0].__struct_config__.tag_field)
         by_tag = {str(one.__struct_config__.tag): one for one in structs}
-        if value.get(key) not in by_tag:
+        if not isinstance(value.get(key), str) or value[key] not in by_tag:
             found = f"found {_shown(value[key])}" if key in value else "it is missing"
             return [key], f"expected one of {', '.join(by_tag)}, {found}"
         structs = [by_tag[value[key]]]

@@ -59,6 +59,11 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
         (
             "\n]\n",
+            '\n]\n[e2e]\nprofile = ["P01"]\nmessages = ["Net"]\n',
+            r"profile: expected one of P01.*found \[\"P01\"\]",
+        ),
+        (
+            "\n]\n",
             '\n]\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\ndata_id = { Pair = 1 }\n',
             "e2e\\], data_id: Pair is not in",
         ),
