@@ -94,8 +94,9 @@ class Telemetry:
                 else:
                     _send(*self.target, line)
                 is_lost, news = False, "lines are written again"
-            except OSError as error:
-                is_lost, news = True, f"{error.strerror}; lines are lost until that has changed"
+            except (OSError, UnicodeError) as error:  # UnicodeError: a host that no name server could know
+                why = error.strerror if isinstance(error, OSError) else error
+                is_lost, news = True, f"{why}; lines are lost until that has changed"
                 self.corrector.counters.telemetry_lost += 1
             if is_lost != was_lost:
                 self.say(f"--telemetry: {news}")
