@@ -87,16 +87,25 @@ def key(
     made = Ed25519PrivateKey.generate()
     pem = serialization.Encoding.PEM
     private, public = out / f"{name}.key", out / f"{name}.pub"
+    exists = "there is a key already; take another name, it cannot be made again"
+    if os.path.lexists(public):
+        raise UserError(f"{public}: {exists}")
     try:
         out.mkdir(parents=True, exist_ok=True)
         handle = os.open(private, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(handle, "wb") as file:
-            file.write(made.private_bytes(pem, serialization.PrivateFormat.PKCS8, encryption))
     except FileExistsError:
-        raise UserError(f"{private}: there is a key already; take another name, it cannot be made again") from None
+        raise UserError(f"{private}: {exists}") from None
     except OSError as error:
         raise UserError(f"{private}: cannot be written: {error.strerror}") from None
-    write_files({public: made.public_key().public_bytes(pem, serialization.PublicFormat.SubjectPublicKeyInfo)})
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(made.private_bytes(pem, serialization.PrivateFormat.PKCS8, encryption))
+        write_files({public: made.public_key().public_bytes(pem, serialization.PublicFormat.SubjectPublicKeyInfo)})
+    except (OSError, UserError) as error:
+        private.unlink()
+        if isinstance(error, OSError):
+            raise UserError(f"{private}: cannot be written: {error.strerror}") from None
+        raise
     facts = {"signer": name, "private_key": str(private), "public_key": str(public)}
     _tell(facts, f"{private}\n{public}".replace("\n", "  "), json=json)
 

@@ -163,6 +163,17 @@ def test_key_is_never_replaced(repo: Repo) -> None:
     for name in ("a/b", ""):
         failed(repo, "a name for a file is expected", "key", name, "--no-passphrase", "--out", repo.folder, code=2)
     assert repo.key("t1").read_bytes() == before
+    (repo.folder / "keys" / "anna.pub").write_text("the public key of somebody else")
+    failed(repo, "anna.pub: there is a key already", "key", "anna", "--no-passphrase", "--out", repo.folder / "keys")
+    assert (repo.folder / "keys" / "anna.pub").read_text() == "the public key of somebody else"
+    assert not repo.key("anna").exists()
+
+
+@pytest.mark.parametrize("free_bytes", [0, 115])
+def test_key_that_is_not_whole_is_not_left(free_bytes: int, repo: Repo) -> None:
+    with full_disk(free_bytes):
+        failed(repo, "cannot be written: File too large", "key", "anna", "--no-passphrase", "--out", repo.folder)
+    assert not list(repo.folder.glob("*anna*"))
 
 
 def test_mistakes_are_one_line_and_change_nothing(repo: Repo, other: VehicleParameters, tmp_path: Path) -> None:
