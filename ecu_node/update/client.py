@@ -26,6 +26,7 @@ from urllib3.exceptions import HTTPError
 
 from ecu_node.core.status import Reason, TrustError, UnfitError
 from ecu_node.database import VehicleDatabase
+from ecu_node.documents import read_user_file
 from ecu_node.errors import UserError
 from ecu_node.parameters import MAX_FILE_BYTES, BranchParameters, VehicleParameters, check_fit, decode_parameters
 from ecu_node.update.sources import open_source
@@ -73,7 +74,7 @@ class TargetFacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
     vehicle: str
     layout: _Digest
     dbc: _Digest
-    expires: datetime
+    expires: Annotated[datetime, msgspec.Meta(tz=True)]
     allow_large_step: bool = False
     revoked: Annotated[list[_Digest], msgspec.Meta(description="SHA-256 of files that must not be used any more")] = []
 
@@ -130,7 +131,7 @@ def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
         If the file is no root that its own keys have signed, there is a state already, or it cannot be written.
     """
     try:
-        content = root.read_bytes()[: _LARGEST_ROOT_BYTES + 1]
+        content = read_user_file(root, largest_bytes=_LARGEST_ROOT_BYTES)
         metadata, text = Metadata[Any].from_bytes(content), content.decode()
         if not isinstance(metadata.signed, Root):
             raise ValueError("metadata of another role")
@@ -206,9 +207,10 @@ def update(
             refusal, taken, event, text = error, kept, "refused", str(error)
         if not dry_run:
             write_state(folder, taken)
-            for entry, words in (("revoked", told), (event, text)):
-                if words and entry != "nothing new":
-                    add_decision(folder, entry, words, now, reason=refusal.reason if refusal else None)
+            if told:
+                add_decision(folder, "revoked", told, now)
+            if event != "nothing new":
+                add_decision(folder, event, text, now, reason=refusal.reason if refusal else None)
         if refusal is not None:
             raise type(refusal)(refusal.reason, f"{refusal}; {told}" if told else str(refusal))
     return f"revoked: {told}; {event}: {text}" if told else f"{event}: {text}"

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from securesystemslib.dsse import Envelope
 from securesystemslib.exceptions import FormatError
 from securesystemslib.formats import encode_canonical
-from tuf.api.metadata import Metadata
+from tuf.api.metadata import Metadata, Targets
 
 from ecu_node.core.status import TrustError
 from ecu_node.database import VehicleDatabase
@@ -284,6 +284,28 @@ def test_vehicle_is_provisioned_once_with_a_root_that_is_signed(repo: Repo, tmp_
     assert not place.exists()
     code, _, err = repo.node("provision", "--vehicle", "v", "--root", tmp_path / "none", "--state", place)
     assert (code, "cannot read the root: No such file" in err) == (1, True)
+    os.mkfifo(tmp_path / "pipe")
+    code, _, err = repo.node("provision", "--vehicle", "v", "--root", tmp_path / "pipe", "--state", place)
+    assert (code, "cannot read the root: it is a pipe" in err) == (1, True)
+
+
+def test_expiry_without_time_zone_is_refused(repo: Repo, new: Path) -> None:
+    def set_expiry(targets: Targets) -> None:
+        targets.targets["v1.json"].custom["expires"] = "2100-01-01T00:00:00"
+
+    repo.forge(repo.bin, set_expiry, "t1", "t2")
+    repo.relist(repo.bin, "snapshot", "timestamp")
+    repo.refused(new, "custom fields of v1.json: Expected `datetime` with a timezone component")
+
+
+def test_what_is_refused_with_a_revocation_is_logged_with_its_own_reason(
+    repo: Repo, state: Path, other: VehicleParameters
+) -> None:
+    repo.done("revoke", repo.path, "v1")
+    repo.offer(replace(other, layout=replace(other.layout, sha256="0" * 64)))
+    assert repo.update(state)[0] == 1
+    lines = [msgspec.json.decode(line) for line in (state / "decisions.log").read_text().splitlines()[-2:]]
+    assert [(line["event"], line.get("reason")) for line in lines] == [("revoked", None), ("refused", "WrongLayout")]
 
 
 def test_second_provisioning_is_refused(offered: Repo, state: Path) -> None:
