@@ -119,9 +119,7 @@ def test_host_that_no_name_server_could_know_is_said(make_outlet: Any) -> None:
     outlet = make_outlet(("a" * 64, 5000))
     outlet.second()
     wait_until(lambda: outlet.said)
-    assert outlet.said == [
-        "--telemetry: encoding with 'idna' codec failed (UnicodeError: label too long); lines are lost until that has changed"
-    ]
+    assert outlet.said[0].endswith("label too long); lines are lost until that has changed")
 
 
 def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tmp_path: Path) -> None:
