@@ -67,15 +67,16 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
         state = read_state(folder)
         if state.on_trial != tried:
             return state
+        latest = max(now, state.latest)
         try:
             require_not_expired(tried, state, now)
-        except TrustError as error:
-            passed, text = False, str(error)
+        except TrustError as error:  # a clock that jumps ahead for a moment must not be believed for ever
+            passed, text, latest = False, str(error), state.latest
         if passed:
             state = replace(state, in_force=tried, before=state.in_force, on_trial=None, failed=None, ended=None)
         else:
             state = replace(state, on_trial=None, failed=tried)
-        state = replace(state, latest=max(now, state.latest))
+        state = replace(state, latest=latest)
         write_state(folder, state)
         add_decision(folder, "in force" if passed else "failed", f"{tried}: {text}", now)
     return state

@@ -211,6 +211,7 @@ def test_set_expires_for_good_and_a_clock_behind_is_not_believed(
     assert tried is not None
     conclude(state, tried, passed=True, text="seen", now=now + timedelta(days=2))
     assert numbers(state) == (300, None), "it expired before its trial ended"
+    assert read_state(state).latest < now + timedelta(days=1), "a clock that jumped ahead is not kept"
     with pytest.raises(TrustError, match="expired at"):
         update(state, str(repo.path), database, now + timedelta(days=40))  # the timestamp has expired by then
     found = read_state(state).in_force
