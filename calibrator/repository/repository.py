@@ -96,7 +96,8 @@ class Repository:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._metadata, self._staged = folder, folder / "metadata", folder / "staged"
-        roots = [int(path.name.partition(".")[0]) for path in self._metadata.glob("*.root.json")]
+        names = [path.name.partition(".")[0] for path in self._metadata.glob("*.root.json")]
+        roots = [int(name) for name in names if name.isdecimal()]
         if not roots and not (self._staged / "root.json").exists():
             raise RepositoryStateError(f"{folder}: no repository; make one with 'calibrator repository init'")
         self._root_version = max(roots, default=0)
@@ -287,8 +288,9 @@ class Repository:
         if not (self._staged / "root.json").exists() and self._root().expires < soon:
             self._stage("root", self._root())
         for role in self._versions:
-            live = self._metadata / f"{self._versions[role]}.{role}.json"
-            if not (self._staged / f"{role}.json").exists() and expiry_of(live.read_bytes()) < soon:
+            if (self._staged / f"{role}.json").exists():
+                continue
+            if self._live_expiry(f"{self._versions[role]}.{role}") < soon:
                 self._restage(role)
 
     def unstage(self) -> list[str]:
@@ -302,8 +304,24 @@ class Repository:
 
     @property
     def valid_until(self) -> datetime | None:
-        """When vehicles stop taking what is published, unless it is published anew; None before the first time."""
-        return expiry_of((self._metadata / "timestamp.json").read_bytes()) if self._timestamp_version else None
+        """When vehicles stop taking what is published, unless it is published anew; None before the first time.
+
+        Timestamp and snapshot are new at each publication; root and targets may lack signatures for longer than they
+        are valid.
+        """
+        if not self._timestamp_version:
+            return None
+        names = ["timestamp", f"{self._root_version}.root", f"{self._versions['targets']}.targets"]
+        return min(map(self._live_expiry, names))
+
+    def _live_expiry(self, name: str) -> datetime:
+        path = self._metadata / f"{name}.json"
+        try:
+            return expiry_of(path.read_bytes())
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
+            raise RepositoryStateError(
+                f"{path}: cannot be read as metadata: {error}; take a copy of the repository"
+            ) from None
 
     def sign(self, signers: Sequence[Signer]) -> Iterator[str]:
         """Sign what is staged; what lacks signatures after that stands in :attr:`waiting`.
@@ -406,7 +424,7 @@ class Repository:
         path, until = target_path(vehicle), self.valid_until
         if until is not None and until <= datetime.now(UTC):
             raise RepositoryStateError(
-                f"{self._folder}: no vehicle takes it since {until:%Y-%m-%d}, when its timestamp expired; publish first"
+                f"{self._folder}: no vehicle takes it since {until:%Y-%m-%d}, when its metadata expired; publish first"
             )
         role = _BINS.get_role_for_target(path)
         targets = self._live(role, Targets)
@@ -420,6 +438,11 @@ class Repository:
             return bundle_bytes({name: (self._folder / name).read_bytes() for name in names})
         except OSError as error:
             raise RepositoryStateError(f"{error.filename}: cannot be read: {error.strerror}") from None
+        except UnicodeDecodeError:
+            raise RepositoryStateError(
+                f"{self._folder}: a root or the parameters of vehicle {vehicle!r} are damaged; take a copy of the "
+                f"repository"
+            ) from None
 
 
 def missing_text(missing: Mapping[str, str]) -> str:

@@ -98,7 +98,7 @@ class _Offer(msgspec.Struct, frozen=True):
 
 def target_path(vehicle: str) -> str:
     """Path of a vehicle's parameter file in the repository, such as ``V001.json``; it never leads anywhere else."""
-    return f"{quote(vehicle, safe='')}.json"
+    return f"{quote(vehicle, safe='', errors='surrogateescape')}.json"
 
 
 def expiry_of(metadata: bytes) -> datetime:

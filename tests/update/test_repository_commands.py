@@ -1,12 +1,14 @@
 """``calibrator repository``: keys, thresholds, signers one after the other, and mistakes in one line."""
 
 import subprocess
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, generate_private_key
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 from msgspec.structs import replace
+from tuf.api.metadata import Root
 
 from ecu_node.parameters import VehicleParameters, write_parameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE, public_key_of
@@ -85,7 +87,7 @@ def test_files_that_no_vehicle_would_take_are_not_added(repo: Repo, parameters: 
 
 def test_bundle_of_expired_metadata_is_refused(repo: Repo) -> None:
     repo.forge("timestamp", expired, "timestamp")
-    failed(repo, "when its timestamp expired; publish first", "bundle", repo.path, "v1", "--out", repo.folder / "b")
+    failed(repo, "when its metadata expired; publish first", "bundle", repo.path, "v1", "--out", repo.folder / "b")
 
 
 def test_publication_that_was_cut_goes_on(
@@ -209,3 +211,29 @@ def test_full_disk_leaves_what_vehicles_see(repo: Repo, new: Path, other: Vehicl
         code, _, err = repo.calibrator("repository", "publish", repo.path, *keys(repo, *ALL))
     assert (code, err.count("\n")) == (1, 1)
     assert repo.updated(new).startswith("nothing new: ")
+
+
+def test_root_that_expires_before_the_timestamp_is_told(repo: Repo) -> None:
+    def expire_soon(root: Root) -> None:
+        root.expires = datetime.now(UTC).replace(microsecond=0) + timedelta(days=3)
+
+    repo.forge("root", expire_soon, "r1", "r2")
+    repo.publish("snapshot", "timestamp")
+    day = f"{datetime.now(UTC) + timedelta(days=3):%Y-%m-%d}"
+    assert f"valid until {day}; 1 roles staged: root has 0 of 2 signatures" in repo.done("status", repo.path)
+
+
+def test_damaged_repository_is_one_line(repo: Repo) -> None:
+    (repo.metadata / "copy of 1.root.json").write_text("")
+    assert "valid until" in repo.done("status", repo.path)
+    next((repo.path / "targets").glob("*.v1.json")).write_bytes(b"\xff")
+    failed(repo, "'v1' are damaged; take a copy", "bundle", repo.path, "v1", "--out", repo.folder / "b")
+    repo.live(repo.bin).write_bytes(b"\xff")
+    failed(repo, "cannot be read as metadata", "publish", repo.path, *keys(repo, "snapshot", "timestamp"))
+    repo.live("targets").write_bytes(b"\xff")
+    failed(repo, "cannot be read as metadata", "status", repo.path)
+
+
+@pytest.mark.parametrize("command", [("revoke",), ("bundle", "--out", "b")])
+def test_vehicle_whose_name_is_no_text_is_one_line(command: tuple[str, ...], repo: Repo) -> None:
+    failed(repo, "no parameters of vehicle", command[0], repo.path, b"\xff", *command[1:])
