@@ -1,7 +1,9 @@
 """``calibrator repository``: what a manufacturer does so that vehicles get their parameters, and only these."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -9,6 +11,7 @@ import typer
 
 from calibrator.errors import ContradictionError, RepositoryStateError
 from calibrator.files.folders import require_possible_folder, write_files
+from calibrator.files.storage import open_storage
 from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption, whole_option
 from calibrator.terminal.progress import shown
@@ -44,6 +47,17 @@ def _open(folder: Path) -> "Repository":
     from calibrator.repository.repository import Repository
 
     return Repository(folder)
+
+
+def _alone(command: Callable[..., None]) -> Callable[..., None]:
+    """A command that writes: it waits until no other one does, as each reads what it changes."""
+
+    @wraps(command)
+    def waiting(folder: Path, **options: object) -> None:
+        with open_storage(folder).locked() if folder.is_dir() else nullcontext():
+            command(folder, **options)
+
+    return waiting
 
 
 def _new_keys(role: str, paths: Sequence[Path], threshold: int | None) -> "NewKeys":
@@ -148,6 +162,7 @@ def make_repository(
 
 
 @repository.command("add", epilog=example("calibrator repository add repo result/params/*.json"))
+@_alone
 def add(
     folder: FolderArgument,
     params: Annotated[list[Path], typer.Argument(help="Parameter files, or folders of them.")],
@@ -172,6 +187,7 @@ def add(
 
 
 @repository.command("publish", epilog=example("calibrator repository publish repo --key anna.key --key online.key"))
+@_alone
 def publish(folder: FolderArgument, key: KeysOption, json: JsonOption = False) -> None:
     """Sign what is staged; once all signatures are there, vehicles see it.
 
@@ -208,6 +224,7 @@ def status(folder: FolderArgument, json: JsonOption = False) -> None:
 
 
 @repository.command("unstage", epilog=example("calibrator repository unstage repo"))
+@_alone
 def unstage(folder: FolderArgument, json: JsonOption = False) -> None:
     """Drop what is staged, as after a mistake; what is published stays."""
     dropped = _open(folder).unstage()
@@ -215,6 +232,7 @@ def unstage(folder: FolderArgument, json: JsonOption = False) -> None:
 
 
 @repository.command("rotate", epilog=example("calibrator repository rotate repo timestamp --public keys/new.pub"))
+@_alone
 def rotate(
     folder: FolderArgument,
     role: Annotated[Literal["root", "targets", "snapshot", "timestamp"], typer.Argument(help="Whose keys.")],
@@ -235,6 +253,7 @@ def rotate(
 
 
 @repository.command("revoke", epilog=example("calibrator repository revoke repo V001"))
+@_alone
 def revoke(
     folder: FolderArgument,
     vehicles: Annotated[list[str], typer.Argument(help="Identities of the vehicles.")],

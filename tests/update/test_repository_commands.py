@@ -1,6 +1,7 @@
 """``calibrator repository``: keys, thresholds, signers one after the other, and mistakes in one line."""
 
 import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from msgspec.structs import replace
 from tuf.api.metadata import Root
 
+from calibrator.files.storage import open_storage
 from ecu_node.parameters import VehicleParameters, write_parameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE, public_key_of
 from tests.disk import full_disk
@@ -223,7 +225,7 @@ def test_root_that_expires_before_the_timestamp_is_told(repo: Repo) -> None:
     assert f"valid until {day}; 1 roles staged: root has 0 of 2 signatures" in repo.done("status", repo.path)
 
 
-def test_damaged_repository_is_one_line(repo: Repo) -> None:
+def test_files_of_a_repository_that_are_no_text_are_one_line(repo: Repo) -> None:
     (repo.metadata / "copy of 1.root.json").write_text("")
     assert "valid until" in repo.done("status", repo.path)
     next((repo.path / "targets").glob("*.v1.json")).write_bytes(b"\xff")
@@ -237,3 +239,12 @@ def test_damaged_repository_is_one_line(repo: Repo) -> None:
 @pytest.mark.parametrize("command", [("revoke",), ("bundle", "--out", "b")])
 def test_vehicle_whose_name_is_no_text_is_one_line(command: tuple[str, ...], repo: Repo) -> None:
     failed(repo, "no parameters of vehicle", command[0], repo.path, b"\xff", *command[1:])
+
+
+def test_commands_that_write_wait_for_each_other(repo: Repo) -> None:
+    command = [sys.executable, "-m", "calibrator", "repository", "unstage", str(repo.path)]
+    with open_storage(repo.path).locked():
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.communicate(timeout=10)
+    assert "0 staged roles dropped" in process.communicate(timeout=60)[0]
