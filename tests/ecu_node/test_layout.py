@@ -20,7 +20,7 @@ def test_the_projects_own_layout_is_read() -> None:
 def test_a_power_branch_is_named_by_its_power(make_database: MakeDatabase) -> None:
     layout = make_database().layout
     assert layout.find_branch("heater").source == "Heater.Power"
-    assert [make_database().current_step_a(name) for name in layout.branch_names] == [0.1, -0.05, 0.0]
+    assert [make_database().current_step_a(name) for name in layout.branch_names] == [0.1, 0.05, 0.0]
     assert layout.offset_limit_a == pytest.approx(0.4 * 400.0)
 
 

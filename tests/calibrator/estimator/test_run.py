@@ -129,7 +129,7 @@ def test_result_has_every_vehicle_once_in_order(result: Path) -> None:
     assert sorted(path.stem for path in (result / "params").iterdir()) == [f"V{j:03d}" for j in range(VEHICLES)]
     assert read_run(result).vehicles == VEHICLES
     assert [path.name for path in result.parent.iterdir() if path.name.startswith(".result")] == []
-    assert {path.name for path in result.iterdir()} == {"params", "parameters", "results.parquet", "run.json"}
+    assert {path.name for path in result.iterdir()} == {"params", "buckets", "results.parquet", "run.json"}
 
 
 def test_result_is_the_same_for_any_number_of_workers(store: SummaryStore, result: Path, tmp_path: Path) -> None:
