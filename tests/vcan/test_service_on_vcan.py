@@ -10,11 +10,11 @@ import pytest
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
-from tests.vcan.patient_layout import LAYOUT, write_patient_layout
+from tests.vcan.conftest import StartNode
+from tests.vcan.patient_layout import write_patient_layout
 from tests.vcan.processes import CHANNEL, ECU_NODE, LONGEST_WAIT_S, Recording, play, playing, running_node, wait_until
-from tests.vcan.small_drive import BRANCHES, VEHICLE, true_parameters, write_drive
+from tests.vcan.small_drive import BRANCHES, true_parameters, write_drive
 
-MONITOR = [*ECU_NODE, "monitor", "--layout", str(LAYOUT), "--channel", CHANNEL]
 UNPRIVILEGED = ["setpriv", "--bounding-set=-all", "--inh-caps=-all", "--ambient-caps=-all", "--no-new-privs"]
 CORRECTED_BATTERY, STATUS = 0x510, 0x5F0
 
@@ -54,38 +54,23 @@ def test_the_monitor_shows_branches_sums_and_node(patient: VehicleDatabase, tmp_
 
 
 def test_the_node_needs_no_capability(
-    database: VehicleDatabase, params: Path, tmp_path: Path, recording: Recording
+    start_node: StartNode, database: VehicleDatabase, params: Path, tmp_path: Path, recording: Recording
 ) -> None:
     """As in deploy/ecu-node@.service: an empty bounding set, no ambient capabilities, no new privileges."""
     write_drive(tmp_path / "drive.log", database, 20)
-    options = [
-        "--unsigned",
-        "--params",
-        str(params),
-        "--layout",
-        str(LAYOUT),
-        "--vehicle",
-        VEHICLE,
-        "--channel",
-        CHANNEL,
-    ]
-    log = tmp_path / "node.err"
-    with log.open("wb") as file, subprocess.Popen([*UNPRIVILEGED, *ECU_NODE, "run", *options], stderr=file) as process:
-        try:
-            wait_until(lambda: "running on" in log.read_text() or process.poll() is not None, "the node to start")
-            capabilities = Path(f"/proc/{process.pid}/status").read_text().partition("CapPrm:")[2].split()
-            assert int(capabilities[0], 16) == 0
-            play(tmp_path / "drive.log")
-            assert len(recording.wait_for(CORRECTED_BATTERY, 20)) == 20
-            assert recording.wait_for(STATUS, 1)
-        finally:
-            process.terminate()
-    assert process.returncode == 0
+    with start_node(params, by=UNPRIVILEGED) as node:
+        capabilities = Path(f"/proc/{node.process.pid}/status").read_text().partition("CapPrm:")[2].split()
+        assert int(capabilities[0], 16) == 0
+        play(tmp_path / "drive.log")
+        assert len(recording.wait_for(CORRECTED_BATTERY, 20)) == 20
+        assert recording.wait_for(STATUS, 1)
+        assert node.stop() == 0
 
 
-def test_real_time_is_first_in_first_out_on_one_processor_with_locked_memory(params: Path, tmp_path: Path) -> None:
-    options = ("--unsigned", "--params", str(params), "--layout", str(LAYOUT), "--realtime")
-    with running_node(tmp_path / "node.err", *options) as node:
+def test_real_time_is_first_in_first_out_on_one_processor_with_locked_memory(
+    start_node: StartNode, params: Path
+) -> None:
+    with start_node(params, "--realtime") as node:
         number = node.process.pid
         status = Path(f"/proc/{number}/status").read_text()
         locked_kb = int(status.partition("VmLck:")[2].split()[0])
