@@ -9,6 +9,7 @@ do, can take each other along when one is killed.
 """
 
 import logging
+import math
 import multiprocessing
 import os
 import pickle
@@ -17,6 +18,7 @@ import signal
 import sys
 import tempfile
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
@@ -25,7 +27,7 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.util import find_spec
-from itertools import islice
+from itertools import islice, takewhile
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from queue import Empty, LifoQueue
@@ -47,6 +49,10 @@ AHEAD_PER_WORKER = 4
 """Items in flight: others go on while one takes long, and few results wait in memory. [1]"""
 CONNECT_S, RETURN_S = 10.0, 60.0
 """Within which a scheduler must answer at first; within which it and a worker must be there after it was lost. [s]"""
+SENT_AT_ONCE = 100
+"""Items in a message to the scheduler, which wants less than 10 MB. [1]"""
+COUNT_EVERY_S = 1.0
+"""How often it is asked how many workers there are, as some come and go. [s]"""
 MEMORY_SHARE, LEAST_MEMORY_BYTES = 0.8, 1 << 30
 """Of the machine's memory for all processes that read; each may use this much at least. [1], [byte]"""
 PRELOADED = [
@@ -401,29 +407,39 @@ def _end_with_parent() -> None:
 def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
     from distributed import KilledWorker  # noqa: PLC0415 (an extra)
 
-    waiting, flight = iter(items), deque[tuple[Any, Any]]()
+    waiting, flight, futures = iter(items), deque[Any](), deque[Any]()  # futures: of the first of the flight
+    workers, counted_s = 1, -math.inf
     with _silenced():
         client = _connect(address, CONNECT_S)
         try:
             while True:
+                flight.extend(islice(waiting, max(AHEAD_PER_WORKER * workers - len(flight), 0)))
+                if not flight:
+                    return
                 try:
-                    ahead = AHEAD_PER_WORKER * max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
-                    for item in islice(waiting, max(ahead - len(flight), 0)):
-                        flight.append((item, None))
-                    flight = deque((i, f or client.submit(_on_worker, job, i, pure=False)) for i, f in flight)
-                    if not flight:
-                        return
-                    outcome = flight[0][1].result()
-                except KilledWorker:
-                    outcome = Failed(reason=f"{address}: it killed its workers one after the other, as by memory")
-                except (CancelledError, OSError) as error:
-                    if client.status == "running" and not isinstance(error, CancelledError):
-                        raise
+                    if time.monotonic() - counted_s > COUNT_EVERY_S:
+                        workers, counted_s = max(len(client.nthreads()), 1), time.monotonic()
+                        continue  # with as many items
+                    while unsent := list(islice(flight, len(futures), len(futures) + SENT_AT_ONCE)):
+                        futures.extend(client.map(partial(_on_worker, job), unsent, pure=False))
+                    error = futures[0].exception()  # waits for it
+                    # many at a time, as each request to the scheduler costs milliseconds; the others keep workers busy
+                    done = list(takewhile(lambda future: future.status == "finished", islice(futures, workers)))
+                    outcomes = client.gather(done)
+                    if error is None and not done:
+                        raise CancelledError  # it was lost
+                except (CancelledError, OSError):
                     client.close(timeout=1)
                     client = _connect(address, RETURN_S, lost=True)
-                    flight = deque((item, None) for item, _ in flight)
+                    futures.clear()
                     continue
-                yield flight.popleft()[0], outcome
+                if isinstance(error, KilledWorker):
+                    outcomes = [Failed(reason=f"{address}: it killed its workers one after the other, as by memory")]
+                elif error is not None:
+                    futures[0].result()  # raises it
+                for outcome in outcomes:
+                    futures.popleft()
+                    yield flight.popleft(), outcome
         finally:
             client.close(timeout=1)
 
@@ -443,9 +459,7 @@ def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
         client.wait_for_workers(1, timeout=RETURN_S)
     except TimeoutError:
         client.close()
-        raise FleetError(
-            f"{address}: the scheduler has no worker; start some with 'dask worker'{again if lost else ''}"
-        ) from None
+        raise FleetError(f"{address}: the scheduler has no worker; start some with 'dask worker'{again}") from None
     return client
 
 

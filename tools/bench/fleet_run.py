@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from bench.row import LAYOUT, MEBIBYTE, Row
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.simulate import FleetPlan, draw_vehicles, simulate_fleet, trip_of, vehicle_drive
 from calibrator.artificial.trips import BuiltinTrips
-from calibrator.drive import Array, Drive, Equipment
+from calibrator.drive import Array, Channel, Drive, Equipment
 from calibrator.drives.delays import BranchDelays
 from calibrator.drives.store import write_drive
 from calibrator.experiments.recorded_trips import RecordedCase, builtin_fleet, record_vehicles
@@ -54,8 +54,8 @@ TRIPS, MINUTES = 64, 6.0
 """Different trips of the summaries, and their least length. [min]"""
 BRANCHES, MAGNITUDE, SPARSITY = ("battery", "motor"), (0.05, 0.25), 80.0
 """Of the fleets; faults are drawn as in the paper. [1], [%]"""
-DRIVES, DRIVE_S = 20, 600.0
-"""Different drives that are read, and their length [s]; noise makes each its own."""
+DRIVES, DRIVE_S, STEP_A = 20, 600.0, 0.1
+"""Different drives that are read, their length [s], and the step of the noise that makes each its own [A]."""
 WORKERS = 2
 """Processes that make fleets and calibrate them."""
 WATCH_EVERY_S = 0.2
@@ -244,8 +244,16 @@ def _measured(trip: DriveSummary, faults: Faults) -> DriveSummary:
     return replace(trip, moments=change @ trip.moments @ change.T, noise_a2=trip.noise_a2 * gain**2, fit=None)
 
 
+def _thinned(channels: Mapping[str, Channel]) -> dict[str, Channel]:
+    """Every fifth sample of channels, which are sent at 50 or 100 Hz, with the time stamps of a logger of 0.1 ms."""
+    return {
+        name: Channel(time_s=channel.time_s[::5].round(4), value=channel.value[::5], good=channel.good[::5])
+        for name, channel in channels.items()
+    }
+
+
 def write_drives(folder: Path, drives: int, *, per_vehicle: int = 10) -> float:
-    """Write drives of ten minutes at 10 Hz into a store; how long they are together. [h]"""
+    """Write drives of ten minutes with frames at 10 and 20 Hz into a store; how long they are together. [h]"""
     database, rng, seconds = read_database(read_layout(LAYOUT)), np.random.default_rng(0), 0.0
     trips = BuiltinTrips(seed=0, duration_s=DRIVE_S, unseen_s=60.0)
     plan = FleetPlan(vehicles=-(-drives // per_vehicle), currents=len(BRANCHES), sparsity=SPARSITY, magnitude=MAGNITUDE)
@@ -254,13 +262,14 @@ def write_drives(folder: Path, drives: int, *, per_vehicle: int = 10) -> float:
         for trip in range(per_vehicle):
             if len(base) < DRIVES:
                 truth = trip_of(trips, vehicle, len(base), "calibration", database.layout)
-                base.append(vehicle_drive(rng, database, vehicle, truth))
+                drive = vehicle_drive(rng, database, vehicle, truth)
+                base.append(replace(drive, branches=_thinned(drive.branches), inputs=_thinned(drive.inputs)))
             like = base[(number + trip) % len(base)]
-            noisy = {
-                name: replace(channel, value=channel.value + rng.normal(scale=0.1, size=len(channel.value)))
+            own = {
+                name: replace(channel, value=channel.value + STEP_A * rng.integers(-1, 2, len(channel.value)))
                 for name, channel in like.branches.items()
             }
-            drive = replace(like, vehicle=vehicle.name, name=f"d{trip}", branches=noisy)
+            drive = replace(like, vehicle=vehicle.name, name=f"d{trip}", branches=own)
             write_drive(folder, drive, database.layout)
             seconds += drive.duration_s
     return seconds / 3600.0

@@ -65,3 +65,10 @@ def gated(number: int, folder: Path) -> int:
     while number >= 2 and not (folder / "go").exists():
         time.sleep(0.02)
     return number
+
+
+def of_no_disk(number: int) -> int:
+    """Fail at the second item."""
+    if number == 1:
+        raise OSError("no disk")
+    return number

@@ -20,7 +20,7 @@ from calibrator.processes.run_many import Failed, Workers, run_many, try_many
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.processes.dask_cluster import DaskCluster, gated
+from tests.calibrator.processes.dask_cluster import DaskCluster, gated, of_no_disk
 from tests.calibrator.processes.test_run_many import LIMIT_S, dying_once, hostile
 
 pytest.importorskip("distributed")
@@ -43,6 +43,21 @@ def test_lost_workers_and_hostile_items_cost_themselves_only(tmp_path: Path) -> 
         assert all(worker.poll() is None for worker in cluster.workers)
         assert list(run_many(partial(dying_once, folder=tmp_path), range(9), where)) == list(range(9))
         assert sorted(worker.poll() is None for worker in cluster.workers) == [False, True]  # it killed one
+
+
+def test_errors_of_function_and_items_are_not_taken_for_a_lost_scheduler(tmp_path: Path) -> None:
+    def items() -> Iterator[int]:
+        yield from range(2, 60)
+        raise OSError("no more")
+
+    with DaskCluster(tmp_path) as cluster:
+        where = Workers(scheduler=cluster.address)
+        results = run_many(of_no_disk, range(3), where)
+        assert next(results) == 0
+        with pytest.raises(OSError, match="no disk"):
+            next(results)
+        with pytest.raises(OSError, match="no more"):
+            list(run_many(of_no_disk, items(), where))
 
 
 def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,100 @@
+"""How many workers of a cluster the process that is started, and the Dask scheduler, can keep busy.
+
+    python -m bench.cluster --workers 1000          (in tools/)
+
+The workers are those of Dask, all in one process, and only wait: each item brings back a record of the usual size.
+Of the two processes at the top the time on a core per item is measured: the slower one limits a fleet, and both have a
+core of their own in a real cluster.
+"""
+
+import argparse
+import asyncio
+import multiprocessing
+import os
+import socket
+import time
+from functools import partial
+
+import dask
+import psutil
+from distributed import Client, Scheduler, Worker
+
+from calibrator.processes.run_many import Workers, run_many
+
+__all__ = ["core_seconds"]
+
+READING_S = 10.0
+"""Of one item; a vehicle with ten hours of driving takes 2.5 s, but here one process is all workers. [s]"""
+TASK_BYTES, RECORD_BYTES = 4_000, 16_000
+"""What goes to a worker: names and versions of a vehicle's drives; what comes back. [byte]"""
+IDLE = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "1h",
+    "distributed.admin.tick.interval": "1h",
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": False,
+}
+"""A thousand workers in one process shall not spend it on watching themselves."""
+
+
+def read(_: bytes, seconds: float) -> bytes:
+    """Stand for a worker that reads a vehicle's drives on a core of its own."""
+    time.sleep(seconds)
+    return bytes(RECORD_BYTES)
+
+
+def core_seconds(workers: int, items_per_worker: int = 5) -> tuple[float, float]:
+    """Time on a core, per item, of the process that was started and of the scheduler. [s]"""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    context, address = multiprocessing.get_context("spawn"), f"tcp://127.0.0.1:{port}"
+    processes = [context.Process(target=_serve, args=(count, port), daemon=True) for count in (None, workers)]
+    try:
+        for process in processes:
+            process.start()
+        with Client(address, timeout=60, set_as_default=False) as client:
+            client.wait_for_workers(workers, timeout=600)
+        tasks = (os.urandom(TASK_BYTES) for _ in range(workers * items_per_worker))
+        watched = (psutil.Process(), psutil.Process(processes[0].pid))
+        before_s = [sum(process.cpu_times()[:2]) for process in watched]
+        found = sum(1 for _ in run_many(partial(read, seconds=READING_S), tasks, Workers(scheduler=address)))
+        after_s = [sum(process.cpu_times()[:2]) for process in watched]
+        own_s, scheduler_s = ((after - before) / found for before, after in zip(before_s, after_s, strict=True))
+        return own_s, scheduler_s
+    finally:
+        for process in processes:
+            process.kill()
+
+
+def _serve(workers: int | None, port: int) -> None:
+    async def serve() -> None:
+        if workers is None:
+            await Scheduler(port=port, host="127.0.0.1", dashboard_address=":0")
+        else:
+            address = f"tcp://127.0.0.1:{port}"
+            for first in range(0, workers, 50):
+                await asyncio.gather(*(Worker(address, nthreads=1) for _ in range(first, min(first + 50, workers))))
+        await asyncio.Event().wait()
+
+    with dask.config.set(IDLE):
+        asyncio.run(serve())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--workers", type=int, default=1000)
+    arguments = parser.parse_args()
+    own_s, scheduler_s = core_seconds(arguments.workers)
+    print(
+        f"{arguments.workers} workers: {1e3 * own_s:.2f} ms per item in the process that was started, "
+        f"{1e3 * scheduler_s:.2f} ms in the scheduler: at most {1.0 / max(own_s, scheduler_s):.0f} vehicles per second"
+    )
+
+
+if __name__ == "__main__":
+    from bench import cluster
+
+    cluster.main()
