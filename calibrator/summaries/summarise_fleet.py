@@ -60,7 +60,8 @@ class SummariseReport:
     store : str
         Path or URL of the store.
     vehicles, drives : int
-        Vehicles whose drives were read, and these drives; those that were in the store already are not.
+        Vehicles of which something was summarised, and these drives; neither what was in the store already counts nor
+        what was left out.
     left_out : dict of str to str
         Vehicles whose drives could not be used, files whose vehicle is unclear, and why.
     notices : list of str
@@ -308,10 +309,11 @@ def _keep(
 
     store.change(bucket, kept, new)
     for record in new:
-        report.vehicles += 1
-        report.drives += len(record.drives)
         if record.problem:
             report.left_out[record.vehicle] = record.problem
+        else:
+            report.vehicles += 1
+            report.drives += len(record.drives)
         twins = [n for n, d in zip(record.drives, record.digests, strict=False) if record.digests.count(d) > 1]
         if twins:
             report.notices.append(
