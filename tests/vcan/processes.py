@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 CHANNEL, OTHER_CHANNEL = "vcan0", "vcan1"
 ECU_NODE = (sys.executable, "-m", "ecu_node")
-LONGEST_WAIT_S = 60.0
+LONGEST_WAIT_S = 180.0
 """System calls of user-mode-linux are slow; nothing here takes this long unless it is broken. [s]"""
 
 
