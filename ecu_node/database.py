@@ -16,16 +16,14 @@ from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Layout, SignalName, joint_digest, read_layout, split_signal
 
 __all__ = [
-    "MAX_DBC_BYTES",
     "VehicleDatabase",
     "codes_of_no_value",
-    "look_everything_up",
     "means_not_available",
     "node_database",
     "read_database",
 ]
 
-MAX_DBC_BYTES = 16_000_000
+_MAX_DBC_BYTES = 16_000_000
 """The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""
 
 
@@ -145,7 +143,7 @@ def read_database(layout: Layout) -> VehicleDatabase:
         for name in layout.wrong_ranges:
             signal = vehicle.signal(name)[1]
             signal.minimum = signal.maximum = None
-        look_everything_up(vehicle)
+        _look_everything_up(vehicle)
     return vehicle
 
 
@@ -184,7 +182,7 @@ def _load(layout: Layout, file: str) -> tuple[Database, str]:
     """Messages of a DBC, and its digest."""
     path = layout.path.parent / file
     try:
-        content = read_user_file(path, largest_bytes=MAX_DBC_BYTES)
+        content = read_user_file(path, largest_bytes=_MAX_DBC_BYTES)
         database = _parsed(content, path.suffix.lower()) if content.strip() else Database()
     except OSError as error:
         line = f'it is named by the line dbc = "{file}" of {layout.path}'
@@ -251,7 +249,7 @@ def _parsed(content: bytes, suffix: str) -> object:
     return cantools.database.load_string("\n".join(known) + "\n", "dbc", strict=False)
 
 
-def look_everything_up(vehicle: VehicleDatabase) -> None:
+def _look_everything_up(vehicle: VehicleDatabase) -> None:
     """Look every signal up that the layout names; raises as :func:`read_database` does."""
     layout = vehicle.layout
     for branch in layout.branch:

@@ -17,7 +17,6 @@ from ecu_node.formulas import formula_names, parse_formula
 
 __all__ = [
     "LONGEST_PERIOD_S",
-    "MAX_LAYOUT_BYTES",
     "AutosarProfile",
     "Branch",
     "Contactor",
@@ -178,10 +177,11 @@ EndToEnd = AutosarProfile | CounterCrc8
 """How some messages are protected."""
 
 
-MAX_LAYOUT_BYTES = 1_000_000
+_MAX_LAYOUT_BYTES = 1_000_000
 """A layout has some kilobytes; a larger file is not one."""
 
 _Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
+_Finite = Annotated[float, msgspec.Meta(ge=-1e300, le=1e300)]
 _VssName = Annotated[
     str,
     msgspec.Meta(
@@ -259,7 +259,7 @@ class Contactor(_Table, frozen=True, kw_only=True):
     """Which input tells that the contactors are open, so that no HV current flows."""
 
     input: Name
-    open: Annotated[list[float], msgspec.Meta(min_length=1)]
+    open: Annotated[list[_Finite], msgspec.Meta(min_length=1)]
     """Values of the input that mean open."""
 
 
@@ -315,7 +315,7 @@ class Watch(_Table, frozen=True, kw_only=True):
     """The bus sleeps once all branches have been silent for so long; shorter gaps release nothing. [s]"""
     input: Name | None = None
     """Input that tells whether all currents of the junction are measured, as they may not be while it is charged."""
-    valid: list[float] = []
+    valid: list[_Finite] = []
     """Its values with which they are; the sums of other times are not judged."""
 
 
@@ -465,8 +465,8 @@ def read_layout(path: Path) -> Layout:
     """
     see = "see the page 'Layout' of the documentation"
     try:
-        content = read_user_file(path, largest_bytes=MAX_LAYOUT_BYTES)
-        document = tomllib.loads(content.decode())
+        content = read_user_file(path, largest_bytes=_MAX_LAYOUT_BYTES)
+        document = tomllib.loads(content.decode("utf-8-sig"))  # Windows may write a byte order mark
     except OSError as error:
         advice = "name the layout (TOML) of this vehicle"
         raise LayoutError(f"{path}: cannot read the layout: {error.strerror}; {advice}") from None
@@ -605,6 +605,9 @@ def _contradictions_of_protection(layout: LayoutKeys) -> Iterator[str]:
                 how = "is named twice" if places[name] == place else f"stands in {places[name]} too"
                 yield f"{place}, messages: {name} {how}; a message has one protection"
             places[name] = place
+        for key in ("init", "valid", "invalid"):
+            if (frames := getattr(entry, key)).min_ok > frames.window:
+                yield f"{place}, {key}: min_ok = {frames.min_ok} of {frames.window} frames; at most all of them can be"
         is_list = isinstance(entry, ProfileP02)
         key = "data_id_list" if is_list else "data_id"
         given = getattr(entry, key)

@@ -442,8 +442,9 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
             lines = view_lines(view, where, counters)
             if is_live:
                 width, height = shutil.get_terminal_size()
-                shown = [f"{line[:width]}{_CLEAR_LINE}" for line in lines[: height - 1]]
-                write_output(_HOME + "\n".join(shown) + _CLEAR_BELOW)
+                # each line is cleared before it is written: behind a full one the cursor stands on its last character
+                shown = [f"{_CLEAR_LINE}{line[:width]}\n" for line in lines[: height - 1]]
+                write_output("".join([_HOME, *shown, _CLEAR_BELOW]), end="")
             elif as_json:
                 write_output(json.dumps(view, indent=2))
             else:

@@ -12,7 +12,8 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -135,8 +136,9 @@ def end_of(program: str, error: Exception, *, debug: bool, packages: Sequence[st
 
 def say_error(text: str) -> None:
     """Say something on standard error in one line."""
-    if sys.stderr is not None:  # closed by who started the program
-        print(printable(" ".join(text.splitlines())), file=sys.stderr, flush=True)
+    with suppress(OSError):  # a disk that is full, or a reader that has left
+        if sys.stderr is not None:  # closed by who started the program
+            print(printable(" ".join(text.splitlines())), file=sys.stderr, flush=True)
 
 
 def _place(error: Exception, packages: Sequence[str]) -> str:
@@ -193,6 +195,8 @@ def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence
         Exit code: that of `work`, :data:`FAILED`, or :data:`INTERNAL_ERROR`.
     """
     others, debug = split_debug(arguments)
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be no text, or not that of the terminal
     try:
         with ending_at_interrupt(f"{name}: interrupted"):
             try:
@@ -215,7 +219,8 @@ def ending_at_interrupt(message: str) -> Iterator[None]:
     """Within the block SIGINT ends the process with one line and :data:`INTERRUPTED`, unless it is ignored."""
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-        os.write(sys.stderr.fileno(), f"{message}\n".encode())
+        with suppress(AttributeError, OSError):  # closed, or taken by nobody
+            os.write(sys.stderr.fileno(), f"{message}\n".encode())
         os._exit(INTERRUPTED)
 
     before = signal.getsignal(signal.SIGINT)

@@ -68,6 +68,12 @@ def make_database(tmp_path: Path) -> MakeDatabase:
     return make
 
 
+@pytest.fixture
+def channel(request: pytest.FixtureRequest) -> str:
+    """A channel of python-can's virtual bus, named after the test."""
+    return str(request.node.name)
+
+
 @pytest.fixture(autouse=True)
 def no_bus_left_open() -> Iterator[None]:
     """Fail a test that leaves a bus open: its frames would reach the next one."""

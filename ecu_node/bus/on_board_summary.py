@@ -562,7 +562,7 @@ def on_board_summary(
     vehicle = options.vehicle or (parameters.vehicle if parameters is not None else None)
     if vehicle is None:
         raise UserError("--summary: it is not known which vehicle this is; give --vehicle or $ECU_NODE_VEHICLE")
-    if "/" in vehicle or vehicle.startswith("."):
+    if "/" in vehicle or vehicle.startswith(".") or not vehicle.isprintable():
         raise UserError(f"--summary: vehicle {vehicle!r} cannot name a folder; rename it")
     found = parameters.branches if parameters is not None else {}
     delays = {name: (branch.delay_s or 0.0, branch.delay_sd_s) for name, branch in found.items()}

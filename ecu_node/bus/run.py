@@ -386,7 +386,7 @@ def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce, mode: 
 def report_text(report: dict[str, Any]) -> str:
     """Show a report of :func:`check_report` as text."""
     head = f"vehicle {report['vehicle']}, parameter set {report['parameter_set']}: fit"
-    lines = [head if report["fit"] else f"NOT FIT ({report['reason']}): {printable(report['message'])}"]
+    lines = [printable(head if report["fit"] else f"NOT FIT ({report['reason']}): {report['message']}")]
     width = max(map(len, ["branch", *report["branches"]]))
     lines.append(f"{'branch':<{width}}{'drift':>11}{'offset':>13}")
     for name, branch in report["branches"].items():

@@ -261,6 +261,7 @@ class Source:
         if self._receiver is not None:
             if now_s > self._silent_from_s:
                 self._receiver.restart()
+            self._silent_from_s = now_s + self._silence_s  # frames that fail are no silence: a frozen counter stays one
             check = self._receiver.check(payload)
             if check is not _OK:
                 counters.corrupt += check is Check.CORRUPT
@@ -269,7 +270,6 @@ class Source:
                 counters.gaps += check is Check.LOST
                 if check > _LAST_USABLE:
                     return check
-            self._silent_from_s = now_s + self._silence_s
         self._frames.append((now_s, payload))
         for branch in ways.missing:
             branch.spoil(now_s)

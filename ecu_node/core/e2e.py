@@ -331,7 +331,14 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
     ):
         if is_wrong:
             raise LayoutError(f"{where}: {text}")
-    crc8 = _algorithm(entry.algorithm, where)
+    from fastcrc import crc8 as known  # noqa: PLC0415  # most vehicles do not need it, and the node is to stay small
+
+    if entry.algorithm not in known.algorithms_available:
+        raise LayoutError(
+            f"{where}: algorithm {entry.algorithm!r} is not known; known are "
+            f"{', '.join(sorted(known.algorithms_available))}"
+        )
+    crc8: Callable[[bytes], int] = getattr(known, entry.algorithm)
     byte = crc_place.first
     counter_byte, shift, ones = counter_place.first, counter_place.shift, counter_place.highest
     is_before = entry.data_id_at == "before"
@@ -355,13 +362,3 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
         "protect": protect,
         "identity": data_id.to_bytes(2, "little")[: entry.data_id_bytes],
     }
-
-
-def _algorithm(name: str, where: str) -> Callable[[bytes], int]:
-    from fastcrc import crc8  # noqa: PLC0415  # most vehicles do not need it, and the node is to stay small
-
-    if name not in crc8.algorithms_available:
-        raise LayoutError(
-            f"{where}: algorithm {name!r} is not known; known are {', '.join(sorted(crc8.algorithms_available))}"
-        )
-    return getattr(crc8, name)  # type: ignore[no-any-return]

@@ -72,11 +72,6 @@ class HeardSignal:
                 return code if time_s - seen_s <= self.timeout_s and self.codes.is_value(code) else None
         return None
 
-    def value_at(self, time_s: float) -> float | None:
-        """The same as a value. [V]"""
-        code = self.code_at(time_s)
-        return None if code is None else float(self.codes.scale) * code + float(self.codes.offset)
-
 
 _LEAST_VOLTAGE_V = 10.0
 """Below this the HV net is switched off, and power / voltage says nothing of the current. [V]"""
@@ -332,8 +327,9 @@ class LiveBranch(HeardSignal):
         """What its signal is divided by: 1 for a current; None if the HV net is off, or that is not known. [V]"""
         if self.voltage is None:
             return 1.0
-        volts = self.voltage.value_at(time_s)
-        return volts if volts is not None and volts >= _LEAST_VOLTAGE_V else None
+        code = self.voltage.code_at(time_s)
+        volts = 0.0 if code is None else float(self.voltage.codes.worth(code))
+        return volts if volts >= _LEAST_VOLTAGE_V else None
 
     def _code_between(self, time_s: float) -> float | None:
         """Code at a time, between codes too; None if it is not known."""

@@ -28,7 +28,7 @@ _SPELLED = re.compile(
     r"(?:unit_|\w+:)?(milli|kilo|mega|[mk])?(a|v|w|(?:amp|amper|ampere|volt|watt)s?)([ _]?(ac|dc|rms))?", re.IGNORECASE
 )
 """As databases of several makers have it: ``Unit_Amper``, ``current:A``."""
-_PER_BIT = re.compile(r"([\d.]+) ?(\w+)/bit\??", re.IGNORECASE)
+_PER_BIT = re.compile(r"(\d*\.?\d+) ?(\w+)/bit\??", re.IGNORECASE)
 _PREFIX = {"": "", "milli": "m", "m": "m", "kilo": "k", "k": "k", "mega": "M"}
 
 
@@ -274,15 +274,16 @@ def placed_signal(message: Message, signal: Signal) -> PlacedSignal:
     Raises
     ------
     DatabaseError
-        As :func:`bit_place`, for the signal or one of its multiplexers; if the message lacks one of these.
+        As :func:`bit_place`, for the signal or one of its multiplexers; if the message lacks one of these, or they
+        stand in a circle.
     """
-    found = []
-    inner = signal
+    found, inner = list[Multiplexer](), signal
     while inner.multiplexer_ids is not None and inner.multiplexer_signal is not None:
         above = next((item for item in message.signals if item.name == inner.multiplexer_signal), None)
-        if above is None:
+        if above is None or len(found) == len(message.signals):
+            has = "has no signal" if above is None else "multiplexes in a circle by"
             raise DatabaseError(
-                f"message {message.name} has no signal {inner.multiplexer_signal!r}, the multiplexer of its signal "
+                f"message {message.name} {has} {inner.multiplexer_signal!r}, the multiplexer of its signal "
                 f"{inner.name}; correct the DBC"
             )
         found.append(Multiplexer(place=bit_place(above), codes=frozenset(inner.multiplexer_ids)))
@@ -334,6 +335,10 @@ class Codes:
         return min(max(code, self.lowest), self.highest)
 
 
+_ENDLESS = 1e300
+"""Some tools write the largest double as a limit, rounded up to what is read as infinite."""
+
+
 def as_written(number: float) -> Fraction:
     """Exact value of the shortest decimal that reads as this float: 1/50 for 0.02, as it stands in a DBC or JSON."""
     return Fraction(repr(number))
@@ -367,7 +372,8 @@ def read_codes(signal: Signal, units: Mapping[str, float] | None, where: str) ->
     lowest, highest = place.lowest, place.highest
     if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
         scale, offset = as_written(signal.scale), as_written(signal.offset)
-        ends = sorted((as_written(limit) - offset) / scale for limit in (signal.minimum, signal.maximum))
+        limits = (min(max(limit, -_ENDLESS), _ENDLESS) for limit in (signal.minimum, signal.maximum))
+        ends = sorted((as_written(limit) - offset) / scale for limit in limits)
         lowest, highest = max(lowest, math.ceil(ends[0])), min(highest, math.floor(ends[1]))
     if lowest > highest:
         raise DatabaseError(f"{where}: no code of signal {signal.name} lies in its range in the DBC")

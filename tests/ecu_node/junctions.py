@@ -30,11 +30,13 @@ message = "S"
 state = "State"
 reason = "Reason"
 """
-_IN = 'BO_ {0} {1}: 2 N\n SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" X\n'
-_OUT = (
-    'BO_ {0} {1}: 3 C\n SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" X\n'
-    ' SG_ Q : 16|{2}@1+ (1,0) [0|7] "" X\nVAL_ {0} I -32768 "SNA";\n'
-)
+_DBC = """VERSION ""
+BU_: N C X
+{measured}{corrected}BO_ 48 S: 2 C
+ SG_ State : 0|4@1+ (1,0) [0|15] "" X
+ SG_ Reason : 8|{reason_bits}@1+ (1,0) [0|255] "" X
+{values}"""
+_CURRENT = ' SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" X\n'
 KEYS = {name: FrameKey(16 + number, False) for number, name in enumerate(NAMES)}
 PHASE_S = {"battery": 0.0, "motor": 0.003, "heater": 0.007}
 """Control units send one after the other. [s]"""
@@ -42,16 +44,12 @@ PHASE_S = {"battery": 0.0, "motor": 0.003, "heater": 0.007}
 
 def three_branches(folder: Path, quality_bits: int = 3, reason_bits: int = 8) -> VehicleDatabase:
     """Layout and DBC of the junction."""
-    blocks = [_IN.format(16 + number, letter) for number, letter in enumerate("BMH")]
-    blocks += [_OUT.format(32 + number, f"{letter}C", quality_bits) for number, letter in enumerate("BMH")]
-    values = [line for block in blocks for line in block.splitlines() if line.startswith("VAL_")]
-    frames = [line for block in blocks for line in block.splitlines() if not line.startswith("VAL_")]
-    status = [
-        "BO_ 48 S: 2 C",
-        ' SG_ State : 0|4@1+ (1,0) [0|15] "" X',
-        f' SG_ Reason : 8|{reason_bits}@1+ (1,0) [0|255] "" X',
-    ]
-    (folder / "three.dbc").write_text("\n".join(['VERSION ""', "BU_: N C X", *frames, *status, *values, ""]))
+    measured = (f"BO_ {16 + number} {letter}: 2 N\n{_CURRENT}" for number, letter in enumerate("BMH"))
+    quality = f' SG_ Q : 16|{quality_bits}@1+ (1,0) [0|7] "" X\n'
+    corrected = (f"BO_ {32 + number} {letter}C: 3 C\n{_CURRENT}{quality}" for number, letter in enumerate("BMH"))
+    values = (f'VAL_ {32 + number} I -32768 "SNA";\n' for number in range(3))
+    blocks = {"measured": "".join(measured), "corrected": "".join(corrected), "values": "".join(values)}
+    (folder / "three.dbc").write_text(_DBC.format(**blocks, reason_bits=reason_bits))
     (folder / "three.toml").write_text(LAYOUT)
     return read_database(read_layout(folder / "three.toml"))
 

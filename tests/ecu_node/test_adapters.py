@@ -17,6 +17,7 @@ import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import can
 import cantools
@@ -25,14 +26,14 @@ from can.typechecking import BitTimingFdDict
 
 from ecu_node.bus.adapters import bus_config, connect
 from ecu_node.cli import main
-from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from ecu_node.parameters import write_parameters
-from tests.ecu_node.vehicles import SMALL_DBC, parameters_for
+from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
 
 _FD_VALUES = (80_000_000, 2, 63, 16, 16, 2, 15, 4, 4)
 FD_TIMING = dict(zip(BitTimingFdDict.__annotations__, _FD_VALUES, strict=True))
 """500 kbit/s and 2 Mbit/s, both sampled at 80 %."""
+FD_RATES = {"fd": True, "bitrate": 500_000, "data_bitrate": 2_000_000}
 CLASSIC_TIMING = {"f_clock": 8_000_000, "brp": 2, "tseg1": 13, "tseg2": 2, "sjw": 1, "nof_samples": 1}
 """250 kbit/s, sampled at 87.5 %."""
 DATABASE = cantools.database.can.Database()
@@ -51,7 +52,7 @@ def _no_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def node(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> list[str]:
+def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
     """Options of a node for the small vehicle."""
     database = make_database()
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
@@ -62,59 +63,41 @@ def node(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> list[
 # ---- the speed of a bus
 
 
-@pytest.mark.parametrize("interface", ["pcan", "kvaser", "vector", "slcan", "gs_usb", "ixxat", "cantact"])
-def test_adapter_without_bit_rate_is_refused(interface: str) -> None:
-    with pytest.raises(
-        BusError, match=rf"^{interface} 1: no bitrate: .* give ecu-node --bitrate BIT_PER_S, or bitrate"
-    ):
-        connect(interface, "1")
-
-
-@pytest.mark.parametrize("interface", ["kvaser", "vector", "ixxat"])
-def test_data_bit_rate_is_needed_for_can_fd(interface: str) -> None:
-    with pytest.raises(BusError, match=r"no data_bitrate: .* --data-bitrate BIT_PER_S"):
-        bus_config(interface, "1", fd=True, bitrate=500_000)
-    config = bus_config(interface, "1", fd=True, bitrate=500_000, data_bitrate=2_000_000)
-    assert (config["fd"], config["bitrate"], config["data_bitrate"]) == (True, 500_000, 2_000_000)
-
-
-@pytest.mark.parametrize("interface", ["pcan", "slcan", "nixnet"])
-def test_can_fd_needs_a_bit_timing_where_the_driver_drops_the_data_bit_rate(interface: str) -> None:
-    with pytest.raises(BusError, match=r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"):
-        bus_config(interface, "1", fd=True, bitrate=500_000, data_bitrate=2_000_000)
-
-
-@pytest.mark.parametrize("interface", ["socketcan", "virtual", "udp_multicast", "serial"])
-def test_bit_rate_that_cannot_be_set_is_refused(interface: str) -> None:
-    with pytest.raises(BusError, match=rf"^{interface} c0: the bit rate of {interface} is not set from here"):
-        connect(interface, "c0", bitrate=250_000)
-
-
 @pytest.mark.parametrize(
-    ("config", "fd", "words"),
+    ("interfaces", "config", "settings", "words"),
     [
-        ({"bitrate": "250k"}, False, "bitrate = 250k: a number of bit/s is expected"),
-        ({"bitrate": -1}, False, "bitrate = -1: a number of bit/s is expected"),
-        ({"bitrate": 83_300}, False, "bitrate = 83300: pcan has 1000000, .*; or give the bit timing"),
-        ({"f_clock": 8_000_000, "bitrate": 250_000}, False, "incomplete, .* classic CAN .* brp, tseg1"),
-        (FD_TIMING, False, "not one of classic CAN"),
-        (CLASSIC_TIMING, True, "not one of CAN FD, which has f_clock, nom_brp"),
-        ({**CLASSIC_TIMING, "bitrate": 500_000}, False, r"bitrate = 500000 contradicts the bit timing \(BR: 250_000"),
-        ({**FD_TIMING, "data_bitrate": 4_000_000}, True, "data_bitrate = 4000000 contradicts"),
+        (
+            "pcan kvaser vector slcan gs_usb ixxat cantact",
+            {},
+            {},
+            "no bitrate: .* give ecu-node --bitrate BIT_PER_S, or",
+        ),
+        ("kvaser vector ixxat", {}, {"fd": True, "bitrate": 500_000}, "no data_bitrate: .* --data-bitrate BIT_PER_S"),
+        ("pcan slcan nixnet", {}, FD_RATES, r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"),
+        ("socketcan virtual udp_multicast serial", {}, {"bitrate": 250_000}, "the bit rate of .* is not set from here"),
+        ("pcan", {"bitrate": "250k"}, {}, "bitrate = 250k: a number of bit/s is expected"),
+        ("pcan", {"bitrate": -1}, {}, "bitrate = -1: a number of bit/s is expected"),
+        ("pcan", {"bitrate": 83_300}, {}, "bitrate = 83300: pcan has 1000000, .*; or give the bit timing"),
+        ("pcan", {"f_clock": 8_000_000, "bitrate": 250_000}, {}, "incomplete, .* classic CAN .* brp, tseg1"),
+        ("pcan", FD_TIMING, {}, "not one of classic CAN"),
+        ("pcan", CLASSIC_TIMING, {"fd": True}, "not one of CAN FD, which has f_clock, nom_brp"),
+        (
+            "pcan",
+            {**CLASSIC_TIMING, "bitrate": 500_000},
+            {},
+            "bitrate = 500000 contradicts the bit timing .BR: 250_000",
+        ),
+        ("pcan", {**FD_TIMING, "data_bitrate": 4_000_000}, {"fd": True}, "data_bitrate = 4000000 contradicts"),
+        ("ixxat", CLASSIC_TIMING, {}, "python-can cannot set a bit timing there; take f_clock out"),
     ],
 )
 def test_speed_that_would_be_another_one_is_refused(
-    config: dict[str, object], fd: bool, words: str, monkeypatch: pytest.MonkeyPatch
+    interfaces: str, config: dict[str, object], settings: Any, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAN_CONFIG", json.dumps(config))
-    with pytest.raises(BusError, match=f"^pcan PCAN_USBBUS1: .*{words}"):
-        bus_config("pcan", "PCAN_USBBUS1", fd=fd)
-
-
-def test_bit_timing_that_the_driver_would_drop_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
-    with pytest.raises(BusError, match="python-can cannot set a bit timing there; take f_clock out"):
-        bus_config("ixxat", "0")
+    for interface in interfaces.split():
+        with pytest.raises(BusError, match=f"^{interface} 1: .*{words}"):
+            connect(interface, "1", **settings)
 
 
 # ---- python-can's configuration
@@ -126,6 +109,8 @@ def test_each_channel_has_its_section_and_the_command_line_goes_first(
     (tmp_path / "can.conf").write_text("[default]\nbitrate = 125000\n[1]\nbitrate = 250000\nserial = 1234\n")
     assert bus_config("vector", "1") == {"interface": "vector", "channel": 1, "bitrate": 250_000, "serial": 1234}
     assert bus_config("vector", "2")["bitrate"] == 125_000
+    rates = bus_config("kvaser", "1", fd=True, bitrate=500_000, data_bitrate=2_000_000)
+    assert (rates["fd"], rates["bitrate"], rates["data_bitrate"]) == (True, 500_000, 2_000_000)
     assert bus_config("vector", "1", bitrate=500_000, data_bitrate=None)["bitrate"] == 500_000
     monkeypatch.setenv("CAN_BITRATE", "100000")
     assert bus_config("vector", "1")["bitrate"] == 100_000

@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -14,7 +13,7 @@ import pytest
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
-from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, parameters_for
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
 
 
 @pytest.fixture
@@ -39,15 +38,11 @@ def test_fit_parameters_are_shown_with_their_integer_plan(params: Path, capsys: 
     assert battery["plan"]["bias"] / 2 ** battery["plan"]["shift"] == pytest.approx(-5.0 / 1.25 / 0.02)
     assert motor["plan"]["gain"] == 2 ** motor["plan"]["shift"]
     assert not report["branches"]["dcdc"]["applied"]
-
-
-def test_the_same_as_text(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(check(params)) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "vehicle v1, parameter set 300: fit"
-    assert lines[2].split()[:3] == ["battery", "+25.0000%", "+5.000"]
-    assert lines[2].endswith("A  corrected")
-    assert lines[3:5] == ["  target HV_BatteryCorrected.BatteryCurrentCorrected", lines[4]]
+    assert (lines[2].split()[:3], lines[2][-12:]) == (["battery", "+25.0000%", "+5.000"], "A  corrected")
+    assert lines[3] == "  target HV_BatteryCorrected.BatteryCurrentCorrected"
     assert lines[4].startswith("  gain ")
     dcdc = next(index for index, line in enumerate(lines) if line.startswith("dcdc"))
     assert lines[dcdc].endswith("passed through")
@@ -58,13 +53,11 @@ def test_the_same_as_text(params: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--interface", "virtual", "--channel", "c0", "--gateway", "c0"]
     assert main(["run", "--unsigned", "--params", str(params), "--layout", str(LAYOUT), *options]) == 2
-    assert (
-        capsys.readouterr().err == "ecu-node: --gateway c0 is the bus of the sensors itself; two buses are expected\n"
-    )
+    assert "ecu-node: --gateway c0 is the bus of the sensors itself; two buses are expected" in capsys.readouterr().err
 
 
 def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gateway_is_one(
-    make_database: Callable[..., VehicleDatabase], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The options of run are those of check."""
     bare = re.sub(r', (corrected|quality) = "[\w.]+"', "", SMALL_LAYOUT)
@@ -82,30 +75,22 @@ def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gate
 def test_fault_that_is_not_applied_is_said(
     database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    parameters = parameters_for(database, battery=(0.25, 5.0))
+    parameters = msgspec.structs.replace(parameters_for(database, battery=(0.25, 5.0)), vehicle="v\x1b[2J")
     held = msgspec.structs.replace(parameters.branches["battery"], apply=False)
     write_parameters(msgspec.structs.replace(parameters, branches={"battery": held}), tmp_path / "v1.json")
     assert main(check(tmp_path / "v1.json")) == 0
-    assert '+5.000 A  passed through, "apply" is false' in capsys.readouterr().out
-
-
-@pytest.fixture
-def small(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> Callable[..., list[str]]:
-    """Options for a small vehicle whose parameters apply a fault to the heater, a power branch."""
-
-    def make(dbc: str = SMALL_DBC) -> list[str]:
-        database = make_database(dbc=dbc)
-        path = tmp_path / "small.json"
-        write_parameters(parameters_for(database, battery=(0.1, 1.0), heater=(0.1, 0.0)), path)
-        return ["--params", str(path), "--layout", str(database.layout.path), "--vehicle", "v1"]
-
-    return make
+    text = capsys.readouterr().out
+    assert '+5.000 A  passed through, "apply" is false' in text
+    assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
 
 
 def test_can_fd_that_run_would_need_is_said(
-    small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["check", *small(SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))]) == 0
+    database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
+    write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
+    files = ["--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
+    assert main(["check", *files]) == 0
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
 
 
@@ -115,16 +100,13 @@ def test_json_of_the_monitor_needs_a_time(capsys: pytest.CaptureFixture[str]) ->
     assert "--json needs --once SECONDS" in capsys.readouterr().err
 
 
-def test_unfit_parameters_end_in_1_and_say_why(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unfit_parameters_end_in_1_and_say_why_also_for_a_vehicle_of_the_environment(
+    params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert main(check(params, "--vehicle", "v2", "--json")) == 1
     report = json.loads(capsys.readouterr().out)
     assert (report["fit"], report["reason"]) == (False, "WRONG_VEHICLE")
     assert report["message"] == f"{params}: parameters are for vehicle 'v1', this is 'v2'"
-
-
-def test_the_vehicle_can_come_from_the_environment(
-    params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setenv("ECU_NODE_VEHICLE", "v2")
     assert main(check(params)) == 1
     assert capsys.readouterr().out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
@@ -135,15 +117,9 @@ def test_a_reader_that_leaves_early_gets_no_traceback(params: Path, command: str
     arguments = check(params) if command == "check" else [command]
     reading, writing = os.pipe()
     os.close(reading)
+    program = [sys.executable, "-m", "ecu_node", *arguments]
     with os.fdopen(writing, "w") as closed:
-        done = subprocess.run(
-            [sys.executable, "-m", "ecu_node", *arguments],
-            stdout=closed,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        done = subprocess.run(program, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (1, "")
 
 

@@ -2,6 +2,7 @@
 
 import math
 from fractions import Fraction
+from typing import Any
 
 import pytest
 from cantools.database.can import Signal
@@ -137,11 +138,6 @@ def test_the_code_for_no_value_is_found_by_its_name(names: dict[int, str]) -> No
     assert not_available_code(current(names=names), "test") == 5
 
 
-def test_a_target_without_a_code_for_no_value_is_refused() -> None:
-    with pytest.raises(DatabaseError, match=r"branch x: signal I needs a code named SNA"):
-        not_available_code(current(), "branch x")
-
-
 def test_a_name_on_the_code_of_zero_is_refused() -> None:
     with pytest.raises(DatabaseError, match="the code of 0 of signal I is named 'Off'"):
         writable_range(current(names={0: "Off"}), "test")
@@ -155,16 +151,21 @@ def test_a_name_amid_the_values_is_refused(scale: float, code: int) -> None:
         require_reach(codes, Fraction(400), "test")
 
 
-def test_a_scale_of_zero_is_refused() -> None:
-    with pytest.raises(DatabaseError, match="signal I has scale 0"):
-        current(0.0)
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"scale": 0.0}, "signal I has scale 0"),
+        ({"limits": (1000.0, 2000.0)}, "no code of signal I lies in its range in the DBC"),
+        ({"unit": "W"}, "signal I is in 'W'; expected A, mA, kA"),
+        ({"unit": "1.2.3A/bit"}, "signal I is in '1.2.3A/bit'; expected A, mA, kA"),
+    ],
+)
+def test_a_signal_that_can_be_no_current_is_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(DatabaseError, match=f"test: .*{words}"):
+        current(**wrong)
 
 
-def test_a_range_that_no_code_reaches_is_refused() -> None:
-    with pytest.raises(DatabaseError, match="test: no code of signal I lies in its range in the DBC"):
-        current(limits=(1000.0, 2000.0))
-
-
-def test_a_unit_of_another_quantity_is_refused() -> None:
-    with pytest.raises(DatabaseError, match="signal I is in 'W'; expected A, mA, kA"):
-        current(unit="W")
+def test_limits_that_are_read_as_infinite_bound_nothing() -> None:
+    """The largest double, as tools write it in 15 digits."""
+    largest = float("1.79769313486232E+308")
+    assert whole_range(current(limits=(-largest, largest))) == whole_range(current())

@@ -1,4 +1,4 @@
-"""What the documents name exists: tests in docs/safety.md, reasons and states in docs/node.md."""
+"""What the documents name exists: tests of hazards and of the fault table, reasons and states of the status."""
 
 import json
 import re
@@ -11,7 +11,6 @@ from ecu_node.cli import main
 from ecu_node.core.status import Reason, State
 
 ROOT = Path(__file__).parents[2]
-FEWEST_HAZARDS = 15
 MEASURED = """VERSION ""
 BU_: BMS Inverter{senders}
 BO_ 256 BMS_1: 8 BMS
@@ -22,21 +21,18 @@ BO_ 272 INV_3: 8 Inverter
 """
 
 
-def hazards() -> list[str]:
-    """Rows of the table of hazards."""
-    section = (ROOT / "docs" / "safety.md").read_text().partition("\n## Hazards\n")[2].partition("\n## ")[0]
-    return [line for line in section.splitlines() if line.startswith("| ") and not line.startswith("| hazard |")]
-
-
-def test_every_hazard_names_tests_and_every_test_exists() -> None:
-    defined = {
-        name
-        for path in (ROOT / "tests").rglob("test_*.py")
-        for name in re.findall(r"(?m)^def (test_\w+)", path.read_text())
-    }
-    named = [re.findall(r"`(test_\w+)`", row.rsplit("|", 2)[1]) for row in hazards()]
-    assert len(named) >= FEWEST_HAZARDS
-    assert [row for row, names in zip(hazards(), named, strict=True) if not names] == []
+@pytest.mark.parametrize(
+    ("document", "head", "fewest"), [("safety.md", "| hazard |", 15), ("fault_table.md", "| fault |", 25)]
+)
+def test_every_row_names_tests_and_every_test_exists(document: str, head: str, fewest: int) -> None:
+    sections = (ROOT / "docs" / document).read_text().split("\n## ")
+    lines = "\n".join(section for section in sections if head in section).splitlines()
+    rows = [line for line in lines if line.startswith("| ") and not line.startswith(head)]
+    named = [re.findall(r"`(test_\w+)`", row.rsplit("|", 2)[1]) for row in rows]
+    tests = (path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+    defined = {name for text in tests for name in re.findall(r"(?m)^def (test_\w+)", text)}
+    assert len(rows) >= fewest
+    assert [row for row, names in zip(rows, named, strict=True) if not names] == []
     assert {name for names in named for name in names} - defined == set()
 
 

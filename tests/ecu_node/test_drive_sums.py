@@ -4,10 +4,6 @@ import argparse
 import math
 import re
 import shutil
-import signal
-import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -20,7 +16,8 @@ from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.summary import SummaryFile, decode_summary, encode_summary, unpacked
-from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
+from tests.ecu_node.test_adapters import running
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, MakeDatabase
 
 OPEN_S, OFFSET_A, HEATER_W, NET_V = 8.0, 5.0, 2000, 400.0
 WITH_CONTACTOR = f"""{SMALL_LAYOUT}
@@ -61,7 +58,7 @@ class Drive:
 
 
 @pytest.fixture
-def drive(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> Drive:
+def drive(make_database: MakeDatabase, tmp_path: Path) -> Drive:
     return Drive(tmp_path / "sums", make_database(WITH_CONTACTOR))
 
 
@@ -139,15 +136,16 @@ def test_record_of_another_version_is_refused(drive: Drive) -> None:
         decode_summary(encode_summary(other))
 
 
-def test_what_cannot_be_summed_is_refused(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> None:
+def test_what_cannot_be_summed_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
     database = make_database(SMALL_LAYOUT)
     (tmp_path / "file").touch()
     options = argparse.Namespace(summary=tmp_path / "file", vehicle="V1")
     with pytest.raises(UserError, match=r"--summary .*/file: cannot be used: .*; name another folder"):
         on_board_summary(options, {}, database, None, print)
-    options = argparse.Namespace(summary=tmp_path, vehicle="../V1")
-    with pytest.raises(UserError, match=re.escape("--summary: vehicle '../V1' cannot name a folder; rename it")):
-        on_board_summary(options, {}, database, None, print)
+    for vehicle in ("../V1", "V\0001"):
+        options = argparse.Namespace(summary=tmp_path, vehicle=vehicle)
+        with pytest.raises(UserError, match=re.escape(f"--summary: vehicle {vehicle!r} cannot name a folder; rename")):
+            on_board_summary(options, {}, database, None, print)
     computed = SMALL_LAYOUT.replace('power = "Heater.Power", voltage = "Net.Voltage"', 'formula = "2.0 * net"')
     database = make_database(f'{computed}\ninput = [{{ name = "net", signal = "Net.Voltage" }}]\n')
     with pytest.raises(LayoutError, match="branch heater is computed by a formula, which --summary does not"):
@@ -157,10 +155,6 @@ def test_what_cannot_be_summed_is_refused(make_database: Callable[..., VehicleDa
 def test_node_that_sums_up_makes_the_folder_of_its_vehicle(tmp_path: Path) -> None:
     options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]
     bus = ["--interface", "virtual", "--channel", "sums", "--summary", str(tmp_path / "sums")]
-    command = [sys.executable, "-m", "ecu_node", "run", *options, *bus]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        assert any("running on virtual sums" in line for line in iter(process.stderr.readline, ""))
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=60) == 0
+    with running("run", *options, *bus) as log:
+        assert "running on virtual sums" in log[-1]
     assert list((tmp_path / "sums" / "V1").iterdir()) == []

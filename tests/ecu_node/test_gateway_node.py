@@ -4,9 +4,10 @@ import queue
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import closing, contextmanager
+from functools import partial
 from typing import Any
 
 import can
@@ -20,54 +21,38 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
+from tests.ecu_node.test_node import LONGEST_WAIT_S, at_work, wait_until
 from tests.ecu_node.vehicles import decoded, parameters_for, protected
 
-LONGEST_WAIT_S = 20.0
 Ends = tuple[can.BusABC, can.BusABC]
 
 
 @pytest.fixture
-def ends(request: pytest.FixtureRequest) -> Iterator[Ends]:
+def ends(channel: str) -> Iterator[Ends]:
     """The sensors' and the vehicle's bus, as the rest of the car sees them."""
-    name = request.node.name
     with (
-        can.Bus(interface="virtual", channel=f"{name} a") as sensors,
-        can.Bus(interface="virtual", channel=f"{name} b") as rest,
+        can.Bus(interface="virtual", channel=f"{channel} a") as sensors,
+        can.Bus(interface="virtual", channel=f"{channel} b") as rest,
     ):
         yield sensors, rest
 
 
 @contextmanager
-def gateway(
-    database: VehicleDatabase, name: str, other: str | None = None, *, routed: bool = False
-) -> Iterator[tuple[Corrector, Future[None]]]:
+def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> Iterator[tuple[Corrector, Future[None]]]:
     """A gateway between the two buses, with a fault of the battery's sensor in force."""
     in_force = InForce(parameters=parameters_for(database, battery=(0.25, 5.0)))
     corrector = wire(database, in_force, time.monotonic(), mode=Mode.GATEWAY)
 
     def opened(channel: str) -> SteadyBus:
-        return SteadyBus(
-            lambda: open_bus(database, interface="virtual", channel=channel, fd=True, mode=Mode.GATEWAY),
-            corrector.counters,
-        )
+        settings: Any = {"interface": "virtual", "channel": channel, "fd": True, "mode": Mode.GATEWAY}
+        return SteadyBus(partial(open_bus, database, **settings), corrector.counters)
 
-    buses = opened(f"{name} a"), opened(other or f"{name} b")
-    stop = threading.Event()
-    with ThreadPoolExecutor(1) as pool:
-        ready = threading.Event()
-        node = Node(*buses, corrector, period_s=0.02, routed=routed)
-        running = pool.submit(node.run, stop.is_set, ready.set)
-        while not ready.wait(0.01) and not running.done():
-            pass
-        try:
-            yield corrector, running
-        finally:
-            stop.set()
-            try:
-                running.exception(LONGEST_WAIT_S)
-            finally:
-                for bus in buses:
-                    bus.close()
+    with (
+        closing(opened(f"{name} a")) as near,
+        closing(opened(other or f"{name} b")) as far,
+        at_work(Node(near, far, corrector, period_s=0.02), may_end=True) as running,
+    ):
+        yield corrector, running
 
 
 def received(bus: can.BusABC, count: int, *, status: bool | None = False) -> list[can.Message]:
@@ -110,11 +95,11 @@ def as_sent(message: can.Message) -> tuple[object, ...]:
 
 
 def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+    database: VehicleDatabase, ends: Ends, channel: str
 ) -> None:
     sensors, vehicle = ends
     sent = random_frames(database, 2000)
-    with gateway(database, request.node.name) as (corrector, _):
+    with gateway(database, channel) as (corrector, _):
         for message in sent:
             sensors.send(message)
         found = received(vehicle, len(sent))
@@ -128,12 +113,9 @@ def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
 
 
 def test_branch_frame_that_waited_too_long_is_not_passed_on(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+    database: VehicleDatabase, ends: Ends, channel: str
 ) -> None:
-    with (
-        gateway(database, request.node.name) as (corrector, _),
-        VirtualBus(f"{request.node.name} a", preserve_timestamps=True) as bus,
-    ):
+    with gateway(database, channel) as (corrector, _), VirtualBus(f"{channel} a", preserve_timestamps=True) as bus:
         for counter, age_s in enumerate((0.0, 5.0, 0.0)):
             data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
             bus.send(can.Message(time.time() - age_s, arbitration_id=0x110, is_extended_id=False, data=data))
@@ -154,12 +136,11 @@ class BlockingBus(VirtualBus):
 
 
 def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
-    database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+    database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)
-    name = request.node.name
     corrector = wire(database, InForce(parameters=None), time.monotonic(), mode=Mode.GATEWAY)
-    near, stop, fed = BlockingBus(f"{name} a"), threading.Event(), queue.SimpleQueue[float]()
+    near, fed = BlockingBus(f"{channel} a"), queue.SimpleQueue[float]()
     near.let_go = threading.Event()
 
     def feed(now_s: float, works: bool) -> None:
@@ -167,10 +148,8 @@ def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
             fed.put(now_s)
 
     sensors = SteadyBus(lambda: near, corrector.counters)
-    vehicle = SteadyBus(lambda: VirtualBus(f"{name} b"), corrector.counters)
-    with ThreadPoolExecutor(1) as pool:
-        node = Node(sensors, vehicle, corrector, period_s=0.02, on_tick=feed)
-        running = pool.submit(node.run, stop.is_set)
+    vehicle = SteadyBus(lambda: VirtualBus(f"{channel} b"), corrector.counters)
+    with closing(sensors), closing(vehicle), at_work(Node(sensors, vehicle, corrector, period_s=0.02, on_tick=feed)):
         try:
             fed.get(timeout=LONGEST_WAIT_S)
             ends[1].send(can.Message(arbitration_id=0x300))
@@ -179,10 +158,6 @@ def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
             fed.get(timeout=LONGEST_WAIT_S)
         finally:
             near.let_go.set()
-            stop.set()
-            running.result(LONGEST_WAIT_S)
-            sensors.close()
-            vehicle.close()
 
 
 def went_quiet(ticks: queue.SimpleQueue[float]) -> bool:
@@ -194,14 +169,8 @@ def went_quiet(ticks: queue.SimpleQueue[float]) -> bool:
     return False
 
 
-def wait_until(done: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + LONGEST_WAIT_S
-    while not done():
-        assert time.monotonic() < give_up, "waited in vain"
-
-
 def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+    database: VehicleDatabase, ends: Ends, channel: str
 ) -> None:
     sensors, vehicle = ends
     ended = threading.Event()
@@ -214,7 +183,7 @@ def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
     sender = threading.Thread(target=send_early)
     sender.start()
     time.sleep(0.05)
-    with gateway(database, request.node.name):
+    with gateway(database, channel):
         ended.set()
         sender.join()
         for bus in ends:
@@ -226,25 +195,21 @@ def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
             assert early < 10, "those of the listening, more than 10, are not passed on"
 
 
-def test_a_remote_frame_passes_whatever_its_identifier(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
-) -> None:
+def test_a_remote_frame_passes_whatever_its_identifier(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, vehicle = ends
     asked = [
         can.Message(arbitration_id=key, is_extended_id=False, is_remote_frame=True, dlc=8) for key in (0x110, 0x5F0)
     ]
-    with gateway(database, request.node.name):
+    with gateway(database, channel):
         for message in asked:
             vehicle.send(message)
         assert list(map(as_sent, received(sensors, 2, status=None))) == list(map(as_sent, asked))
 
 
-def test_the_status_goes_to_the_vehicle_alone(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
-) -> None:
+def test_the_status_goes_to_the_vehicle_alone(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, vehicle = ends
     values: dict[str, Any] = {}
-    with gateway(database, request.node.name):
+    with gateway(database, channel):
         for counter in range(200):
             data = protected(database, "HV_Battery", counter % 15, BatteryCurrent=100.0)
             sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
@@ -262,10 +227,10 @@ WORDS = "another node sends frames 0x(110|5F0), which only this one may send the
 
 @pytest.mark.parametrize(("origin", "identifier"), [("vehicle", 0x110), ("vehicle", 0x5F0), ("sensors", 0x5F0)])
 def test_frames_that_only_it_may_send_are_dropped_and_counted_and_end_nothing(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest, origin: str, identifier: int
+    database: VehicleDatabase, ends: Ends, channel: str, origin: str, identifier: int
 ) -> None:
     sensors, vehicle = ends
-    with gateway(database, request.node.name) as (corrector, running):
+    with gateway(database, channel) as (corrector, running):
         received(vehicle, 1, status=True)
         sender = vehicle if origin == "vehicle" else sensors
         for counter in range(100):
@@ -274,19 +239,15 @@ def test_frames_that_only_it_may_send_are_dropped_and_counted_and_end_nothing(
             data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
             sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
         found = received(vehicle, 10)
-        give_up = time.monotonic() + LONGEST_WAIT_S
-        while corrector.counters.foreign < 100 and time.monotonic() < give_up:
-            time.sleep(0.01)
-        assert corrector.counters.foreign == 100
+        wait_until(lambda: corrector.counters.foreign == 100)
         assert not running.done()
     assert {message.arbitration_id for message in found} == {0x110}
     assert sensors.recv(0.0) is None, "none was passed on"
 
 
-def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest) -> None:
+def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, _ = ends
-    name = request.node.name
-    with gateway(database, name, f"{name} a") as (_, running):
+    with gateway(database, channel, f"{channel} a") as (_, running):
         for counter in range(100):
             data = protected(database, "HV_Battery", counter % 15, BatteryCurrent=float(counter))
             sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
@@ -295,14 +256,11 @@ def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, requ
             running.result(LONGEST_WAIT_S)
 
 
-def test_a_second_gateway_between_the_same_buses_refuses(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
-) -> None:
+def test_a_second_gateway_between_the_same_buses_refuses(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     _, vehicle = ends
-    name = request.node.name
-    with gateway(database, name) as (_, first):
+    with gateway(database, channel) as (_, first):
         received(vehicle, 1, status=True)
-        with gateway(database, name) as (_, second), pytest.raises(BusError, match=WORDS):
+        with gateway(database, channel) as (_, second), pytest.raises(BusError, match=WORDS):
             second.result(LONGEST_WAIT_S)
         received(vehicle, 3, status=True)
         assert not first.done()

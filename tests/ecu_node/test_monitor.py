@@ -6,9 +6,9 @@ import pty
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import cycle
 from typing import Any
 
 import can
@@ -19,7 +19,7 @@ from ecu_node.cli import main
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.monitor import BusMonitor, View, view_lines
-from tests.ecu_node.vehicles import LAYOUT, protected
+from tests.ecu_node.vehicles import LAYOUT, MakeDatabase, protected
 
 CHANNEL = "monitor"
 MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--channel", CHANNEL]
@@ -38,19 +38,13 @@ class Bus:
         data[7] ^= spoilt
         self.monitor.take(key_of(self.database.message(message)), data, time_s)
 
-    def send_pair(self, name: str, time_s: float, measured_a: float, corrected_a: float | None, quality: int) -> None:
+    def pair(self, name: str, time_s: float, measured_a: float, corrected_a: float | None = None) -> None:
         """A measured frame and its answer, in the direction of the signal."""
-        measured: dict[str, Any] = {f"{name}Current": measured_a}
-        self.send(f"HV_{name}", time_s, **measured)
+        values: dict[str, Any] = {f"{name}Current": measured_a}
+        self.send(f"HV_{name}", time_s, **values)
         if corrected_a is not None:
-            values: dict[str, Any] = {f"{name}CurrentCorrected": corrected_a, f"{name}CurrentQuality": quality}
+            values = {f"{name}CurrentCorrected": corrected_a, f"{name}CurrentQuality": 2}
             self.send(f"HV_{name}Corrected", time_s + 0.001, **values)
-
-    def battery(self, time_s: float, measured_a: float, corrected_a: float | None = None, quality: int = 2) -> None:
-        self.send_pair("Battery", time_s, measured_a, corrected_a, quality)
-
-    def motor(self, time_s: float, measured_a: float, corrected_a: float | None = None) -> None:
-        self.send_pair("Motor", time_s, measured_a, corrected_a, 2)
 
     def branch(self, now_s: float, name: str = "battery") -> View:
         return next(branch for branch in self.monitor.look(now_s)["branches"] if branch["name"] == name)
@@ -68,21 +62,21 @@ def bus(database: VehicleDatabase) -> Bus:
     return Bus(database)
 
 
-def currents(branch: View) -> tuple[Any, ...]:
-    return branch["measured_a"], branch["corrected_a"], branch["correction_a"]
+def currents(branch: View) -> list[Any]:
+    return [branch[key] for key in ("measured_a", "corrected_a", "correction_a")]
 
 
 def test_branch_shows_measured_published_and_difference(bus: Bus) -> None:
-    bus.battery(0.01, 100.0, 95.5)
-    bus.motor(0.01, 80.0, 81.0)
+    bus.pair("Battery", 0.01, 100.0, 95.5)
+    bus.pair("Motor", 0.01, 80.0, 81.0)
     battery = bus.branch(0.05)
-    assert currents(battery) == pytest.approx((100.0, 95.5, -4.5))
-    assert currents(bus.branch(0.05, "motor")) == pytest.approx((-80.0, -81.0, -1.0))
+    assert currents(battery) == pytest.approx([100.0, 95.5, -4.5])
+    assert currents(bus.branch(0.05, "motor")) == pytest.approx([-80.0, -81.0, -1.0])
     assert (battery["quality"], battery["age_s"]) == ("CORRECTED", pytest.approx(0.04))
-    bus.battery(0.07, 200.0)
-    assert currents(bus.branch(0.071)) == pytest.approx((100.0, 95.5, -4.5)), "until it is answered"
+    bus.pair("Battery", 0.07, 200.0)
+    assert currents(bus.branch(0.071)) == pytest.approx([100.0, 95.5, -4.5]), "until it is answered"
     for k in range(20):
-        bus.battery(0.09 + 0.02 * k, 200.0)
+        bus.pair("Battery", 0.09 + 0.02 * k, 200.0)
     battery = bus.branch(0.55)
     assert (battery["measured_a"], battery["corrected_is_stale"]) == (pytest.approx(200.0), True)
 
@@ -90,11 +84,11 @@ def test_branch_shows_measured_published_and_difference(bus: Bus) -> None:
 def test_latency_is_from_a_frame_to_its_answer_on_the_bus(bus: Bus) -> None:
     assert bus.monitor.look(0.0)["latency_us"] is None
     for k in range(10):
-        bus.battery(0.02 * k, 100.0, 95.0)
+        bus.pair("Battery", 0.02 * k, 100.0, 95.0)
     assert bus.monitor.look(0.2)["latency_us"]["max"] == 1000
     assert "from a frame to its answer [us]: p50 1000, p99.9 1000, max 1000" in bus.lines(0.2)
-    bus.battery(0.5, 100.0)
-    bus.battery(3.0, 100.0, 95.0)
+    bus.pair("Battery", 0.5, 100.0)
+    bus.pair("Battery", 3.0, 100.0, 95.0)
     assert bus.monitor.look(3.0)["latency_us"]["max"] == 1000, "a frame that nobody answered"
 
 
@@ -103,8 +97,8 @@ def test_sums_are_taken_in_one_instant_however_late_the_answers_come(bus: Bus) -
     waiting: list[float] = []
     for k in range(30):
         t = 0.02 * k
-        bus.battery(t, 1000.0 * t + 5.0)
-        bus.motor(t + 0.003, 1000.0 * (t + 0.003))
+        bus.pair("Battery", t, 1000.0 * t + 5.0)
+        bus.pair("Motor", t + 0.003, 1000.0 * (t + 0.003))
         waiting.append(1000.0 * (t + 0.003))
         bus.send("HV_BatteryCorrected", t + 0.008, BatteryCurrentCorrected=1000.0 * t + 5.0, BatteryCurrentQuality=1)
         for motor_a in waiting if k % 3 == 2 else ():
@@ -120,11 +114,11 @@ def test_sums_are_taken_in_one_instant_however_late_the_answers_come(bus: Bus) -
 def test_sum_needs_a_fresh_value_of_every_branch_seen_and_its_answer(bus: Bus) -> None:
     bus.send("HV_BatteryCorrected", 0.001, BatteryCurrentCorrected=500.0)
     assert bus.sums(0.002) == (None, None)
-    bus.battery(0.01, 100.0, 90.0)
-    bus.motor(0.01, 80.0)
+    bus.pair("Battery", 0.01, 100.0, 90.0)
+    bus.pair("Motor", 0.01, 80.0)
     assert bus.monitor.look(0.02)["sums"] == {"measured_a": pytest.approx(20.0), "corrected_a": None}
     assert [each["name"] for each in bus.monitor.look(0.02)["branches"] if each["is_seen"]] == ["battery", "motor"]
-    bus.battery(0.3, 100.0, 90.0)
+    bus.pair("Battery", 0.3, 100.0, 90.0)
     assert bus.sums(0.31) == (None, None)
     assert bus.branch(0.31, "motor")["is_stale"]
 
@@ -140,34 +134,28 @@ def test_frames_that_fail_their_check_are_counted_and_not_used(bus: Bus) -> None
     assert battery["faults"] == {"corrupt": 2, "repeated": 1, "lost": 1}
     assert battery["corrected_faults"] == {"corrupt": 1, "repeated": 0, "lost": 0}
     assert (battery["measured_a"], battery["age_s"]) == pytest.approx((100.0, 0.05))
-    (row,) = [line for line in bus.lines(0.06) if line.startswith("battery ")]
-    assert row.endswith("corrupt 2, repeated 1, lost 1, corrected: corrupt 1")
-
-
-def status(bus: Bus, time_s: float, **values: Any) -> None:
-    bus.send("HV_CorrectionStatus", time_s, **({"JunctionSumMeasured": -12.3, "JunctionSumCorrected": 0.4} | values))
+    assert any(line.endswith("corrupt 2, repeated 1, lost 1, corrected: corrupt 1") for line in bus.lines(0.06))
 
 
 def test_status_is_read_as_the_node_wrote_it(bus: Bus) -> None:
-    bus.battery(1.2, 100.0, 95.0)
-    status(bus, 1.0, State=State.PASSING_THROUGH, Reason=Reason.BRANCH_STALE, ParameterSet=44)
+    bus.pair("Battery", 1.2, 100.0, 95.0)
+    said: dict[str, Any] = {"State": State.PASSING_THROUGH, "Reason": Reason.BRANCH_STALE, "ParameterSet": 44}
+    bus.send("HV_CorrectionStatus", 1.0, **said, JunctionSumMeasured=-12.3, JunctionSumCorrected=0.4)
     node = bus.monitor.look(1.25)["node"]
     assert (node["state"], node["reason"], node["parameter_set"]) == ("PASSING_THROUGH", "BRANCH_STALE", 44)
     assert node["sums"] == {"measured_a": pytest.approx(-12.3), "corrected_a": pytest.approx(0.4)}
     assert (node["age_s"], node["is_silent"]) == (pytest.approx(0.25), False)
     lines = bus.lines(1.25)
-    assert lines[:2] == [
-        f"can0: node: {State.PASSING_THROUGH.words}; parameter set 44; status 0.2 s ago",
-        f"because {Reason.BRANCH_STALE.words}",
-    ]
+    assert lines[0] == f"can0: node: {State.PASSING_THROUGH.words}; parameter set 44; status 0.2 s ago"
+    assert lines[1] == f"because {Reason.BRANCH_STALE.words}"
     assert "node's sum, corrected: what its parameters would make of it; it publishes what was measured" in lines
     assert bus.lines(4.0)[0] == "can0: no node on this bus any more: its last status came 3.0 s ago"
-    status(bus, 4.0, State=14, Reason=Reason.NONE, JunctionSumMeasured=-3276.8, JunctionSumCorrected=-3276.8)
+    bus.send("HV_CorrectionStatus", 4.0, State=14, JunctionSumMeasured=-3276.8, JunctionSumCorrected=-3276.8)
     assert bus.monitor.look(4.0)["node"]["sums"] == {"measured_a": None, "corrected_a": None}
     assert bus.lines(4.0)[0] == "can0: node: state 14, which this version does not know; status 0.0 s ago"
 
 
-def test_what_else_a_reader_should_know_is_said(make_database: Callable[..., VehicleDatabase]) -> None:
+def test_what_else_a_reader_should_know_is_said(make_database: MakeDatabase) -> None:
     """A small vehicle without a status message, whose heater is a power."""
     bus = Bus(make_database())
     lines = bus.lines(0.1, Counters(bus_errors=2, dropped=3))
@@ -185,23 +173,15 @@ def test_what_else_a_reader_should_know_is_said(make_database: Callable[..., Veh
 @contextmanager
 def battery_on_bus(database: VehicleDatabase) -> Iterator[can.BusABC]:
     """A battery that sends; the bus to listen on whether anybody else does."""
-    ended = threading.Event()
+    counters = cycle(range(15))
 
-    def send(bus: can.BusABC) -> None:
-        counter = 0
-        while not ended.wait(0.01):
-            data = protected(database, "HV_Battery", counter % 15, BatteryCurrent=100.0)
-            bus.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
-            counter += 1
+    def count_on(message: can.Message) -> None:
+        message.data = bytearray(protected(database, "HV_Battery", next(counters), BatteryCurrent=100.0))
 
     with can.Bus(interface="virtual", channel=CHANNEL) as bus:
-        thread = threading.Thread(target=send, args=(bus,))
-        thread.start()
-        try:
-            yield bus
-        finally:
-            ended.set()
-            thread.join()
+        frame = can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8))
+        bus.send_periodic(frame, 0.01, modifier_callback=count_on)
+        yield bus
 
 
 @pytest.fixture
@@ -251,7 +231,8 @@ def test_in_a_terminal_a_table_is_drawn_and_ctrl_c_ends_it_with_0() -> None:
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 0
     os.close(ours)
-    first = shown.decode().partition("\x1b[H")[2].partition("\x1b[J")[0].replace("\x1b[K", "").splitlines()
+    lines = shown.decode().partition("\x1b[H")[2].partition("\x1b[J")[0].splitlines()
+    first = [line.removeprefix("\x1b[K") for line in lines]  # cleared behind a full line, its last character would go
     assert first[0] == f"virtual {CHANNEL}: no node on this bus"
     assert len(first) == 6
     assert max(map(len, first)) <= 60

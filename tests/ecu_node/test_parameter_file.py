@@ -1,7 +1,6 @@
 """Parameters of a running node: replaced by what fits, kept otherwise."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
-from tests.ecu_node.vehicles import SMALL_DBC, parameters_for
+from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
 
 
 @pytest.fixture
@@ -66,20 +65,15 @@ def test_a_file_that_is_half_written_changes_nothing_and_counts_once_it_is_whole
     assert running.corrector.counters.reload_failures == 1
 
 
-def test_a_file_that_is_gone_changes_nothing(path: Path, database: VehicleDatabase) -> None:
-    running = Running(path, database)
-    path.unlink()
-    running.file.look(running.corrector, 2.0)
-    assert running.drift == 0.25
-    assert running.said[0].endswith("no such parameter file; name one that is there")
-
-
-def test_parameters_of_another_vehicle_change_nothing(path: Path, database: VehicleDatabase) -> None:
+def test_a_file_that_is_gone_or_of_another_vehicle_changes_nothing(path: Path, database: VehicleDatabase) -> None:
     running = Running(path, database)
     path.write_bytes(path.read_bytes().replace(b'"v1"', b'"v2"'))
-    running.file.look(running.corrector, 2.0)
+    assert not running.file.look(running.corrector, 2.0)
+    path.unlink()
+    assert not running.file.look(running.corrector, 4.0)
     assert running.drift == 0.25
     assert "parameters are for vehicle 'v2', this is 'v1'" in running.said[0]
+    assert running.said[1].endswith("no such parameter file; name one that is there")
 
 
 def test_a_file_that_comes_later_is_put_in_force(path: Path, database: VehicleDatabase) -> None:
@@ -93,9 +87,7 @@ def test_a_file_that_comes_later_is_put_in_force(path: Path, database: VehicleDa
 
 
 @pytest.mark.parametrize("mode", [Mode.OVERLAY, Mode.GATEWAY])
-def test_after_a_change_all_is_as_after_a_start(
-    make_database: Callable[..., VehicleDatabase], path: Path, mode: Mode
-) -> None:
+def test_after_a_change_all_is_as_after_a_start(make_database: MakeDatabase, path: Path, mode: Mode) -> None:
     """Measured and corrected signal count differently here."""
     database = make_database(dbc=SMALL_DBC.replace("SG_ Battery : 0|16@1- (0.1,0)", "SG_ Battery : 0|16@1- (0.2,0)"))
     write_parameters(parameters_for(database, motor=(0.0, 1.0)), path)

@@ -45,3 +45,16 @@ def test_a_result_that_cannot_be_written_is_one_line_and_1(
 ) -> None:
     done = written_nowhere(tmp_path, "ecu_node", *arguments, unbuffered=unbuffered)
     assert (done.returncode, done.stderr) == (1, f"ecu-node{LINE}")
+
+
+def test_wrong_use_ends_in_2_though_nobody_can_be_told() -> None:
+    with Path("/dev/full").open("w") as full:
+        assert subprocess.run([sys.executable, "-m", "ecu_node", "run"], stderr=full, check=False).returncode == 2
+
+
+def test_names_that_the_terminal_cannot_show_are_escaped() -> None:
+    command = [sys.executable, "-m", "ecu_node", "check", "--params", "\N{SUN}.json", "--layout", str(LAYOUT)]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.startswith("NOT FIT (NO_PARAMETERS): \\u2609.json: no such parameter file")

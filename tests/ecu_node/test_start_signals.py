@@ -38,6 +38,11 @@ def test_ctrl_c_at_start_is_one_line_and_130(tmp_path: Path, event: str, what: s
     command = program(event, what, signal.SIGINT, ["check", *files(tmp_path)])
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ecu-node: interrupted\n")
+    for nobody in ("2>&-", "2>/dev/full"):
+        done = subprocess.run(
+            ["sh", "-c", f'"$@" {nobody}', "sh", *command], stdout=subprocess.PIPE, text=True, check=False
+        )
+        assert (done.returncode, done.stdout) == (130, "")
 
 
 @pytest.mark.parametrize(("event", "what"), MOMENTS)

@@ -55,10 +55,15 @@ def test_every_silence_and_its_end_is_said_the_first_one_too(drive: Drive) -> No
     assert [line for _ in range(3) for line in drive.go_on(1.0, ()) + drive.go_on(1.0, BOTH)] == 3 * AGAIN
 
 
-def test_a_silence_after_a_fall_back_is_said_in_the_same_way(drive: Drive) -> None:
+@pytest.mark.parametrize("revoked", [False, True])
+def test_a_silence_after_a_fall_back_is_said_in_the_same_way_also_without_parameters(
+    drive: Drive, revoked: bool
+) -> None:
     assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [
         f"{FALLS_BACK}{Reason.BRANCH_STALE.words} (motor)"
     ]
+    if revoked:
+        assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None], "it does not correct again"
     assert drive.go_on(7.0, ()) + drive.go_on(1.0, BOTH) == AGAIN
 
 
@@ -82,10 +87,3 @@ def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(d
     assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ()) == AGAIN[:1]
     assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None]
     assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ()) == AGAIN[::-1]
-
-
-def test_parameters_that_are_taken_back_after_a_fall_back_do_not_correct_again(drive: Drive) -> None:
-    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [
-        f"{FALLS_BACK}{Reason.BRANCH_STALE.words} (motor)"
-    ]
-    assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None]

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,8 @@ from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters, Latency
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
-from tests.ecu_node.test_node import FullBus, wait_until
-from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers, parameters_for
+from tests.ecu_node.test_node import wait_until
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, MakeDatabase, answers, parameters_for
 
 ROOT = Path(__file__).parents[2]
 VSS = "Vehicle.Powertrain.TractionBattery.CurrentCurrent"
@@ -48,6 +47,9 @@ class Outlet:
             target, self.corrector, layout=database.layout, latency=Latency(), buses=[self.bus], say=self.said.append
         )
 
+    def wait_for_loss(self, count: int) -> None:
+        wait_until(lambda: self.corrector.counters.telemetry_lost >= count)
+
     def second(self) -> None:
         """A frame of the pair, of 80 A from battery to motor, and what is done once per second."""
         self.now_s = getattr(self, "now_s", time.monotonic()) + 1.0
@@ -58,7 +60,7 @@ class Outlet:
 
 
 @pytest.fixture
-def make_outlet(make_database: Callable[..., VehicleDatabase]) -> Iterator[Callable[..., Outlet]]:
+def make_outlet(make_database: MakeDatabase) -> Iterator[Callable[..., Outlet]]:
     made: list[Outlet] = []
 
     def make(target: Path | tuple[str, int]) -> Outlet:
@@ -68,10 +70,6 @@ def make_outlet(make_database: Callable[..., VehicleDatabase]) -> Iterator[Calla
     yield make
     for outlet in made:
         outlet.bus.close()
-
-
-def lost(outlet: Outlet, count: int) -> bool:
-    return outlet.corrector.counters.telemetry_lost >= count
 
 
 def lines_of(path: Path, count: int) -> list[dict[str, Any]]:
@@ -115,20 +113,13 @@ def test_lines_come_by_udp(make_outlet: Any) -> None:
         assert json.loads(receiver.recv(65536))["branches"][VSS]["corrected_a"] == 60.0
 
 
-def test_host_that_no_name_server_could_know_is_said(make_outlet: Any) -> None:
-    outlet = make_outlet(("a" * 64, 5000))
-    outlet.second()
-    wait_until(lambda: outlet.said)
-    assert outlet.said[0].endswith("label too long); lines are lost until that has changed")
-
-
 def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tmp_path: Path) -> None:
     path = tmp_path / "link"
     path.symlink_to("/dev/full")
     outlet = make_outlet(path)
     for count in (1, 2, 3):
         outlet.second()
-        wait_until(partial(lost, outlet, count))
+        outlet.wait_for_loss(count)
     assert outlet.said == ["--telemetry: No space left on device; lines are lost until that has changed"]
     path.unlink()
     outlet.second()
@@ -137,16 +128,20 @@ def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tm
     assert outlet.said[1] == "--telemetry: lines are written again"
 
 
-@pytest.mark.parametrize("kind", ["folder", "pipe without reader", "host without address"])
-def test_target_that_takes_nothing_never_blocks(kind: str, make_outlet: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("target", [".", "pipe", ("no-such-host.invalid", 5000), ("a" * 64, 5000)])
+def test_target_that_takes_nothing_never_blocks_and_is_said(
+    target: str | tuple[str, int], make_outlet: Any, tmp_path: Path
+) -> None:
+    """A folder, a pipe without a reader, a host without an address, and one that no name server could know."""
     os.mkfifo(tmp_path / "pipe")
-    target = {"folder": tmp_path, "pipe without reader": tmp_path / "pipe"}.get(kind, ("no-such-host.invalid", 5000))
-    outlet = make_outlet(target)
+    outlet = make_outlet(tmp_path / target if isinstance(target, str) else target)
     start_s = time.monotonic()
     for _ in range(5):
         outlet.second()
     assert time.monotonic() - start_s < 1.0
-    wait_until(partial(lost, outlet, 3))
+    outlet.wait_for_loss(3)
+    wait_until(lambda: outlet.said)
+    assert outlet.said[0].endswith("; lines are lost until that has changed")
 
 
 def test_line_that_finds_the_writer_busy_is_lost(make_outlet: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,15 +168,9 @@ def test_wrong_target_is_wrong_use(text: str, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("name", ["CurrentCurrent", "Vehicle", "vehicle.Current", "Vehicle.a b", "Vehicle..A"])
-def test_wrong_vss_name_is_refused(name: str, make_database: Callable[..., VehicleDatabase]) -> None:
+def test_wrong_vss_name_is_refused(name: str, make_database: MakeDatabase) -> None:
     with pytest.raises(LayoutError, match=r"'battery', vss: expected a name of the Vehicle Signal Spec"):
         make_database(NAMED.replace(VSS, name))
-
-
-def test_vss_name_of_two_branches_is_refused(make_database: Callable[..., VehicleDatabase]) -> None:
-    twice = NAMED.replace('name = "motor"', f'name = "motor", vss = "{VSS}"')
-    with pytest.raises(LayoutError, match=f"vss '{VSS}' stands at two branches; each needs a name of its own"):
-        make_database(twice)
 
 
 def test_example_takes_the_currents_out_of_a_line(make_outlet: Any, tmp_path: Path) -> None:
@@ -198,7 +187,7 @@ def test_line_that_fits_in_part_is_taken_back(
     outlet = make_outlet(path)
     monkeypatch.setattr(os, "write", lambda file, line: write(file, line[:7] if line.startswith(b'{"time"') else line))
     outlet.second()
-    wait_until(partial(lost, outlet, 1))
+    outlet.wait_for_loss(1)
     assert path.read_bytes() == b""
 
 
@@ -217,25 +206,6 @@ def test_latency_is_counted_by_bits_of_microseconds(monkeypatch: pytest.MonkeyPa
     latency.sent(1)  # an answer that the bus did not take is none
     latency.sent(0)
     assert sum(latency.counts) == 1000
-
-
-def test_full_send_queue_is_a_state_until_it_opens(
-    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
-    full = FullBus(request.node.name)
-    bus = SteadyBus(lambda: full, Counters())
-    now_s, states = time.monotonic(), []
-    for later_s in (0.0, 0.9, 1.1):
-        monkeypatch.setattr(time, "monotonic", lambda later_s=later_s: now_s + later_s)
-        bus.send(can.Message(arbitration_id=1))
-        bus.flush()
-        states.append(bus.state)
-    monkeypatch.setattr(full, "send", lambda *_: None)
-    bus.send(can.Message(arbitration_id=1))
-    bus.flush()
-    states.append(bus.state)
-    bus.close()
-    assert [*states, bus.state] == ["open", "open", "full", "open", "gone"]
 
 
 def test_nothing_leaks_and_no_garbage_is_collected_in_100000_frames(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """``ecu-node template``: what it prints fits at once, and once filled in it is applied."""
 
 import json
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,9 +9,8 @@ import pytest
 from ecu_node.bus.wiring import InForce, key_of, wire
 from ecu_node.cli import main, template_text
 from ecu_node.core.status import Reason, State
-from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import check_fit, decode_parameters
-from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, MakeDatabase, answers
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 
@@ -40,7 +38,7 @@ def test_the_template_of_a_layout_fits_it_at_once_and_corrects_nothing(
     ],
 )
 def test_the_sum_is_judged_about_the_load_that_the_layout_declares(
-    make_database: Callable[..., VehicleDatabase], load: str, expected_a: float, state: tuple[State, Reason]
+    make_database: MakeDatabase, load: str, expected_a: float, state: tuple[State, Reason]
 ) -> None:
     """The battery shows 4 A too little and feeds a load of 6.1 A that no branch measures: about 0 A it looks better."""
     database = make_database(f"{SMALL_LAYOUT}{load}")
@@ -70,7 +68,7 @@ def test_a_vehicle_that_no_parameter_file_can_name_is_wrong_use(
 
 
 def test_template_of_a_load_beyond_the_limits_is_refused(
-    make_database: Callable[..., VehicleDatabase], capsys: pytest.CaptureFixture[str]
+    make_database: MakeDatabase, capsys: pytest.CaptureFixture[str]
 ) -> None:
     database = make_database(f"{SMALL_LAYOUT}\nunmeasured_load = {{ mean_a = 200.0, sd_a = 1.0 }}\n")
     assert main(["template", "--layout", str(database.layout.path), "--vehicle", "v1"]) == 1

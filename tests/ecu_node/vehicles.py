@@ -1,5 +1,6 @@
 """Small vehicles for the node's tests: layouts and DBCs made to measure, parameters, and frames with cantools."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -51,6 +52,14 @@ VAL_ 256 Battery -32768 "SNA";
 VAL_ 512 Battery -32768 "SNA";
 VAL_ 512 Motor -32768 "SNA";
 """
+
+
+def whole_vehicle(make_database: MakeDatabase, more: str, *changes: tuple[str, str]) -> VehicleDatabase:
+    """The project's own layout with some lines at its end, and some patterns replaced; with its DBC."""
+    text = f"{LAYOUT.read_text()}{more}".replace("hv_powertrain.dbc", "small.dbc")
+    for pattern, new in changes:
+        text = re.sub(pattern, new, text)
+    return make_database(text, LAYOUT.with_suffix(".dbc").read_text())
 
 
 def parameters_for(database: VehicleDatabase, **faults: tuple[float, float]) -> VehicleParameters:
