@@ -206,9 +206,12 @@ def bit_place(signal: Signal) -> BitPlace:
     """
     if signal.is_float:
         raise DatabaseError(f"signal {signal.name} is a floating-point number; the node corrects integer signals only")
-    if not 1 <= signal.length <= _LONGEST:
-        raise DatabaseError(f"signal {signal.name} has {signal.length} bits; 1 to {_LONGEST} are expected")
     low = start_bit(signal)  # of a big-endian signal its most significant bit, numbered from the top of its byte
+    if low < 0 or not 1 <= signal.length <= _LONGEST:
+        raise DatabaseError(
+            f"signal {signal.name} has {signal.length} bits from bit {signal.start} on; 1 to {_LONGEST} bits from 0 on "
+            f"are expected"
+        )
     high = low + signal.length - 1
     is_little = signal.byte_order == "little_endian"
     return BitPlace(
@@ -367,8 +370,11 @@ def read_codes(signal: Signal, units: Mapping[str, float] | None, where: str) ->
         If the unit is wrong, the scale is zero, or the signal cannot be read bit by bit.
     """
     place = bit_place(signal)
-    if signal.scale == 0:
-        raise DatabaseError(f"{where}: signal {signal.name} has scale 0 in the DBC; a number other than 0 is expected")
+    if signal.scale == 0 or not math.isfinite(signal.scale + signal.offset):
+        raise DatabaseError(
+            f"{where}: signal {signal.name} has scale {signal.scale:g} and offset {signal.offset:g} in the DBC; finite "
+            f"numbers are expected, and a scale other than 0"
+        )
     lowest, highest = place.lowest, place.highest
     if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
         scale, offset = as_written(signal.scale), as_written(signal.offset)

@@ -58,8 +58,9 @@ def test_a_code_beyond_the_width_is_refused_and_never_wraps() -> None:
 def test_signals_that_are_no_plain_integers_are_refused() -> None:
     with pytest.raises(DatabaseError, match="S is a floating-point number"):
         bit_place(Signal("S", start=0, length=32, conversion=BaseConversion.factory(is_float=True)))
-    with pytest.raises(DatabaseError, match="has 65 bits"):
-        bit_place(Signal("S", start=0, length=65))
+    for start, length in ((0, 65), (-8, 8)):
+        with pytest.raises(DatabaseError, match=f"has {length} bits from bit {start} on; 1 to 64 bits from 0 on are"):
+            bit_place(Signal("S", start=start, length=length))
 
 
 CUT_NAME = "PackStatus_loggingAndVitals_Page"

@@ -154,7 +154,8 @@ def test_a_name_amid_the_values_is_refused(scale: float, code: int) -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"scale": 0.0}, "signal I has scale 0"),
+        ({"scale": 0.0}, "signal I has scale 0 and offset 0 in the DBC"),
+        ({"offset": math.inf}, "signal I has scale 0.02 and offset inf in the DBC"),
         ({"limits": (1000.0, 2000.0)}, "no code of signal I lies in its range in the DBC"),
         ({"unit": "W"}, "signal I is in 'W'; expected A, mA, kA"),
         ({"unit": "1.2.3A/bit"}, "signal I is in '1.2.3A/bit'; expected A, mA, kA"),
