@@ -1,6 +1,7 @@
 """What the doctor complains of beside the sum of the currents: checks, each a function from the facts to findings.
 
-A new check is one function more in :data:`CHECKS`; those of the sum are in :mod:`calibrator.kirchhoff.findings`.
+A new check is one function more in :data:`CHECKS`: what it needs, counts and values, is in :class:`.Facts`. Those of the
+sum are in :mod:`calibrator.kirchhoff.findings`.
 """
 
 from collections.abc import Callable, Sequence
@@ -127,30 +128,33 @@ def values(facts: Facts) -> Findings:
 
 def impossible_voltage(facts: Facts) -> Findings:
     """A voltage that powers are divided by and that no vehicle has: a slip of its unit is every such branch's."""
-    for item in facts.junction.database.layout.input:
-        channels = [drive.inputs[VOLTAGE] for drive in facts.drives if VOLTAGE in drive.inputs]
-        value_v = np.abs(np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)]))
-        is_known = item.name == VOLTAGE and facts.database.signal(item.signal)[1].unit == "V" and value_v.any()
-        median_v = float(np.median(value_v)) if is_known else 0.0  # which is possible: contactors are open
-        if median_v > 0.0 and not LEAST_V <= median_v <= GREATEST_V:
-            factor = 10.0 ** float(np.rint(np.log10(USUAL_V / median_v)))
-            text = f"the voltage is {figure(median_v)} V in the median, probably {times(factor)}"
-            advice = "correct its scale or unit in the DBC, or name another signal as the voltage"
-            yield error("unit", item.signal, text, advice, factor)
+    value_v = np.abs(facts.values(VOLTAGE))
+    signal = next((item.signal for item in facts.junction.database.layout.input if item.name == VOLTAGE), "")
+    if not value_v.any() or facts.logs[0].source.unit(signal) != "V":
+        return
+    median_v = float(np.median(value_v))  # 0 is possible: contactors are open
+    if median_v > 0.0 and not LEAST_V <= median_v <= GREATEST_V:
+        factor = 10.0 ** float(np.rint(np.log10(USUAL_V / median_v)))
+        text = f"the voltage is {figure(median_v)} V in the median, probably {times(factor)}"
+        advice = "correct its scale or unit, or name another signal as the voltage"
+        yield error("unit", signal, text, advice, factor)
 
 
 def full_scale(facts: Facts) -> Findings:
-    """Currents beyond full scale, or far from it."""
-    scale_a, branches = facts.database.layout.full_scale_a, facts.channels[facts.channels.is_branch].set_index("name")
-    seen_a = branches[["low", "high"]].abs().max(axis=1).dropna()
-    for name, peak_a in seen_a[seen_a > scale_a].items():
-        text = f"it reaches {figure(peak_a)} A, and full_scale_a is {figure(scale_a)} A"
-        advice = "raise full_scale_a in the layout to the nominal maximum of the junction, if the value is right"
-        yield warning("full scale", name, text, advice, peak_a)
-    if seen_a.max() < LEAST_OF_SCALE * scale_a and not facts.junction.stands_still:
-        text = f"no branch exceeds {figure(seen_a.max())} A, and full_scale_a is {figure(scale_a)} A"
-        advice = "record a drive, or check units and full_scale_a"
-        yield warning("full scale", "all branches", text, advice, float(seen_a.max()))
+    """Currents beyond full scale, or far from it; of those with a slip of a unit what they are without it."""
+    scale_a, junction = facts.database.layout.full_scale_a, facts.junction
+    right = dict(zip(junction.branches, np.abs(junction.multipliers).tolist(), strict=True))
+    names = facts.database.layout.branch_names
+    peaks_a = {name: right.get(name, 1.0) * float(np.abs(facts.values(name)).max(initial=0.0)) for name in names}
+    for name, peak_a in peaks_a.items():
+        if peak_a > scale_a:
+            text = f"it reaches {figure(peak_a)} A, and full_scale_a is {figure(scale_a)} A"
+            advice = "raise full_scale_a in the layout to the nominal maximum of the junction, if the value is right"
+            yield warning("full scale", name, text, advice, peak_a)
+    greatest_a = max(peaks_a.values())
+    if 0.0 < greatest_a < LEAST_OF_SCALE * scale_a and not junction.stands_still:
+        text = f"no branch exceeds {figure(greatest_a)} A, and full_scale_a is {figure(scale_a)} A"
+        yield warning("full scale", "all branches", text, "record a drive, or check units and full_scale_a", greatest_a)
 
 
 CHECKS: Sequence[Callable[[Facts], Findings]] = (
@@ -199,8 +203,8 @@ def _for_fleet(facts: Facts) -> str:
     if problem := too_slow(facts.junction.database.layout.period_s):
         return problem
     if facts.junction.valid_s < LEAST_DURATION_S:
-        valid_s = figure(facts.junction.valid_s)
-        return f"the logs of a vehicle of a fleet need {LEAST_DURATION_S:.0f} s together, and these have {valid_s} s"
+        has = f"{facts.junction.valid_s:.1f} s"
+        return f"the logs of a vehicle of a fleet need {LEAST_DURATION_S:.0f} s together, and these have {has}"
     return ""
 
 

@@ -96,6 +96,11 @@ class Facts:
     channels: pd.DataFrame
     junction: RecordedJunction
 
+    def values(self, name: str) -> Array:
+        """Good values of a branch [A], positive into the junction, or of an input in its unit, over all logs."""
+        channels = [{**drive.inputs, **drive.branches}.get(name, NOTHING) for drive in self.drives]
+        return np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)])
+
 
 def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
     """Gather the facts of a layout, whose DBC is read, and of logs or tables of one vehicle.

@@ -57,7 +57,9 @@ def kirchhoff(
         "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table"
     )
     for what, is_wrong in {
-        "give either a LOG, or --interface and --channel of a live bus": (log is None) == (interface is None),
+        "give either a LOG, or --interface and --channel of a live bus": (
+            len({log is None, interface is not None, channel is not None}) > 1
+        ),
         with_layout: (layout is None) == (branches is None),
         "--full-scale goes with --branches; a layout has full_scale_a": full_scale is not None and branches is None,
         "--parameters belong to a layout; give --layout, not --branches": parameters is not None and layout is None,
@@ -120,7 +122,11 @@ def kirchhoff(
         is_told = each.subject == "sum" and each.code in TOLD
         notices.append(each.text if is_told else f"{each.severity}: {each.line}")
     write_output(kirchhoff_text(comparison, notices))
-    if log is not None and "after" not in comparison.stages:
+    if (
+        log is not None
+        and "after" not in comparison.stages
+        and not any(branch.computed for branch in database.layout.branch if branches)
+    ):
         say_error(f"next: calibrator {_next_step(log, layout, branches)}")
 
 

@@ -14,8 +14,10 @@ from calibrator.findings import Finding, Severity, worst_first
 from calibrator.kirchhoff.junction import RecordedJunction
 from calibrator.kirchhoff.signs import SURE
 from calibrator.kirchhoff.sums import SUM
+from calibrator.recordings.tables import bare_name
 from calibrator.terminal.text import figure
 from calibrator.words import POSITIONS, places_of, words_of
+from ecu_node.core.signals import AMPERE
 
 __all__ = ["CHECKS", "CHECKS_OF_MOVING", "Findings", "error", "hint", "sum_findings", "times", "warning"]
 
@@ -44,6 +46,9 @@ vary meanwhile. [s], [1]"""
 STUCK_MOVE, STUCK_VALUE, STUCK_ROUNDING = 0.02, 0.002, 1e-9
 """Of full scale: by which the others' sum must vary meanwhile; near nothing a branch may well stand; what interpolation
 adds to values that are the same. [1]"""
+
+UNITS = {factor_a: unit for unit, factor_a in AMPERE.items()}
+"""Units of currents by what their values must be multiplied by."""
 
 Findings = Iterator[Finding]
 error, warning, hint = (partial(Finding, severity) for severity in Severity)
@@ -106,7 +111,9 @@ def signs_and_units(junction: RecordedJunction) -> Findings:
         if layout.path.name == "--branches":
             turn = f"leave the minus before {name} out in --branches"
             turn = turn if branch.sign < 0 else f"write a minus before {name} in --branches"
-            scale = f"write the unit into the header of column {source}, such as '{source} [mA]'"
+            scale = f"multiply {source} by {factor:g}, in the table or in --branches"
+            if factor in UNITS and not branch.computed:
+                scale = f"write the unit into the header of column {source}: '{bare_name(source)} [{UNITS[factor]}]'"
         for code, wrong, what, change, advice in (
             ("sign", abs(wanted) if wanted < 0.0 else wanted, "its sign is inverted", "the other sign", turn),
             ("unit", wanted / factor, f"its current is {times(factor)}", f"{name} times {factor:g}", scale),

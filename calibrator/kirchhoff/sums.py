@@ -33,6 +33,7 @@ from calibrator.drives.delays import MAX_DELAY_S
 from calibrator.errors import DriveError
 from ecu_node.core.signals import VOLT, WATT, unit_factor
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError
 from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
 from ecu_node.summary import DIFFERENCE_GAIN, MAD_TO_SD
@@ -226,6 +227,8 @@ def compare_kirchhoff(
 
     Raises
     ------
+    LayoutError
+        If a branch is called as the sum.
     DriveError
         If fewer than two branches have usable values, no instant is valid for all of them, or the parameters are of
         other branches.
@@ -233,6 +236,8 @@ def compare_kirchhoff(
     layout, where = at_pace(database.layout, [drive]), f"vehicle {drive.vehicle}, drive {drive.name}"
     usable = {name: channel for name, channel in drive.branches.items() if channel.good.any()}
     names = [name for name in layout.branch_names if name in usable]
+    if SUM in names:
+        raise LayoutError(f"{layout.path}: branch {SUM!r} is called like the sum of all branches; give it another name")
     if len(names) < 2:
         what = f"usable frames of {', '.join(names)} only" if names else "no branch has usable frames"
         raise DriveError(f"{where}: {what}; a sum needs two branches")

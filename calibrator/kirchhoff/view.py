@@ -35,15 +35,16 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
     """Tables of 80 columns, notices, and the line that sums it up."""
     stages = {stage: found for stage, found in comparison.figures.items() if stage != "change"}
     rows = [
-        [name, *(f"{value:.2f}" for value in row)] for name, *row in pd.concat(stages.values(), axis=1).itertuples()
+        [name, *(f"{value:z.2f}" for value in row)] for name, *row in pd.concat(stages.values(), axis=1).itertuples()
     ]
     header = ["", *(word for stage in stages for word in (STAGES[stage], "", "", ""))]
     parts = ", ".join(f"{name} {figure(value, 2)}" for name, value in comparison.parts_a.items() if value >= 0.001)
+    expected = figure(round(comparison.expected_a, 2))
     lines = [
         "Currents [A], positive into the junction",
         table(header, [["", *["RMSE", "max", "mean", "sd"] * len(stages)], *rows]),
         "",
-        f"right sensors would sum to {figure(comparison.expected_a)} +- {figure(comparison.usual_sd_a, 2)} A"
+        f"right sensors would sum to {expected} +- {figure(comparison.usual_sd_a, 2)} A"
         + (f" ({parts})" if parts else ""),
         f"within {BAND:g} sd of that: {_inside(comparison)} of the instants",
     ]
@@ -61,7 +62,7 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
         title = "What the gain of one branch alone could explain of how the sum varies"
         lines += ["", title, table(["", "gain error", "explains"], rows), ""]
     before_a, *corrected_a = (found.loc[SUM, "rmse_a"] for found in stages.values())
-    about = f" about the {figure(comparison.expected_a)} A expected" if comparison.expected_a else ""
+    about = "" if expected == "0" else f" about the {expected} A expected"
     total = f"RMSE of the sum{about}: {before_a:.2f} A measured"
     for after_a in corrected_a:
         ratio = f", {figure(before_a / after_a, 2)} times less" if 0.0 < after_a < before_a else ""

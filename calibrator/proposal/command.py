@@ -66,7 +66,7 @@ def propose(
         if out.exists() or out.is_symlink():
             raise ProposalError(f"{out}: exists, and is not overwritten; choose another --out")
         require_possible_file(out)
-    if is_log(source) and not is_table(source):
+    if source.exists() and is_log(source) and not is_table(source):
         other = f"and {log} is none; " if log is not None and not is_log(log) else ""
         raise ProposalError(f"{source}: a log, {other}the database comes first, the log behind --log")
     proposal = look_at(source, log, _name_of(out or source))

@@ -124,7 +124,7 @@ class Proposal:
             return "no pack current found: no candidate is the current or power of a high-voltage battery"
         if not any(item.place in {"motor", "charger"} for item in self.branches):
             wrong = "; it is signed, and unsigned in the database" if battery.wrong == "sign" else ""
-            others = f"no current, power or torque of a motor or charger was found{wrong}"
+            others = f"no current or power of a motor or charger was found, nor torque and speed of a motor{wrong}"
             return f"the pack current is {battery.name}, but {others}"
         share = closure(self.branches, self.voltage)
         if share > OPEN:

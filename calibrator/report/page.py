@@ -288,16 +288,20 @@ def _sensor_figure(table: FleetTable, files: Mapping[int, ParameterDetails]) -> 
                 if each.probability >= RIVAL:
                     what, values = f"{table.vehicle[j]}, {each.probability:.0%}", (each.drift, each.offset_a)
                     points.append((k, RIVALS, what, *(value.get(branch, 0.0) for value in values), 0.0, 0.0))
-        axis = str(k + 1 if k else "")
-        for letter, name, title, factor in (
-            ("x", "drift", f"{branch}: gain error [%]", 100.0),
-            ("y", "offset_a", "" if k else "offset [A]", 1.0),
-        ):
-            largest = 1.1 * max(factor * float(np.abs(table[name][:, k]).max(initial=0.0)), 1.0)
-            figure.layout[f"{letter}axis{axis}"] = {"title": {"text": title}, "range": [-largest, largest]}
     frame = pd.DataFrame(points, columns=["k", "label", "vehicle", "drift", "offset_a", "drift_sd", "offset_sd_a"])
     first = ~frame["label"].duplicated()
     frame = frame.fillna(0.0)
+    for k, branch in enumerate(table.branches):
+        x, y = (frame[name][frame["k"] == k] for name in ("drift", "offset_a"))
+        for letter, values, title in (
+            ("x", 100.0 * x, f"{branch}: gain error [%]"),
+            ("y", y, "" if k else "offset [A]"),
+        ):
+            largest = 1.1 * max(1.0, values.abs().max())
+            figure.layout[f"{letter}axis{k + 1 if k else ''}"] = {
+                "title": {"text": title},
+                "range": [-largest, largest],
+            }
     for (k, label), part in frame.groupby(["k", "label"], sort=False):
         axis, bars = str(k + 1 if k else ""), {"thickness": 0.7, "width": 0}
         figure.add_scatter(

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from calibrator.drive import Array, Channel, Drive
@@ -172,6 +173,7 @@ def test_slip_of_a_unit_is_found_with_its_factor(
     told = examined(write_layout(tmp_path, units={signal: unit}), log)
     assert told.errors == [("unit", branch)]
     assert told.findings("unit")[0].number == factor
+    assert told.findings("full scale") == []
 
 
 def test_sign_of_a_branch_too_small_to_tell_is_not_guessed(log: Path, tmp_path: Path) -> None:
@@ -199,6 +201,22 @@ def told_of(folder: Path, currents_a: Array) -> list[tuple[str, str]]:
 
 def test_unrelated_currents_are_an_error_of_the_sum(tmp_path: Path) -> None:
     assert told_of(tmp_path, 30.0 * RNG.normal(size=(300, 3))) == [("sum", "sum")]
+
+
+@pytest.mark.parametrize(("factor", "wrong"), [(1.0, []), (1000.0, [("unit", "U [V]")]), (0.01, [("unit", "U [V]")])])
+def test_voltage_that_no_vehicle_has_is_blamed_for_the_powers(
+    factor: float, wrong: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    rows = np.repeat(TRUE, 10, axis=0)
+    volts = 400.0 - 0.1 * rows[:, 0]
+    columns = {"t [s]": 0.1 * np.arange(len(rows)), "I": rows[:, 0], "P [W]": rows[:, 1:].sum(axis=1) * volts}
+    pd.DataFrame({**columns, "U [V]": factor * volts}).to_csv(tmp_path / "t.csv", index=False)
+    power = '[[branch]]\nname = "motor"\npower = "P [W]"\nvoltage = "U [V]"\n'
+    battery = '[[branch]]\nname = "battery"\nsignal = "I"\n'
+    (tmp_path / "t.toml").write_text(
+        f'schema = 1\nname = "t"\nfull_scale_a = 150\n{battery}sign = 1\n{power}sign = 1\n'
+    )
+    assert examined(tmp_path / "t.toml", tmp_path / "t.csv").errors == wrong
 
 
 # ---- delays, gains
@@ -326,7 +344,8 @@ def test_short_log_is_called_so_by_kirchhoff(
     assert told.errors == []
     (short,) = told.findings("too short")
     assert (short.severity, short.number) == ("hint" if seconds == 40.0 else "warning", pytest.approx(seconds, abs=0.5))
-    assert "need 120 s together, and these have" in told.report["not_ready"]["calibrate"] or seconds == 3.0
+    needs = f"need 120 s together, and these have {seconds:.1f} s"
+    assert needs in told.report["not_ready"]["calibrate"] or seconds == 3.0
     assert ("calibrate --trusted" in told.report["ready"]) is (seconds > 5.0)
     shown = calibrator("kirchhoff", log, "--layout", layout).stdout
     assert short.text in " ".join(shown.split())

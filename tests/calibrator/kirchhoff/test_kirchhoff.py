@@ -152,21 +152,44 @@ def test_empty_cell_widens_the_band_there_alone(tmp_path: Path) -> None:
     assert list(np.flatnonzero(sd_a > 3.0 * sd_a.median())) == [600]
 
 
-@pytest.mark.parametrize(("factor", "told"), [
-    (-1.0, "error: motor: its sign is inverted"), (1000.0, "error: motor: its current is 1000 times too large"),
+@pytest.mark.parametrize(("factor", "told", "advice", "column", "sign", "times"), [
+    (-1.0, "its sign is inverted", "write a minus before motor in --branches", "motor [A]", "-", 1.0),
+    (1e3, "its current is 1000 times too large", "of column motor [A]: 'motor [mA]'", "motor [mA]", "", 1.0),
+    (1e-3, "its current is 1000 times too small", "of column motor [A]: 'motor [kA]'", "motor [kA]", "", 1.0),
+    (10.0, "its current is 10 times too large", "multiply motor [A] by 0.1, in the table or in --branches",
+     "motor", "", 0.1),
 ])  # fmt: skip
-def test_slip_of_sign_or_unit_is_said_with_what_to_do_and_no_gain_error(
-    factor: float, told: str, tmp_path: Path
+def test_slip_of_sign_or_unit_is_gone_when_its_advice_is_followed(
+    factor: float, told: str, advice: str, column: str, sign: str, times: float, tmp_path: Path
 ) -> None:
     heater = 5.0 * np.sin(2.0 * TABLE_S)
-    path, *rest, _, _ = table(
-        tmp_path, battery=MOTOR_A + heater, heater=-heater, motor=-factor * MOTOR_A
-    )  # nothing tells full scale
-    (line,) = [line for line in run(path, *rest).stdout.splitlines() if line.startswith("error")]
-    assert line.startswith(told)
-    assert "in --branches" in line if factor < 0.0 else "such as 'motor [mA]'" in line
-    right_too = run(*table(tmp_path, battery=MOTOR_A + heater, heater=-heater, motor=-1.2 * MOTOR_A)).stdout
-    assert "error:" not in right_too
+
+    def errors(column: str, sign: str, motor_a: Array) -> list[str]:
+        path, *_ = table(tmp_path, 6, battery=MOTOR_A + heater, heater=-heater, **{column: motor_a})
+        lines = run(path, "--branches", f"battery=battery,heater=heater,{sign}motor={column}").stdout.splitlines()
+        return [line for line in lines if line.startswith("error")]  # nothing tells full scale
+
+    (line,) = errors("motor [A]", "", -factor * MOTOR_A)
+    assert line.startswith(f"error: motor: {told}: ")
+    assert line.endswith(advice)
+    assert errors(column, sign, -factor * times * MOTOR_A) == []
+    assert errors("motor", "", -1.2 * MOTOR_A) == []
+
+
+def test_next_step_is_one_that_works(tmp_path: Path) -> None:
+    path, *_ = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
+    for column, is_told in (("motor", True), ("motor*1", False)):  # a layout is not made of formulas
+        done = run(path, "--branches", f"battery=battery,motor={column}")
+        assert ("next: calibrator layout init" in done.stderr) is is_told
+
+
+def test_no_figure_is_more_exact_than_its_unit_allows(tmp_path: Path) -> None:
+    path, *_ = table(tmp_path, battery=MOTOR_A - 0.002, motor=-MOTOR_A)
+    (tmp_path / "layout.toml").write_text(f"{LAYOUT_OF_TABLE}[unmeasured_load]\nmean_a = 0.00123\nsd_a = 0.1\n")
+    text = run(path, "--layout", tmp_path / "layout.toml").stdout
+    assert "right sensors would sum to 0 +- 0.1 A" in text
+    assert "-0.00" not in text
+    assert "RMSE of the sum: 0.00 A measured" in text
 
 
 def test_of_a_short_or_resting_log_no_shares_are_told_as_doctor_says(tmp_path: Path) -> None:

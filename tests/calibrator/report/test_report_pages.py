@@ -17,7 +17,7 @@ from calibrator.errors import FleetError
 from calibrator.report import page as page_module
 from calibrator.report.page import fleet_report, vehicle_report
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import SensorFinding
+from ecu_node.parameters import Explanation, SensorFinding
 from tests.calibrator.report.results_at_hand import (
     EVIL,
     sensor,
@@ -83,12 +83,16 @@ def test_every_figure_is_one_that_plotly_takes(result: Path) -> None:
     assert load["x"] == [0.3, 0.3]
 
 
-def test_other_explanations_of_an_undecided_sensor_are_drawn(result: Path) -> None:
-    traces = facts_of(fleet_report(result)[0])["figures"]["sensors"]["data"]
-    battery = {trace["name"]: trace for trace in traces if trace["xaxis"] == "x"}
+def test_other_explanations_of_an_undecided_sensor_are_drawn(tmp_path: Path, database: VehicleDatabase) -> None:
+    vehicles = six_vehicles(database)
+    rivals = [vehicles[3].explanations[0], Explanation(probability=0.4, offset_a={"battery": -12.0})]
+    vehicles[3] = replace(vehicles[3], explanations=rivals)
+    figure = facts_of(fleet_report(write_result(tmp_path / "r", vehicles))[0])["figures"]["sensors"]
+    battery = {trace["name"]: trace for trace in figure["data"] if trace["xaxis"] == "x"}
     assert battery["not corrected"]["y"] == [8.0]
-    assert battery["what it may be instead"]["y"] == [0.0]
+    assert battery["what it may be instead"]["y"] == [-12.0]
     assert battery["what it may be instead"]["text"] == ["V4, 40%"]
+    assert figure["layout"]["yaxis"]["range"] == pytest.approx([-13.2, 13.2])
 
 
 def test_names_and_reasons_are_text_and_never_code(result: Path) -> None:
