@@ -1,7 +1,7 @@
 """What the doctor complains of beside the sum of the currents: checks, each a function from the facts to findings.
 
-A new check is one function more in :data:`CHECKS`: what it needs, counts and values, is in :class:`.Facts`. Those of the
-sum are in :mod:`calibrator.kirchhoff.findings`.
+A new check is one function more in :data:`CHECKS`; counts and values that it needs are in :class:`.Facts`. Those of
+the sum are in :mod:`calibrator.kirchhoff.findings`.
 """
 
 from collections.abc import Callable, Sequence

@@ -13,13 +13,7 @@ import pytest
 from calibrator.drive import Array, Channel, Drive
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator
-from tests.calibrator.doctor.artificial_logs import (
-    examined,
-    true_drive,
-    with_branch,
-    write_layout,
-    write_log,
-)
+from tests.calibrator.doctor.artificial_logs import examined, true_drive, with_branch, write_layout, write_log
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +37,11 @@ def cut(drive: Drive, seconds: float) -> Drive:
         }
 
     return replace(drive, branches=first(drive.branches), inputs=first(drive.inputs))
+
+
+def calibrated(folder: Path, log: Path, layout: Path, *arguments: object) -> tuple[int, str]:
+    done = calibrator("calibrate", log, "--layout", layout, "--out", folder / "result", *arguments)
+    return done.returncode, done.stdout + done.stderr
 
 
 # ---- a sound log
@@ -101,10 +100,11 @@ def at_rest(
 
 
 @pytest.mark.parametrize(("noise_a", "offset_a"), [(0.0, 0.0), (0.7, 0.0), (0.3, 2.0)])
-def test_car_at_rest_has_no_error_and_stands_still(
+def test_car_at_rest_is_called_so_without_an_error_and_taken_by_calibrate(
     noise_a: float, offset_a: float, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
-    told = examined(layout, at_rest(database, tmp_path, noise_a=noise_a, offset_a=offset_a))
+    log = at_rest(database, tmp_path, noise_a=noise_a, offset_a=offset_a)
+    told = examined(layout, log)
     assert told.errors == []
     (still,) = told.findings("stands still")
     assert still.text.startswith("the car stands still: no current varies by more than ")
@@ -112,6 +112,11 @@ def test_car_at_rest_has_no_error_and_stands_still(
     assert told.findings("sign", "unit", "cannot tell", "gain", "delay", "constant", "full scale", "inputs") == []
     assert [round(item.number) for item in told.findings("mean")] == ([2] if offset_a else [])
     assert "calibrate --trusted" in told.report["ready"]
+    shown = calibrator("kirchhoff", log, "--layout", layout).stdout
+    assert still.text in " ".join(shown.split())
+    assert "gain error" not in shown
+    assert "of the sum measured" not in shown
+    assert calibrated(tmp_path, log, layout, "--trusted", "battery")[0] == 0
 
 
 def test_currents_that_stand_still_while_the_car_drives_are_not_called_rest(
@@ -317,22 +322,6 @@ def test_log_of_another_vehicle_is_an_error_that_names_what_it_has(tmp_path: Pat
 
 
 # ---- doctor, kirchhoff and calibrate say the same
-
-
-def calibrated(folder: Path, log: Path, layout: Path, *arguments: object) -> tuple[int, str]:
-    done = calibrator("calibrate", log, "--layout", layout, "--out", folder / "result", *arguments)
-    return done.returncode, done.stdout + done.stderr
-
-
-def test_car_at_rest_is_called_so_by_kirchhoff_and_taken_by_calibrate(
-    tmp_path: Path, layout: Path, database: VehicleDatabase
-) -> None:
-    log = at_rest(database, tmp_path, noise_a=0.3, offset_a=2.0)
-    (still,) = examined(layout, log).findings("stands still")
-    told = calibrator("kirchhoff", log, "--layout", layout).stdout
-    assert still.text in " ".join(told.split())
-    assert "gain error" not in told
-    assert calibrated(tmp_path, log, layout, "--trusted", "battery")[0] == 0
 
 
 @pytest.mark.parametrize("seconds", [3.0, 12.0, 40.0])

@@ -192,20 +192,6 @@ def test_no_figure_is_more_exact_than_its_unit_allows(tmp_path: Path) -> None:
     assert "RMSE of the sum: 0.00 A measured" in text
 
 
-def test_of_a_short_or_resting_log_no_shares_are_told_as_doctor_says(tmp_path: Path) -> None:
-    path, *rest = table(tmp_path, battery=MOTOR_A + 3.0, motor=-MOTOR_A)
-    whole = pd.read_csv(str(path))
-    doctor = ("doctor", "--layout", tmp_path / "layout.toml", "--log", path)
-    (tmp_path / "layout.toml").write_text(LAYOUT_OF_TABLE)
-    still = whole.assign(battery=whole["battery"] * 0.0 + 3.0, motor=whole["motor"] * 0.0)
-    for frame, said in ((whole[:100], "signs, units and gains cannot be told"), (still, "the car stands still")):
-        frame.to_csv(str(path), index=False)
-        found = figures(path, *rest)
-        assert found["residual"] == {"before": None}
-        (text,) = [each["text"] for each in found["findings"] if said in each["text"]]
-        assert text in " ".join(calibrator(*doctor).stdout.split())
-
-
 # ---- parameters
 
 

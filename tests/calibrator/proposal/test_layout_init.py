@@ -1,27 +1,22 @@
 """``calibrator layout init``: databases with the units, names and ranges of real ones, logs, tables, the dialogue."""
 
-import fcntl
 import json
-import math
-import os
-import pty
-import re
-import struct
-import subprocess
-import sys
-import termios
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cantools
+import numpy as np
+import pandas as pd
 import pytest
 
+from calibrator.words import word_set
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import Layout, read_layout
 from tests.calibrator.command_here import calibrator
 from tests.calibrator.doctor.artificial_logs import DBC, true_drive, write_log
+from tests.calibrator.screen import Screen
 
 HEAD = 'VERSION ""\nBU_: BMS INV OBC EMS CLIMA Battery\n'
 PACK = """BO_ 1 PackStatus: 8 BMS
@@ -64,18 +59,9 @@ def test_own_power_train_is_found_whole(tmp_path: Path) -> None:
     (tmp_path / "hv_powertrain.dbc").write_bytes((DBC / "hv_powertrain.dbc").read_bytes())
     guessed = found(tmp_path / "hv_powertrain.dbc")
     by_hand = read_layout(DBC / "hv_powertrain.toml")
-    assert {(b.source, b.sign, b.timeout_s) for b in guessed.branch} == {
-        (b.source, b.sign, b.timeout_s) for b in by_hand.branch
-    }
-    needed = {
-        "voltage",
-        "torque",
-        "speed",
-        "heater_demand",
-        "aircon_demand",
-        "low_voltage_demand",
-        "sensor_temperature",
-    }
+    told, wanted = ({(b.source, b.sign, b.timeout_s) for b in each.branch} for each in (guessed, by_hand))
+    assert told == wanted
+    needed = word_set("voltage torque speed heater_demand aircon_demand low_voltage_demand sensor_temperature")
     signals = {item.name: item.signal for item in guessed.input}
     assert signals.items() >= {item.name: item.signal for item in by_hand.input if item.name in needed}.items()
     assert set(by_hand.model_inputs) <= set(guessed.model_inputs)
@@ -183,11 +169,11 @@ Series = Mapping[str, Callable[[float], float]]
 
 
 def motor_a(t: float) -> float:
-    return 60.0 * math.sin(0.9 * t) + 30.0 * math.sin(2.1 * t + 1.0) + 20.0
+    return 60.0 * np.sin(0.9 * t) + 30.0 * np.sin(2.1 * t + 1.0) + 20.0
 
 
 def heater_a(t: float) -> float:
-    return 8.0 + 4.0 * math.copysign(1.0, math.sin(0.3 * t))
+    return 8.0 + 4.0 * np.sign(np.sin(0.3 * t))
 
 
 def battery_a(t: float) -> float:
@@ -242,7 +228,7 @@ def test_with_a_log_signs_are_told_against_convention(tmp_path: Path) -> None:
 
 def test_motor_that_does_not_follow_the_battery_is_none(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER)
-    log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 15.0 * math.sin(5.3 * t)})
+    log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 15.0 * np.sin(5.3 * t)})
     run = calibrator("layout", "init", dbc, "--log", log)
     assert run.returncode == 1
     assert "of the greatest of them: a branch is missing or wrong" in run.stderr
@@ -324,16 +310,16 @@ def test_i3_at_its_chargers(recording: str, shared_data: Path, tmp_path: Path) -
 # ---- tables and names
 
 
+TIME_S = np.arange(0.0, 60.0, 0.1)
+
+
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
-    rows = ["Zeit [s];Batteriestrom [A];Motorstrom [A];Heizungsstrom [A];Batteriespannung [V];Bordnetz [A]"]
-    for k in range(600):
-        t = 0.1 * k
-        values = (t, -battery_a(t), motor_a(t), heater_a(t), volts(t), 20.0 + (k * 7 % 11))
-        rows.append(";".join(f"{value:.2f}".replace(".", ",") for value in values))
-    path = tmp_path / "drive.csv"
-    path.write_text("\n".join(rows) + "\n")
-    return path
+    columns = {"Batteriestrom [A]": -battery_a(TIME_S), "Motorstrom [A]": motor_a(TIME_S)}
+    columns |= {"Heizungsstrom [A]": heater_a(TIME_S), "Batteriespannung [V]": volts(TIME_S)}
+    frame = pd.DataFrame({"Zeit [s]": TIME_S, **columns, "Bordnetz [A]": 20.0 + np.arange(600) * 7 % 11})
+    frame.to_csv(tmp_path / "drive.csv", sep=";", decimal=",", float_format="%.2f", index=False)
+    return tmp_path / "drive.csv"
 
 
 def test_columns_of_a_table_are_proposed(table: Path) -> None:
@@ -346,11 +332,12 @@ def test_columns_of_a_table_are_proposed(table: Path) -> None:
     assert calibrator("kirchhoff", table, "--layout", layout.path).returncode == 0
 
 
-def columns(path: Path, *names: str, delay_s: float = 0.0) -> Path:
+def columns(path: Path, *names: str, delay_s: float = 0.0, scale: float = 1.0) -> Path:
     """A table of battery, motor and heater under other names."""
-    times = [0.1 * k for k in range(900)]
-    rows = [(t, battery_a(t) + 2.0, 1.03 * motor_a(t), heater_a(t - delay_s)) for t in times]
-    path.write_text("\n".join([",".join(["time", *names]), *(",".join(f"{x:.4f}" for x in row) for row in rows)]))
+    time_s = np.arange(0.0, 90.0, 0.1)
+    currents_a = battery_a(time_s) + 2.0, 1.03 * scale * motor_a(time_s), heater_a(time_s - delay_s)
+    frame = pd.DataFrame({"time": time_s, **dict(zip(names, currents_a, strict=False))})
+    frame.to_csv(path, float_format="%.4f", index=False)
     return path
 
 
@@ -361,9 +348,8 @@ def test_current_that_closes_the_sum_is_a_branch_whatever_its_name(tmp_path: Pat
 
 
 def test_current_in_another_unit_than_its_header_says_is_named(tmp_path: Path) -> None:
-    rows = [f"{0.1 * k:.1f},{battery_a(0.1 * k):.3f},{1000.0 * motor_a(0.1 * k):.3f}" for k in range(900)]
-    (tmp_path / "x.csv").write_text("\n".join(["time,Ibat,Imot", *rows]))
-    run = calibrator("layout", "init", tmp_path / "x.csv", "--out", tmp_path / "x.toml", "--yes")
+    path = columns(tmp_path / "x.csv", "Ibat", "Imot", scale=1000.0)
+    run = calibrator("layout", "init", path, "--out", tmp_path / "x.toml", "--yes")
     assert run.returncode == 1
     assert "in mA?" in run.stderr
     assert not (tmp_path / "x.toml").exists()
@@ -371,11 +357,10 @@ def test_current_in_another_unit_than_its_header_says_is_named(tmp_path: Path) -
 
 def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
-    rows = ["time,PackStatus.PackCurrent [mA],PackVoltage,DcPower,ClimaStatus.HeaterCurrent"]
-    for t in (0.1 * k for k in range(600)):
-        values = (t, 1e3 * battery_a(t), volts(t), 1e-3 * motor_a(t) * volts(t), heater_a(t))
-        rows.append(",".join(f"{value:.4f}" for value in values))
-    (tmp_path / "x.csv").write_text("\n".join(rows))
+    kilowatts = 1e-3 * motor_a(TIME_S) * volts(TIME_S)
+    names = "time", "PackStatus.PackCurrent [mA]", "PackVoltage", "DcPower", "ClimaStatus.HeaterCurrent"
+    values = TIME_S, 1e3 * battery_a(TIME_S), volts(TIME_S), kilowatts, heater_a(TIME_S)
+    pd.DataFrame(dict(zip(names, values, strict=True))).to_csv(tmp_path / "x.csv", index=False)
     layout = found(dbc, "--log", tmp_path / "x.csv")
     assert {b.name: (b.source, b.sign) for b in layout.branch} == {
         "battery": ("PackStatus.PackCurrent", 1),
@@ -436,41 +421,8 @@ def test_json_has_every_candidate(tmp_path: Path) -> None:
 # ---- the dialogue
 
 
-class Screen:
-    """The command at a terminal of 80 columns and 24 lines; what it shows last."""
-
-    def __init__(self, *arguments: object) -> None:
-        self._ours, theirs = pty.openpty()
-        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-        environment = {key: value for key, value in os.environ.items() if key not in {"COLUMNS", "LINES"}}
-        self._run = subprocess.Popen(
-            [sys.executable, "-m", "calibrator", "layout", "init", *map(str, arguments)],
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
-            env={**environment, "TERM": "xterm-256color"},
-        )
-        os.close(theirs)
-        self._text = ""
-
-    def until(self, wanted: str) -> list[str]:
-        """Lines of the screen as soon as it has a text."""
-        while wanted not in (shown := self._text.rpartition("\x1b[H")[2]):
-            self._text += os.read(self._ours, 65536).decode()
-        return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line) for line in shown.splitlines()]
-
-    def press(self, keys: str) -> None:
-        self._text = ""
-        os.write(self._ours, keys.encode())
-
-    def ended(self) -> tuple[int, str]:
-        try:
-            while part := os.read(self._ours, 65536):
-                self._text += part.decode()
-        except OSError:  # EIO: the other end is closed
-            pass
-        os.close(self._ours)
-        return self._run.wait(), self._text
+def screen(*arguments: object) -> Screen:
+    return Screen("-m", "calibrator", "layout", "init", *map(str, arguments))
 
 
 DOWN = "\x1b[B"
@@ -478,15 +430,15 @@ DOWN = "\x1b[B"
 
 def test_dialogue_takes_and_leaves(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
-    screen = Screen(dbc, "--log", log_file(dbc, DRIVING), "--out", tmp_path / "car.toml")
-    lines = screen.until("q quit")
+    shown = screen(dbc, "--log", log_file(dbc, DRIVING), "--out", tmp_path / "car.toml")
+    lines = shown.until("q quit")
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
     assert any("[x]" in line and "HeaterCurrent" in line for line in lines)
-    screen.press(f"{DOWN}{DOWN} ")
-    assert any("[ ]" in line and "HeaterCurrent" in line for line in screen.until("q quit"))
-    screen.press("\r")
-    code, text = screen.ended()
+    shown.press(f"{DOWN}{DOWN} ")
+    assert any("[ ]" in line and "HeaterCurrent" in line for line in shown.until("q quit"))
+    shown.press("\r")
+    code, text = shown.ended()
     assert code == 0
     assert "branches battery, motor;" in text
     assert {b.name: b.sign for b in read_layout(tmp_path / "car.toml").branch} == {"battery": 1, "motor": -1}
@@ -495,11 +447,11 @@ def test_dialogue_takes_and_leaves(tmp_path: Path) -> None:
 def test_dialogue_writes_what_does_not_close_only_when_asked_again(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 0.2e-3 * motor_a(t) * volts(t)})
-    screen = Screen(dbc, "--log", log, "--out", tmp_path / "car.toml")
-    screen.until("q quit")
-    screen.press("\r")
-    screen.until("enter again writes it, but the sum of battery, motor")
+    shown = screen(dbc, "--log", log, "--out", tmp_path / "car.toml")
+    shown.until("q quit")
+    shown.press("\r")
+    shown.until("enter again writes it, but the sum of battery, motor")
     assert not (tmp_path / "car.toml").exists()
-    screen.press("\r")
-    assert screen.ended()[0] == 0
+    shown.press("\r")
+    assert shown.ended()[0] == 0
     assert (tmp_path / "car.toml").exists()

@@ -1,6 +1,7 @@
 """Results whose every number is known, without a calibration."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -81,38 +82,22 @@ def vehicle(
 
 def six_vehicles(database: VehicleDatabase) -> list[VehicleParameters]:
     """One of each kind."""
-    offset_or_drift = (
+    make, sound, corrected = partial(vehicle, database), sensor(), partial(sensor, apply=True)
+    hardware = HardwareFault(suspected=True, drift=-0.06, offset_a={"battery": 2.0, "motor": -2.0}, probability=0.97)
+    rivals = [
         Explanation(probability=0.6, offset_a={"battery": 8.0}),
         Explanation(probability=0.4, drift={"motor": -0.03}, hardware_drift=0.01),
-    )
-    moved_hardware = HardwareFault(
-        suspected=True, drift=-0.06, offset_a={"battery": 2.0, "motor": -2.0}, probability=0.97
-    )
+    ]
+    harmful, beyond = (partial(sensor, held_back=why) for why in ("harm limit", "beyond the limits"))
+    faultless, open_ = {"verdict": "no sensor fault"}, {"verdict": "cannot tell"}
+    decides = "a zero-current window (contactors open) would decide"
     return [
-        vehicle(database, "V1", sensor(0.1, 4.0, apply=True), sensor(), sums_a=(24.0, 0.5)),
-        vehicle(database, "V2", sensor(), sensor(), verdict="no sensor fault", sums_a=(0.4, 0.4)),
-        vehicle(
-            database, "V3", sensor(), sensor(), verdict="no sensor fault", sums_a=(0.6, 0.6), hardware=moved_hardware
-        ),
-        vehicle(
-            database,
-            "V4",
-            sensor(0.0, 8.0, held_back="harm limit", sd=0.02),
-            sensor(),
-            verdict="cannot tell",
-            sums_a=(8.0, 8.0),
-            explanations=offset_or_drift,
-            decides="a zero-current window (contactors open) would decide",
-        ),
-        vehicle(
-            database,
-            "V5",
-            sensor(),
-            sensor(0.45, 0.0, held_back="beyond the limits"),
-            verdict="cannot tell",
-            sums_a=(60.0, 60.0),
-        ),
-        vehicle(database, "V10", sensor(-0.05, 0.0, apply=True), sensor(0.0, -6.0, apply=True), sums_a=(13.0, 0.7)),
+        make("V1", corrected(0.1, 4.0), sound, sums_a=(24.0, 0.5)),
+        make("V2", sound, sound, **faultless, sums_a=(0.4, 0.4)),
+        make("V3", sound, sound, **faultless, sums_a=(0.6, 0.6), hardware=hardware),
+        make("V4", harmful(0.0, 8.0, sd=0.02), sound, **open_, sums_a=(8.0, 8.0), explanations=rivals, decides=decides),
+        make("V5", sound, beyond(0.45, 0.0), **open_, sums_a=(60.0, 60.0)),
+        make("V10", corrected(-0.05, 0.0), corrected(0.0, -6.0), sums_a=(13.0, 0.7)),
     ]
 
 
@@ -143,7 +128,6 @@ def write_result(
     *,
     left_out: Mapping[str, str] | None = None,
     moved: Mapping[tuple[str, str], str] | None = None,
-    method: str = "posterior",
     evidence: bool = True,
     created: str = "2026-01-01T00:00:00+00:00",
 ) -> Path:
@@ -154,36 +138,28 @@ def write_result(
     part_file(folder, 0).write_bytes(part)
     join_rows(folder, {})
     write_parameter_files(folder, vehicles=len(vehicles))
-    run = run_of(len(vehicles), left_out or {}, method=method, evidence=evidence)
-    write_run(folder, replace(run, created=created))
-    return folder
-
-
-def run_of(vehicles: int, left_out: Mapping[str, str], *, method: str, evidence: bool) -> RunRecord:
-    """How a result at hand was made."""
-    reference = {
-        "agreeing_share": {"battery": 0.8, "motor": 0.75},
-        "unmeasured_a": 0.3,
-    }
+    reference = {"agreeing_share": {"battery": 0.8, "motor": 0.75}, "unmeasured_a": 0.3}
     spread = {"model_spread": {"battery": 0.004, "motor": 0.005}}
     own = {"reference": reference, "hyperparameters": spread, "evidence": evidence_names(BRANCHES)}
-    return RunRecord(
+    run = RunRecord(
         tool="calibrator test",
-        method=method,
+        method="posterior",
         fleet="at hand",
         layout="hv_powertrain",
         branches=list(BRANCHES),
         model_inputs=[],
         settings={},
-        created="2026-01-01T00:00:00+00:00",
+        created=created,
         details=own if evidence else {},
-        vehicles=vehicles,
+        vehicles=len(vehicles),
         buckets=0,
         full_scale_a=FULL_SCALE_A,
-        left_out=dict(left_out),
-        left_out_count=len(left_out),
+        left_out=dict(left_out or {}),
+        left_out_count=len(left_out or {}),
         notices=[f"a notice with {EVIL}"],
     )
+    write_run(folder, run)
+    return folder
 
 
 def six_vehicle_result(folder: Path, database: VehicleDatabase) -> Path:

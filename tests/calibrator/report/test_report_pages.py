@@ -2,9 +2,9 @@
 
 import base64
 import gzip
+import html
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -51,26 +51,8 @@ def columns_of(page: str) -> dict[str, np.ndarray[Any, Any]]:
 
 def visible(page: str) -> str:
     """Text of a page outside scripts and styles, blanks together."""
-
-    class Reader(HTMLParser):
-        def __init__(self) -> None:
-            super().__init__()
-            self.parts: list[str] = []
-            self.hidden = 0
-
-        def handle_starttag(self, tag: str, attrs: object) -> None:
-            self.hidden += tag in {"script", "style"}
-
-        def handle_endtag(self, tag: str) -> None:
-            self.hidden -= tag in {"script", "style"}
-
-        def handle_data(self, data: str) -> None:
-            if not self.hidden:
-                self.parts.append(data)
-
-    reader = Reader()
-    reader.feed(page)
-    return " ".join(" ".join(reader.parts).split())
+    shown = re.sub(r"<(script|style)\b.*?</\1>|<[^>]*>", " ", page, flags=re.DOTALL)
+    return " ".join(html.unescape(shown).split())
 
 
 def test_every_figure_is_one_that_plotly_takes(result: Path) -> None:

@@ -1,14 +1,11 @@
 """What a bar shows, at any width, and what goes to a log instead."""
 
-import os
-import pty
 import re
-import subprocess
-import sys
 
 import pytest
 
 from calibrator.terminal.progress import numbered_passes, progress_bar, shown
+from tests.calibrator.screen import Screen
 
 
 def test_a_log_gets_lines_with_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -51,30 +48,13 @@ with progress_bar("read drives", 4, "vehicles") as done:
 """
 
 
-def in_terminal(*, interrupt: bool = False, **environment: str) -> bytes:
-    ours, theirs = pty.openpty()
-    run = subprocess.Popen(
-        [sys.executable, "-c", IN_TERMINAL.format(interrupt=interrupt)],
-        stderr=theirs,
-        stdout=subprocess.PIPE,
-        env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "80", **environment},
-    )
-    os.close(theirs)
-    text = b""
-    try:
-        while part := os.read(ours, 65536):
-            text += part
-    except OSError:  # EIO: the other end is closed
-        pass
-    os.close(ours)
-    out, _ = run.communicate()
-    assert out == b""
-    return text
+def in_terminal(*, interrupt: bool = False, columns: int = 80) -> str:
+    return Screen("-c", IN_TERMINAL.format(interrupt=interrupt), columns=columns).ended()[1]
 
 
 @pytest.mark.parametrize("columns", [30, 50, 80, 120])
 def test_a_line_fits_every_terminal_and_has_the_count(columns: int) -> None:
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", in_terminal(COLUMNS=str(columns)).decode())
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", in_terminal(columns=columns))
     lines = [line.rstrip() for line in re.split(r"[\r\n]+", text) if line.strip()]
     assert max(map(len, lines)) <= columns
     assert "4/4" in lines[-1]
@@ -83,12 +63,12 @@ def test_a_line_fits_every_terminal_and_has_the_count(columns: int) -> None:
 
 def test_a_terminal_gets_a_bar_with_colour() -> None:
     text = in_terminal()
-    assert "read drives" in text.decode()
-    assert "4/4 vehicles" in text.decode()
-    assert re.search(rb"\x1b\[[0-9;]*3[0-9;]*m", text)
+    assert "read drives" in text
+    assert "4/4 vehicles" in text
+    assert re.search(r"\x1b\[[0-9;]*3[0-9;]*m", text)
 
 
 def test_ctrl_c_leaves_the_cursor_and_a_new_line() -> None:
-    before, _, _ = in_terminal(interrupt=True).partition(b"Traceback")
-    assert before.rindex(b"\x1b[?25h") > before.rindex(b"\x1b[?25l")
-    assert before.rstrip(b"\x1b[?25h").endswith(b"\n")
+    before, _, _ = in_terminal(interrupt=True).partition("Traceback")
+    assert before.rindex("\x1b[?25h") > before.rindex("\x1b[?25l")
+    assert before.rstrip("\x1b[?25h").endswith("\n")
