@@ -1,6 +1,7 @@
 """Command line of the calibrator. Results go to stdout, progress and messages to stderr."""
 
 import sys
+from collections.abc import Callable
 from itertools import chain
 from typing import Annotated, Any
 
@@ -13,7 +14,7 @@ from calibrator.estimator.command import calibrate, identify, params
 from calibrator.experiments.command import experiment, score
 from calibrator.export.command import export
 from calibrator.kirchhoff.command import kirchhoff
-from calibrator.proposal.command import layout as layout_commands
+from calibrator.proposal.command import layout
 from calibrator.recordings.command import replay
 from calibrator.report.command import report
 from calibrator.repository.command import repository
@@ -24,22 +25,49 @@ from ecu_node import __version__
 
 __all__ = ["app", "main"]
 
-ORDER = {
-    "Commands to look at a recording": ("layout", "doctor", "kirchhoff", "replay"),
-    "Commands to calibrate": ("import", "summarise", "store", "calibrate", "params", "report", "export"),
-    "Commands to bring parameters to vehicles": ("repository",),
-    "Commands for research": ("simulate", "identify", "score", "experiment"),
+COMMANDS: dict[str, dict[str, tuple[Callable[..., None] | typer.Typer, list[str]]]] = {
+    "Commands to look at a recording": {
+        "layout": (layout, ["layout init my_car.dbc --out my_car.toml"]),
+        "doctor": (doctor, ["doctor --layout my_car.toml --log drive.blf"]),
+        "kirchhoff": (
+            kirchhoff,
+            [
+                "kirchhoff table.csv --branches battery=Ibat,-motor=Imot --plot sum.html",
+                "kirchhoff drive.blf --layout my_car.toml --plot sum.png",
+            ],
+        ),
+        "replay": (replay, ["replay drive.log --interface socketcan --channel vcan0"]),
+    },
+    "Commands to calibrate": {
+        "import": (import_, ["import logs --layout my_car.toml --out store"]),
+        "summarise": (summarise, ["summarise store --layout my_car.toml --out summaries"]),
+        "store": (store_app, ["store info summaries"]),
+        "calibrate": (
+            calibrate,
+            [
+                "calibrate drive.csv --layout my_car.toml --trusted battery --out result",
+                "calibrate fleet --layout my_car.toml --out result",
+            ],
+        ),
+        "params": (params, ["params result V001 V002 --out params"]),
+        "report": (report, ["report result"]),
+        "export": (export, ["export result/params/V001.json --layout my_car.toml --format c --out hv_calibration.c"]),
+    },
+    "Commands to bring parameters to vehicles": {"repository": (repository, ["repository add repo result/params"])},
+    "Commands for research": {
+        "simulate": (simulate, ["simulate --layout dbc/hv_powertrain.toml --vehicles 40 --currents 3 --out fleet"]),
+        "identify": (identify, ["identify store --layout my_car.toml --out bank.json"]),
+        "score": (score, ["score result --truth fleet/truth.json"]),
+        "experiment": (experiment, ["experiment sparsity --repetitions 2"]),
+    },
 }
-"""Commands in the order of use, by the heading under which ``--help`` lists them."""
+"""Commands with examples in the order of use, by the heading under which ``--help`` lists them."""
 
 
 class _InOrder(TyperGroup):
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 (typer's signature)
-        return list(chain.from_iterable(ORDER.values()))
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
-        width = max(map(len, self.list_commands(None)))
-        for heading, names in ORDER.items():
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 (typer's signature)
+        width = max(map(len, self.commands))
+        for heading, names in COMMANDS.items():
             with formatter.section(heading):
                 formatter.write_dl([(name.ljust(width), self.commands[name].short_help) for name in names])
 
@@ -50,37 +78,12 @@ app = command_app(
     no_args_is_help=True,
     epilog=example("calibrator kirchhoff table.csv --branches battery=Ibat,-motor=Imot"),
 )
-app.add_typer(layout_commands, name="layout", epilog=example("calibrator layout init my_car.dbc --out my_car.toml"))
-app.add_typer(store_app, name="store", epilog=example("calibrator store info summaries"))
-app.add_typer(repository, name="repository", epilog=example("calibrator repository add repo result/params"))
-for function, lines in (
-    (doctor, ["calibrator doctor --layout my_car.toml --log drive.blf"]),
-    (
-        kirchhoff,
-        [
-            "calibrator kirchhoff table.csv --branches battery=Ibat,-motor=Imot --plot sum.html",
-            "calibrator kirchhoff drive.blf --layout my_car.toml --plot sum.png",
-        ],
-    ),
-    (replay, ["calibrator replay drive.log --interface socketcan --channel vcan0"]),
-    (summarise, ["calibrator summarise store --layout my_car.toml --out summaries"]),
-    (
-        calibrate,
-        [
-            "calibrator calibrate drive.csv --layout my_car.toml --trusted battery --out result",
-            "calibrator calibrate fleet --layout my_car.toml --out result",
-        ],
-    ),
-    (params, ["calibrator params result V001 V002 --out params"]),
-    (report, ["calibrator report result"]),
-    (export, ["calibrator export result/params/V001.json --layout my_car.toml --format c --out hv_calibration.c"]),
-    (simulate, ["calibrator simulate --layout dbc/hv_powertrain.toml --vehicles 40 --currents 3 --out fleet"]),
-    (identify, ["calibrator identify store --layout my_car.toml --out bank.json"]),
-    (score, ["calibrator score result --truth fleet/truth.json"]),
-    (experiment, ["calibrator experiment sparsity --repetitions 2"]),
-):
-    app.command(epilog=example(*lines))(function)
-app.command("import", epilog=example("calibrator import logs --layout my_car.toml --out store"))(import_)
+for name, (command, lines) in chain.from_iterable(commands.items() for commands in COMMANDS.values()):
+    epilog = example(*(f"calibrator {line}" for line in lines))
+    if isinstance(command, typer.Typer):
+        app.add_typer(command, name=name, epilog=epilog)
+    else:
+        app.command(name, epilog=epilog)(command)
 
 
 def main() -> int:

@@ -250,11 +250,8 @@ def stuck(junction: RecordedJunction) -> Findings:
             ends = ~(currents_a[name].diff().abs() <= STUCK_ROUNDING * scale_a)  # also where it is not valid
             run = ends.cumsum()
             part = currents_a[run == run.mode()[0]]
-            start_s, duration_s, value_a = (
-                part.index[0],
-                float(part.index[-1] - part.index[0]),
-                float(part[name].iloc[0]),
-            )
+            start_s, value_a = part.index[0], float(part[name].iloc[0])
+            duration_s = float(part.index[-1] - start_s)
             low_a, high_a = (part[SUM] - part[name]).quantile(STUCK_RANGE)  # not of a step at the end
             others_a = float(high_a - low_a)
             moves = others_a > STUCK_MOVE * scale_a and abs(value_a) > STUCK_VALUE * scale_a

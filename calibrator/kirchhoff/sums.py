@@ -286,10 +286,7 @@ def _explained(
     time_s, measured_a = frames["before"].index.to_numpy(), frames["before"].to_numpy()
     channels = {name: drive.branches[name] for name in frames["before"]}
     good_s = [channel.time_s[channel.good] for channel in channels.values()]
-    load, formulas = (
-        database.layout.unmeasured_load,
-        [database.layout.find_branch(name).uncertainty for name in channels],
-    )
+    load, formulas = database.layout.unmeasured_load, [database.layout.find_branch(k).uncertainty for k in channels]
     slope = np.gradient(measured_a, time_s, axis=0) if len(time_s) > 1 else np.zeros_like(measured_a)
     step_a = np.array([step_of(database, name, drive) for name in channels])
     noise_a = np.array([_noise(channel.value[channel.good]) for channel in channels.values()])

@@ -94,10 +94,7 @@ def names(browser: webdriver.Chrome) -> list[str]:
 
 
 def test_it_opens_without_an_error_and_fetches_nothing(page: webdriver.Chrome) -> None:
-    page.execute_script("document.querySelectorAll('[data-figure]').forEach((at) => at.scrollIntoView())")
-    for name in ("junction", "sensors"):
-        page.execute_script(f"document.querySelector('[data-figure={name}]').scrollIntoView()")
-        until(page, f"return document.querySelector('[data-figure={name}]').dataset.drawn")
+    until(page, "return document.querySelectorAll('[data-figure][data-drawn]').length === 2")
     assert page.execute_script("return document.body.dataset.failed") is None
     assert page.get_log("browser") == []
     events = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]

@@ -1,5 +1,5 @@
 "use strict";
-// The report: unpacks the columns of its vehicles, draws figures when they come into sight, filters, sorts, explains.
+// The report: unpacks the columns of its vehicles, draws figures, filters, sorts, explains.
 (() => {
   const $ = (id) => document.getElementById(id);
   const facts = JSON.parse($("facts").textContent);
@@ -88,25 +88,10 @@
     place.dataset.drawn = "true";
   }
 
-  function drawWhenSeen() {
-    const places = document.querySelectorAll("[data-figure]");
-    const drawn = (place) => draw(place, facts.figures[place.dataset.figure]).catch(fail);
-    const watch = new IntersectionObserver((entries) => {
-      for (const { isIntersecting, target } of entries) {
-        if (!isIntersecting) continue;
-        watch.unobserve(target);
-        drawn(target);
-      }
-    }, { rootMargin: "400px" });
-    for (const place of places) watch.observe(place);
-    window.addEventListener("beforeprint", () => {
-      for (const place of places) if (!place.dataset.drawn) drawn(place);
-      for (const place of document.querySelectorAll(".plot[data-drawn]")) window.Plotly.relayout(place, { width: PRINT_WIDTH });
+  for (const [event, size] of [["beforeprint", { width: PRINT_WIDTH }], ["afterprint", { width: null, autosize: true }]])
+    window.addEventListener(event, () => {
+      for (const place of document.querySelectorAll(".plot[data-drawn]")) window.Plotly.relayout(place, size);
     });
-    window.addEventListener("afterprint", () => {
-      for (const place of document.querySelectorAll(".plot[data-drawn]")) window.Plotly.relayout(place, { width: null, autosize: true });
-    });
-  }
 
   // ---- the table of vehicles -----------------------------------------------------------------------------------
   const sensors = (j) => facts.branches.map((_, k) => j * K + k);
@@ -364,9 +349,9 @@
     const columns = await loadColumns();
     if (facts.alone) await show(0, columns);
     else vehicles(columns);
-    drawWhenSeen();
     await loadPlotly();
     document.body.dataset.ready = String(Math.round(performance.now()));
+    for (const place of document.querySelectorAll("[data-figure]")) await draw(place, facts.figures[place.dataset.figure]);
   }
   start().catch(fail);
 })();

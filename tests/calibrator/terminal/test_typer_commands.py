@@ -6,7 +6,7 @@ from typing import Annotated
 import pytest
 import typer
 
-from calibrator.cli import ORDER
+from calibrator.cli import COMMANDS as ALL
 from calibrator.cli import app as calibrator_app
 from calibrator.errors import ContradictionError, FleetError
 from calibrator.processes.run_many import Workers, run_many
@@ -77,7 +77,7 @@ def test_help_is_not_cut_and_tells_exit_codes(capsys: pytest.CaptureFixture[str]
 
 
 COMMANDS = [[], ["layout"], ["layout", "init"], ["repository"], ["repository", "init"], ["repository", "add"]]
-COMMANDS += [[name] for names in ORDER.values() for name in names if [name] not in COMMANDS]
+COMMANDS += [[name] for names in ALL.values() for name in names if [name] not in COMMANDS]
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
