@@ -109,6 +109,8 @@ MISTAKES = [
     ("calibrator kirchhoff drive.csv CURRENTS --table drive.csv", 2, "drive.csv"),
     ("calibrator kirchhoff drive.csv CURRENTS --parameters noise", 2, "--parameters belong to a layout"),
     ("calibrator kirchhoff drive.csv CURRENTS --channel can0", 2, "either a LOG, or --interface and --channel"),
+    ("calibrator kirchhoff drive.csv CURRENTS --dbc car.dbc", 2, "--dbc goes with --layout"),
+    ("calibrator kirchhoff drive.csv CURRENTS --duration 9", 2, "--duration is that of a live bus"),
     ("calibrator kirchhoff --interface virtual CAR", 2, "either a LOG, or --interface and --channel"),
     ("calibrator kirchhoff drive.csv --branches sum=Ibat,motor=Imot", 1, "branch 'sum' is called like the sum"),
     ("calibrator layout init none.dbc --log drive.csv --out x", 1, "none.dbc"),

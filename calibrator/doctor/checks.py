@@ -145,11 +145,13 @@ def full_scale(facts: Facts) -> Findings:
     scale_a, junction = facts.database.layout.full_scale_a, facts.junction
     right = dict(zip(junction.branches, np.abs(junction.multipliers).tolist(), strict=True))
     names = facts.database.layout.branch_names
-    peaks_a = {name: right.get(name, 1.0) * float(np.abs(facts.values(name)).max(initial=0.0)) for name in names}
+    values_a = {name: right.get(name, 1.0) * np.abs(facts.values(name)) for name in names}
+    peaks_a = {name: float(value_a.max(initial=0.0)) for name, value_a in values_a.items()}
     for name, peak_a in peaks_a.items():
         if peak_a > scale_a:
-            text = f"it reaches {figure(peak_a)} A, and full_scale_a is {figure(scale_a)} A"
-            advice = "raise full_scale_a in the layout to the nominal maximum of the junction, if the value is right"
+            beyond = f"{np.sum(values_a[name] > scale_a):,} of {len(values_a[name]):,} values"
+            text = f"it reaches {figure(peak_a)} A: {beyond} are beyond full_scale_a = {figure(scale_a)} A"
+            advice = "raise that to the nominal maximum of the junction, or take wild values out of the recording"
             yield warning("full scale", name, text, advice, peak_a)
     greatest_a = max(peaks_a.values())
     if 0.0 < greatest_a < LEAST_OF_SCALE * scale_a and not junction.stands_still:

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,12 +13,17 @@ from calibrator.terminal.options import DbcOption, JsonOption, number_option
 from calibrator.terminal.text import dumps
 from ecu_node.program import say_error, write_output
 
+if TYPE_CHECKING:
+    from ecu_node.database import VehicleDatabase
+
 __all__ = ["kirchhoff"]
 
 PICTURES, TABLES = (".png", ".pdf", ".svg", ".html"), (".csv", ".parquet")
 """Ends of the names of files that can be written."""
 TOLD = ("too short", "stands still", "delay")
 """Hints that are told: what the figures cannot tell, and what no figure shows."""
+USUAL_S = 30.0
+"""How long is listened to a bus. [s]"""
 USUAL_SCALE_A = 500.0
 """Currents are plausible up to it where nothing tells full scale but the currents themselves. [A]"""
 
@@ -46,22 +51,24 @@ def kirchhoff(
     interface: Annotated[str | None, typer.Option(help="Listen to a bus of this python-can interface.")] = None,
     channel: Annotated[str | None, typer.Option(help="Channel of the bus, such as vcan0.")] = None,
     duration: Annotated[
-        float, number_option("--duration", 0.1, 86400.0, "How long to listen, or until Ctrl-C [s]")
-    ] = 30.0,
+        float | None,
+        number_option("--duration", 0.1, 86400.0, f"How long to listen, or until Ctrl-C; {USUAL_S:g} without it [s]"),
+    ] = None,
     plot: Annotated[Path | None, typer.Option(help=f"Draw the currents ({' '.join(PICTURES)}).")] = None,
     table: Annotated[Path | None, typer.Option(help=f"Write the currents ({' '.join(TABLES)}).")] = None,
     json: JsonOption = False,
 ) -> None:
     """Print the branch currents and their sum, before and after correction, and what is expected of right sensors."""
-    with_layout = (
-        "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table"
-    )
     for what, is_wrong in {
         "give either a LOG, or --interface and --channel of a live bus": (
             len({log is None, interface is not None, channel is not None}) > 1
         ),
-        with_layout: (layout is None) == (branches is None),
+        "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table": (
+            (layout is None) == (branches is None)
+        ),
         "--full-scale goes with --branches; a layout has full_scale_a": full_scale is not None and branches is None,
+        "--dbc goes with --layout": dbc is not None and layout is None,
+        "--duration is that of a live bus; a LOG is read whole": duration is not None and log is not None,
         "--parameters belong to a layout; give --layout, not --branches": parameters is not None and layout is None,
     }.items():
         if is_wrong:
@@ -97,13 +104,11 @@ def kirchhoff(
     if (found := None if parameters is None else read_parameters(parameters)) is not None:
         check_fit(found, database, None)
     vehicle, where = database.layout.name, f"{interface}:{channel}" if log is None else log.name
-    recording = (
-        read_recording(log, database, vehicle=vehicle, name=where.partition(".")[0])
-        if log is not None
-        else drive_from_frames(
-            record_bus(str(interface), channel, duration), database, vehicle=vehicle, name="live", where=where
-        )
-    )
+    if log is None:
+        frames = record_bus(str(interface), channel, duration or USUAL_S)
+        recording = drive_from_frames(frames, database, vehicle=vehicle, name="live", where=where)
+    else:
+        recording = read_recording(log, database, vehicle=vehicle, name=where.partition(".")[0])
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:
         draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {where}")
@@ -118,20 +123,17 @@ def kirchhoff(
     if json:
         write_output(dumps(comparison.as_json() | {"notices": notices, "findings": findings}))
         return
-    for each in findings:
-        is_told = each.subject == "sum" and each.code in TOLD
-        notices.append(each.text if is_told else f"{each.severity}: {each.line}")
+    told = [each.subject == "sum" and each.code in TOLD for each in findings]
+    notices += [f.text if is_told else f"{f.severity}: {f.line}" for f, is_told in zip(findings, told, strict=True)]
     write_output(kirchhoff_text(comparison, notices))
-    if (
-        log is not None
-        and "after" not in comparison.stages
-        and not any(branch.computed for branch in database.layout.branch if branches)
-    ):
-        say_error(f"next: calibrator {_next_step(log, layout, branches)}")
+    if log is not None and "after" not in comparison.stages and (step := _next_step(log, layout, branches, database)):
+        say_error(f"next: calibrator {step}")
 
 
-def _next_step(log: Path, layout: Path | None, branches: str | None) -> str:
-    """How to have a correction of a log that has none."""
+def _next_step(log: Path, layout: Path | None, branches: str | None, database: "VehicleDatabase") -> str:
+    """How to have a correction of a log that has none; empty if there is no short way, as with formulas."""
     if layout is not None:
         return f"calibrate {quote(str(log))} --layout {quote(str(layout))} --trusted BRANCH --out result"
+    if any(branch.computed for branch in database.layout.branch):
+        return ""
     return f"layout init {quote(str(log))} --branches {quote(str(branches))} --out my_car.toml"

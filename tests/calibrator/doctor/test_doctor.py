@@ -304,6 +304,7 @@ def test_time_out_shorter_than_the_period_is_an_error(log: Path, layout: Path) -
 def test_full_scale_that_is_exceeded_or_never_approached_is_told(log: Path, tmp_path: Path) -> None:
     beyond = examined(write_layout(tmp_path, full_scale_a=50.0), log).findings("full scale")
     assert {item.subject for item in beyond} == {"battery", "motor"}
+    assert all(re.search(r"[0-9,]+ of [0-9]+,000 values are beyond full_scale_a = 50 A", item.text) for item in beyond)
     (far,) = examined(write_layout(tmp_path, full_scale_a=20000.0), log).findings("full scale")
     assert far.subject == "all branches"
     assert "full_scale_a is 20,000 A" in far.text

@@ -165,18 +165,18 @@ def test_other_databases_do_as_well(kind: str, tmp_path: Path) -> None:
 
 # ---- with a log
 
-Series = Mapping[str, Callable[[float], float]]
+Series = Mapping[str, Callable[[Any], Any]]
 
 
-def motor_a(t: float) -> float:
+def motor_a(t: Any) -> Any:
     return 60.0 * np.sin(0.9 * t) + 30.0 * np.sin(2.1 * t + 1.0) + 20.0
 
 
-def heater_a(t: float) -> float:
+def heater_a(t: Any) -> Any:
     return 8.0 + 4.0 * np.sign(np.sin(0.3 * t))
 
 
-def battery_a(t: float) -> float:
+def battery_a(t: Any) -> Any:
     return motor_a(t) + heater_a(t) + 2.0
 
 
@@ -184,7 +184,7 @@ def nothing_a(_: float) -> float:
     return 0.0
 
 
-def volts(t: float) -> float:
+def volts(t: Any) -> Any:
     return 390.0 - 0.1 * battery_a(t)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -89,7 +90,8 @@ def six_vehicles(database: VehicleDatabase) -> list[VehicleParameters]:
         Explanation(probability=0.4, drift={"motor": -0.03}, hardware_drift=0.01),
     ]
     harmful, beyond = (partial(sensor, held_back=why) for why in ("harm limit", "beyond the limits"))
-    faultless, open_ = {"verdict": "no sensor fault"}, {"verdict": "cannot tell"}
+    faultless: dict[str, Any] = {"verdict": "no sensor fault"}
+    open_: dict[str, Any] = {"verdict": "cannot tell"}
     decides = "a zero-current window (contactors open) would decide"
     return [
         make("V1", corrected(0.1, 4.0), sound, sums_a=(24.0, 0.5)),
