@@ -104,11 +104,17 @@ def kirchhoff(
     if (found := None if parameters is None else read_parameters(parameters)) is not None:
         check_fit(found, database, None)
     vehicle, where = database.layout.name, f"{interface}:{channel}" if log is None else log.name
-    if log is None:
-        frames = record_bus(str(interface), channel, duration or USUAL_S)
-        recording = drive_from_frames(frames, database, vehicle=vehicle, name="live", where=where)
-    else:
-        recording = read_recording(log, database, vehicle=vehicle, name=where.partition(".")[0])
+    recording = (
+        drive_from_frames(
+            record_bus(str(interface), channel, duration or USUAL_S),
+            database,
+            vehicle=vehicle,
+            name="live",
+            where=where,
+        )
+        if log is None
+        else read_recording(log, database, vehicle=vehicle, name=where.partition(".")[0])
+    )
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:
         draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {where}")
