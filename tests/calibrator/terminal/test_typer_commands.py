@@ -1,10 +1,12 @@
 """What command lines made with typer share."""
 
 import re
-from typing import Annotated
+from collections.abc import Iterator
+from typing import Annotated, Any
 
 import pytest
 import typer
+from typer.main import get_command
 
 from calibrator.cli import COMMANDS as ALL
 from calibrator.cli import app as calibrator_app
@@ -90,6 +92,22 @@ def test_help_has_an_example_and_words_that_people_use(
     assert max(map(len, text.splitlines())) <= 80
     assert f"Example:\n    {' '.join(['calibrator', *command])} " in text
     assert re.search(r"list\[|<[a-zA-Z]+>|[{}]|e\+[0-9]", text) is None
+
+
+def number_options(command: Any, *words: str) -> Iterator[list[str]]:
+    """Words that call each option that is a number."""
+    for name, each in getattr(command, "commands", {}).items():
+        yield from number_options(each, *words, name)
+    yield from ([*words, option.opts[0]] for option in command.params if option.metavar == "NUMBER")
+
+
+@pytest.mark.parametrize("given", ["few", "nan", "inf"])
+def test_every_number_has_bounds_and_is_looked_at_first(given: str, capsys: pytest.CaptureFixture[str]) -> None:
+    options = [*number_options(get_command(calibrator_app))]
+    assert len(options) > 20
+    for words in options:
+        assert run_app(calibrator_app, "calibrator", [*words, given]) == 2
+        assert re.search(f"'{words[-1]}': {given}: expected a (whole )?number from .* to", capsys.readouterr().err)
 
 
 def test_ctrl_c_ends_a_tool_with_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
