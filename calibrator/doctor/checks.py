@@ -53,7 +53,7 @@ def logs_as_a_whole(facts: Facts) -> Findings:
 
 
 def absent(facts: Facts) -> Findings:
-    """Branches and inputs that no log has."""
+    """Branches and inputs that no log has, and branches that some logs lack."""
     what, where = "frame of", "record the bus that carries it"
     if not facts.database.layout.dbc_files:
         what, where = "column of numbers", "name the column that has it"
@@ -64,6 +64,11 @@ def absent(facts: Facts) -> Findings:
         elif row.needed:
             say, advice = warning, f"{where}, or name other inputs: without it what is derived from it is left out"
         yield say("not in log", row.name, f"no {what} {row.signal} in the logs", advice)
+    some = facts.channels.is_branch & facts.channels.in_logs.between(1, len(facts.drives) - 1)
+    for row in facts.channels[some].itertuples():
+        text = f"{row.in_logs} of {len(facts.drives)} logs have it; the others are not in the sum"
+        advice = "leave out logs that lack it, or record it in all: 'calibrate' may take it as not fitted"
+        yield warning("not in log", row.name, text, advice, row.in_logs)
 
 
 def late(facts: Facts) -> Findings:

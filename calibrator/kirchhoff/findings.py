@@ -207,8 +207,9 @@ def delays(junction: RecordedJunction) -> Findings:
 
 
 def gains(junction: RecordedJunction) -> Findings:
-    """The branch whose gain alone would explain most of how the sum varies, in the first recording."""
-    for residual in filter(None, (comparison.residual["before"] for comparison in junction.comparisons[:1])):
+    """The branch whose gain alone would explain most of how the sum varies, in the longest recording."""
+    by_length = sorted(junction.comparisons, key=lambda each: each.valid.sum())
+    for residual in filter(None, (comparison.residual["before"] for comparison in by_length[-1:])):
         alone: dict[str, dict[str, float]] = residual["alone"]
         if junction.changed or not alone or residual["gains"] < max(residual["delays"], LEAST_SHARE * residual["rest"]):
             return

@@ -22,6 +22,7 @@ __all__ = [
     "overview_of",
     "percent",
     "probability",
+    "share",
     "steps_to_take",
     "workshop_list",
 ]
@@ -245,6 +246,12 @@ def amperes(value: float | None, *, digits: int = 2, sign: bool = False) -> str:
 def percent(value: float | None, digits: int, *, sign: bool = False) -> str:
     """A share or a relative change [1] in percent."""
     return _number(None if value is None else 100.0 * value, digits, sign=sign, unit=" %")
+
+
+def share(part: int, whole: int) -> str:
+    """A share of vehicles in whole percent: neither none nor all where there is one that tells otherwise."""
+    percents = 100.0 * part / whole
+    return "< 1 %" if 0.0 < percents < 0.5 else "> 99 %" if 99.5 <= percents < 100.0 else f"{percents:.0f} %"
 
 
 def probability(value: float | None) -> str:

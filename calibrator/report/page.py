@@ -32,6 +32,7 @@ from calibrator.report.overview import (
     overview_of,
     percent,
     probability,
+    share,
     steps_to_take,
     workshop_list,
 )
@@ -232,7 +233,13 @@ def _template() -> Any:
     )
     environment.policies["json.dumps_function"] = lambda value, **_: msgspec.json.encode(value).decode()
     environment.globals |= {"amperes": amperes, "counted": counted, "percent": percent, "probability": probability}
-    environment.globals |= {"few": few, "MOST_POINTS": MOST_POINTS, "MOST_WORKSHOP": MOST_WORKSHOP, "SIGMAS": SIGMAS}
+    environment.globals |= {
+        "few": few,
+        "share": share,
+        "MOST_POINTS": MOST_POINTS,
+        "MOST_WORKSHOP": MOST_WORKSHOP,
+        "SIGMAS": SIGMAS,
+    }
     return environment.get_template("page.html")
 
 

@@ -241,8 +241,9 @@ def test_delay_is_found_and_is_no_error(
 
 def test_gain_below_a_slip_of_units_is_told_in_percent(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     drive = true_drive()
+    short = write_log(tmp_path, cut(drive, 12.0), database).rename(tmp_path / "short.log")
     log = write_log(tmp_path, with_branch(drive, "motor", 1.08 * drive.branches["motor"].value), database)
-    told = examined(layout, log)
+    told = examined(layout, short, log)
     assert told.errors == []
     (gain,) = told.findings("gain")
     assert gain.subject in {"motor", "battery"}
@@ -320,6 +321,16 @@ def test_log_of_another_vehicle_is_an_error_that_names_what_it_has(tmp_path: Pat
     assert error.severity == "error"
     assert "0x7FF" in error.text
     assert told.report["ready"] == []
+
+
+def test_branch_that_some_logs_lack_is_told(log: Path, layout: Path, tmp_path: Path) -> None:
+    without = [line for line in log.read_text().splitlines() if "can0 120#" not in line]
+    (tmp_path / "other.log").write_text("\n".join(without))
+    (lacks,) = [
+        item for item in examined(layout, log, tmp_path / "other.log").findings("not in log") if item.subject == "motor"
+    ]
+    assert (lacks.severity, lacks.number) == ("warning", 1)
+    assert lacks.text.startswith("1 of 2 logs have it; the others are not in the sum")
 
 
 # ---- doctor, kirchhoff and calibrate say the same

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from calibrator.errors import FleetError
 from calibrator.report import page as page_module
+from calibrator.report.overview import share
 from calibrator.report.page import fleet_report, vehicle_report
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import Explanation, SensorFinding
@@ -155,3 +156,11 @@ def test_a_vehicle_that_was_left_out_is_told_why(result: Path) -> None:
         vehicle_report(result, f"log of {EVIL}")
     with pytest.raises(FleetError, match="no vehicle 'V99' in it"):
         vehicle_report(result, "V99")
+
+
+@pytest.mark.parametrize(
+    ("part", "whole", "text"),
+    [(0, 9, "0 %"), (1, 3000, "< 1 %"), (1, 3, "33 %"), (2999, 3000, "> 99 %"), (9, 9, "100 %")],
+)
+def test_share_of_few_vehicles_is_neither_none_nor_all(part: int, whole: int, text: str) -> None:
+    assert share(part, whole) == text
