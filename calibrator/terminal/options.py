@@ -5,7 +5,8 @@ Upper bounds are far beyond what a vehicle has; they catch slips of units before
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -47,11 +48,13 @@ MAX_TIME_LIMIT_S = 86_400.0
 """A day. [s]"""
 
 
-def number_option(name: str, low: float, high: float, meaning: str) -> Any:
+def _bounded(kind: type[float], name: str, low: float, high: float, meaning: str) -> Any:
     """Make an option that is a finite number between bounds; whatever else is given is named with what is expected.
 
     Parameters
     ----------
+    kind : type
+        ``float``, or ``int`` for whole numbers.
     name : str
         Of the option, with its dashes.
     low, high : float
@@ -62,32 +65,24 @@ def number_option(name: str, low: float, high: float, meaning: str) -> Any:
     Returns
     -------
     typer's option
-        For ``Annotated[float, ...]``.
+        For ``Annotated[float, ...]`` or ``Annotated[int, ...]``.
     """
-    return _bounded(name, low, high, meaning, read=float, what="a number")
 
-
-def whole_option(name: str, low: int, high: int, meaning: str) -> Any:
-    """Make an option that is a whole number between bounds; parameters and result as for :func:`number_option`."""
-
-    def whole(text: str) -> float:
-        return int(text) if re.fullmatch(r"[+-]?[0-9]{1,20}", text) else math.nan
-
-    return _bounded(name, low, high, meaning, read=whole, what="a whole number")
-
-
-def _bounded(name: str, low: float, high: float, meaning: str, *, read: Callable[[str], float], what: str) -> Any:
     def parse(given: str | float) -> float:
         try:
-            value = read(str(given))
+            value = kind(given)
         except ValueError:
             value = math.nan
         if not low <= value <= high:  # nor is not-a-number
-            raise typer.BadParameter(f"{given}: expected {what} from {low:.16g} to {high:.16g}")
+            what = "number" if kind is float else "whole number"
+            raise typer.BadParameter(f"{given}: expected a {what} from {low:.16g} to {high:.16g}")
         return value
 
     bounds = f"{low:g} to {high:.12g}" if high < FAR else f"{low:g} or more"
     return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {bounds}.")
+
+
+number_option, whole_option = partial(_bounded, float), partial(_bounded, int)
 
 
 def _branches(value: str | None) -> str | None:
