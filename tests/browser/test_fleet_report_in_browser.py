@@ -135,9 +135,7 @@ def test_an_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     assert peaks[0][2] > peaks[1][2], "the more probable, the larger"
 
 
-def test_what_is_not_known_is_never_a_zero(
-    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
-) -> None:
+def test_what_is_not_known_is_no_zero(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
     lost = replace(sensor(), drift_sd=None, offset_sd_a=None, fault_probability=None, delay_s=None)
     items = [
         vehicle(database, "V1", lost, lost, verdict="cannot tell"),
@@ -213,9 +211,7 @@ def test_text_can_be_read_against_its_background(page: webdriver.Chrome) -> None
     assert [item for item in found if item[0] < LEAST_CONTRAST] == []
 
 
-def test_one_junction_by_itself_opens_without_an_error(
-    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
-) -> None:
+def test_junction_opens_without_an_error(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
     rivals = [Explanation(probability=0.6), Explanation(probability=0.4, offset_a={"motor": 2.2})]
     mixed = replace(sensor(0.0, 0.9, sd=0.011), identifiable=False)
     item = vehicle(database, "car", sensor(0.1, 4.0, apply=True), mixed, explanations=rivals)

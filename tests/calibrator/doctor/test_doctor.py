@@ -119,9 +119,7 @@ def test_car_at_rest_is_called_so_without_an_error_and_taken_by_calibrate(
     assert calibrated(tmp_path, log, layout, "--trusted", "battery")[0] == 0
 
 
-def test_currents_that_stand_still_while_the_car_drives_are_not_called_rest(
-    tmp_path: Path, layout: Path, database: VehicleDatabase
-) -> None:
+def test_still_currents_of_a_driving_car_are_no_rest(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     told = examined(layout, at_rest(database, tmp_path, noise_a=0.02, speed=50.0))
     assert told.findings("stands still") == []
     assert [item.subject for item in told.findings("full scale")] == ["all branches"]
@@ -172,9 +170,7 @@ def test_all_signs_inverted_are_told_by_the_voltage(log: Path, tmp_path: Path) -
         ("auxiliary", "AuxiliaryCurrent", "kA", 0.001),
     ],
 )
-def test_slip_of_a_unit_is_found_with_its_factor(
-    branch: str, signal: str, unit: str, factor: float, log: Path, tmp_path: Path
-) -> None:
+def test_unit_slip_gives_factor(branch: str, signal: str, unit: str, factor: float, log: Path, tmp_path: Path) -> None:
     told = examined(write_layout(tmp_path, units={signal: unit}), log)
     assert told.errors == [("unit", branch)]
     assert told.findings("unit")[0].number == factor
@@ -209,9 +205,7 @@ def test_unrelated_currents_are_an_error_of_the_sum(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("factor", "wrong"), [(1.0, []), (1000.0, [("unit", "U [V]")]), (0.01, [("unit", "U [V]")])])
-def test_voltage_that_no_vehicle_has_is_blamed_for_the_powers(
-    factor: float, wrong: list[tuple[str, str]], tmp_path: Path
-) -> None:
+def test_impossible_voltage_is_blamed_for_powers(factor: float, wrong: list[tuple[str, str]], tmp_path: Path) -> None:
     rows = np.repeat(TRUE, 10, axis=0)
     volts = 400.0 - 0.1 * rows[:, 0]
     columns = {"t [s]": 0.1 * np.arange(len(rows)), "I": rows[:, 0], "P [W]": rows[:, 1:].sum(axis=1) * volts}
@@ -228,9 +222,7 @@ def test_voltage_that_no_vehicle_has_is_blamed_for_the_powers(
 
 
 @pytest.mark.parametrize("delay_s", [0.06, 0.2, -0.3])
-def test_delay_is_found_and_is_no_error(
-    delay_s: float, tmp_path: Path, layout: Path, database: VehicleDatabase
-) -> None:
+def test_delay_is_found_as_no_error(delay_s: float, tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     late = {"motor": 0.4 + delay_s, "battery": 0.4, "auxiliary": 0.4, "dcdc": 0.4}
     told = examined(layout, write_log(tmp_path, true_drive(delay_s=late), database))
     assert told.errors == []
@@ -269,9 +261,7 @@ def test_clipped_branch_is_found(tmp_path: Path, layout: Path, database: Vehicle
     assert [item.subject for item in examined(layout, log).findings("clipped")] == ["battery"]
 
 
-def test_constant_branch_and_one_without_values_are_told(
-    tmp_path: Path, layout: Path, database: VehicleDatabase
-) -> None:
+def test_constant_branch_and_one_without_values(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     drive = with_branch(true_drive(), "auxiliary", np.full(2400, -5.0))
     told = examined(layout, write_log(tmp_path, with_branch(drive, "dcdc", np.full(1200, np.nan)), database))
     assert [item.subject for item in told.findings("constant")] == ["auxiliary"]
@@ -337,9 +327,7 @@ def test_branch_that_some_logs_lack_is_told(log: Path, layout: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("seconds", [3.0, 12.0, 40.0])
-def test_short_log_is_called_so_by_kirchhoff(
-    seconds: float, tmp_path: Path, layout: Path, database: VehicleDatabase
-) -> None:
+def test_short_log_is_told_by_both(seconds: float, tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     log = write_log(tmp_path, cut(true_drive(), seconds), database)
     told = examined(layout, log)
     assert told.errors == []
@@ -365,9 +353,7 @@ def exchange(layout: Path, one: str, other: str) -> None:
     layout.write_text(mark.replace("signal = @", f"signal = {second[1]}"))
 
 
-def test_exchanged_branches_of_other_signs_are_an_error_that_calibrate_refuses(
-    log: Path, layout: Path, tmp_path: Path
-) -> None:
+def test_exchanged_branches_of_other_signs_are_an_error(log: Path, layout: Path, tmp_path: Path) -> None:
     exchange(layout, "battery", "motor")
     told = examined(layout, log)
     assert told.errors == [("exchanged", "battery")]

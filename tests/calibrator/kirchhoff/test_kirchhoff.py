@@ -278,9 +278,7 @@ def test_table_has_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
-def test_live_bus_gives_the_figures_of_its_log(
-    interrupted: bool, log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_live_bus_gives_figures_of_its_log(interrupted: bool, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def send() -> None:
         while not channels.get("live"):  # until the command listens
             time.sleep(0.01)

@@ -52,6 +52,10 @@ def sources(layout: Layout) -> dict[str, str]:
     return {branch.name: branch.source for branch in layout.branch}
 
 
+def signed(layout: Layout) -> dict[str, tuple[str, int]]:
+    return {branch.name: (branch.source, branch.sign) for branch in layout.branch}
+
+
 # ---- from a database alone
 
 
@@ -280,7 +284,7 @@ def test_tesla_gives_its_three_branches(shared_data: Path, tmp_path: Path) -> No
     started = time.process_time()
     layout = found(tmp_path / "Model3CAN.dbc", "--log", shared_data / "tesla_model3" / "drive.log.gz")
     assert time.process_time() - started < 10.0
-    assert {branch.name: (branch.source, branch.sign) for branch in layout.branch} == {
+    assert signed(layout) == {
         "battery": ("ID132HVBattAmpVolt.SmoothBattCurrent132", 1),
         "motor_rear": ("ID266RearInverterPower.RearPower266", -1),
         "motor_front": ("ID2E5FrontInverterPower.FrontPower2E5", -1),
@@ -301,7 +305,7 @@ def test_i3_at_its_chargers(recording: str, shared_data: Path, tmp_path: Path) -
     """Real ones, of 9 to 40 s; in two of them the current does not change, and only its mean tells the signs."""
     log = shared_data / "bmw_i3_charging" / f"2019_{recording}.csv.gz"
     layout = found(database_file(tmp_path, I3), "--log", log)
-    assert {branch.name: (branch.source, branch.sign) for branch in layout.branch} == {
+    assert signed(layout) == {
         "battery": ("Battery112.Battery_Current", -1),
         "charger": ("Charger2B2.CHG_Amps", 1),
     }
@@ -324,7 +328,7 @@ def table(tmp_path: Path) -> Path:
 
 def test_columns_of_a_table_are_proposed(table: Path) -> None:
     layout = found(table)
-    assert {branch.name: (branch.source, branch.sign) for branch in layout.branch} == {
+    assert signed(layout) == {
         "battery": ("Batteriestrom [A]", -1),
         "motor": ("Motorstrom [A]", -1),
         "heater": ("Heizungsstrom [A]", -1),
@@ -362,7 +366,7 @@ def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
     values = TIME_S, 1e3 * battery_a(TIME_S), volts(TIME_S), kilowatts, heater_a(TIME_S)
     pd.DataFrame(dict(zip(names, values, strict=True))).to_csv(tmp_path / "x.csv", index=False)
     layout = found(dbc, "--log", tmp_path / "x.csv")
-    assert {b.name: (b.source, b.sign) for b in layout.branch} == {
+    assert signed(layout) == {
         "battery": ("PackStatus.PackCurrent", 1),
         "motor": ("InverterStatus.DcPower", -1),
         "heater": ("ClimaStatus.HeaterCurrent", -1),
@@ -380,27 +384,27 @@ def test_named_branches_are_written_without_a_guess(table: Path) -> None:
     ]
 
 
-def test_mistake_with_a_database_is_one_line(tmp_path: Path) -> None:
-    dbc = database_file(tmp_path, PACK, INVERTER)
-    two = database_file(tmp_path, PACK, PACK.replace("1 PackStatus", "9 Twin"), name="two.dbc")
+@pytest.mark.parametrize(("line", "said"), [
+    ("none.dbc", "no such file"),
+    ("car.dbc --log other.log", "none of its identifiers is in"),
+    ("car.dbc --log other.csv", "none of its columns is in"),
+    ("two.dbc --log two.csv", "column 'PackCurrent' could be PackStatus.PackCurrent and Twin.PackCurr"),
+    ("other.log --log car.dbc", "the database comes first"),
+    ("car.dbc --out there.toml", "exists, and is not overwritten"),
+])  # fmt: skip
+def test_mistake_with_a_database_is_one_line(
+    line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database_file(tmp_path, PACK, INVERTER)
+    database_file(tmp_path, PACK, PACK.replace("1 PackStatus", "9 Twin"), name="two.dbc")
     (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n")
     (tmp_path / "other.csv").write_text("time,a\n0,1\n1,2\n")
     (tmp_path / "two.csv").write_text("time,PackCurrent\n0,1\n1,2\n")
     (tmp_path / "there.toml").write_text("kept")
-    for arguments, said in (
-        ((tmp_path / "none.dbc",), "no such file"),
-        ((dbc, "--log", tmp_path / "other.log"), "none of its identifiers is in"),
-        ((dbc, "--log", tmp_path / "other.csv"), "none of its columns is in"),
-        (
-            (two, "--log", tmp_path / "two.csv"),
-            "column 'PackCurrent' could be PackStatus.PackCurrent and Twin.PackCurr",
-        ),
-        ((tmp_path / "other.log", "--log", dbc), "the database comes first"),
-        ((dbc, "--out", tmp_path / "there.toml"), "exists, and is not overwritten"),
-    ):
-        run = calibrator("layout", "init", *arguments)
-        assert (run.returncode, len(run.stderr.splitlines())) == (1, 1)
-        assert said in run.stderr
+    monkeypatch.chdir(tmp_path)
+    run = calibrator("layout", "init", *line.split())
+    assert (run.returncode, len(run.stderr.splitlines())) == (1, 1)
+    assert said in run.stderr
     assert (tmp_path / "there.toml").read_text() == "kept"
 
 

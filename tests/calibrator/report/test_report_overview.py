@@ -60,9 +60,7 @@ def test_sums_are_those_of_the_result(result: Path) -> None:
     assert found["duration_h"]["median"] == 0.5
 
 
-def test_workshop_list_has_hardware_then_sensors_then_what_many_share(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_workshop_list_has_hardware_sensors_then_what_many_share(tmp_path: Path, database: VehicleDatabase) -> None:
     vehicles = six_vehicles(database)
     load = SensorFinding(branch="battery", cause="load", probability=0.99, text="5 A without a sensor.")
     inverted = SensorFinding(branch="motor", cause="inverted", probability=0.9, text="its sign is turned.")

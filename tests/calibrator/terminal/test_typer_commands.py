@@ -48,9 +48,7 @@ def hello() -> None:
         (["fly"], 2, "prog: No such command 'fly'; see 'prog --help'"),
     ],
 )
-def test_every_error_is_one_line(
-    arguments: list[str], code: int, text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_error_is_one_line(arguments: list[str], code: int, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(app, "prog", arguments) == code
     printed = capsys.readouterr()
     assert printed.out == ""
