@@ -414,7 +414,8 @@ class Corrector:
         if any(branch.is_fitted and not branch.seen for branch in self.branches):
             return State.STARTING, Reason.NONE
         is_invalid = any(source.is_invalid for source in self.sources.values())
-        if is_invalid or any(branch.lacks_input(self._looked_s) for branch in applied):
+        lacks_input = any(branch.lacks_input(self._looked_s) for branch in applied)
+        if is_invalid or lacks_input or self.watch.is_blind(self._looked_s):
             return State.PARTLY_CORRECTING, Reason.E2E_INVALID if is_invalid else Reason.INPUT_MISSING
         return State.CORRECTING, beside
 

@@ -10,7 +10,7 @@ into the junction [A]; times are those of one steady clock, passed in [s].
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise, takewhile
 from operator import mul
 from typing import NamedTuple
@@ -486,8 +486,6 @@ class JunctionWatch:
         That instant. [s]
     verdict : tuple or None
         Why the parameters in force must not be used any more; None while they may.
-    is_whole : callable
-        Whether all currents of the junction are measured now; sums of other times are published, but not judged.
     """
 
     def __init__(
@@ -495,12 +493,20 @@ class JunctionWatch:
     ) -> None:
         self._branches = {branch.name: branch for branch in branches}
         self._window_s, self._margin_a, self._full_scale_a = window_s, margin_a, full_scale_a
-        self.is_whole: Callable[[float], bool] = lambda _: True
+        self._whole: tuple[HeardSignal, frozenset[int]] | None = None
         self.restart()
 
     def judge_only(self, state: HeardSignal, valid: frozenset[int]) -> None:
         """Judge sums while a state has one of these codes: all currents of the junction are measured then."""
-        self.is_whole = lambda now_s: state.code_at(now_s) in valid
+        self._whole = state, valid
+
+    def is_whole(self, now_s: float) -> bool:
+        """Whether all currents of the junction are measured now; sums of other times are published, but not judged."""
+        return self._whole is None or self._whole[0].code_at(now_s) in self._whole[1]
+
+    def is_blind(self, now_s: float) -> bool:
+        """Whether the state is missing that says when sums can be judged."""
+        return self._whole is not None and self._whole[0].code_at(now_s) is None
 
     def restart(self, expected: JunctionResidual = _NOTHING_EXPECTED) -> None:
         """Forget what was seen, and judge by what the parameter file says of the sum of right sensors from now on.

@@ -48,7 +48,10 @@ class Reason(_WithWords):
     BRANCH_STALE = 7, "a branch has sent nothing that can be used for longer than its timeout"
     CORRECTION_WORSE = 8, "the corrected Kirchhoff sum is worse than the measured one"
     BRANCH_STUCK = 9, "a branch never changes while the others do"
-    INPUT_MISSING = 10, "a voltage, or a value of a branch, is missing; not everything is corrected"
+    INPUT_MISSING = (
+        10,
+        "a voltage, a branch's value or the state of the watch is missing; not everything is corrected, or judged",
+    )
     NOT_SIGNED = 11, "the parameters are not what trusted signers have signed"
     NOT_VALID_NOW = 12, "the parameters have expired, or do not hold yet"
     REPLAYED = 13, "the parameters are older than what was accepted before"

@@ -291,6 +291,21 @@ def test_sums_are_not_judged_while_the_layout_says_that_a_current_is_not_measure
     assert found == [Reason.NONE, Reason.CORRECTION_WORSE]
 
 
+def test_a_watch_whose_state_is_missing_is_said(make_database: MakeDatabase) -> None:
+    own = whole_vehicle(make_database, '\n[watch]\ninput = "speed"\nvalid = [0]\n')
+    corrector, states = corrector_for(own, battery=(0.01, 0.0), motor=(0.0, 0.0)), []
+    motion = FrameKey(own.message("VD_Motion").frame_id, extended=False)
+    for k in range(60):
+        answers(corrector, battery(own, k % 15), 0.05 * k)
+        answers(corrector, motor(own, k % 15), 0.05 * k)
+        if 20 <= k < 25:
+            answers(corrector, Frame(motion, protected(own, "VD_Motion", k % 15)), 0.05 * k)
+        corrector.look(0.05 * k + 0.01)
+        states.append(corrector.state())
+    missing = (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
+    assert [states[k] for k in (19, 24, 59)] == [missing, (State.CORRECTING, Reason.NONE), missing]
+
+
 @pytest.mark.parametrize("value", ["4", "-1", "0.5"])
 @pytest.mark.parametrize("key", ["[watch] valid", "[contactor] open"])
 def test_a_value_that_an_input_cannot_have_is_refused(make_database: MakeDatabase, key: str, value: str) -> None:
