@@ -51,6 +51,7 @@ __all__ = [
     "RowPlaces",
     "VehicleRegressions",
     "collect_rows",
+    "covariances",
     "densest_clusters",
     "evidence_names",
     "fit_fleet_model",
@@ -74,6 +75,8 @@ TOO_FEW = 4.0
 itself makes the tails heavier than normal."""
 SINGULAR = 1e-12
 """Eigenvalue over the largest one below which a direction counts as unknown. [1]"""
+LEAST_PRIOR = 100.0 * SINGULAR
+"""Of the prior in the diagonal of the normal equations: it decides where constants cannot be told apart. [1]"""
 GAIN_SD = 0.4
 """Prior deviation of a gain ratio from -1: no running sensor is farther off. [1]"""
 NOISE_ROUNDS = 3
@@ -94,6 +97,8 @@ MOST_VARIATION = 100.0
 """Deviation of an input over the fleet's median deviation from which on a vehicle has another unit there. [1]"""
 TINY_A2 = 1e-12
 """Of a fleet that stands still. [A^2]"""
+CONSTANT = 1e-12
+"""Variance over mean square below which a column counts as constant: rounding. [1]"""
 MOST_CENTRES = 200
 SPREADS = 12
 SHARE_STEPS = 8
@@ -177,6 +182,11 @@ class FleetMoments:
         return np.asarray(total / total[:, -1:, -1:])
 
     @property
+    def covariance(self) -> Array:
+        """Covariances of the same columns, shape (N, p, p), see :func:`covariances`."""
+        return covariances(self.mean)
+
+    @property
     def mean_a(self) -> Array:
         """Mean measured currents, shape (N, K). [A]"""
         return self.mean[:, -1, self.inputs : -1]
@@ -190,6 +200,14 @@ class FleetMoments:
     def variance_a2(self) -> Array:
         """Variance of the measured currents, which no offset changes, shape (N, K). [A^2]"""
         return np.asarray(self.mean_square_a2 - self.mean_a**2)
+
+
+def covariances(mean: Array) -> Array:
+    """Covariances of columns of mean products (N, p, p), whose last column is 1; zero where a column is constant."""
+    means = mean[:, :, -1]
+    covariance = mean - means[:, :, None] * means[:, None, :]
+    varies = np.diagonal(covariance, axis1=1, axis2=2) > CONSTANT * means**2
+    return np.where(varies[:, :, None] & varies[:, None, :], covariance, 0.0)
 
 
 def stack_summaries(summaries: Sequence[DriveSummary], order: Sequence[int] | None = None) -> FleetMoments:
@@ -279,6 +297,8 @@ def regress_vehicles(
     count, p = blocks.count, right.shape[1]
     Z, y = blocks.total(gram), blocks.total(right)
     least = np.maximum(LEAST_RHO * power, LEAST_VARIANCE)
+    held = np.flatnonzero(prior_precision)
+    least = np.maximum(least, LEAST_PRIOR * (Z[:, held, held] / prior_precision[held]).max(axis=1, initial=0.0))
     rho = least
     for _ in range(REGRESSION_ROUNDS):
         # (Z^T Z + rho P) theta = Z^T y + rho P theta_0, by the pseudo-inverse of the matrix scaled to a diagonal of one
@@ -374,7 +394,7 @@ def fit_fleet_model(fleet: FleetMoments) -> Array:
     """
     M, K = fleet.inputs, fleet.branches
     u = [*range(M), M + K]  # columns of the inputs and the constant
-    centred = fleet.mean - fleet.mean[:, :, -1:] * fleet.mean[:, -1:, :]
+    centred = fleet.covariance
     variance = np.diagonal(centred, axis1=1, axis2=2)[:, :M]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # an input that varies in no vehicle has no median
@@ -403,7 +423,7 @@ def fit_fleet_model(fleet: FleetMoments) -> Array:
     # Ideal currents sum to zero, whatever the inputs. The excess of an input is shared by the branches as their
     # currents' variance. The excess of the constants is the mean load that no branch measures: it is taken from the
     # source, as it does not grow with others.
-    mean = fleet.mean.mean(axis=0)
+    mean = fleet.mean[usual].mean(axis=0)
     mean_a = mean[-1, u] @ read_out
     variance_a2 = np.diag(read_out.T @ mean[np.ix_(u, u)] @ read_out) - mean_a**2
     excess = read_out.sum(axis=1)
@@ -728,7 +748,7 @@ def collect_rows(
     covariance = _shifted(covariance, to_means, first=R)
     blocks = fleet.blocks.count[:, None, None]
     covariance[blocks[:, 0, 0] < FEWEST_BLOCKS] = UNKNOWN_VARIANCE * np.eye(3 * K)
-    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))  # exact ones are rounding
     safe_sd = np.where(sd > 0.0, sd, np.inf)
     own = covariance / (safe_sd[:, :, None] * safe_sd[:, None, :])
     usual = own.mean(axis=0) if usual_correlation is None else usual_correlation

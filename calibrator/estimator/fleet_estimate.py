@@ -289,8 +289,7 @@ def learn_fleet(
 def _require_balance(fleet: FleetMoments, branches: Sequence[str]) -> None:
     """Refuse a fleet in which most currents balance in a ratio that is no gain error: a sign or a unit is wrong."""
     M, K = fleet.inputs, fleet.branches
-    mean_a = fleet.mean_a
-    covariance = fleet.mean[:, M : M + K, M : M + K] - mean_a[:, :, None] * mean_a[:, None, :]
+    covariance = fleet.covariance[:, M:-1, M:-1]
     sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), np.finfo(float).tiny))
     precision = np.linalg.inv(covariance / sd[:, :, None] / sd[:, None, :] + LEAST_OWN * np.eye(K))
     own = np.diagonal(precision, axis1=1, axis2=2)

@@ -22,6 +22,7 @@ import numpy as np
 from calibrator.drive import Array, Equipment, FleetSource
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
+from calibrator.estimator.evidence import covariances
 from calibrator.processes.run_many import Workers
 from calibrator.published.state_space import pooled_poles, snr_from_power, solve_scaled
 from calibrator.sources.fleet_source import find_fleet, probe_equipment, read_vehicles
@@ -41,8 +42,6 @@ FOLDS = 5
 """Every fifth block is held out, as the published method holds out 20 %."""
 FIRST_HELD_OUT = 2
 """So that three blocks already have one to judge from, amid the others."""
-CONSTANT = 1e-12
-"""Variance over mean square below which a column counts as constant: rounding. [1]"""
 ORDERS = (1, 2, 3, 4, 5, 6, 8)
 """Of the pooled systems: a power train as seen at 10 Hz has few modes. [1]"""
 LOW_PASSES = (1, 2, 4, 6)
@@ -82,25 +81,22 @@ def held_out_snr_db(summaries: Sequence[DriveSummary]) -> Array:
     own = np.broadcast_to(np.eye(K), (len(held_out), K, K))
     weights = np.concatenate([-coefficients, own, -offset_a[:, None]], axis=1)  # current less what is simulated
     error_a2 = np.einsum("nqk,nqr,nrk->nk", weights, held_out, weights) / np.maximum(held_out[:, -1:, -1], 1.0)
-    signal_a2 = np.einsum("nkk->nk", _centred(held_out)[1])[:, -K - 1 : -1]
+    signal_a2 = np.einsum("nkk->nk", covariances(_mean(held_out)))[:, -K - 1 : -1]
     return snr_from_power(signal_a2, np.maximum(error_a2, 0.0))
 
 
 def read_outs(moments: Array, branches: int) -> tuple[Array, Array]:
     """Coefficients (N, P, K) [A] and offsets (N, K) [A] of K currents over P columns, by moments (N, P+K+1, P+K+1)."""
-    mean, covariance = _centred(moments)
+    mean = _mean(moments)
+    covariance = covariances(mean)
     P = moments.shape[1] - branches - 1
     coefficients = solve_scaled(covariance[:, :P, :P], covariance[:, :P, P:-1])
-    return coefficients, mean[:, P:-1] - np.einsum("np,npk->nk", mean[:, :P], coefficients)
+    return coefficients, mean[:, -1, P:-1] - np.einsum("np,npk->nk", mean[:, -1, :P], coefficients)
 
 
-def _centred(moments: Array) -> tuple[Array, Array]:
-    """Means (N, Q) and covariances (N, Q, Q) of all columns, the latter zero where a column is constant."""
-    samples = np.maximum(moments[:, -1:, -1], 1.0)
-    mean = moments[:, -1] / samples
-    covariance = moments / samples[:, :, None] - mean[:, :, None] * mean[:, None, :]
-    varies = np.einsum("nqq->nq", covariance) > CONSTANT * mean**2
-    return mean, np.where(varies[:, :, None] & varies[:, None, :], covariance, 0.0)
+def _mean(moments: Array) -> Array:
+    """Mean products of all columns (N, Q, Q), zero where there is no sample."""
+    return np.asarray(moments / np.maximum(moments[:, -1:, -1:], 1.0))
 
 
 def choose_filter_bank(vehicles: Sequence[Sequence[Samples]], *, period_s: float) -> FilterBank:

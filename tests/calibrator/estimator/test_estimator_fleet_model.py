@@ -10,7 +10,16 @@ from calibrator.drive import Array
 from calibrator.estimator.evidence import fit_fleet_model, regress_on_fleet, stack_summaries
 from calibrator.faults import Faults
 from calibrator.summaries.moments import DriveSummary
-from tests.calibrator.estimator.simulated_drives import no_faults, read_out_of, summaries_of
+from calibrator.summaries.summariser import summarise_samples
+from tests.calibrator.estimator.simulated_drives import (
+    PERIOD_S,
+    Conditions,
+    coloured,
+    drive_of,
+    no_faults,
+    read_out_of,
+    summaries_of,
+)
 
 K = 3
 
@@ -63,6 +72,20 @@ def test_order_of_vehicles_units_and_copies_of_inputs_do_not_matter() -> None:
     columns = [0, 0, *range(1, summaries[0].moments.shape[1])]
     twice = [replace(summary, moments=summary.moments[:, columns][:, :, columns]) for summary in summaries]
     np.testing.assert_allclose(slopes_of(twice)[0], slopes_of(summaries)[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("varying", [0, 3])
+def test_input_that_stands_still_in_most_vehicles_is_learnt_from_the_others(varying: int) -> None:
+    """Of the mass of a vehicle, say: where it stands still its variance is rounding, which must not be divided by."""
+    rng, summaries, told = np.random.default_rng(8), [], np.array([0.1, -0.1, 0.0])
+    for j in range(12):
+        drive = drive_of(rng, no_faults(1, K).take(0), Conditions())
+        change = 50.0 * coloured(rng, len(drive.inputs), 1, 0.9) * (j < varying)
+        inputs = np.hstack([drive.inputs, round(rng.uniform(1500.0, 2300.0), 3) + change])
+        names = (*drive.input_names, "mass")
+        drive = replace(drive, input_names=names, inputs=inputs, currents_a=drive.currents_a + change * told)
+        summaries.append(summarise_samples([drive], period_s=PERIOD_S))
+    np.testing.assert_allclose(model_of(summaries)[-2], told * bool(varying), atol=2e-4)  # [A] per kg
 
 
 def test_vehicle_with_an_input_in_another_unit_does_not_bend_the_model() -> None:

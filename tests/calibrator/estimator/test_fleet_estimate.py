@@ -1,6 +1,7 @@
 """From summaries to what is corrected: known truth, one vehicle at a time, limits, few vehicles, batches."""
 
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,8 @@ from calibrator.estimator.fleet_estimate import FleetReference, estimate_vehicle
 from calibrator.faults import Faults
 from calibrator.score import harmed, recovered
 from calibrator.summaries.moments import DriveSummary
-from tests.calibrator.estimator.simulated_drives import Conditions, summaries_of
+from calibrator.summaries.summariser import summarise_samples
+from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, drive_of, no_faults, summaries_of
 from tests.calibrator.estimator.simulated_rows import random_faults
 
 SCALE_A, VEHICLES, K = 400.0, 24, 2
@@ -110,3 +112,21 @@ def test_pit_of_the_truth_lies_between_zero_and_one(
         assert pit.shape == (VEHICLES, K)
         assert ((pit >= 0.0) & (pit <= 1.0 + 1e-9)).all()
         assert 0.3 < pit.mean() < 0.7
+
+
+@pytest.mark.parametrize("step_a", [0.0, 0.37])
+def test_branch_that_shows_a_constant_in_each_vehicle_blames_nobody(step_a: float) -> None:
+    """Its gain is open, though its variance and that of its model are not zero but rounding."""
+    rng, summaries = np.random.default_rng(6), []
+    for j in range(8):
+        drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=360))
+        still_a = np.full(360, round(1.1 + step_a * j, 2))
+        currents_a = np.column_stack([drive.currents_a - [1.0, 0.0] * still_a[:, None], still_a])
+        still = replace(drive, branch_names=(*drive.branch_names, "still"), currents_a=currents_a)
+        summaries.append(summarise_samples([still], period_s=PERIOD_S))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=[*NAMES, "still"])
+    found = estimate_vehicles(summaries, learnt)
+    assert not found.identifiable[:, 2].any()
+    assert not found.corrected.any()
