@@ -738,19 +738,21 @@ def _charges(
         raise FleetError(
             f"--charge is of the recordings of one vehicle, and there are {len(fleet.vehicles)}; give those of one"
         )
-    found = {}
+    found, duration_s = {}, sum(drive.duration_s for mine in drives for drive in mine)
     for branch, (charge_ah, sd_ah) in settings.charge_ah.items():
         measured_as = span_s = missing_s = 0.0
-        for channel in (drive.branches[branch] for drive in drives[0]):
+        for drive in drives[0]:
+            channel = drive.branches[branch]
             time_s, value_a = channel.time_s[channel.good], channel.value[channel.good]
             step_s = np.diff(time_s)
+            usual = step_s <= GAP_PERIODS * np.median(step_s) if step_s.size else step_s > 0.0
             measured_as += float(np.trapezoid(value_a, time_s))
-            span_s += float(time_s[-1] - time_s[0])
-            missing_s += float(step_s[step_s > GAP_PERIODS * np.median(step_s)].sum())
-        if missing_s > MOST_MISSING * span_s:
+            span_s += float(step_s.sum())
+            missing_s += drive.duration_s - float(step_s[usual].sum())
+        if missing_s > MOST_MISSING * duration_s:
             raise FleetError(
-                f"--charge {branch}: {missing_s:.0f} s of {span_s:.0f} s have no samples of it, so its charge is not "
-                f"known; leave the option out"
+                f"--charge {branch}: {missing_s:.0f} s of {duration_s:.0f} s have no samples of it, so its charge is "
+                f"not known; leave the option out"
             )
         found[branch] = measured_as / span_s, charge_ah * 3600.0 / span_s, sd_ah * 3600.0 / span_s
     return found

@@ -41,6 +41,7 @@ __all__ = [
     "join_rows",
     "left_out_of",
     "part_file",
+    "parts_of",
     "read_part",
     "read_results",
     "read_run",
@@ -255,7 +256,7 @@ def join_rows(folder: Path, left_out: Mapping[str, str]) -> int:
     """
     path, calibrated, others = folder / ROWS, 0, dict(left_out)
     with pq.ParquetWriter(path, SCHEMA, compression="zstd") as writer:
-        for part in _parts(folder):
+        for part in parts_of(folder).values():
             found = pq.read_table(part, columns=SCHEMA.names, use_threads=False)
             calibrated += len(pc.unique(found.filter(pc.field("branch").is_valid())["vehicle"]))
             for name in others.keys() & set(found["vehicle"].to_pylist()):
@@ -278,14 +279,15 @@ def write_parameter_files(folder: Path, *, vehicles: int) -> str:
     if vehicles > MOST_FILES:
         return PARTS
     (folder / FILES).mkdir(exist_ok=True)
-    for part in _parts(folder):
+    for part in parts_of(folder).values():
         for vehicle, written in read_part(part).items():
             write_atomically(folder / FILES / f"{vehicle}.json", written.text)
     return FILES
 
 
-def _parts(result: Path) -> list[Path]:
-    return sorted((result / PARTS).glob("[0-9]*.parquet"))
+def parts_of(result: Path) -> dict[int, Path]:
+    """Parts of a result, by their buckets."""
+    return {int(path.stem): path for path in sorted((result / PARTS).glob(f"{'[0-9]' * 5}.parquet"))}
 
 
 def part_file(result: Path, number: int) -> Path:

@@ -30,6 +30,7 @@ from calibrator.estimator.results import (
     join_rows,
     left_out_of,
     part_file,
+    parts_of,
     read_run,
     report_of,
     write_parameter_files,
@@ -110,7 +111,7 @@ def calibrate_fleet(
     identity, fleet, passes = require_fleet(storage, place, database), None, 4  # look, learn, calibrate, write
     calibrate: Calibrate | None = None
     if identity is not None:
-        _require_summaries_enough(storage, settings)
+        _require_summaries_enough(storage, settings, database.layout)
         name, fleet_ids = identity.fleet, list(identity.fleet_ids)
     elif since is not None:
         raise FleetError(
@@ -161,7 +162,7 @@ def require_fleet(storage: Storage, place: str | Path, database: VehicleDatabase
     return read_identity(storage, database)
 
 
-def _require_summaries_enough(storage: Storage, settings: CalibrationSettings) -> None:
+def _require_summaries_enough(storage: Storage, settings: CalibrationSettings, layout: Layout) -> None:
     """Refuse drives beside summaries, as nobody can tell which are meant, and options that need the drives."""
     drives = [name for name in (DRIVES_FOLDER, LOGS_FOLDER) if storage.is_local and (Path(storage.url) / name).is_dir()]
     if drives:
@@ -169,7 +170,14 @@ def _require_summaries_enough(storage: Storage, settings: CalibrationSettings) -
             f"{storage.url}: holds drives ({few(drives)}) and summaries (summaries.json); move one of them elsewhere, "
             f"and give the folder of the other"
         )
-    needs = {"--method published": settings.method is Method.PUBLISHED, "--branches": settings.branches is not None}
+    needs = {
+        "--method published": settings.method is Method.PUBLISHED,
+        "--branches": settings.branches is not None,
+        "--charge": settings.charge_ah,
+        "--meter": settings.meter is not None,
+        "--trusted with a branch": settings.trusted & set(layout.branch_names),
+        "a junction without a fleet": settings.alone,
+    }
     for option in (option for option, wanted in needs.items() if wanted):
         raise FleetError(f"{storage.url}: a store of summaries, and {option} needs the drives; give the drive store")
 
@@ -329,11 +337,12 @@ class _Run:
                 fleet_size=census.size,
             )
         calibrate, seen = partial(calibrate_bucket, store=store, task=task, previous=previous), 0
+        earlier = () if previous is None else parts_of(previous)  # also of those who are there no more
+        buckets = sorted({*census.usable, *earlier})
         with progress_bar("calibrate", census.size, "vehicles") as progress:
-            found = run_many(calibrate, list(census.usable), self.workers)
-            for bucket, part in zip(census.usable, found, strict=True):
+            for bucket, part in zip(buckets, run_many(calibrate, buckets, self.workers), strict=True):
                 write_atomically(part_file(self.result, bucket), part)
-                seen += census.usable[bucket]
+                seen += census.usable.get(bucket, 0)
                 progress(seen)
         if store.versions() != versions:
             raise FleetError(f"{store.url}: the summaries were changed during the run; run the same command again")

@@ -11,7 +11,10 @@ import pytest
 
 from calibrator import Junction, JunctionCalibrator
 from calibrator.errors import ContradictionError, DriveError, FleetError
+from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator as command
+from tests.calibrator.conftest import LAYOUT
+from tests.calibrator.summaries.small_stores import random_faults, small_store
 
 JUNCTION = Junction(branches=["battery", "motor", "heater"], full_scale_a=400.0)
 SECONDS, PERIOD_S = 240.0, 0.1
@@ -273,10 +276,13 @@ def test_standard_deviations_are_right() -> None:
         (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
         (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
         (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
-        (
-            lambda frame: frame.assign(battery=frame["battery"].where(abs(frame.index - 100.0) > 30.0)),
-            {"charge_ah": {"battery": (1.0, 0.1)}},
-            "have no samples of it",
+        *(
+            (
+                lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
+                {"charge_ah": {"battery": (1.0, 0.1)}},
+                "have no samples of it",
+            )
+            for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
         ),
     ],
 )
@@ -308,6 +314,12 @@ def test_command_writes_what_python_finds(table: Path, tmp_path: Path, motor_off
     rows = pd.read_parquet(out / "results.parquet").set_index("branch")
     here = found(motor_off, trusted=["battery"]).loc["vehicle"]
     assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
+
+
+def test_store_of_summaries_is_no_junction(database: VehicleDatabase, tmp_path: Path) -> None:
+    store = small_store(tmp_path / "store", database, random_faults(2))
+    with pytest.raises(FleetError, match="a store of summaries, and a junction without a fleet needs the drives"):
+        JunctionCalibrator().fit(store.url, LAYOUT)
 
 
 def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from calibrator.errors import FleetError
 from calibrator.estimator.fleet_task import FleetTask, calibrate_bucket, learn_task
-from calibrator.estimator.results import read_results, read_run
+from calibrator.estimator.results import left_out_of, read_results, read_run
 from calibrator.estimator.run import read_sample, take_census
 from calibrator.estimator.settings import CalibrationSettings
 from calibrator.faults import Faults
@@ -171,6 +171,9 @@ def test_cluster_that_loses_a_worker_gives_the_same_result(database: VehicleData
     [
         (("--method", "published"), 1, "a store of summaries, and --method published needs the drives"),
         (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
+        (("--charge", "battery=3:0.1"), 1, "a store of summaries, and --charge needs the drives"),
+        (("--meter", "motor"), 1, "a store of summaries, and --meter needs the drives"),
+        (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
         (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
         (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
         (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
@@ -334,6 +337,20 @@ def test_only_those_who_drove_since_are_calibrated(store: SummaryStore, result: 
     assert "V009: battery drift" in done.stdout
     old, now = contents(result / "params"), contents(tmp_path / "out" / "params")
     assert [name for name in old if old[name] != now[name]] == ["V009.json"]
+
+
+def test_vehicle_of_the_earlier_result_that_is_in_the_store_no_more_is_named(
+    store: SummaryStore, result: Path, tmp_path: Path
+) -> None:
+    """Also if it was the only one of its bucket."""
+    shutil.copytree(store.url, tmp_path / "store")
+    gone = {name for name in (f"V{j:03d}" for j in range(VEHICLES)) if store.bucket_of(name) == fullest(store)}
+    for path in (tmp_path / "store" / "buckets").glob(f"{fullest(store):05d}-*"):
+        path.unlink()
+    done = calibrate(str(tmp_path / "store"), tmp_path / "out", "--since", result, "--workers", 1)
+    assert done.returncode == 0, done.stderr
+    why = "it is not in this store; its earlier parameters are in the earlier result"
+    assert left_out_of(tmp_path / "out") == dict.fromkeys(gone, why)
 
 
 @pytest.mark.parametrize(
