@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 
-__all__ = ["Faults", "corrected_currents", "measured_currents", "slopes_and_intercepts", "true_currents"]
+__all__ = ["Faults", "measured_currents", "slopes_and_intercepts", "true_currents"]
 
 
 Index = int | slice | NDArray[np.int64] | Mask
@@ -102,24 +102,6 @@ def true_currents(i_s: Array, faults: Faults) -> Array:
 def measured_currents(i: Array, faults: Faults) -> Array:
     """What the sensors of one vehicle show for its true currents, (13) in [1]_; shapes as in true_currents."""
     return (1.0 + faults.drift) * i + faults.offset_a
-
-
-def corrected_currents(i_m: Array, *, drift: Array, offset_a: Array) -> Array:
-    """Invert the sensor model, (25) in [1]_.
-
-    Parameters
-    ----------
-    i_m : ndarray of shape (T, K)
-        Measured currents. [A]
-    drift, offset_a : ndarray of shape (K,)
-        Sensor faults of this vehicle. [1], [A]
-
-    Returns
-    -------
-    ndarray of shape (T, K)
-        Corrected currents. [A]
-    """
-    return (i_m - offset_a) / (1.0 + drift)
 
 
 def slopes_and_intercepts(faults: Faults) -> tuple[Array, Array]:

@@ -261,12 +261,7 @@ def identify(
         from calibrator.summaries.filter_bank import read_bank
 
     given = None if bank is None else read_bank(bank)
-    report = identify_fleet(
-        fleet,
-        vehicle_database(layout),
-        bank=given,
-        workers=Workers(processes=workers),
-    )
+    report = identify_fleet(fleet, vehicle_database(layout), bank=given, workers=Workers(processes=workers))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, report.bank.to_json())

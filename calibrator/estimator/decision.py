@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces
-from calibrator.estimator.posterior import Draws, FaultModel, explain, weigh_draws
+from calibrator.estimator.posterior import Draws, FaultModel, explain, weigh
 from calibrator.score import TOLERANCE
 from ecu_node.parameters import Explanation, SensorFinding
 
@@ -350,7 +350,8 @@ def estimate_rows(
     explained = []
     for model in models:
         draws = explain(rows, model, feed=feed)
-        explained.append(Explained(model.probability, draws, weigh_draws(draws, model), model.prior.group_centre))
+        weight = np.sum([share * weigh(draws, prior)[0] for share, prior in model.priors], axis=0)
+        explained.append(Explained(model.probability, draws, weight, model.prior.group_centre))
     smallest = np.array([models[0].prior.gain.smallest, models[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
     fault, hardware, points, supports = np.zeros((N, K)), np.zeros(N), posterior_points(explained), []

@@ -227,11 +227,7 @@ class IdentificationReport:
 
 
 def identify_fleet(
-    path: str | Path,
-    database: VehicleDatabase,
-    *,
-    bank: FilterBank | None,
-    workers: Workers,
+    path: str | Path, database: VehicleDatabase, *, bank: FilterBank | None, workers: Workers
 ) -> IdentificationReport:
     """Choose the filter bank of a fleet, or take one that is given, and judge it by every vehicle.
 
@@ -272,9 +268,8 @@ def identify_fleet(
     named = {
         one.vehicle: dict(zip(equipment.branches, of, strict=True)) for one, of in zip(vehicles, snr_db, strict=True)
     }
-    notices = equipment.notices
     return IdentificationReport(
-        bank=bank, branches=equipment.branches, snr_db=named, left_out=left_out, notices=notices
+        bank=bank, branches=equipment.branches, snr_db=named, left_out=left_out, notices=equipment.notices
     )
 
 

@@ -399,12 +399,7 @@ def _fault_probability(mean: Array, sd: Array, prior_sd: float, sound_sd: float)
 
 
 def _estimate(
-    vehicles: Sequence[VehicleSummary],
-    branches: Sequence[str],
-    known: _Known,
-    *,
-    layout: Layout,
-    harm_limit: float,
+    vehicles: Sequence[VehicleSummary], branches: Sequence[str], known: _Known, *, layout: Layout, harm_limit: float
 ) -> tuple[FleetEstimate, list[_Law], list[str], list[str]]:
     """Estimate the sensors of one vehicle; or of one car in several recordings, each with its own meter.
 

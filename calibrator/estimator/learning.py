@@ -42,7 +42,6 @@ from calibrator.estimator.prior import (
     first_prior,
     sparse_counts,
     uniform_density,
-    with_slabs,
 )
 
 __all__ = ["LEAST_SHARED", "centre_rows", "learn_fault_models"]
@@ -334,7 +333,7 @@ class _Learner:
             prior = model.prior
             if bounds is not None:
                 slab = Slab(low=bounds[0], high=bounds[1], tail=0.03)
-                prior = with_slabs(prior, slab, slab)
+                prior = replace(prior, gain=slab, offset=slab)
             for n in range(3):
                 prior = self._next_prior(draws, prior, coarse=bounds is not None and not n, grouping=False)
             found.append((float(weigh(draws, prior)[1].sum()), prior))
@@ -484,7 +483,7 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
         uniform = uniform_density(pairs[:, 0], pairs[:, 1]) @ pairs[:, 2] / pairs[:, 2].sum()
         tail = sum(value * w for value, w in odds["tail"])
         slabs[kind] = replace(best, density=(1.0 - tail) * uniform + tail * TAIL_DENSITY)
-        prior = with_slabs(prior, slabs[GAIN], slabs[OFFSET])
+        prior = replace(prior, gain=slabs[GAIN], offset=slabs[OFFSET])
     return prior
 
 

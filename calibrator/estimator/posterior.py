@@ -61,7 +61,6 @@ __all__ = [
     "row_residuals",
     "size_evidence",
     "weigh",
-    "weigh_draws",
 ]
 
 Integers = NDArray[np.int64]
@@ -732,8 +731,3 @@ def explain(rows: EvidenceRows, model: FaultModel, *, feed: int) -> Draws:
         return draws
     wider = (fits.chi2[picked] / free)[:, None, None]
     return fitted(np.where(bad[:, None, None], wider, 1.0) * covariance)
-
-
-def weigh_draws(draws: Draws, model: FaultModel) -> Array:
-    """Weights of draws averaged over the priors of a model; see :func:`calibrator.estimator.posterior.weigh`."""
-    return np.asarray(sum(share * weigh(draws, prior)[0] for share, prior in model.priors))

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibrator.drive import Array
 
-__all__ = ["GRID", "LARGEST_SHARED", "Prior", "Slab", "first_prior", "known_prior", "sparse_counts", "with_slabs"]
+__all__ = ["GRID", "LARGEST_SHARED", "Prior", "Slab", "first_prior", "known_prior", "sparse_counts"]
 
 GRID: Array = np.geomspace(1e-4, 4.0, 500)
 """Magnitudes at which densities are tabulated: drifts [1], offsets and loads in fractions of full scale."""
@@ -137,11 +137,6 @@ def known_prior(counts: Array, magnitude: tuple[float, float]) -> Prior:
     """Prior of a fleet whose faults were drawn in a known way: numbers (K + 1, 2K + 1), and bounds of all sizes."""
     slab = Slab(low=magnitude[0], high=magnitude[1], tail=1e-6)
     return Prior(counts=counts + 1e-9, gain=slab, offset=slab, load_share=1e-9)
-
-
-def with_slabs(prior: Prior, gain: Slab, offset: Slab) -> Prior:
-    """The same prior with other sizes of faults."""
-    return Prior(**{**vars(prior), "gain": gain, "offset": offset})
 
 
 def _sparse(K: int) -> Array:

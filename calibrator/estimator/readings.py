@@ -21,6 +21,7 @@ from calibrator.errors import FleetError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.summaries.vehicle_summary import VehicleSummary, weighted_mean
 from calibrator.terminal.text import few
+from ecu_node.documents import read_user_file
 from ecu_node.layout import UnmeasuredLoad
 
 __all__ = [
@@ -57,6 +58,8 @@ COLUMNS = ("vehicle", "branch", *PAIRS[0], *PAIRS[1])
 MEANING = {"drift": "a relative gain error; 2 % is 0.02", "drift_sd": "a standard deviation; 0.1 % is 0.001"}
 LEAST_SD = 1e-5
 """Least standard deviation of a reading: no bench is sharper; of offsets over full scale. [1]"""
+MOST_BYTES = 100_000_000
+"""Of a table: a million vehicles. [byte]"""
 LARGEST = 0.9
 """Largest fault that a sensor of a running vehicle is read with; a drift of 2 is 2 %, wrongly typed. [1]"""
 
@@ -146,7 +149,7 @@ def with_knowledge(
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_user_file(path, largest_bytes=MOST_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise FleetError(f"{path}: cannot read the bench readings: {error.strerror}; give a CSV table") from None
     except UnicodeDecodeError:
@@ -182,7 +185,7 @@ def read_bench_table(source: Path | str, branches: Names, *, full_scale_a: float
     def place() -> str:
         if isinstance(source, str):  # rows of a data frame count from 0, without the header
             return f"{where}: row {lines.line_num - 2}" if lines.line_num > 1 else where
-        return f"{where}: line {lines.line_num}"
+        return f"{where}: line {lines.line_num or 1}"
 
     try:
         header = [cell.strip() for cell in next(lines, [])]
@@ -259,7 +262,9 @@ def check_bench_table(
         if vehicle in left_out and vehicle not in vehicles:
             raise FleetError(f"{place}: vehicle {vehicle!r} is left out: {left_out[vehicle]}")
         if vehicle not in vehicles:
-            raise FleetError(f"{place}: no vehicle {vehicle!r} in this fleet; known are {few(sorted(vehicles))}")
+            raise FleetError(
+                f"{place}: no vehicle {vehicle!r} in this fleet; there are, for example, {few(sorted(vehicles))}"
+            )
         apart = abs(drift) / np.hypot(drift_sd, TRUSTED_DRIFT_SD), abs(offset_a) / np.hypot(offset_sd_a, accuracy_a)
         if vehicle in trusted and np.nanmax(apart) > CONTRADICTION:
             raise FleetError(

@@ -130,12 +130,7 @@ def calibrate_fleet(
     with whole_folder(out) as result, TemporaryDirectory(dir=result) as summaries, numbered_passes(passes):
         (result / PARTS).mkdir()
         run = _Run(
-            result=result,
-            shown=out,
-            identity=run_identity,
-            fleet_ids=fleet_ids,
-            settings=settings,
-            workers=workers,
+            result=result, shown=out, identity=run_identity, fleet_ids=fleet_ids, settings=settings, workers=workers
         )
         if identity is not None:
             return run.summaries(SummaryStore(storage=storage, identity=identity), {}, since)

@@ -1,14 +1,6 @@
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
 
-from calibrator.faults import (
-    Faults,
-    corrected_currents,
-    measured_currents,
-    slopes_and_intercepts,
-    true_currents,
-)
+from calibrator.faults import Faults, measured_currents, slopes_and_intercepts, true_currents
 
 FAULTS = Faults(
     hardware_drift=np.array([0.1, 0.0]),
@@ -16,19 +8,6 @@ FAULTS = Faults(
     drift=np.array([[0.2, 0.0], [0.0, 0.0]]),
     offset_a=np.array([[-3.0, 0.0], [0.0, 0.0]]),
 )
-
-
-@given(st.floats(-0.9, 3.0), st.floats(-500.0, 500.0), st.floats(-1000.0, 1000.0))
-def test_correction_inverts_the_sensor(drift: float, offset_a: float, current_a: float) -> None:
-    faults = Faults(
-        hardware_drift=np.zeros(()),
-        hardware_offset_a=np.zeros(1),
-        drift=np.array([drift]),
-        offset_a=np.array([offset_a]),
-    )
-    measured = measured_currents(np.array([[current_a]]), faults)
-    corrected = corrected_currents(measured, drift=faults.drift, offset_a=faults.offset_a)
-    np.testing.assert_allclose(corrected, current_a, atol=1e-9)
 
 
 def test_hardware_faults_keep_the_junction_law() -> None:

@@ -81,33 +81,19 @@ def strict(summaries: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made_once(tmp_path_factory, "strict_result", "calibrate", summaries, "--harm-limit", 0)
 
 
-def test_a_stricter_harm_limit_corrects_no_more_branches(result: Path, strict: Path) -> None:
-    assert not any(row["applied"] for row in read_results(strict))
-    assert any(row["applied"] for row in read_results(result))
-
-
-def test_what_was_chosen_and_why_faults_are_held_back_is_told_of_each_branch(result: Path, strict: Path) -> None:
-    chosen = read_run(strict).settings
+def test_a_harm_limit_of_zero_corrects_nothing_and_every_fault_says_why(result: Path, strict: Path) -> None:
+    chosen, rows, usual = read_run(strict).settings, read_results(strict), read_results(result)
     assert (chosen["harm_limit"], chosen["trusted"], chosen["hold_out"]) == (0.0, [], [])
-    rows = read_results(strict)
-    found = [row for row in rows if row["drift"] or row["offset_a"]]
-    assert {row["held_back"] for row in found} == {"harm limit"}
-    assert all(row["held_back"] is None for row in rows if row not in found)
-    assert not any(row["held_back"] for row in read_results(result) if row["applied"])
+    assert not any(row["applied"] for row in rows)
+    assert {row["held_back"] for row in usual if row["applied"]} == {None}
     for row in rows:
+        assert row["held_back"] == ("harm limit" if row["drift"] or row["offset_a"] else None)
         assert 0.0 <= row["fault_probability"] <= 1.0
-        assert row["drift_sd"] >= 0.0
-        assert row["offset_sd_a"] >= 0.0
-
-
-def test_a_vehicle_of_which_nothing_can_be_told_names_its_explanations(strict: Path) -> None:
+        assert min(row["drift_sd"], row["offset_sd_a"]) >= 0.0
     parameters = [read_parameters(path) for path in sorted((strict / "params").iterdir())]
-    untold = [item for item in parameters if item.verdict == "cannot tell"]
-    assert untold
-    for item in untold:
-        assert item.explanations
-        assert item.deciding_evidence
-        assert not any(branch.apply for branch in item.branches.values())
+    unknown = [item for item in parameters if item.verdict == "cannot tell"]
+    assert unknown
+    assert all(item.explanations and item.deciding_evidence for item in unknown)
 
 
 @pytest.mark.long
@@ -151,17 +137,3 @@ def test_a_slip_in_the_bench_readings_ends_the_run_before_any_drive_is_read(flee
     assert run.returncode == 1
     assert "bench.csv: line 2: offset_a is '1 A'; expected a number" in run.stderr
     assert not out.exists()
-
-
-def test_a_vehicle_cannot_be_trusted_and_held_out(fleet: Path, tmp_path: Path) -> None:
-    both = ("--trusted", "V001", "--hold-out", "V001")
-    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *both)
-    assert run.returncode == 2
-    assert "vehicle V001 is both held out and trusted" in run.stderr
-
-
-def test_a_vehicle_that_is_not_there_cannot_be_trusted(fleet: Path, tmp_path: Path) -> None:
-    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", "--trusted", "V999")
-    assert run.returncode == 1
-    assert "no usable vehicle V999 to trust" in run.stderr
-    assert not (tmp_path / "result").exists()

@@ -13,14 +13,7 @@ from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise_samples
 from ecu_node.parameters import SensorFinding
-from tests.calibrator.estimator.simulated_drives import (
-    INPUTS,
-    PERIOD_S,
-    coloured,
-    no_faults,
-    read_out_of,
-    samples_of,
-)
+from tests.calibrator.estimator.simulated_drives import INPUTS, PERIOD_S, coloured, no_faults, read_out_of, samples_of
 from tests.calibrator.estimator.simulated_rows import random_faults
 
 BRANCHES = ("battery", "motor", "auxiliary")

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.decision import (
-    Explained,
-    Points,
-    best_estimate,
-    harm_probability,
-    posterior_points,
-)
+from calibrator.estimator.decision import Explained, Points, best_estimate, harm_probability, posterior_points
 from calibrator.estimator.posterior import draw_explanations, fit_explanations, weigh
 from calibrator.estimator.prior import Prior, Slab, first_prior
 from calibrator.faults import Faults

@@ -15,7 +15,6 @@ from calibrator.drive import Array, Channel, Drive, DriveFile, Equipment, Mask
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.published_fleet import read_vehicle_model
-from calibrator.faults import corrected_currents
 from calibrator.files.parameter_files import current_moments, junction_residual
 from calibrator.published.state_space import VehicleModel
 from calibrator.summaries.filter_bank import FilterBank, low_passes, read_bank
@@ -86,7 +85,7 @@ def test_parked_and_hardly_recorded_vehicles_are_refused(database: VehicleDataba
 def test_junction_residual_from_moments_is_that_of_the_samples() -> None:
     measured = np.random.default_rng(1).normal(2.0, 20.0, size=(500, 2))
     drift, offset_a = np.array([0.1, -0.05]), np.array([2.0, -1.0])
-    corrected = corrected_currents(measured, drift=drift, offset_a=offset_a)
+    corrected = (measured - offset_a) / (1.0 + drift)
     moments = current_moments(measured.mean(axis=0), measured.T @ measured / len(measured))
     found = junction_residual(moments, gain=1.0 + drift[None], offset_a=offset_a, expected_a=1.5)
     sums = [values.sum(axis=1) for values in (measured, corrected, measured - corrected)]

@@ -47,9 +47,7 @@ def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> Ev
     """Vehicles of three branches; the second gain ratio of the first is off, and junction constants are."""
     N, K = len(constant_a), 3
     rows = EvidenceRows(
-        values=np.zeros((N, 5 * K)),
-        covariance=np.tile(1e-6 * np.eye(5 * K), (N, 1, 1)),
-        means=np.zeros((N, 2, K)),
+        values=np.zeros((N, 5 * K)), covariance=np.tile(1e-6 * np.eye(5 * K), (N, 1, 1)), means=np.zeros((N, 2, K))
     )
     rows.relative[0, K + 1] = relative
     rows.constant[:, K] = np.array(constant_a) / FULL_SCALE_A
@@ -90,7 +88,7 @@ def test_table_is_read_in_any_order_and_empty_cells_are_not_read(tmp_path: Path)
         (["vehicle;branch;drift"], r"line 1: columns vehicle;branch;drift; expected each of vehicle, branch, drift"),
         (["vehicle,branch,drift,drift_sd,drift,drift_sd"], r"line 1: columns .*; expected each of .* once"),
         ([HEADER], r"no reading below the header; leave --readings out"),
-        ([HEADER, "V3,motor,0,0.1,,"], r"line 2: no vehicle 'V3' in this fleet; known are V1, V2"),
+        ([HEADER, "V3,motor,0,0.1,,"], r"line 2: no vehicle 'V3' in this fleet; there are, for example, V1, V2"),
         ([HEADER, "copy,motor,0.2,0.1,,"], r"line 2: vehicle 'copy' is left out: same recording as V1"),
         ([HEADER, "V1,engine,0,0.1,,"], r"line 2: no branch 'engine' in this fleet; known are battery, motor"),
         ([HEADER, "V1,motor,2 %,0.1,,"], r"line 2: drift is '2 %'; expected a number"),

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.evidence import (
-    EvidenceRows,
-    RowPlaces,
-    collect_rows,
-    row_design,
-    stack_summaries,
-)
+from calibrator.estimator.evidence import EvidenceRows, RowPlaces, collect_rows, row_design, stack_summaries
 from calibrator.faults import Faults
 from calibrator.summaries.moments import DriveSummary
 from tests.calibrator.estimator import simulated_rows

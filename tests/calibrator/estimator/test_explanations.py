@@ -57,7 +57,7 @@ def test_residuals_are_those_of_the_equations_of_the_rows(K: int) -> None:
 def test_fits_of_two_branches_are_those_of_all_supports_one_by_one(errors: Errors) -> None:
     rows = rows_of(random_faults(4, vehicles=8, branches=2, sparsity=60.0), seed=4, errors=errors)
     fits, log_prior = fitted(plain_evidence(rows)), first_prior(2).log_supports
-    for j in range(len(rows)):
+    for j in range(len(rows)):  # none has both a load and an offset of the feeding sensor
         dense = {on: dense_fit(rows.take(slice(j, j + 1)), on) for on in all_supports(2) if len(on) <= 6}
         prior = {
             on: log_prior[sum(p in {0, 3} for p in on), sum(p in {1, 2, 4, 5} for p in on)] + LOG_LOAD * (6 in on)
@@ -101,15 +101,6 @@ def test_what_all_sensors_share_leaves_nothing_either(K: int, of_sensor: bool) -
     rows = rows_of(both, noise=0.0, load=0.0 if of_sensor else group)
     left = row_residuals(plain_evidence(rows, centre=centre, shared=shared), theta[:, None])[:, 0]
     np.testing.assert_allclose(left[rows.known], 0.0, atol=1e-12)
-
-
-def test_offset_of_the_feeding_sensor_and_a_load_are_never_both_fitted() -> None:
-    faults = random_faults(9, vehicles=20, branches=3)
-    faults.offset_a[:, 0] = 0.02
-    fits = fitted(plain_evidence(rows_of(faults, seed=9, load=0.01)))
-    assert fits.support[:, :, 6].any()
-    assert fits.support[:, :, 9].any()
-    assert not (fits.support[:, :, 6] & fits.support[:, :, 9]).any()
 
 
 def test_rows_that_nothing_explains_and_rows_that_say_nothing_are_fitted_without_failing() -> None:

@@ -90,12 +90,6 @@ def test_a_wrong_sign_or_unit_in_most_vehicles_is_refused(
     assert learn_fleet(few, full_scale_a=SCALE_A, branches=NAMES).vehicles == VEHICLES
 
 
-def test_nothing_is_corrected_at_a_harm_limit_of_zero(summaries: list[DriveSummary], reference: FleetReference) -> None:
-    found = estimate_vehicles(summaries, reference, harm_limit=0.0)
-    assert not found.corrected.any()
-    assert "corrected" not in found.verdicts
-
-
 def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_said(truth: Faults) -> None:
     batch = replace(truth, offset_a=truth.offset_a + np.array([12.0, 0.0]))
     summaries = list(summaries_of(batch, Conditions(model_error_a=0.3), seed=4))

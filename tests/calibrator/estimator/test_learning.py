@@ -21,9 +21,9 @@ def moved(rows: EvidenceRows, by: Array) -> EvidenceRows:
     return replace(rows, values=rows.values + by * rows.known)
 
 
-def learned(rows: EvidenceRows, **knowledge: float) -> FaultModel:
+def learned(rows: EvidenceRows) -> FaultModel:
     """The most probable model."""
-    models = learn_fault_models(rows, feed=0, **knowledge)  # type: ignore[arg-type]
+    models = learn_fault_models(rows, feed=0)
     assert sum(model.probability for model in models) == pytest.approx(1.0)
     assert [model.probability for model in models] == sorted((model.probability for model in models), reverse=True)
     assert all(sum(share for share, _ in model.priors) == pytest.approx(1.0) for model in models)
@@ -65,24 +65,10 @@ def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magni
     assert model.prior.load_share < 0.02
 
 
-def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "MOST_LEARNT", 25)
     rows = rows_of(random_faults(6, vehicles=40, branches=2), seed=6)
     same(learned(rows.take(np.random.default_rng(6).permutation(40))), learned(rows), rtol=1e-6)
-
-
-@pytest.mark.parametrize("declared", [None, 0.0125])
-def test_load_of_all_vehicles_is_found_or_taken_as_declared(declared: float | None) -> None:
-    K, at = 3, RowPlaces(3)
-    rows = rows_of(random_faults(11, vehicles=40, branches=K), seed=11, load=0.0125)
-    models = learn_fault_models(rows, feed=0, load=declared)
-    assert models[0].spread.mean[at.junction] == pytest.approx(0.0125, abs=3e-4)
-    assert not models[0].spread.shared[:K].any()
-    assert models[0].prior.counts[0].sum() == pytest.approx(0.7, abs=0.2)
-    if declared is not None:
-        assert models[0].spread.mean[at.junction] == declared
 
 
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
@@ -172,22 +158,6 @@ def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> N
     variance = 0.001**2 * wide.dispersion + np.diag(wide.covariance)[at]
     np.testing.assert_allclose(variance, 0.004**2, rtol=0.5)
     assert (wide.dispersion > 2.0 * plain.dispersion).all()
-
-
-def test_share_of_faulty_vehicles_is_as_expected() -> None:
-    rows = rows_of(random_faults(9, vehicles=20, branches=2, sparsity=90.0), seed=9)
-    for share in (0.1, 0.6):
-        assert learned(rows, expected_faults=share).prior.counts[:, 1:].sum() == pytest.approx(share, abs=1e-9)
-
-
-def test_centre_that_trusted_vehicles_carry_is_kept() -> None:
-    K, at = 2, RowPlaces(2)
-    rows, fixed = rows_of(random_faults(10, vehicles=25, branches=K), seed=10), np.full(5 * K, np.nan)
-    trusted = [at.slope(0), at.intercept(0)]
-    fixed[trusted] = 0.001, -0.0005
-    model = learn_fault_models(rows, feed=0, fixed=fixed)[0]
-    np.testing.assert_array_equal(model.spread.mean[trusted], fixed[trusted])
-    assert np.isnan(fixed[at.junction]), "what the caller gave is not changed"
 
 
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])

@@ -1,5 +1,7 @@
 """Weights of the draws: those of integration on a grid, probabilities for fleets that the prior describes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
@@ -15,7 +17,7 @@ from calibrator.estimator.posterior import (
     size_evidence,
     weigh,
 )
-from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, known_prior, with_slabs
+from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, known_prior
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import (
     Errors,
@@ -125,8 +127,8 @@ def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None
     draws = drawn(rows_of(random_faults(9, vehicles=40, branches=2, sparsity=70.0), seed=9), prior)
     slabs = [Slab(low=low, high=high, tail=0.02) for low, high in ((0.02, 0.3), (0.05, 0.25), (0.1, 0.5))]
     found = size_evidence(draws, prior, kind, np.stack([slab.density for slab in slabs]), every=every)
-    parts = [(slab, prior.offset) if kind == GAIN else (prior.gain, slab) for slab in slabs]
-    exact = np.array([weigh(draws, with_slabs(prior, *part))[1].sum() for part in parts])
+    of = [replace(prior, gain=slab) if kind == GAIN else replace(prior, offset=slab) for slab in slabs]
+    exact = np.array([weigh(draws, each)[1].sum() for each in of])
     np.testing.assert_allclose(found - found[0], exact - exact[0], atol=1e-6 if every == 1 else 3.0)
     assert np.argmax(found) == np.argmax(exact) == 1
 

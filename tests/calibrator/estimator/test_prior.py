@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.prior import (
-    GRID,
-    TAIL_DENSITY,
-    Slab,
-    first_prior,
-    known_prior,
-    sparse_counts,
-)
+from calibrator.estimator.prior import GRID, TAIL_DENSITY, Slab, first_prior, known_prior, sparse_counts
 from tests.calibrator.estimator.simulated_rows import random_faults
 
 BRANCHES = pytest.mark.parametrize("K", [2, 3, 5])

@@ -37,7 +37,7 @@ from tests.calibrator.processes.dask_cluster import DaskCluster
 from tests.calibrator.summaries.small_stores import BRANCHES, random_faults, record_of, small_store
 
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
-VEHICLES = 60
+VEHICLES = 24
 ONE = Workers(processes=1)
 
 
@@ -282,7 +282,6 @@ def failing_for(bad: str, error: Exception, monkeypatch: pytest.MonkeyPatch) -> 
     ("error", "reason"),
     [
         (FleetError("evidence is not finite"), "its evidence cannot be used: evidence is not finite; look at its rec"),
-        (ZeroDivisionError("by nothing"), "internal error: ZeroDivisionError: by nothing (test_run.py:"),
         (KeyError("x"), "internal error: KeyError: 'x' (test_run.py:"),
     ],
 )
