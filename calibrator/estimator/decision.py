@@ -394,17 +394,18 @@ def estimate_rows(
 
 def _unmeasured(models: Sequence[Explained]) -> tuple[Array, Array, Array]:
     """Probability and size of a load without a sensor, probabilities of the groups, over all fault models."""
-    own, size, groups = [], [], []
+    own, size = [], []
+    centres = max((model.group_centre for model in models), key=len)  # the first model's, if it has any
+    groups = np.zeros((len(models[0].weight), len(centres)))
     for model in models:
         place = ParameterPlaces(model.draws.values.shape[3] // 3).load
         alone = model.weight[..., 0] * model.draws.fits.support[:, :, None, place]
         own.append(model.probability * _total(alone))
         size.append(model.probability * _total(alone * model.draws.values[..., place]))
-        groups.append(model.probability * _total(model.weight[..., 1:]))
-    most = max(group.shape[1] for group in groups)
+        for centre, share in zip(model.group_centre, _total(model.weight[..., 1:]).T, strict=True):
+            groups[:, np.argmin(np.abs(centres - centre))] += model.probability * share
     load = np.sum(own, axis=0)
-    everywhere = [np.pad(group, [(0, 0), (0, most - group.shape[1])]) for group in groups]
-    return load, np.sum(size, axis=0) / np.maximum(load, 1e-300), np.sum(everywhere, axis=0)
+    return load, np.sum(size, axis=0) / np.maximum(load, 1e-300), groups
 
 
 def _total(values: Array) -> Array:

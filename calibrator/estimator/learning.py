@@ -310,7 +310,7 @@ class _Learner:
         K = self.rows.branches
         off = np.zeros(K)
         for k in range(1, K):
-            for cluster in densest_clusters(*self.rows.shown(self.at.ratio(k))):  # at most one
+            for cluster in densest_clusters(*self.rows.shown(self.at.ratio(k)), widest=1.0):  # at most one
                 if cluster.share > LEAST_SHARED_GAIN[0] and abs(cluster.centre) > LEAST_SHARED_GAIN[1]:
                     off[k] = cluster.centre
         if not off.any():

@@ -99,6 +99,18 @@ def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_said(truth
     assert not worse(found, batch, summaries)
 
 
+@pytest.mark.parametrize(("vehicles", "branch", "gain"), [(5, 0, 0.1), (8, 1, -0.09), (8, 0, 0.03), (12, 1, 0.02)])
+def test_gain_error_that_all_sensors_of_a_branch_share_is_said_and_not_corrected_in_either(
+    vehicles: int, branch: int, gain: float
+) -> None:
+    batch = no_faults(vehicles, K)
+    batch.drift[:, branch] = gain
+    summaries = list(summaries_of(batch, Conditions(samples=900), seed=vehicles))
+    learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=NAMES)
+    assert any("a gain error that a batch of sensors shares" in notice for notice in learnt.notices)
+    assert not estimate_vehicles(summaries, learnt).corrected.any()
+
+
 def test_pit_of_the_truth_lies_between_zero_and_one(
     truth: Faults, summaries: list[DriveSummary], reference: FleetReference
 ) -> None:
