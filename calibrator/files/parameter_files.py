@@ -166,7 +166,7 @@ def _spread(moments: Array, sums: Array) -> tuple[float, float]:
     quiet = level <= np.quantile(level, QUIET_SHARE)
     rest_a2 = float(square_a2[quiet].sum() / share[quiet].sum())
     growth = max(float(square_a2.sum()) - rest_a2, 0.0) / max(float(throughput_a2.sum()), TINY_A2)
-    return math.sqrt(rest_a2), math.hypot(math.sqrt(growth), STABILITY)
+    return math.sqrt(rest_a2), min(math.hypot(math.sqrt(growth), STABILITY), 1.0)  # of a dead sensor it is all
 
 
 def held_back_lines(parameters: VehicleParameters) -> list[str]:

@@ -188,12 +188,12 @@ def test_offset_beside_what_a_group_shares_is_that_of_the_sensor(of_sensor: bool
 
 def test_group_is_the_same_whatever_its_place_in_a_fault_model() -> None:
     rows, prior = rows_of(no_faults(2, K), load=np.array([0.03, 0.0])), group_prior()
-    two = {"group_share": np.array([0.3, 0.2]), "group_sd": np.array([0.001, 0.001])}
+    prior = replace(prior, group_share=np.array([0.3, 0.2]), group_sd=np.array([0.001, 0.001]))
     spread = Spread(mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(5))
     models = [
-        FaultModel(probability=0.5, spread=spread, priors=((1.0, replace(prior, group_centre=centre, **two)),))
+        FaultModel(probability=0.5, spread=spread, priors=((1.0, replace(prior, group_centre=centre)),))
         for centre in (np.array([0.03, -0.02]), np.array([-0.02, 0.03]))
     ]
-    drives = {"mean": np.zeros((2, K)), "mean_square": np.full((2, K), 0.04), "usual": np.full((2, K), 0.04)}
-    found = estimate_rows(rows, models, feed=0, **drives)
+    square = np.full((2, K), 0.04)
+    found = estimate_rows(rows, models, feed=0, mean=np.zeros((2, K)), mean_square=square, usual=square)
     np.testing.assert_allclose(found.group_probability, [[1.0, 0.0], [0.0, 0.0]], atol=0.1)

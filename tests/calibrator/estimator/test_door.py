@@ -251,6 +251,18 @@ def test_several_frames_and_bad_samples_are_taken_as_they_are() -> None:
     assert "at least 120 s are needed" in found.left_out_["V8"]
 
 
+@pytest.mark.parametrize(
+    ("column", "factor", "said"), [("battery", -1.0, "reads with the wrong sign"), ("motor", 0.0, "does not follow")]
+)
+def test_vehicle_whose_currents_do_not_balance_at_all_is_told_what_is_wrong(
+    column: str, factor: float, said: str
+) -> None:
+    given = frames(6)
+    given["V6"][column] = factor * given["V6"][column] + np.sin(given["V6"].index)
+    found = FleetCalibrator().fit(Fleet.from_frames(given, JUNCTION))
+    assert said in found.vehicles_["V6"].explain()
+
+
 def changed(**changes: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     """Three vehicles, one or more of them changed."""
     return lambda: {name: changes.get(name, lambda each: each)(each) for name, each in frames().items()}

@@ -1,5 +1,6 @@
 """Direct readings: every slip in a table is named, contradictions are named, and nothing is averaged over them."""
 
+import os
 import re
 from pathlib import Path
 
@@ -102,6 +103,14 @@ def test_table_is_read_in_any_order_and_empty_cells_are_not_read(tmp_path: Path)
 def test_slip_is_named_with_its_line(tmp_path: Path, lines: list[str], message: str) -> None:
     with pytest.raises(FleetError, match=message):
         check(read(tmp_path, *lines))
+
+
+def test_table_that_is_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "bench.csv")
+    with pytest.raises(
+        FleetError, match=r"bench\.csv: cannot read the bench readings: it is a pipe; a file is expected"
+    ):
+        read_bench_table(tmp_path / "bench.csv", BRANCHES, full_scale_a=FULL_SCALE_A)
 
 
 @pytest.mark.parametrize("reading", [(0.05, 0.002, NAN, NAN), (NAN, NAN, 3.0, 0.2)])

@@ -99,20 +99,3 @@ def test_standard_deviations_are_those_of_the_errors() -> None:
     within = np.abs(error[sure]) / sd[sure]
     assert 0.55 < (within < 1.0).mean() < 0.95
     assert (within > 3.5).mean() < 0.02
-
-
-@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_vehicle_is_estimated_alike_to_the_bit_alone_and_in_any_fleet(K: int) -> None:
-    rows = rows_of(random_faults(7, vehicles=300, branches=K, sparsity=70.0), seed=7)
-    models, drives = learn_fault_models(rows.take(slice(0, 40)), feed=0), moments(rows)
-    together = estimate_rows(rows, models, feed=0, **drives)
-    for j in (0, 171, 299):
-        one = slice(j, j + 1)
-        own = {"mean": drives["mean"][one], "mean_square": drives["mean_square"][one], "usual": drives["usual"]}
-        alone = estimate_rows(rows.take(one), models, feed=0, **own)
-        for name, values in vars(alone).items():
-            if isinstance(values, np.ndarray):
-                np.testing.assert_array_equal(values[0], getattr(together, name)[j], err_msg=name)
-        for found, other in zip(alone.supports[0], together.supports[j], strict=True):
-            assert found[0] == other[0]
-            np.testing.assert_array_equal(found[1], other[1])
