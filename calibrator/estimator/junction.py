@@ -639,6 +639,13 @@ def calibrate_junctions(
             notices.append(f"what is known contradicts itself, so nothing is corrected: {why}")
         for i, j in enumerate(group):
             name, ratios, constant_a = vehicles[j].vehicle, _named_ratios(laws[i], branches), laws[i].constant_a
+            k = int(np.argmax(found.drift[i]))
+            if found.drift[i, k] >= 1.0:  # as in the schema of the parameter file
+                left_out[name] = (
+                    f"sensor {branches[k]} reads {1.0 + found.drift[i, k]:.1f} times the current; check its unit, or "
+                    f"what is known of the other sensors"
+                )
+                continue
             expected_a = 0.0 if load is None else load.mean_a
             mine = parameters_of(
                 vehicles[j],
