@@ -150,7 +150,7 @@ def test_one_vehicle_and_a_branch_that_nobody_used_are_learned_from_without_fail
 
 def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> None:
     K = 2
-    rows = rows_of(random_faults(4, vehicles=60, branches=K), seed=4, errors=Errors(intercept=0.004))
+    rows = rows_of(random_faults(4, vehicles=30, branches=K), seed=4, errors=Errors(intercept=0.004))
     stated = rows.covariance.copy()
     at = RowPlaces(K).intercepts
     stated[:, at, at] -= np.diag([0.004**2 - 0.001**2] * K)

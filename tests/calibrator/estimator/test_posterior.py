@@ -124,7 +124,7 @@ def test_weights_are_those_of_integration_on_a_grid(faults: int, points: int, to
 @pytest.mark.parametrize("every", [1, 4])
 def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None:
     prior = paper_prior(2, 0, 1, 2)
-    draws = drawn(rows_of(random_faults(9, vehicles=40, branches=2, sparsity=70.0), seed=9), prior)
+    draws = drawn(rows_of(random_faults(9, vehicles=20, branches=2, sparsity=70.0), seed=9), prior)
     slabs = [Slab(low=low, high=high, tail=0.02) for low, high in ((0.02, 0.3), (0.05, 0.25), (0.1, 0.5))]
     found = size_evidence(draws, prior, kind, np.stack([slab.density for slab in slabs]), every=every)
     of = [replace(prior, gain=slab) if kind == GAIN else replace(prior, offset=slab) for slab in slabs]
