@@ -75,8 +75,9 @@ TOO_FEW = 4.0
 itself makes the tails heavier than normal."""
 SINGULAR = 1e-12
 """Eigenvalue over the largest one below which a direction counts as unknown. [1]"""
+TINY = np.finfo(float).tiny
 LEAST_PRIOR = 100.0 * SINGULAR
-"""Of the prior in the diagonal of the normal equations: it decides where constants cannot be told apart. [1]"""
+"""Of the prior in the diagonal of the normal equations where z stands still, and looks like the constant. [1]"""
 GAIN_SD = 0.4
 """Prior deviation of a gain ratio from -1: no running sensor is farther off. [1]"""
 NOISE_ROUNDS = 3
@@ -279,7 +280,7 @@ def regress_vehicles(
     Parameters
     ----------
     gram : ndarray of shape (B, p, p)
-        Sums of z z^T per block.
+        Sums of z z^T per block; the last z is 1.
     right : ndarray of shape (B, p)
         Sums of z y per block.
     power : ndarray of shape (N,)
@@ -297,26 +298,28 @@ def regress_vehicles(
     count, p = blocks.count, right.shape[1]
     Z, y = blocks.total(gram), blocks.total(right)
     least = np.maximum(LEAST_RHO * power, LEAST_VARIANCE)
-    held = np.flatnonzero(prior_precision)
-    least = np.maximum(least, LEAST_PRIOR * (Z[:, held, held] / prior_precision[held]).max(axis=1, initial=0.0))
+    still = np.diagonal(covariances(Z / Z[:, -1:, -1:]), axis1=1, axis2=2) == 0.0  # the prior alone tells of these
+    least_prior = LEAST_PRIOR * np.diagonal(Z, axis1=1, axis2=2) * (still & (prior_precision > 0.0))
     rho = least
     for _ in range(REGRESSION_ROUNDS):
         # (Z^T Z + rho P) theta = Z^T y + rho P theta_0, by the pseudo-inverse of the matrix scaled to a diagonal of one
-        matrix = Z + rho[:, None, None] * np.diag(prior_precision)
+        prior = np.maximum(rho[:, None] * prior_precision, least_prior)
+        matrix = Z + prior[:, :, None] * np.eye(p)
         scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), np.finfo(float).tiny))
         square = scale[:, :, None] * scale[:, None, :]
         inverse = np.linalg.pinv(matrix * square, rcond=SINGULAR, hermitian=True) * square
-        estimate = products(inverse, y + rho[:, None] * prior_precision * prior_mean)
+        estimate = products(inverse, y + prior * prior_mean)
         scores = right - products(gram, estimate[blocks.vehicle])
         influence = products(inverse[blocks.vehicle], scores)
         # long-run variance of the residual: its variance times by how much neighbouring samples repeat each other
         rho = np.maximum(blocks.total(np.sum(scores * influence, axis=1)) / p, least)
     influence -= (blocks.total(influence) / count[:, None])[blocks.vehicle]
+    prior = np.maximum(rho[:, None] * prior_precision, least_prior)
     widened = np.sqrt(np.maximum(count, TOO_FEW + 1.0) / np.maximum(count - TOO_FEW, 1.0))
     return VehicleRegressions(
         estimate=estimate,
         influence=influence * widened[blocks.vehicle][:, None],
-        prior_covariance=rho[:, None, None] ** 2 * (inverse * prior_precision) @ inverse,
+        prior_covariance=(inverse * (prior**2 / np.maximum(prior_precision, TINY))[:, None]) @ inverse,
         blocks=blocks,
     )
 
