@@ -109,13 +109,13 @@ def reconciliation(trial: Trial) -> Faults:
 
 
 BASELINES = {
-    "best subset": (best_subset, "best subset with BIC on the default's evidence"),
-    "LASSO": (lasso, "LASSO with refit on the same"),
-    "fleet median": (fleet_median, "regression on the fleet's median"),
-    "total least squares": (total_least_squares, "total least squares on the junction law"),
-    "VDI 2048": (reconciliation, "reconciliation by VDI 2048"),
+    "best subset": best_subset,
+    "LASSO": lasso,
+    "fleet median": fleet_median,
+    "total least squares": total_least_squares,
+    "VDI 2048": reconciliation,
 }
-"""By name: what finds the faults of the vehicles of a trial, and what it is."""
+"""By name: what finds the faults of the vehicles of a trial."""
 
 
 def _sensors_alone(drift: Array, offset_a: Array) -> Faults:

@@ -69,8 +69,8 @@ def experiment(
         raise typer.BadParameter(f"{name}: expected one of {', '.join(EXPERIMENTS)} or all", param_hint="NAME")
     rows = list(EXPERIMENTS.values()) if name == "all" else [EXPERIMENTS[name]]
     recorded = [row for row in rows if row.recorded]
-    others = ", ".join(row.name for row in EXPERIMENTS.values() if row.recorded)
-    unheeded, reason = ["drives", "layout"], f"{name} takes the built-in vehicle; this is only for {others}"
+    names = ", ".join(row.name for row in EXPERIMENTS.values() if row.recorded)
+    unheeded, reason = ["drives", "layout"], f"{name} takes the built-in vehicle; this is only for {names}"
     if rows == [CALIBRATION]:
         unheeded += ["quick", "repetitions", "seed", "workers"]
         reason = "calibration runs nothing, it pools what is recorded in --out"
@@ -91,12 +91,12 @@ def experiment(
     for number, row in enumerate(rows, start=1):
         with one_pass(number, len(rows)):
             if row is CALIBRATION:
-                before = {each.experiment.name: each for each in read_records(out, EXPERIMENTS)} if out else {}
-                if not before | done:
+                others = read_records(out, EXPERIMENTS) if out else [*done.values()]
+                if not others:
                     raise FleetError(
                         f"{out}: no experiment is recorded that calibration could pool; {first.format(out)}"
                     )
-                result = pool_confidences([*(before | done).values()])
+                result = pool_confidences(others)
             else:
                 fleet = trips if row.recorded and trips is not None else fleet_for(row, quick=quick)
                 small = row.small() if quick else row

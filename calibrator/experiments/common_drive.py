@@ -23,7 +23,7 @@ from calibrator.artificial.trips import with_branches
 from calibrator.drive import Array
 from calibrator.errors import DriveError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, densest_clusters
-from calibrator.experiments.trial import CommonEvidence, Trial, UnseenDrive
+from calibrator.experiments.trial import CommonEvidence, Trial, UnseenDrive, drawn_distribution
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.published.state_space import choose_order, identify_model
@@ -213,6 +213,8 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         simulate_other = _simulation(drive, other, case, Purpose.TRAINING_ERROR, seed)
         return collect_evidence(simulate_other(), fleet_mean(simulate_other()), _junction_a2(drive, other)), other
 
+    K, either_sign = drive.branches, not case.sign_bias
+    drawn = drawn_distribution(K, case.sparsity, case.magnitude, balanced=case.balanced) if either_sign else None
     return Trial(
         smallest_fault=case.magnitude[0],
         full_scale_a=drive.full_scale_a,
@@ -220,6 +222,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         unseen=UnseenDrive.of_linear_sensors(drive.unseen, truth),
         record=record,
         collect=lambda: evidence,
+        drawn_from=drawn,
         training=training,
     )
 

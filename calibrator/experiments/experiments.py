@@ -101,6 +101,8 @@ class Experiment:
         Series and values of x to which ``--quick`` keeps; empty: all.
     drive_s : float
         Length of the common drive. [s]
+    branches : int
+        Number of branches K of the common drive, 2 to 5; on recorded trips the cases say it.
     paper : mapping
         Figures of the paper by (x, method) and name; the best by x stands in the tables.
     note : str
@@ -108,15 +110,13 @@ class Experiment:
     picture : str
         Kind of its picture, see :mod:`calibrator.experiments.pages`.
     shown : tuple of str
-        Figures, besides the recovery rate, that its table shows of the default, by the names of
+        Figures of the default that stand beside the recovery rates of all methods, by the names of
         :data:`calibrator.experiments.figures.FIGURES`.
     panels : tuple of str
         Figures that its picture shows.
     pooled : bool
         Whether its confidences are among those that ``calibration`` pools: not of worlds that the estimator does not
         expect.
-    deviations : bool
-        Whether it is about standard deviations, and shows what all else leaves out.
     """
 
     name: str
@@ -127,29 +127,33 @@ class Experiment:
     settings: tuple[Setting, ...]
     quick: Mapping[str, Sequence[float]] = field(default_factory=dict)
     drive_s: float = 3600.0
+    branches: int = 2
     paper: Mapping[tuple[float, str], Mapping[str, float]] = field(default_factory=dict)
     note: str = ""
     picture: Literal["lines", "dots", "map", "reliability"] = "lines"
     shown: tuple[str, ...] = ("confidence", "sure_wrong", "ece", "ece_by_chance", "deployed", "harmed", "delay_rmse_ms")
     panels: tuple[str, ...] = ("recovery_rate", "confidence")
     pooled: bool = True
-    deviations: bool = False
 
     @property
     def recorded(self) -> bool:
         """Whether it is on recorded trips."""
         return any(isinstance(setting.case, RecordedCase) for setting in self.settings)
 
-    def with_vehicles(self, vehicles: int, training_vehicles: int | None = None) -> "Experiment":
+    def with_vehicles(self, vehicles: int, training_vehicles: int = 3000) -> "Experiment":
         """The same with smaller fleets on the common drive, and a smaller one to train trees on."""
-
-        def smaller(case: CommonCase | RecordedCase) -> CommonCase | RecordedCase:
-            if isinstance(case, RecordedCase):
-                return case
-            training = case.training_vehicles if training_vehicles is None else training_vehicles
-            return replace(case, vehicles=min(case.vehicles, vehicles), training_vehicles=training)
-
-        return replace(self, settings=tuple(replace(each, case=smaller(each.case)) for each in self.settings))
+        settings = tuple(
+            replace(
+                each,
+                case=replace(
+                    each.case, vehicles=min(each.case.vehicles, vehicles), training_vehicles=training_vehicles
+                ),
+            )
+            if isinstance(each.case, CommonCase)
+            else each
+            for each in self.settings
+        )
+        return replace(self, settings=settings)
 
     def small(self) -> "Experiment":
         """The same with small fleets and few settings: shows that it runs, not the figures."""
@@ -360,7 +364,6 @@ TABLE = (
         picture="dots",
         shown=COVERAGE,
         panels=("gain_within_1", "offset_within_1"),
-        deviations=True,
     ),
 )
 CALIBRATION = Experiment(
@@ -400,7 +403,8 @@ def fleet_for(
         If layout or drives cannot be read, there are too few trips, or there is no default layout.
     """
     if not experiment.recorded:
-        return builtin_common_drive(duration_s=QUICK_DURATION_S if quick else experiment.drive_s)
+        duration_s = QUICK_DURATION_S if quick else experiment.drive_s
+        return builtin_common_drive(branches=experiment.branches, duration_s=duration_s)
     if layout is None and not DEFAULT_LAYOUT.is_file():
         raise FleetError(
             f"{DEFAULT_LAYOUT}: not in this folder, which is no checkout of the source; experiments on recorded trips "

@@ -62,9 +62,7 @@ FIGURES = {
     "sure": FigureKind("> 0.95", "share of vehicles with a confidence above 0.95"),
     "sure_confidence": FigureKind("their confidence", "their mean confidence"),
     "sure_recovered": FigureKind("of them recovered", "share of them that is recovered"),
-    "sure_wrong": FigureKind(
-        "> 0.95, wrong", "of the vehicles above 0.95 those not recovered, and how many they expect", rare=True
-    ),
+    "sure_wrong": FigureKind("> 0.95, wrong", "share of them that is not recovered", rare=True),
     "ece": FigureKind("ECE", "expected calibration error, by tenths of the confidence", _error(0)),
     "ece_by_chance": FigureKind("by chance", "what it is by chance if the confidence is exact", _error(1)),
     "corrected": FigureKind("corrected", "share of the vehicles that is corrected in some branch"),

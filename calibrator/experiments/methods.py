@@ -22,7 +22,7 @@ from calibrator.published.classify import Classification, FaultTrees, classify_b
 from calibrator.published.recovery import recover_fleet
 
 __all__ = [
-    "BASELINES", "CEILING", "LEFT_IN", "MEANINGS", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "MethodRow",
+    "BASELINES", "CEILING", "LEFT_IN", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "MethodRow",
     "require_estimate",
 ]  # fmt: skip
 
@@ -48,8 +48,11 @@ class MethodRow:
 
 def _posterior(trial: Trial, *, known: bool = False) -> Estimate:
     """The default, which corrects the branches that are hardly ever made worse; told how faults were drawn, or not."""
-    drawn = trial.drawn_from if known else None
-    prior = None if drawn is None else known_prior(drawn.counts, drawn.gain)
+    prior = None
+    if known:
+        if trial.drawn_from is None:
+            raise FleetError("posterior/law known: nobody can say what the faults of these trials were drawn from")
+        prior = known_prior(trial.drawn_from.counts, trial.drawn_from.gain)
     if isinstance(trial.recorded, CommonEvidence):
         return _of_rows(trial.recorded, prior, trial.full_scale_a)
     names = [f"{k + 1}" for k in range(trial.truth.drift.shape[1])]
@@ -133,14 +136,7 @@ PERFECT = MethodRow("published/perfect", partial(_published, classify=_by_truth)
 POSTERIOR = MethodRow("posterior", _posterior)
 CEILING = MethodRow("posterior/law known", partial(_posterior, known=True))
 LEFT_IN = MethodRow("posterior, delays left in", _posterior)
-BASELINES = tuple(MethodRow(name, partial(_baseline, solve=solve)) for name, (solve, _) in SOLVERS.items())
-MEANINGS = {
-    **{name: meaning for name, (_, meaning) in SOLVERS.items()},
-    POSTERIOR.name: "the default",
-    LEFT_IN.name: "the default with the delays left in",
-    CEILING.name: "the default if it is told how the faults were drawn: the most that this evidence gives",
-}
-"""What the names of methods mean, where they do not say it."""
+BASELINES = tuple(MethodRow(name, partial(_baseline, solve=solve)) for name, solve in SOLVERS.items())
 
 
 def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
@@ -165,20 +161,22 @@ def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
         raise wrong("estimate() returned", estimate, "an Estimate")
     if not isinstance(estimate.faults, Faults):
         raise wrong("faults are", estimate.faults, "Faults of calibrator.faults")
-    arrays = {f"faults.{name}": value for name, value in vars(estimate.faults).items()}
-    arrays |= {name: getattr(estimate, name) for name in ("hardware", "corrected", "confidence")}
-    if estimate.confidence is None:
-        del arrays["confidence"]
-    for what, given in arrays.items():
+    given = {f"faults.{name}": value for name, value in vars(estimate.faults).items()}
+    given |= {name: getattr(estimate, name) for name in ("hardware", "corrected")}
+    optional = {name: getattr(estimate, name) for name in ("confidence", "drift_sd", "offset_sd_a")}
+    given |= {name: value for name, value in optional.items() if value is not None}
+    for what, values in given.items():
         shape = (N,) if what in {"faults.hardware_drift", "hardware", "confidence"} else (N, K)
         kinds, elements = ("b", "bool") if what in {"hardware", "corrected"} else ("fiu", "numbers")
-        if not (isinstance(given, np.ndarray) and given.shape == shape and given.dtype.kind in kinds):
+        if not (isinstance(values, np.ndarray) and values.shape == shape and values.dtype.kind in kinds):
             axes = "vehicles and branches" if shape[1:] else "vehicles"
-            raise wrong(f"{what} is", given, f"an array of {elements} of shape {shape}: {axes}")
-        bad, expected = ~np.isfinite(given), "finite ones, 0 where no fault is found"
+            raise wrong(f"{what} is", values, f"an array of {elements} of shape {shape}: {axes}")
+        bad, expected = ~np.isfinite(values), "finite ones, 0 where no fault is found"
         if what == "confidence":
-            bad |= (given < -ROUNDING) | (given > 1.0 + ROUNDING)
+            bad |= (values < -ROUNDING) | (values > 1.0 + ROUNDING)
             expected = "probabilities from 0 to 1"
         if bad.any():
-            raise wrong(f"{what} has {np.sum(bad)} wrong values in", given, expected)
+            raise wrong(f"{what} has {np.sum(bad)} wrong values in", values, expected)
+    if len(estimate.findings) not in {0, N}:
+        raise wrong(f"findings are of {len(estimate.findings)} vehicles in", estimate.findings, f"{N}, or none")
     return estimate

@@ -271,10 +271,12 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
     if case.minutes is not None:
         fleet = replace(fleet, trips=_runs(fleet, case.minutes, case.vehicles or len(fleet.trips), seed))
     trips, truth, N = fleet.with_branches(case.branches), None, len(fleet.trips)
+    drawn = drawn_distribution(case.branches, case.sparsity, case.magnitudes, balanced=case.balanced)
     if case.own_prior is not None:
         learnt = case.own_prior.estimate(recorded_trial(fleet, replace(case, own_prior=None), seed)).learnt
-        assert learnt is not None
-        truth = learnt.draw(random_stream(Purpose.TRAINING_FAULTS, seed), N, fleet.full_scale_a)
+        if learnt is None:
+            raise FleetError(f"method '{case.own_prior.name}': learns no prior that faults could be drawn from")
+        drawn, truth = learnt, learnt.draw(random_stream(Purpose.TRAINING_FAULTS, seed), N, fleet.full_scale_a)
     vehicles = record_vehicles(fleet, case, trips, seed, truth=truth)
     attack, ideal = vehicles.attack, [trip.matrix_a() for trip in trips]
     return Trial(
@@ -284,7 +286,7 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
         unseen=UnseenDrive.of_samples([vehicles.currents_a(j, ideal[j], ideal[(j + 1) % N]) for j in range(N)]),
         record=partial(_summaries, vehicles.samples, fleet),
         collect=partial(_published_evidence, vehicles.samples, fleet),
-        drawn_from=drawn_distribution(case.branches, case.sparsity, case.magnitudes, balanced=case.balanced),
+        drawn_from=drawn,
         delay_error_s=vehicles.delay_error_s,
         attacked=None if attack is None else attack.has,
         causes=() if attack is None else attack.world.causes,

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrator.errors import DriveError
+from calibrator.errors import DriveError, FleetError
 from calibrator.experiments.common_drive import (
     CommonCase,
     CommonDrive,
@@ -14,7 +14,7 @@ from calibrator.experiments.common_drive import (
     noise_sd_a,
 )
 from calibrator.experiments.figures import figure_rows, judge
-from calibrator.experiments.methods import PERFECT, POSTERIOR, THRESHOLD, TREE
+from calibrator.experiments.methods import CEILING, PERFECT, POSTERIOR, THRESHOLD, TREE
 from calibrator.experiments.trial import ComparedMethod
 from calibrator.faults import slopes_and_intercepts
 from tests.calibrator.experiments.small_trials import smooth_drive
@@ -108,6 +108,18 @@ def test_fleet_that_is_not_symmetric_defeats_the_mean_and_not_the_default() -> N
     published, default = rates(replace(CASE, vehicles=60, symmetric=False, sign_bias=0.4), PERFECT, POSTERIOR)
     assert published < 0.3
     assert default > 0.8
+
+
+def test_ceiling_is_told_how_the_faults_were_drawn_or_refused() -> None:
+    case = replace(CASE, vehicles=20, sparsity=20.0)
+    trial = common_trial(smooth_drive(), case, 0)
+    told, default = (method.estimate(trial).confidence for method in (CEILING, POSTERIOR))
+    assert told is not None
+    assert default is not None
+    assert not np.array_equal(told, default)
+    biased = common_trial(smooth_drive(), replace(case, symmetric=False, sign_bias=0.4), 0)
+    with pytest.raises(FleetError, match="nobody can say what the faults of these trials were drawn from"):
+        CEILING.estimate(biased)
 
 
 def test_builtin_drive_has_the_branches_asked_for_and_an_unseen_drive() -> None:

@@ -104,7 +104,7 @@ def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet,
     assert (read.settings, read.made) == (result.settings, result.made)
     page = (tmp_path / "results" / f"{name}.md").read_text()
     assert f"`calibrator experiment {name} --out FOLDER`" in page
-    assert ("minus the sum of the other branches" in page) == row.recorded
+    assert ("minus the sum of the others" in page) == row.recorded
     assert (tmp_path / "results" / f"{name}.png").is_file()
     for line in printed(result, width=80).splitlines():
         assert len(line) <= 80
@@ -136,11 +136,17 @@ def test_table_puts_paper_published_method_and_default_side_by_side(snr: Experim
     assert f" / {0.91:.2f} |" in result_markdown(snr)
 
 
-def test_captions_explain_only_columns_that_are_there(snr: ExperimentResult) -> None:
+def test_only_columns_that_are_there_are_explained(snr: ExperimentResult) -> None:
     only_published = only(snr, "method", PERFECT.name)
     for text in (result_markdown(only_published), printed(only_published)):
-        assert not any(absent in text for absent in ("the default", "confidence", "calibration error", "delays"))
-    assert "counts as harmed although it is recovered." in result_markdown(snr)
+        assert "harmed: share of the corrected vehicles" in text
+        assert not any(absent in text for absent in ("confidence", "calibration error", "delays", "failed"))
+    assert "0.91" in printed(snr), "the paper stands beside"
+
+
+def test_common_drive_has_the_branches_of_the_row() -> None:
+    drive = fleet_for(replace(EXPERIMENTS["snr"], branches=4), quick=True)
+    assert drive.record["branches"] == 4
 
 
 def test_damaged_record_is_named(tmp_path: Path) -> None:

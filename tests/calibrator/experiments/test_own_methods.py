@@ -51,7 +51,8 @@ def test_own_methods_stand_beside_the_paper_and_confidence_is_of_the_first_that_
     assert list(table.columns[:6]) == ["reading of S", "sparsity S [%]", "paper", PERFECT.name, "silent", "own"]
     assert table.iloc[:, :3].to_numpy().tolist() == [["", "60", "0.91"], ["3 of 6", "60", "0.91"]]
     assert table["confidence"].iloc[0] == "0.800"
-    assert "Of own: confidence (mean confidence)" in result_markdown(result)
+    assert "then figures of own:" in result_markdown(result)
+    assert list(headline(run(Own("silent"))).columns[2:]) == ["paper", "silent"]
     both = run(sure, POSTERIOR)
     default = both.value("confidence", x=60.0, method=POSTERIOR.name)
     assert headline(both)["confidence"].iloc[0] == f"{default:.3f}"
@@ -81,6 +82,8 @@ def test_methods_of_one_name_are_refused() -> None:
             lambda e: replace(e, confidence=np.full(N, 1.5)),
             "confidence has 20 wrong values .* probabilities from 0 to 1",
         ),
+        (lambda e: replace(e, drift_sd=MANY[:3], offset_sd_a=MANY), r"drift_sd is .* \(3, 2\), expected .*\(20, 2\)"),
+        (lambda e: replace(e, findings=[["load"]]), "findings are of 1 vehicles in .* expected 20, or none"),
     ],
 )
 def test_what_is_no_estimate_is_refused_with_the_name_of_the_method(change: Change, message: str) -> None:

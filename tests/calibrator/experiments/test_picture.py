@@ -98,11 +98,10 @@ def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult
     for result in (equal, shown_as(equal, "real"), pool_confidences([equal])):
         figure = drawn(result)
         (legend,) = figure.legends
-        assert all(axes.get_legend() is None for axes in figure.axes)
         assert not any(legend.get_window_extent().overlaps(axes.get_window_extent()) for axes in figure.axes)
         names = [text.get_text() for text in legend.get_texts()]
         assert len(names) == len(set(names))
-    assert [text.get_text() for text in drawn(equal).legends[0].get_texts()] == list(BIASES)
+    assert [text.get_text() for text in drawn(equal).legends[0].get_texts()] == [f"sign bias {b}" for b in BIASES]
 
 
 def test_map_shows_every_rate(equal: ExperimentResult) -> None:

@@ -85,6 +85,10 @@ def test_faults_of_the_own_prior_are_drawn_anew_for_the_same_trips(fleet: Record
     first = recorded_trial(fleet, RecordedCase(), 0)
     own = recorded_trial(fleet, RecordedCase(own_prior=POSTERIOR), 0)
     assert not np.array_equal(own.truth.drift, first.truth.drift)
+    learnt = POSTERIOR.estimate(first).learnt
+    assert own.drawn_from is not None
+    assert learnt is not None
+    np.testing.assert_array_equal(own.drawn_from.counts, learnt.counts)
     values = judge(POSTERIOR.estimate(own), own)
     assert values["recovery_rate"].mean() >= 0.8
     assert not values["harmed"].any()
