@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Recordings of one BMW i3 (CSV, 10 Hz) as drives, and as CAN logs where asked; each trip is a vehicle.
+"""Recordings of one BMW i3 (CSV, 10 Hz) as drives; each trip is a vehicle.
 
 Source: Steinstraeter, Buberger, Trifonov, "Battery and Heating Data in Real Driving Cycles", IEEE DataPort,
 DOI 10.21227/6jr9-5235. The car measures the battery current and the powers of heater and air conditioning; there is no
@@ -35,7 +35,6 @@ from calibrator.errors import DriveError, LogError
 from calibrator.files.folders import require_possible_folder
 from calibrator.recordings.decode import SignalRange, signal_range
 from calibrator.recordings.tables import Table, read_table
-from calibrator.recordings.write_logs import write_drive_log
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps, told_once
@@ -89,13 +88,10 @@ def main(
     csv: Annotated[list[Path], typer.Argument(help="CSV files (.csv, .csv.gz), or folders of them.")],
     layout: Annotated[Path, typer.Option(help="Layout with the branches battery, motor and auxiliary.")],
     out: Annotated[Path, typer.Option(help="Drive store to write to; trips that it has stay as they are.")],
-    logs: Annotated[Path | None, typer.Option(help="Write CAN logs into this folder too: VEHICLE/TRIP.log.gz.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the account as JSON.")] = False,
 ) -> None:
     """Turn recordings of a BMW i3 into drives; each file becomes a vehicle named after it."""
-    for folder in (out, logs):
-        if folder is not None:
-            require_possible_folder(folder)
+    require_possible_folder(out)
     database = read_database(read_layout(layout))
     names = {*database.layout.branch_names, *(item.name for item in database.layout.input)}
     if missing := [name for name in (*BRANCHES, *INPUTS) if name not in names]:
@@ -104,7 +100,7 @@ def main(
     trips = _trips(csv)
     for name, paths in shown(trips.items(), "import", len(trips), "trips"):
         try:
-            trip = _import_trip(name, paths, database, out, logs)
+            trip = _import_trip(name, paths, database, out)
         except UserError as error:
             failed[name] = str(error)
             continue
@@ -162,25 +158,15 @@ def _trips(arguments: Iterable[Path]) -> dict[str, list[Path]]:
     return trips
 
 
-def _import_trip(
-    name: str, paths: list[Path], database: VehicleDatabase, out: Path, logs: Path | None
-) -> ImportedTrip | None:
-    """Import what is missing of drive and log; None if nothing is."""
+def _import_trip(name: str, paths: list[Path], database: VehicleDatabase, out: Path) -> ImportedTrip | None:
+    """Import a trip; None if it is there already."""
     if len(paths) > 1:
         raise LogError(f"two files for one trip: {' and '.join(map(str, paths))}; remove or rename one")
     require_plain_name(name, f"{paths[0]}: the file's name, which names the trip,")
-    log = None if logs is None else logs / name / f"{name}.log.gz"
-    in_store = has_drive(out, name, name, database.layout)
-    if in_store and (log is None or log.exists()):
+    if has_drive(out, name, name, database.layout):
         return None
     trip = trip_from_table(read_table(paths[0]), vehicle=name, name=name, ranges=signal_ranges(database))
-    if not in_store:
-        write_drive(out, trip.drive, database.layout)
-    if log is not None and not log.exists():
-        try:
-            write_drive_log(log, trip.drive, database)
-        except OSError as error:
-            raise LogError(f"{log}: cannot write the log: {error.strerror}; choose another --logs") from None
+    write_drive(out, trip.drive, database.layout)
     return trip
 
 

@@ -37,12 +37,12 @@ def test_a_real_process_starts_and_keeps_its_memory() -> None:
 @pytest.mark.long
 def test_both_ways_of_reading_give_the_same_channels_and_a_figure_each() -> None:
     found = {row.name: row for row in ingest.rows(quick=True)}  # compares the channels of both ways
-    assert [row.unit for row in found.values()] == ["frames/s"] * 4 + ["h/s"] * 6
+    assert [row.unit for row in found.values()] == ["frames/s"] * 4 + ["h/s"] * 2
     assert all((found[f"{name} log to drive"].ratio or 0.0) > 1.0 for name in ("BLF", "candump", "ASC"))
 
 
 @pytest.mark.long
 def test_posterior_stands_beside_basis_pursuit() -> None:
     found = {row.name: row for row in posterior.rows(quick=True)}
-    assert sum(row.peer is not None for row in found.values()) == 4
-    assert all(f"posterior, K = {K}, S = {S} %" in found for K in (2, 3, 4, 5, 6, 8) for S in (80, 60))
+    assert list(found) == [f"posterior, K = {K}, S = {S} %" for K in (2, 4) for S in (80, 60)]
+    assert all(row.peer is not None for row in found.values())

@@ -23,14 +23,10 @@ from calibrator.published.recovery import BasisPursuit
 
 __all__ = ["rows"]
 
-VEHICLES, QUICK_VEHICLES = {2: 300, 3: 300, 4: 150, 5: 32, 6: 16, 8: 8}, 4
+VEHICLES, QUICK_VEHICLES = {2: 300, 4: 150}, 4
 """Of a fleet, by number of branches."""
 SOLVED, QUICK_SOLVED = 40, 2
 """Vehicles that the peer solves."""
-FLEET, QUICK_FLEET = 1000, 20
-"""Vehicles of the fleet that is estimated as a whole."""
-WITH_PEER = (2, 4)
-"""Numbers of branches that are measured beside the peer."""
 SPARSITIES = (80.0, 60.0)
 """Typical, and worst. [%]"""
 SLOPE_SD, RATIO_SD, INTERCEPT_SD, JUNCTION_SD = 0.002, 0.0005, 0.001, 0.0005
@@ -51,16 +47,11 @@ def rows(*, quick: bool) -> list[Row]:
                 fleet = _simulated(branches, QUICK_VEHICLES if quick else vehicles, sparsity)
                 models = learn_fault_models(fleet, feed=0)
                 seconds = _best_s(partial(_estimate, fleet, models)) / len(fleet)
-                peer, ratio = None, None
-                if branches in WITH_PEER:
-                    peer_s = _basis_pursuit_s(fleet, QUICK_SOLVED if quick else SOLVED)
-                    peer, ratio = f"basis pursuit, cvxpy (DPP) and Clarabel: {1e3 * peer_s:.2f} ms", peer_s / seconds
+                peer_s = _basis_pursuit_s(fleet, QUICK_SOLVED if quick else SOLVED)
+                peer, ratio = f"basis pursuit, cvxpy (DPP) and Clarabel: {1e3 * peer_s:.2f} ms", peer_s / seconds
                 name = f"posterior, K = {branches}, S = {sparsity:.0f} %"
                 found.append(Row(name=name, value=1e3 * seconds, unit="ms per vehicle", peer=peer, ratio=ratio))
-        fleet = _simulated(2, QUICK_FLEET if quick else FLEET, SPARSITIES[0])
-        seconds = _best_s(lambda: _estimate(fleet, learn_fault_models(fleet, feed=0)))
-        name = f"fleet of {len(fleet)} vehicles, hyper-parameters too, K = 2, S = {SPARSITIES[0]:.0f} %"
-        return [*found, Row(name=name, value=seconds, unit="s")]
+    return found
 
 
 def _best_s(measured: Callable[[], object]) -> float:

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bench.dynamic_vehicles import PERIOD_S, bank_model, drive_inputs, recorded
 from calibrator.drives.align import Samples
 from calibrator.estimator.fleet_identification import choose_filter_bank
 from calibrator.published.state_space import StateSpaceModel, simulation_snr_db
+from tests.calibrator.estimator.dynamic_vehicles import PERIOD_S, bank_model, drive_inputs, recorded
 
 LEAD_IN = 600
 GAINS = np.random.default_rng(0).normal(size=(4, 3))

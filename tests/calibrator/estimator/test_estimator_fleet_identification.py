@@ -9,7 +9,6 @@ import pytest
 from scipy.signal import lfilter
 from typer.testing import CliRunner, Result
 
-from bench.dynamic_vehicles import PERIOD_S
 from calibrator.cli import app
 from calibrator.drive import Array, Channel, Drive, DriveFile, Equipment, Mask
 from calibrator.drives.store import write_drive
@@ -24,7 +23,7 @@ from ecu_node.layout import read_layout
 INPUTS, BRANCHES = ("driving_current", "heater_current"), ("battery", "motor", "auxiliary")
 EQUIPMENT = Equipment(branches=BRANCHES, inputs=INPUTS, fleet_inputs=INPUTS, notices=())
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
-SAMPLES = 3000
+SAMPLES, PERIOD_S = 3000, 0.1
 MOTOR_S, SLUGGISH_S = 2.0, 12.0
 """Time constants of the motor of the fleet, and of the one vehicle that is different. [s]"""
 SLUGGISH = "V4"

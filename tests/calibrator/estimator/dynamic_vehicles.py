@@ -1,4 +1,4 @@
-"""Vehicles with slow and oscillating currents, each a little different: what identification is tested and measured on.
+"""Vehicles with slow and oscillating currents, each a little different: what identification is tested on.
 
 Four lags and one resonance (order 6) couple three inputs to four branches whose currents sum to zero. The couplings are
 those of the fleet; time constants, frequency and damping differ between vehicles. Inputs are steps and low-pass noise,
@@ -17,17 +17,6 @@ from calibrator.published.state_space import StateSpaceModel
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.summariser import summarise_samples
 
-__all__ = [
-    "INPUT_NAMES",
-    "PERIOD_S",
-    "SAMPLES",
-    "DynamicVehicle",
-    "bank_model",
-    "drive_inputs",
-    "dynamic_vehicle",
-    "recorded",
-]
-
 PERIOD_S = 0.1
 """Distance of the samples. [s]"""
 SAMPLES = 12_000
@@ -38,6 +27,8 @@ LAGS_S = np.array([0.3, 1.0, 4.0, 15.0])
 """From the filter of an inverter to the warming up of a heater. [s]"""
 RESONANCE_HZ, DAMPING = 0.5, 0.35
 """Of a power train that a step of torque shakes. [Hz], [1]"""
+POLE_SPREAD = 0.15
+"""Largest relative difference of a vehicle's time constants, frequency and damping from the fleet's. [1]"""
 OFFSET_A = 3.0
 """Standard deviation of the constant parts of the currents. [A]"""
 CURRENT_A = 20.0
@@ -65,33 +56,16 @@ class DynamicVehicle:
     samples: Samples
 
 
-def dynamic_vehicle(number: int, *, pole_spread: float = 0.15, pole_scale: float = 1.0) -> StateSpaceModel:
-    """Make a vehicle of the fleet.
-
-    Parameters
-    ----------
-    number : int
-        Of the vehicle.
-    pole_spread : float
-        Largest relative difference of its time constants, frequency and damping from the fleet's. [1]
-    pole_scale : float
-        Factor on all its time constants and on the period of its resonance: another kind of vehicle. [1]
-
-    Returns
-    -------
-    StateSpaceModel
-        Of order 6 with 3 inputs and 4 branches. [A]
-    """
+def dynamic_vehicle(number: int) -> StateSpaceModel:
+    """Make a vehicle of the fleet, of order 6 with 3 inputs and 4 branches."""
     rng = np.random.default_rng(0)  # the couplings are the fleet's
     B = rng.normal(size=(len(LAGS_S) + 2, len(INPUT_NAMES)))
     C, D, offset = (
         scale * _on_junction_law(rng.normal(size=(BRANCHES, width)))
         for scale, width in ((CURRENT_A, len(B)), (CURRENT_A, B.shape[1]), (OFFSET_A, 1))
     )
-    factors = 1.0 + pole_spread * np.random.default_rng([1, number]).uniform(-1.0, 1.0, len(B))
-    A, gains = _modes(
-        pole_scale * LAGS_S * factors[:-2], RESONANCE_HZ / pole_scale * factors[-2], DAMPING * factors[-1]
-    )
+    factors = 1.0 + POLE_SPREAD * np.random.default_rng([1, number]).uniform(-1.0, 1.0, len(B))
+    A, gains = _modes(LAGS_S * factors[:-2], RESONANCE_HZ * factors[-2], DAMPING * factors[-1])
     return StateSpaceModel(
         A=A, B=gains @ B, C=C, D=D, x0=np.zeros(len(A)), offset_a=offset[:, 0], snr_db=np.full(BRANCHES, np.inf)
     )
@@ -109,24 +83,7 @@ def drive_inputs(number: int, *, samples: int = SAMPLES) -> Array:
 def recorded(
     number: int, *, snr_db: float, samples: int = SAMPLES, model: StateSpaceModel | None = None
 ) -> DynamicVehicle:
-    """Record a drive of a vehicle.
-
-    Parameters
-    ----------
-    number : int
-        Of vehicle and drive.
-    snr_db : float
-        Power of each current about its mean over that of its sensor's white noise. [dB]
-    samples : int
-        Length T.
-    model : StateSpaceModel or None
-        Another vehicle than :func:`dynamic_vehicle` makes.
-
-    Returns
-    -------
-    DynamicVehicle
-        The vehicle and its drive.
-    """
+    """Record a drive, with the power of each current about its mean over that of its sensor's white noise in dB."""
     vehicle = dynamic_vehicle(number) if model is None else model
     inputs = drive_inputs(number, samples=samples + WARM_UP)
     clean = vehicle.simulate(inputs)[WARM_UP:]
@@ -145,20 +102,7 @@ def recorded(
 
 
 def bank_model(bank: FilterBank, drive: Samples) -> StateSpaceModel:
-    """Identify a vehicle with the poles of a bank, judged on held-out blocks.
-
-    Parameters
-    ----------
-    bank : FilterBank
-        A and B.
-    drive : Samples
-        What the vehicle recorded.
-
-    Returns
-    -------
-    StateSpaceModel
-        With the state of the vehicle's mean inputs as initial state.
-    """
+    """Identify a vehicle with the poles of a bank; its initial state is that of its mean inputs."""
     summary = summarise_samples([drive], period_s=PERIOD_S, bank=bank)
     (coefficients,), (offset_a,) = read_outs(summary.total[None], summary.branches)
     (A, B), M = bank.system(), len(bank.input_names)
