@@ -21,7 +21,6 @@ from calibrator.terminal.options import (
     number_option,
     whole_option,
 )
-from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import dumps
 from ecu_node.program import write_output
 
@@ -110,8 +109,7 @@ def simulate(
         unseen_s=60.0 * unseen_minutes,
         common=common_drive,
     )
-    with progress_bar("simulate", vehicles, "vehicles") as progress:
-        truth = simulate_fleet(plan, trips, database, out, workers=workers, progress=progress)
+    truth = simulate_fleet(plan, trips, database, out, workers=workers)
     if json:
         found = {"vehicles": len(truth.vehicles), "branches": truth.branches, "out": str(out), "notices": trips.notices}
         write_output(dumps(found))

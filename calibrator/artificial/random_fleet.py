@@ -3,13 +3,15 @@
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Faults
 
-__all__ = ["draw_faults", "nonzero_count"]
+__all__ = ["FaultSettings", "nonzero_count"]
 
 
 def nonzero_count(branches: int, sparsity: float) -> int:
@@ -34,73 +36,66 @@ def nonzero_count(branches: int, sparsity: float) -> int:
     return round((1.0 - sparsity / 100.0) * 3 * branches)
 
 
-def draw_faults(
-    rng: np.random.Generator,
-    *,
-    vehicles: int,
-    branches: int,
-    sparsity: float,
-    magnitude: tuple[float, float],
-    full_scale_a: float,
-    balanced: bool = False,
-    symmetric: bool = False,
-    sign_bias: float = 0.0,
-) -> Faults:
-    """Draw the fault parameters of a fleet, (20) and (22) in [1]_.
+@dataclass(frozen=True, kw_only=True)
+class FaultSettings:
+    """How the faults of a fleet are drawn, (20) and (22) in [1]_.
 
-    Parameters
+    Attributes
     ----------
-    rng : numpy.random.Generator
-        Source of chance.
-    vehicles : int
-        Fleet size N; a multiple of 4 for a symmetric fleet.
-    branches : int
-        Number of branches K.
     sparsity : float
         Sparsity level S. [%]
     magnitude : tuple of float
-        a, b: magnitudes are U(a, b) with random sign; drifts [1], offsets in fractions of full scale.
-    full_scale_a : float
-        Full scale of the junction. [A]
+        a, b: magnitudes are U(a, b) with random sign; gain errors [1], offsets in fractions of full scale.
     balanced : bool
-        No hardware faults in half of the vehicles.
+        No hardware faults in half of the vehicles; else any vehicle may have one.
     symmetric : bool
         Vehicles come in groups of four whose measured currents have the ideal current as their mean (22).
     sign_bias : float
         Faults are positive with probability 0.5 + sign_bias, 0 to 0.5: what a common cause does to a fleet. [1]
-
-    Returns
-    -------
-    Faults
-        Of N vehicles, in random order.
-
-    Raises
-    ------
-    FleetError
-        If a symmetric fleet is wanted whose size is no multiple of 4, or whose faults have a preferred sign; or if no
-        probability belongs to the bias.
     """
-    if not 0.0 <= sign_bias <= 0.5 or (symmetric and sign_bias):
-        raise FleetError(f"a sign bias of {sign_bias:g}: expected 0 to 0.5, and 0 for a symmetric fleet")
-    if symmetric and vehicles % 4:
-        raise FleetError(f"a symmetric fleet needs a multiple of 4 vehicles, not {vehicles}")
-    n = vehicles // 4 if symmetric else vehicles
-    values = _sparse_values(rng, n, 3 * branches, nonzero_count(branches, sparsity), magnitude)
-    if sign_bias:
-        values = np.where(rng.random(values.shape) < 2.0 * sign_bias, np.abs(values), values)
-    if balanced:
-        values[rng.permutation(n) < n // 2, :branches] = 0.0
-    faults = Faults.of_parameters(values, full_scale_a)
-    if symmetric:  # each vehicle with three others, so that the mean of (21) is the ideal current
-        signs = {
-            "hardware_drift": (1, -1, 1, -1),
-            "hardware_offset_a": (1, -1, 1, -1),
-            "drift": (1, -1, -1, 1),
-            "offset_a": (1, -1, 1, -1),
-        }
-        group = {name: np.concatenate([s * getattr(faults, name) for s in own]) for name, own in signs.items()}
-        faults = Faults(**group)
-    return faults.take(rng.permutation(vehicles))
+
+    sparsity: float
+    magnitude: tuple[float, float] = (0.05, 0.25)
+    balanced: bool = False
+    symmetric: bool = False
+    sign_bias: float = 0.0
+
+    def draw(self, rng: np.random.Generator, *, vehicles: int, branches: int, full_scale_a: float) -> Faults:
+        """Draw the fault parameters of a fleet, in random order.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Source of chance.
+        vehicles : int
+            Fleet size N; a multiple of 4 for a symmetric fleet.
+        branches : int
+            Number of branches K.
+        full_scale_a : float
+            Full scale of the junction. [A]
+
+        Raises
+        ------
+        FleetError
+            If a symmetric fleet is wanted whose size is no multiple of 4, or whose faults have a preferred sign; or if
+            no probability belongs to the bias.
+        """
+        if not 0.0 <= self.sign_bias <= 0.5 or (self.symmetric and self.sign_bias):
+            raise FleetError(f"a sign bias of {self.sign_bias:g}: expected 0 to 0.5, and 0 for a symmetric fleet")
+        if self.symmetric and vehicles % 4:
+            raise FleetError(f"a symmetric fleet needs a multiple of 4 vehicles, not {vehicles}")
+        n = vehicles // 4 if self.symmetric else vehicles
+        values = _sparse_values(rng, n, 3 * branches, nonzero_count(branches, self.sparsity), self.magnitude)
+        if self.sign_bias:
+            values = np.where(rng.random(values.shape) < 2.0 * self.sign_bias, np.abs(values), values)
+        if self.balanced:
+            values[rng.permutation(n) < n // 2, :branches] = 0.0
+        faults = Faults.of_parameters(values, full_scale_a)
+        if self.symmetric:  # each vehicle with three others, so that the mean of (21) is the ideal current
+            signs = dict.fromkeys(("hardware_drift", "hardware_offset_a", "offset_a"), (1, -1, 1, -1))
+            signs["drift"] = (1, -1, -1, 1)
+            faults = Faults(**{k: np.concatenate([s * getattr(faults, k) for s in own]) for k, own in signs.items()})
+        return faults.take(rng.permutation(vehicles))
 
 
 def _sparse_values(

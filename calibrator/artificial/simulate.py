@@ -6,14 +6,14 @@ delay and noise, sampled by its own message at its own instants, quantised by th
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.artificial.trips import (
     GroundTruth,
     TripPurpose,
@@ -31,6 +31,7 @@ from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fl
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.recordings.write_logs import FrameSeries, encode_message, sent_values, write_candump
+from calibrator.terminal.progress import shown
 from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch, Layout, split_signal
@@ -236,19 +237,13 @@ def _current_signal(branch: Branch) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FleetPlan:
-    """What an artificial fleet is like.
+class FleetPlan(FaultSettings):
+    """What an artificial fleet is like; beside what its faults are like:
 
     Attributes
     ----------
     vehicles, currents : int
         Fleet size N and number of branches K.
-    sparsity : float
-        Sparsity level S. [%]
-    magnitude : tuple of float
-        Range of fault magnitudes: drifts [1], offsets in fractions of full scale.
-    balanced, symmetric : bool
-        As in section IV-B of the paper.
     common_drive : bool
         Whether all vehicles drive the same trip. Only written down here; the trip source decides.
     noise : float
@@ -263,10 +258,6 @@ class FleetPlan:
 
     vehicles: int
     currents: int
-    sparsity: float
-    magnitude: tuple[float, float]
-    balanced: bool = False
-    symmetric: bool = False
     common_drive: bool = False
     noise: float = 0.001
     delay_max_s: float = 0.0
@@ -281,7 +272,6 @@ def simulate_fleet(
     out: Path,
     *,
     workers: int,
-    progress: Callable[[int], None] = lambda _: None,
 ) -> FleetTruth:
     """Draw a fleet and write its logs and its truth.
 
@@ -297,8 +287,6 @@ def simulate_fleet(
         New or empty folder. It appears only when it is complete.
     workers : int
         Number of processes.
-    progress : callable
-        Called with the number of vehicles written so far.
 
     Returns
     -------
@@ -316,10 +304,8 @@ def simulate_fleet(
     with whole_folder(out) as folder:
         write = partial(_write, folder=folder, database=database, trips=trips, seed=plan.seed)
         written = run_many(write, enumerate(vehicles), Workers(processes=workers))
-        truths = dict[str, VehicleTruth]()
-        for vehicle, truth in zip(vehicles, written, strict=True):
-            truths[vehicle.name] = truth
-            progress(len(truths))
+        told = shown(written, "simulate", len(vehicles), "vehicles")
+        truths = {vehicle.name: truth for vehicle, truth in zip(vehicles, told, strict=True)}
         fleet = FleetTruth(
             fleet_id="",
             layout=layout.name,
@@ -338,16 +324,7 @@ def simulate_fleet(
 def draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -> list[Vehicle]:
     """Draw the vehicles of a fleet, each with what is wrong with it; of a plan, a layout, and the names of branches."""
     rng = random_stream(Purpose.FAULTS, plan.seed)
-    faults = draw_faults(
-        rng,
-        vehicles=plan.vehicles,
-        branches=len(branches),
-        sparsity=plan.sparsity,
-        magnitude=plan.magnitude,
-        full_scale_a=layout.full_scale_a,
-        balanced=plan.balanced,
-        symmetric=plan.symmetric,
-    )
+    faults = plan.draw(rng, vehicles=plan.vehicles, branches=len(branches), full_scale_a=layout.full_scale_a)
     digits = max(3, len(str(plan.vehicles)))
     return [
         Vehicle(

@@ -172,6 +172,8 @@ class BuiltinTrips:
         Seed of the trips.
     duration_s, unseen_s : float
         Length of each trip to learn from, and of each trip to test on. [s]
+    common : bool
+        Whether every vehicle drives the trips of the first one, as in the experiments of the paper.
     notices : tuple of str
         What a user should know about the trips.
     """
@@ -179,6 +181,7 @@ class BuiltinTrips:
     seed: int
     duration_s: float
     unseen_s: float
+    common: bool = False
     notices: tuple[str, ...] = ()
 
     @property
@@ -188,6 +191,7 @@ class BuiltinTrips:
 
     def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
         """Drive a trip for vehicle ``number``."""
+        number = 0 if self.common else number
         rng = random_stream(_STREAM[purpose], self.seed, number)
         duration_s = self.duration_s if purpose == "calibration" else self.unseen_s
         return builtin_trip(rng, duration_s=duration_s, name=f"builtin-{number}-{purpose}")
@@ -204,9 +208,9 @@ class RecordedTrips:
     seed : int
         Seed of the trips.
     recorded : sequence of GroundTruth
-        The recordings.
+        The recordings, all with the same branches.
     vehicles : int
-        How many vehicles need trips.
+        How many vehicles need trips of their own; 1: all drive those of the first one.
     unseen_s : float
         Length of each trip to test on. [s]
     notices : tuple of str
@@ -221,11 +225,12 @@ class RecordedTrips:
 
     @property
     def branches(self) -> tuple[str, ...]:
-        """Branches that all recordings have."""
-        return tuple(b for b in self.recorded[0].currents_a if all(b in trip.currents_a for trip in self.recorded))
+        """Branches of the recordings."""
+        return tuple(self.recorded[0].currents_a)
 
     def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
         """Take or join a trip for vehicle ``number``."""
+        number = 0 if self.vehicles == 1 else number
         count, learnt, half = len(self.recorded), purpose == "calibration", len(self.recorded) // 2
         if learnt and count > 1 and self.vehicles <= count:
             return self.recorded[number]
@@ -244,28 +249,7 @@ class RecordedTrips:
         return joined.part(0, int(duration_s / joined.period_s))
 
 
-@dataclass(frozen=True, kw_only=True)
-class CommonTrips:
-    """Every vehicle drives the trips of vehicle 0 of some source, as in the experiments of the paper."""
-
-    of: BuiltinTrips | RecordedTrips
-
-    @property
-    def branches(self) -> tuple[str, ...]:
-        """Branches that the trips have."""
-        return self.of.branches
-
-    @property
-    def notices(self) -> tuple[str, ...]:
-        """What a user should know about the trips."""
-        return self.of.notices
-
-    def trip(self, _: int, purpose: TripPurpose) -> GroundTruth:
-        """Trip of any vehicle."""
-        return replace(self.of.trip(0, purpose), name=f"common-{purpose}")
-
-
-TripSource = BuiltinTrips | RecordedTrips | CommonTrips
+TripSource = BuiltinTrips | RecordedTrips
 """Gives every vehicle its trips."""
 
 
@@ -282,7 +266,7 @@ def read_recorded_trips(store: Path, layout: Layout) -> tuple[list[GroundTruth],
     Returns
     -------
     trips : list of GroundTruth
-        In the order of the store.
+        In the order of the store, with the branches and inputs that all of them have.
     unusable : list of str
         Names of the drives that lack good samples of some channel.
 
@@ -298,7 +282,19 @@ def read_recorded_trips(store: Path, layout: Layout) -> tuple[list[GroundTruth],
     trips = [trip for _, trip in made if trip is not None]
     if not trips:
         raise FleetError(f"{store}: no drive with usable samples; import drives with 'calibrator import'")
-    return trips, [name for name, trip in made if trip is None]
+    branches, inputs = (
+        [name for name in getattr(trips[0], group) if all(name in getattr(trip, group) for trip in trips)]
+        for group in ("currents_a", "inputs")
+    )
+    alike = [
+        replace(
+            trip,
+            currents_a={name: trip.currents_a[name] for name in branches},
+            inputs={name: trip.inputs[name] for name in inputs},
+        )
+        for trip in trips
+    ]
+    return alike, [name for name, trip in made if trip is None]
 
 
 def choose_trips(
@@ -331,16 +327,13 @@ def choose_trips(
     FleetError
         If no drive of the store is usable, or the built-in vehicle has not what the layout names.
     """
-    found: BuiltinTrips | RecordedTrips
     if drives == "builtin":
         notices = _builtin_notices(layout)
-        found = BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s, notices=notices)
-    else:
-        recorded, unusable = read_recorded_trips(Path(drives), layout)
-        text = f"{len(unusable)} drives lack good samples of some channel and are left out: {', '.join(unusable)}"
-        count, notices = 1 if common else vehicles, (text,) if unusable else ()
-        found = RecordedTrips(seed=seed, recorded=recorded, vehicles=count, unseen_s=unseen_s, notices=notices)
-    return CommonTrips(of=found) if common else found
+        return BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s, common=common, notices=notices)
+    recorded, unusable = read_recorded_trips(Path(drives), layout)
+    text = f"{len(unusable)} drives lack good samples of some channel and are left out: {', '.join(unusable)}"
+    count, notices = 1 if common else vehicles, (text,) if unusable else ()
+    return RecordedTrips(seed=seed, recorded=recorded, vehicles=count, unseen_s=unseen_s, notices=notices)
 
 
 def _builtin_notices(layout: Layout) -> tuple[str, ...]:

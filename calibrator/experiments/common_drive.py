@@ -14,11 +14,12 @@ branch, (.)_r the others and M the covariance of the measured currents, g = M_rr
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, builtin_trip
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.artificial.trips import with_branches
 from calibrator.drive import Array
 from calibrator.errors import DriveError
@@ -140,8 +141,8 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommonCase:
-    """How a fleet on the common drive is drawn, section IV-B of [1]_, and simulated.
+class CommonCase(FaultSettings):
+    """How a fleet on the common drive is drawn, section IV-B of [1]_, and simulated; beside what its faults are like:
 
     Attributes
     ----------
@@ -149,16 +150,8 @@ class CommonCase:
         Fleet size N, a multiple of 4 for a symmetric fleet.
     training_vehicles : int
         Size of the artificial fleet that trees learn from; 3,000 in section V-B.
-    sparsity : float
-        Sparsity level S. [%]
-    magnitude : tuple of float
-        a, b: gain errors [1], offsets in fractions of full scale.
     snr_db : float
         Of the artificial simulation (26). [dB]
-    balanced, symmetric : bool
-        See :func:`~calibrator.artificial.random_fleet.draw_faults`.
-    sign_bias : float
-        Faults are positive with probability 0.5 + sign_bias. [1]
     state_space : bool
         Simulate by a state-space model of each vehicle (2), trained on 80 % of the drive, instead of artificially (23).
     """
@@ -166,26 +159,10 @@ class CommonCase:
     vehicles: int = 1000
     training_vehicles: int = 3000
     sparsity: float = 60.0
-    magnitude: tuple[float, float] = (0.05, 0.25)
     snr_db: float = 20.0
     balanced: bool = True
     symmetric: bool = True
-    sign_bias: float = 0.0
     state_space: bool = False
-
-    def draw(self, drive: CommonDrive, vehicles: int, purpose: Purpose, seed: int) -> Faults:
-        """Draw the faults of a fleet."""
-        return draw_faults(
-            random_stream(purpose, seed),
-            vehicles=vehicles,
-            branches=drive.branches,
-            sparsity=self.sparsity,
-            magnitude=self.magnitude,
-            full_scale_a=drive.full_scale_a,
-            balanced=self.balanced,
-            symmetric=self.symmetric,
-            sign_bias=self.sign_bias,
-        )
 
 
 def noise_sd_a(drive: CommonDrive, snr_db: float) -> float:
@@ -195,7 +172,8 @@ def noise_sd_a(drive: CommonDrive, snr_db: float) -> float:
 
 def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
     """Evidence of N vehicles on the unity drive; the same for the same seed."""
-    truth = case.draw(drive, case.vehicles, Purpose.FAULTS, seed)
+    junction: dict[str, Any] = {"branches": drive.branches, "full_scale_a": drive.full_scale_a}
+    truth = case.draw(random_stream(Purpose.FAULTS, seed), vehicles=case.vehicles, **junction)
     simulate = _simulation(drive, truth, case, Purpose.SIMULATION_ERROR, seed)
     if case.state_space:
         simulate = list(_state_space_simulations(drive, truth)).copy
@@ -209,12 +187,10 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
 
     def training() -> tuple[FleetEvidence, Faults]:
         """Evidence and truth of another fleet, for the trees."""
-        other = case.draw(drive, case.training_vehicles, Purpose.TRAINING_FAULTS, seed)
+        other = case.draw(random_stream(Purpose.TRAINING_FAULTS, seed), vehicles=case.training_vehicles, **junction)
         simulate_other = _simulation(drive, other, case, Purpose.TRAINING_ERROR, seed)
         return collect_evidence(simulate_other(), fleet_mean(simulate_other()), _junction_a2(drive, other)), other
 
-    K, either_sign = drive.branches, not case.sign_bias
-    drawn = drawn_distribution(K, case.sparsity, case.magnitude, balanced=case.balanced) if either_sign else None
     return Trial(
         smallest_fault=case.magnitude[0],
         full_scale_a=drive.full_scale_a,
@@ -222,7 +198,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         unseen=UnseenDrive.of_linear_sensors(drive.unseen, truth),
         record=record,
         collect=lambda: evidence,
-        drawn_from=drawn,
+        drawn_from=drawn_distribution(case, drive.branches),
         training=training,
     )
 

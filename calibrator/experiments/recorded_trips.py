@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.artificial.builtin_drives import builtin_trip
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.artificial.simulate import Vehicle, vehicle_drive
 from calibrator.artificial.trips import GroundTruth, balance_branch, choose_branches, read_recorded_trips, with_branches
 from calibrator.drive import Array
@@ -68,6 +68,12 @@ class RecordedFleet:
             raise FleetError(
                 f"{self.name}: {len(self.trips)} usable trips, at least {FEWEST_TRIPS} are needed, as each is a "
                 "vehicle; import more drives"
+            )
+        if not self.input_names(self.trips[0].inputs):
+            layout = self.database.layout
+            raise FleetError(
+                f"{layout.path}: {self.name} have none of its model inputs {', '.join(layout.model_inputs)}; they have "
+                f"{', '.join(self.trips[0].inputs) or 'no inputs'}; name the layout that these trips are of"
             )
 
     @property
@@ -166,21 +172,15 @@ def builtin_fleet(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedCase:
-    """How vehicles are made of trips.
+class RecordedCase(FaultSettings):
+    """How vehicles are made of trips; beside what their faults are like:
 
     Attributes
     ----------
     branches : int
         Number of branches K.
-    sparsity : float
-        Sparsity level S. [%]
-    magnitude : tuple of float
-        Gain errors [1], offsets in fractions of full scale.
     unmeasured_a : tuple of float
         Mean and standard deviation over vehicles of a load that no branch measures, never negative. [A]
-    balanced : bool
-        Whether half of the vehicles have no hardware fault; else any vehicle may have one.
     world : str
         What else befalls some vehicles, of :data:`~calibrator.experiments.attacks.WORLDS`; empty: nothing.
     own_prior : ComparedMethod or None
@@ -196,7 +196,6 @@ class RecordedCase:
 
     branches: int = 2
     sparsity: float = 80.0
-    magnitude: tuple[float, float] = (0.05, 0.25)
     unmeasured_a: tuple[float, float] = (0.0, 0.0)
     balanced: bool = True
     world: str = ""
@@ -207,10 +206,10 @@ class RecordedCase:
     delays_left_in: bool = False
 
     @property
-    def magnitudes(self) -> tuple[float, float]:
-        """Range of the faults' magnitudes, which a world may change."""
+    def faults(self) -> FaultSettings:
+        """How the faults are drawn; a world may change their magnitude."""
         own = WORLDS[self.world].magnitude if self.world else None
-        return self.magnitude if own is None else own
+        return self if own is None else replace(self, magnitude=own)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,7 +270,7 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
     if case.minutes is not None:
         fleet = replace(fleet, trips=_runs(fleet, case.minutes, case.vehicles or len(fleet.trips), seed))
     trips, truth, N = fleet.with_branches(case.branches), None, len(fleet.trips)
-    drawn = drawn_distribution(case.branches, case.sparsity, case.magnitudes, balanced=case.balanced)
+    drawn = drawn_distribution(case.faults, case.branches)
     if case.own_prior is not None:
         learnt = case.own_prior.estimate(recorded_trial(fleet, replace(case, own_prior=None), seed)).learnt
         if learnt is None:
@@ -280,7 +279,7 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
     vehicles = record_vehicles(fleet, case, trips, seed, truth=truth)
     attack, ideal = vehicles.attack, [trip.matrix_a() for trip in trips]
     return Trial(
-        smallest_fault=case.magnitudes[0],
+        smallest_fault=case.faults.magnitude[0],
         full_scale_a=fleet.full_scale_a,
         truth=vehicles.truth,
         unseen=UnseenDrive.of_samples([vehicles.currents_a(j, ideal[j], ideal[(j + 1) % N]) for j in range(N)]),
@@ -326,15 +325,7 @@ def record_vehicles(
         Faults of the vehicles; None: drawn as the case says.
     """
     N, full_scale_a, rng = len(trips), fleet.full_scale_a, random_stream(Purpose.FAULTS, seed)
-    faults = truth or draw_faults(
-        rng,
-        vehicles=N,
-        branches=case.branches,
-        sparsity=case.sparsity,
-        magnitude=case.magnitudes,
-        full_scale_a=full_scale_a,
-        balanced=case.balanced,
-    )
+    faults = truth or case.faults.draw(rng, vehicles=N, branches=case.branches, full_scale_a=full_scale_a)
     attack = draw_attack(case.world, N, full_scale_a=full_scale_a, seed=seed) if case.world else None
     vehicles = VehicleSamples(
         truth=faults if attack is None else attack.truth(faults),

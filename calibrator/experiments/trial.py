@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from calibrator.artificial.random_fleet import nonzero_count
+from calibrator.artificial.random_fleet import FaultSettings, nonzero_count
 from calibrator.drive import Array, Mask
 from calibrator.estimator.evidence import EvidenceRows
 from calibrator.faults import Faults
@@ -60,32 +60,21 @@ class FaultDistribution:
         return Faults.of_parameters(values, full_scale_a)
 
 
-def drawn_distribution(
-    branches: int, sparsity: float, magnitude: tuple[float, float], *, balanced: bool
-) -> FaultDistribution:
-    """Distribution that :func:`~calibrator.artificial.random_fleet.draw_faults` draws from.
+def drawn_distribution(settings: FaultSettings, branches: int) -> FaultDistribution | None:
+    """Distribution that the faults of vehicles with K branches are drawn from; None for faults of a preferred sign.
 
     An estimator that knows it shows the ceiling: with the same evidence no estimator recovers more on average than its
     mean confidence says, as far as the errors of the evidence are stated rightly.
-
-    Parameters
-    ----------
-    branches : int
-        Number of branches K.
-    sparsity : float
-        Sparsity level S. [%]
-    magnitude : tuple of float
-        Range of gain errors [1] and of offsets in fractions of full scale.
-    balanced : bool
-        Whether the hardware faults of half of the vehicles are set to zero.
     """
-    K, n = branches, nonzero_count(branches, sparsity)
+    if settings.sign_bias:
+        return None
+    K, n = branches, nonzero_count(branches, settings.sparsity)
     counts = np.zeros((K + 1, 2 * K + 1))
     for hardware in range(max(n - 2 * K, 0), min(n, K) + 1):
         probability = comb(K, hardware) * comb(2 * K, n - hardware) / comb(3 * K, n)
-        counts[hardware, n - hardware] += probability / (2.0 if balanced else 1.0)
-        counts[0, n - hardware] += probability / 2.0 if balanced else 0.0
-    return FaultDistribution(counts=counts, gain=magnitude, offset=magnitude)
+        counts[hardware, n - hardware] += probability / (2.0 if settings.balanced else 1.0)
+        counts[0, n - hardware] += probability / 2.0 if settings.balanced else 0.0
+    return FaultDistribution(counts=counts, gain=settings.magnitude, offset=settings.magnitude)
 
 
 @dataclass(frozen=True, kw_only=True)

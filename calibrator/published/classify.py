@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.tree import DecisionTreeClassifier
 
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.evidence import FleetEvidence
@@ -213,15 +213,9 @@ def classify_by_expected_tree(
         How many vehicles the reference is the mean of.
     """
     i_s = reference - reference.mean(axis=1, keepdims=True)
-    faults = draw_faults(
-        random_stream(Purpose.TRAINING_FAULTS, expected.seed),
-        vehicles=TRAINING_VEHICLES,
-        branches=evidence.branches,
-        sparsity=expected.sparsity,
-        magnitude=expected.magnitude,
-        full_scale_a=full_scale_a,
-        balanced=True,
-    )
+    settings = FaultSettings(sparsity=expected.sparsity, magnitude=expected.magnitude, balanced=True)
+    rng = random_stream(Purpose.TRAINING_FAULTS, expected.seed)
+    faults = settings.draw(rng, vehicles=TRAINING_VEHICLES, branches=evidence.branches, full_scale_a=full_scale_a)
     features = expected_features(
         faults, i_s, simulation_error_a, reference_vehicles=None if expected.symmetric else reference_vehicles
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.artificial.simulate import Vehicle, vehicle_frames
 from calibrator.artificial.trips import GroundTruth, ground_truth_from_drive, with_branches
 from calibrator.drive import Array, Channel, Drive, Mask
@@ -107,9 +107,8 @@ def _ideal_trip(drive: Drive, branches: Sequence[str]) -> GroundTruth | None:
 def _delayed(trip: GroundTruth, database: VehicleDatabase, rng: np.random.Generator) -> DelayedTrip:
     names = tuple(trip.currents_a)
     full_scale_a = database.layout.full_scale_a
-    faults = draw_faults(
-        rng, vehicles=1, branches=len(names), sparsity=SPARSITY, magnitude=FAULTS, full_scale_a=full_scale_a
-    ).take(0)
+    settings = FaultSettings(sparsity=SPARSITY, magnitude=FAULTS)
+    faults = settings.draw(rng, vehicles=1, branches=len(names), full_scale_a=full_scale_a).take(0)
     vehicle = Vehicle(
         name=trip.name,
         branches=names,

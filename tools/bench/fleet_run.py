@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.row import LAYOUT, MEBIBYTE, Row
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.artificial.simulate import FleetPlan, draw_vehicles, simulate_fleet, trip_of, vehicle_drive
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.drive import Array, Channel, Drive, Equipment
@@ -52,8 +52,8 @@ KILLED_FLEET, KILLS = 2_000, 20
 QUICK_KILLED_FLEET, QUICK_KILLS = 500, 2
 TRIPS, MINUTES = 64, 6.0
 """Different trips of the summaries, and their least length. [min]"""
-BRANCHES, MAGNITUDE, SPARSITY = ("battery", "motor"), (0.05, 0.25), 80.0
-"""Of the fleets; faults are drawn as in the paper. [1], [%]"""
+BRANCHES, SPARSITY = ("battery", "motor"), 80.0
+"""Of the fleets; faults are drawn as in the paper. [%]"""
 DRIVES, DRIVE_S, STEP_A = 20, 600.0, 0.1
 """Different drives that are read, their length [s], and the step of the noise that makes each its own [A]."""
 WORKERS = 2
@@ -150,7 +150,7 @@ def killed_runs(folder: Path, vehicles: int, kills: int, command: str = "calibra
     if command == "calibrate":
         make_store(given, vehicles=vehicles)
     else:
-        plan = FleetPlan(vehicles=vehicles, currents=len(BRANCHES), sparsity=SPARSITY, magnitude=MAGNITUDE)
+        plan = FleetPlan(vehicles=vehicles, currents=len(BRANCHES), sparsity=SPARSITY)
         trips = BuiltinTrips(seed=0, duration_s=DRIVE_S, unseen_s=60.0)
         simulate_fleet(plan, trips, read_database(read_layout(LAYOUT)), given, workers=WORKERS)
         given /= "logs"
@@ -187,7 +187,7 @@ def make_store(folder: Path, *, vehicles: int, branches: int = 2) -> None:
     """Write a store of summaries of so many vehicles with known kinds of faults."""
     database, K = read_database(read_layout(LAYOUT)), branches
     fleet = builtin_fleet(database, trips=TRIPS, duration_s=60.0 * MINUTES)
-    case = RecordedCase(branches=K, sparsity=100.0, magnitude=MAGNITUDE)
+    case = RecordedCase(branches=K, sparsity=100.0)
     inputs = database.layout.fleet_inputs or database.layout.model_inputs
     recorded = record_vehicles(fleet, case, fleet.with_branches(K), 0).samples
     trips = [summarise_samples([item.with_inputs(inputs)], period_s=fleet.period_s) for item in recorded]
@@ -212,15 +212,8 @@ def _write(
 ) -> None:
     (number, names), branches = bucket, store.identity.branches
     K = len(branches)
-    faults = draw_faults(
-        np.random.default_rng(number),
-        vehicles=len(names),
-        branches=K,
-        sparsity=SPARSITY,
-        magnitude=MAGNITUDE,
-        full_scale_a=full_scale_a,
-        balanced=True,
-    )
+    settings, rng = FaultSettings(sparsity=SPARSITY, balanced=True), np.random.default_rng(number)
+    faults = settings.draw(rng, vehicles=len(names), branches=K, full_scale_a=full_scale_a)
     zero, unknown = np.zeros(K), np.full(K, np.nan)
     records = {}
     for j, name in enumerate(names):

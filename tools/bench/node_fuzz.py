@@ -12,7 +12,6 @@ rounded, halves up; the node may come out as if the value were greater by less t
 import argparse
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple
 
 from bench.c_core import frames as random_frames
 from bench.fuzz_vehicles import FuzzBranch, FuzzMessage, FuzzVehicle, draw_vehicle
+from calibrator.terminal.progress import shown
 from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase
@@ -299,23 +299,19 @@ def fuzz(frames: int, seed: int = 0, frames_per_vehicle: int = FRAMES_PER_VEHICL
         yield done + count
 
 
-def main() -> int:
+def main() -> None:
     """Try as many frames as asked for."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--frames", type=int, default=10_000_000)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    start_s, done = time.monotonic(), 0
+    vehicles = arguments.frames // FRAMES_PER_VEHICLE
     try:
-        for done in fuzz(arguments.frames, arguments.seed):
-            if done % (50 * FRAMES_PER_VEHICLE) == 0:
-                print(f"{done} frames, {done / (time.monotonic() - start_s):.0f} frames/s", file=sys.stderr, flush=True)
+        done = max(shown(fuzz(arguments.frames, arguments.seed), "fuzz", vehicles, "vehicles"), default=0)
     except WrongFrameError as error:
-        print(error, file=sys.stderr)
-        return 1
-    print(f"{done} frames right in both modes, {done / (time.monotonic() - start_s):.0f} frames/s")
-    return 0
+        sys.exit(f"{error}")
+    print(f"{done} frames right in both modes")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

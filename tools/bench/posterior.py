@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bench.row import Row, run
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.estimator.decision import estimate_rows
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces, row_design
 from calibrator.estimator.learning import learn_fault_models
@@ -81,9 +81,7 @@ def _estimate(fleet: EvidenceRows, models: Sequence[FaultModel]) -> None:
 def _simulated(branches: int, vehicles: int, sparsity: float) -> EvidenceRows:
     """Rows of vehicles with random faults and errors, the same in each run."""
     K, rng, at = branches, np.random.default_rng(branches), RowPlaces(branches)
-    faults = draw_faults(
-        rng, vehicles=vehicles, branches=K, sparsity=sparsity, magnitude=(0.05, 0.25), full_scale_a=1.0, balanced=True
-    )
+    faults = FaultSettings(sparsity=sparsity, balanced=True).draw(rng, vehicles=vehicles, branches=K, full_scale_a=1.0)
     factor = 1.0 + faults.drift
     gains = np.log1p(np.column_stack([faults.hardware_drift, faults.drift]))
     parameters = np.column_stack(

@@ -18,7 +18,6 @@ import multiprocessing
 import os
 import sys
 import tempfile
-import time
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,6 +32,7 @@ from tuf.api.metadata import Metadata
 from bench.row import LAYOUT
 from bench.true_parameters import true_parameters
 from calibrator.repository.repository import ROLES, NewKeys, Repository
+from calibrator.terminal.progress import shown
 from ecu_node.core.status import UnfitError
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
@@ -229,27 +229,23 @@ def _vehicle(folder: Path) -> Vehicle:
     return Vehicle(Path(tempfile.mkdtemp(dir=folder)))
 
 
-def main() -> int:
+def main() -> None:
     """Run, and say how many were refused."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--bundles", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     options = parser.parse_args()
-    start_s, done = time.monotonic(), 0
     parts = [range(first, min(first + _CHUNK, options.bundles)) for first in range(0, options.bundles, _CHUNK)]
     in_memory = _MEMORY if os.access(_MEMORY, os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=in_memory) as name, multiprocessing.Pool(options.processes) as pool:
+        refused = pool.imap_unordered(functools.partial(fuzz, folder=Path(name), seed=options.seed), parts)
         try:
-            for refused in pool.imap_unordered(functools.partial(fuzz, folder=Path(name), seed=options.seed), parts):
-                done += refused
-                print(f"{done} refused, {done / (time.monotonic() - start_s):.0f} per second", file=sys.stderr)
+            done = sum(shown(refused, "fuzz", len(parts), "thousand bundles"))
         except WrongAnswerError as error:
-            print(error)
-            return 1
-    print(f"{done} changed bundles refused, each in one line, {done / (time.monotonic() - start_s):.0f} per second")
-    return 0
+            sys.exit(f"{error}")
+    print(f"{done} changed bundles refused, each in one line")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,21 +1,18 @@
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults, nonzero_count
+from calibrator.artificial.random_fleet import FaultSettings, nonzero_count
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, measured_currents, true_currents
 
 
-def draw(seed: int = 0, **changes: object) -> Faults:
-    settings: dict[str, object] = {
-        "vehicles": 2000,
-        "branches": 2,
-        "sparsity": 60.0,
-        "magnitude": (0.05, 0.25),
-        "full_scale_a": 400.0,
-    }
-    return draw_faults(np.random.default_rng(seed), **(settings | changes))  # type: ignore[arg-type]
+def draw(*, vehicles: int = 2000, branches: int = 2, **changes: Any) -> Faults:
+    settings = replace(FaultSettings(sparsity=60.0), **changes)
+    return settings.draw(np.random.default_rng(0), vehicles=vehicles, branches=branches, full_scale_a=400.0)
 
 
 def free_parameters(faults: Faults) -> Array:

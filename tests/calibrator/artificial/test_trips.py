@@ -7,7 +7,6 @@ import pytest
 
 from calibrator.artificial.trips import (
     BuiltinTrips,
-    CommonTrips,
     GroundTruth,
     RecordedTrips,
     TripSource,
@@ -65,7 +64,7 @@ def test_single_recording_is_cut_in_time() -> None:
 
 
 def test_common_trips_are_the_same_for_all_and_differ_by_purpose() -> None:
-    trips = CommonTrips(of=BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0))
+    trips = BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0, common=True)
     first, second = trips.trip(0, "calibration"), trips.trip(5, "calibration")
     np.testing.assert_array_equal(first.currents_a["battery"], second.currents_a["battery"])
     unseen = trips.trip(0, "unseen")

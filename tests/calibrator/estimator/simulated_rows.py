@@ -5,13 +5,13 @@ that it is compared with: :func:`rows_of` and :func:`plain_residual`.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.estimator.posterior import WIDE_SD, Evidence, evidence_of
@@ -113,9 +113,8 @@ def random_faults(
     **more: Any,
 ) -> Faults:
     """Faults as in the paper; no hardware faults in half of the vehicles."""
-    settings: dict[str, Any] = {"sparsity": sparsity, "magnitude": magnitude, "balanced": True, **more}
-    rng = np.random.default_rng(seed)
-    return draw_faults(rng, vehicles=vehicles, branches=branches, full_scale_a=full_scale_a, **settings)
+    settings = replace(FaultSettings(sparsity=sparsity, magnitude=magnitude, balanced=True), **more)
+    return settings.draw(np.random.default_rng(seed), vehicles=vehicles, branches=branches, full_scale_a=full_scale_a)
 
 
 def plain_evidence(rows: EvidenceRows, *, centre: Array | None = None, shared: Array | None = None) -> Evidence:

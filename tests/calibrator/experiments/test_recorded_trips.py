@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.errors import FleetError
 from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import PERFECT, POSTERIOR
@@ -57,18 +57,12 @@ def test_corrections_are_judged_on_the_trip_of_the_next_vehicle(fleet: RecordedF
 def test_distribution_is_that_of_drawn_fleets_and_draws_such_fleets(
     branches: int, sparsity: float, balanced: bool
 ) -> None:
-    rng, vehicles, magnitude = np.random.default_rng(1), 40_000, (0.05, 0.25)
-    known = drawn_distribution(branches, sparsity, magnitude, balanced=balanced)
+    rng, vehicles = np.random.default_rng(1), 40_000
+    settings = FaultSettings(sparsity=sparsity, balanced=balanced)
+    known = drawn_distribution(settings, branches)
+    assert known is not None
     assert known.counts.sum() == pytest.approx(1.0)
-    drawn = draw_faults(
-        rng,
-        vehicles=vehicles,
-        branches=branches,
-        sparsity=sparsity,
-        magnitude=magnitude,
-        full_scale_a=400.0,
-        balanced=balanced,
-    )
+    drawn = settings.draw(rng, vehicles=vehicles, branches=branches, full_scale_a=400.0)
     for faults in (drawn, known.draw(rng, vehicles, 400.0)):
         hardware = (faults.hardware_drift != 0.0) + np.count_nonzero(faults.hardware_offset_a[:, :-1], axis=1)
         sensor = np.count_nonzero(faults.drift, axis=1) + np.count_nonzero(faults.offset_a, axis=1)

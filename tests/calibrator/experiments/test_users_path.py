@@ -1,5 +1,6 @@
 """Fleets of the experiments in memory, and ``simulate`` -> logs -> ``calibrate``: same vehicles, same result."""
 
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,11 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from calibrator.artificial.trips import GroundTruth
 from calibrator.cli import app
 from calibrator.drive import Channel, Drive
 from calibrator.drives.store import write_drive
+from calibrator.errors import FleetError
 from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import POSTERIOR
 from calibrator.experiments.recorded_trips import RecordedCase, read_fleet, recorded_trial
@@ -22,18 +25,35 @@ from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
 VEHICLES = 12
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Trips as ``calibrator import`` leaves them."""
-    folder = tmp_path_factory.mktemp("trips") / "store"
-    for number, trip in enumerate(small_fleet(VEHICLES).trips):
+def write_store(folder: Path, trips: Iterable[GroundTruth], *, lacking: Collection[str] = ()) -> Path:
+    """Trips as ``calibrator import`` leaves them, of which the third may lack channels."""
+    for number, trip in enumerate(trips):
         branches, inputs = (
-            {name: Channel(time_s=trip.time_s, value=x, good=np.isfinite(x)) for name, x in group.items()}
+            {
+                name: Channel(time_s=trip.time_s, value=x, good=np.isfinite(x))
+                for name, x in group.items()
+                if number != 2 or name not in lacking
+            }
             for group in (trip.currents_a, trip.inputs)
         )
         drive = Drive(vehicle=f"trip-{number:02d}", name="d", branches=branches, inputs=inputs)
         write_drive(folder, drive, read_layout(LAYOUT))
     return folder
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_store(tmp_path_factory.mktemp("trips") / "store", small_fleet(VEHICLES).trips)
+
+
+def test_trips_that_differ_have_what_all_of_them_have_and_without_model_inputs_are_refused(tmp_path: Path) -> None:
+    database, trips = read_database(read_layout(LAYOUT)), small_fleet(5, samples=1800).trips
+    fleet = read_fleet(write_store(tmp_path / "some", trips, lacking=["motor", "speed"]), database)
+    assert {frozenset(trip.currents_a) for trip in fleet.trips} == {frozenset({"battery", "auxiliary"})}
+    assert {frozenset(trip.inputs) for trip in fleet.trips} == {frozenset({"voltage", "torque", "heater_demand"})}
+    recorded_trial(fleet, RecordedCase(), 0).evidence  # noqa: B018  # their models have the same inputs
+    with pytest.raises(FleetError, match=r"have none of its model inputs driving_current, .*; they have no inputs;"):
+        read_fleet(write_store(tmp_path / "none", trips, lacking=[*trips[0].inputs]), database)
 
 
 def calibrated(store: Path, out: Path, *more: str) -> pd.DataFrame:
