@@ -32,7 +32,6 @@ from calibrator.random_streams import Purpose, random_stream
 
 __all__ = [
     "CommonCase", "CommonDrive", "builtin_common_drive", "common_rows", "common_trial", "measured_moments",
-    "noise_sd_a",
 ]  # fmt: skip
 
 TRAIN_SHARE = 0.8
@@ -165,11 +164,6 @@ class CommonCase(FaultSettings):
     state_space: bool = False
 
 
-def noise_sd_a(drive: CommonDrive, snr_db: float) -> float:
-    """Standard deviation of the artificial simulation error, (26), with the power of i_s,1 on the unity drive. [A]"""
-    return float(np.sqrt(10.0 ** (-snr_db / 10.0) * np.mean(drive.unity[:, 0] ** 2)))
-
-
 def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
     """Evidence of N vehicles on the unity drive; the same for the same seed."""
     junction: dict[str, Any] = {"branches": drive.branches, "full_scale_a": drive.full_scale_a}
@@ -207,7 +201,7 @@ def _simulation(
     drive: CommonDrive, truth: Faults, case: CommonCase, purpose: Purpose, seed: int
 ) -> Callable[[], Iterable[Array]]:
     """Measured currents with white noise (23), made anew by each call instead of kept in memory."""
-    noise_a = noise_sd_a(drive, case.snr_db)
+    noise_a = np.sqrt(10.0 ** (-case.snr_db / 10.0) * np.mean(drive.unity[:, 0] ** 2))  # (26), with the power of i_s,1
 
     def simulate() -> Iterator[Array]:
         for j, measured in enumerate(_measured(drive.unity, truth)):

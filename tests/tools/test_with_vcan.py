@@ -17,9 +17,3 @@ def test_wrong_use_ends_in_2(arguments: list[str]) -> None:
     result = run(*arguments)
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith("usage: tools/with_vcan [--or-skip] COMMAND")
-
-
-def test_help_is_given() -> None:
-    result = run("--help")
-    assert (result.returncode, result.stderr) == (0, "")
-    assert "HV_REQUIRE_ALL=1" in result.stdout

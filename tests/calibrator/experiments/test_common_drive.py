@@ -11,7 +11,6 @@ from calibrator.experiments.common_drive import (
     common_rows,
     common_trial,
     measured_moments,
-    noise_sd_a,
 )
 from calibrator.experiments.figures import figure_rows, judge
 from calibrator.experiments.methods import CEILING, PERFECT, POSTERIOR, THRESHOLD, TREE
@@ -34,7 +33,6 @@ def test_artificial_trial_has_the_signal_to_noise_ratio_asked_for() -> None:
     trial = common_trial(drive, replace(CASE, vehicles=400, snr_db=20.0), 0)
     noise_a2 = np.mean(trial.evidence.slope_variances * np.sum((drive.unity - drive.unity.mean(axis=0)) ** 2, axis=0))
     assert noise_a2 == pytest.approx(0.01 * np.mean(drive.unity[:, 0] ** 2), rel=0.02)
-    assert noise_sd_a(drive, 20.0) == pytest.approx(np.sqrt(noise_a2), rel=0.01)
 
 
 def test_trial_is_the_same_for_the_same_seed_and_differs_from_its_training_fleet() -> None:

@@ -1,7 +1,7 @@
 """Pictures of results: nothing is hidden, cut off or indistinguishable."""
 
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
@@ -22,30 +22,6 @@ from calibrator.experiments.runner import pool_confidences
 BIASES = ("0", "0.2", "0.4", "0.5")
 
 
-Point = tuple[float, str, float, str]
-"""Value of what is varied, method, recovery rate, series."""
-
-
-def result_of(*points: Point, name: str = "asymmetry") -> ExperimentResult:
-    """Result of 30 vehicles per point; the default is as confident as it is right."""
-    figures: list[pd.DataFrame] = []
-    tenths: list[pd.DataFrame] = []
-    for x, method, rate, series in points:
-        within = np.arange(30) < round(30 * rate)
-        values: dict[str, np.ndarray] = {"recovery_rate": within}
-        if method == POSTERIOR.name:
-            values |= {"confidence": within.astype(float), "sure": within, "sure_confidence": within[within] + 0.0}
-            values |= {"ece": np.column_stack([np.where(within, 0.99, 0.25), within])}
-        for tables, table in zip((figures, tenths), figure_rows([values]), strict=True):
-            tables.append(table.assign(series=series, x=float(x), method=method))
-    return ExperimentResult(
-        experiment=EXPERIMENTS[name],
-        settings={"seed": 0},
-        figures=pd.concat(figures, ignore_index=True),
-        tenths=pd.concat(tenths, ignore_index=True),
-    )
-
-
 def shown_as(result: ExperimentResult, name: str) -> ExperimentResult:
     """The same figures, drawn as another experiment."""
     return replace(result, experiment=EXPERIMENTS[name])
@@ -53,9 +29,17 @@ def shown_as(result: ExperimentResult, name: str) -> ExperimentResult:
 
 @pytest.fixture(scope="module")
 def equal() -> ExperimentResult:
-    """All series and methods the same, at the ends of the scale."""
-    methods = (PERFECT.name, POSTERIOR.name)
-    return result_of(*((x, m, rate, one) for one in BIASES for x, rate in ((20, 0.0), (2000, 1.0)) for m in methods))
+    """All series and methods the same, at the ends of the scale, of 30 vehicles each; the default knows it."""
+    tables = []
+    for series, (x, rate), method in product(BIASES, ((20.0, 0.0), (2000.0, 1.0)), (PERFECT, POSTERIOR)):
+        within = np.full(30, rate > 0.0)
+        values = {"recovery_rate": within}
+        if method is POSTERIOR:
+            values |= {"confidence": within + 0.0, "sure": within, "sure_confidence": within[within] + 0.0}
+            values |= {"ece": np.column_stack([np.where(within, 0.99, 0.25), within])}
+        tables.append([table.assign(series=series, x=x, method=method.name) for table in figure_rows([values])])
+    figures, tenths = (pd.concat(some, ignore_index=True) for some in zip(*tables, strict=True))
+    return ExperimentResult(experiment=EXPERIMENTS["asymmetry"], settings={"seed": 0}, figures=figures, tenths=tenths)
 
 
 def curves_of(axes: Axes) -> list[Line2D]:
