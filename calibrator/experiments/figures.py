@@ -41,9 +41,8 @@ Values = Mapping[str, NDArray[Any]]
 
 
 class FigureKind(NamedTuple):
-    """Heading of a figure's column, what it is, how values become it, and whether it is rare (counts stand beside)."""
+    """What a figure is, how values become it, and whether it is rare (counts stand beside)."""
 
-    heading: str
     meaning: str
     merged: Callable[[NDArray[Any]], Any] = np.mean
     rare: bool = False
@@ -54,39 +53,35 @@ def _error(which: int) -> Callable[[Array], float]:
 
 
 FIGURES = {
-    "recovery_rate": FigureKind("10 %", "share of vehicles recovered within 10 %"),
-    "recovery_rate_25": FigureKind("25 %", "share within 25 %"),
-    "f2": FigureKind("f2", "f2 of the hardware classification", lambda pairs: f2_score(*pairs.T)),
-    "complexity": FigureKind("hardware", "share held to have hardware faults"),
-    "confidence": FigureKind("confidence", "mean confidence"),
-    "sure": FigureKind("> 0.95", "share of vehicles with a confidence above 0.95"),
-    "sure_confidence": FigureKind("their confidence", "their mean confidence"),
-    "sure_recovered": FigureKind("of them recovered", "share of them that is recovered"),
-    "sure_wrong": FigureKind("> 0.95, wrong", "share of them that is not recovered", rare=True),
-    "ece": FigureKind("ECE", "expected calibration error, by tenths of the confidence", _error(0)),
-    "ece_by_chance": FigureKind("by chance", "what it is by chance if the confidence is exact", _error(1)),
-    "corrected": FigureKind("corrected", "share of the vehicles that is corrected in some branch"),
-    "deployed": FigureKind("deployed", "share of the vehicles with faulty sensors that is corrected in some branch"),
+    "recovery_rate": FigureKind("share of vehicles recovered within 10 %"),
+    "recovery_rate_25": FigureKind("the same within 25 %"),
+    "f2": FigureKind("of the hardware classification", lambda pairs: f2_score(*pairs.T)),
+    "complexity": FigureKind("share of vehicles held to have a hardware fault"),
+    "confidence": FigureKind("mean confidence"),
+    "sure": FigureKind("share of vehicles with a confidence above 0.95"),
+    "sure_confidence": FigureKind("mean confidence of these"),
+    "sure_recovered": FigureKind("share of these that is recovered"),
+    "sure_wrong": FigureKind("share of these that is not", rare=True),
+    "ece": FigureKind("expected calibration error, by tenths of the confidence", _error(0)),
+    "ece_by_chance": FigureKind("what it is by chance if the confidence is exact", _error(1)),
+    "corrected": FigureKind("share of the vehicles that is corrected in some branch"),
+    "deployed": FigureKind("share of the vehicles with faulty sensors that is corrected in some branch"),
     "harmed": FigureKind(
-        "harmed",
-        "share of the corrected vehicles of which some branch gets worse on an unseen drive, however little",
-        rare=True,
+        "share of the corrected vehicles of which some branch gets worse on an unseen drive, however little", rare=True
     ),
-    "worst_a": FigureKind("worst [A]", "largest worsening of a branch's root mean square error", np.max),
-    "named": FigureKind("named", "share of the vehicles attacked of which a finding names the cause", rare=True),
-    "misnamed": FigureKind("misnamed", "share of the others of which a finding names any cause", rare=True),
-    "gain_within_1": FigureKind(
-        "gain, within 1", "share of the deployed gain errors within 1 standard deviation of the truth"
-    ),
-    "gain_beyond_3": FigureKind("gain, beyond 3", "the same beyond 3", rare=True),
-    "offset_within_1": FigureKind("offset, within 1", "share of the deployed offsets within 1"),
-    "offset_beyond_3": FigureKind("offset, beyond 3", "the same beyond 3", rare=True),
+    "worst_a": FigureKind("largest worsening of a branch's root mean square error [A]", np.max),
+    "named": FigureKind("share of the vehicles attacked of which a finding names the cause", rare=True),
+    "misnamed": FigureKind("share of the others of which a finding names any cause", rare=True),
+    "gain_within_1": FigureKind("share of the deployed gain errors within 1 standard deviation of the truth"),
+    "gain_beyond_3": FigureKind("the same beyond 3", rare=True),
+    "offset_within_1": FigureKind("share of the deployed offsets within 1 standard deviation of the truth"),
+    "offset_beyond_3": FigureKind("the same beyond 3", rare=True),
     "delay_rmse_ms": FigureKind(
-        "delay error [ms]", "root mean square error of the estimated delays", lambda e: np.sqrt(np.mean(e**2))
+        "root mean square error of the estimated delays [ms]", lambda e: np.sqrt(np.mean(e**2))
     ),
-    "failed": FigureKind("failed", "share of vehicles whose optimisation failed"),
+    "failed": FigureKind("share of vehicles whose optimisation failed"),
 }
-"""In the order of the columns."""
+"""In the order of the columns; pages name them by the same words."""
 
 
 def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:

@@ -38,9 +38,7 @@ def headline(result: ExperimentResult) -> pd.DataFrame:
     parts = [
         figures[rates].pivot(index=["series", "x"], columns="method", values="text").reindex(columns=result.methods)
     ]
-    parts += [
-        figures[own].pivot(index=["series", "x"], columns="figure", values="text")[shown].rename(columns=_heading)
-    ]
+    parts += [figures[own].pivot(index=["series", "x"], columns="figure", values="text")[shown]]
     table = pd.concat(parts, axis=1).reindex(settings)
     if experiment.paper:  # its best figure, whatever methods were run
         best = dict(sorted((x, found["recovery_rate"]) for (x, _), found in experiment.paper.items()))
@@ -55,7 +53,7 @@ def figure_table(result: ExperimentResult, names: Iterable[str], *, intervals: b
     figures["text"] += [f" / {value:.2f}" if np.isfinite(value) else "" for value in paper]
     rows = pd.MultiIndex.from_frame(figures[KEYS].drop_duplicates())
     table = figures.pivot(index=KEYS, columns="figure", values="text").reindex(index=rows, columns=names)
-    return _labelled(table.rename(columns=_heading), result.experiment)
+    return _labelled(table, result.experiment)
 
 
 def _texts(result: ExperimentResult, *, intervals: bool = True) -> list[str]:
@@ -73,16 +71,13 @@ def _of_paper(experiment: Experiment, row: Any) -> float:
     return experiment.paper.get((row.x, row.method), {}).get(row.figure, float("nan"))
 
 
-def _heading(name: str) -> str:
-    return FIGURES[name].heading
-
-
 def _labelled(table: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
     """Table whose index, what is varied, has become columns with labels; without series, if there are none."""
     table = table.astype(object).fillna("-").reset_index()
     table["x"] = ["" if np.isnan(x) else f"{x:g}" for x in table["x"]]
     table = table if experiment.series_label else table.drop(columns="series")
-    return table.rename(columns={"series": experiment.series_label, "x": experiment.x_label})
+    labels = {name: name.replace("_", " ") for name in FIGURES}
+    return table.rename(columns=labels | {"series": experiment.series_label, "x": experiment.x_label})
 
 
 def _owner(result: ExperimentResult) -> str:
@@ -112,7 +107,7 @@ def _effort(result: ExperimentResult) -> str:
 
 
 def _explained(names: Iterable[str]) -> str:
-    return "; ".join(f"{FIGURES[name].heading}: {FIGURES[name].meaning}" for name in names)
+    return "; ".join(f"{name.replace('_', ' ')}: {FIGURES[name].meaning}" for name in names)
 
 
 def result_table(result: ExperimentResult) -> Group:
@@ -121,7 +116,7 @@ def result_table(result: ExperimentResult) -> Group:
     table, cells = Table(box=None, pad_edge=False, collapse_padding=True), figure_table(result, names, intervals=False)
     for heading in cells.columns:
         text = heading in {"method", result.experiment.series_label}
-        table.add_column(Text(heading), justify="left" if text else "right", no_wrap=text)
+        table.add_column(Text(heading), justify="left" if text else "right", no_wrap=text, overflow="fold")
     for row in cells.to_numpy():
         table.add_row(*map(Text, row))
     caption = f"{_explained(names)}. {_notes(result)} {_effort(result)}."
@@ -203,14 +198,6 @@ def write_page(folder: Path, result: ExperimentResult) -> None:
 
 # ---- pictures: one function per kind; bars are 95 % intervals, rings the paper's figures
 
-TITLES = {
-    "recovery_rate": "recovery rate",
-    "confidence": "mean confidence",
-    "harmed": "harmed of the corrected",
-    "named": "cause named",
-    "gain_within_1": "gain errors within 1 sd",
-    "offset_within_1": "offsets within 1 sd",
-}
 SHARES = (-0.03, 1.03)
 """Axis of a share: 0 to 1, with room for the markers at its ends. [1]"""
 FEW = 30
@@ -268,7 +255,7 @@ def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
             places = [keys.index(key) for key in zip(rows["series"], rows["x"], strict=True)]
             if places:
                 _draw_points(axes, experiment, rows, places, label=method, number=number, of=len(result.methods))
-        axes.set(title=TITLES[name], xlim=SHARES)
+        axes.set(title=name.replace("_", " "), xlim=SHARES)
         axes.grid(visible=True, alpha=0.3)
     ticks = [f"{series}, {experiment.x_label.split()[0]} {x:g}".removeprefix(", ") for series, x in keys]
     all_axes[0].set_yticks(range(len(keys)), ticks, fontsize="small")
@@ -294,7 +281,8 @@ def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
             if places := [values.index(x) for x in rows["x"]]:
                 label = f"{experiment.series_label} {one or 'as S says'}" if several else one
                 _draw_points(axes, experiment, rows, places, label=label, number=number, of=len(curves))
-        axes.set(title=f"{TITLES[name]}, {method}" if several else TITLES[name], xlabel=experiment.x_label, ylim=SHARES)
+        title = name.replace("_", " ")
+        axes.set(title=f"{title}, {method}" if several else title, xlabel=experiment.x_label, ylim=SHARES)
         axes.set_xticks(range(len(values)), [f"{value:g}" for value in values])
         axes.grid(visible=True, alpha=0.3)
     all_axes[0].set_ylabel("share of vehicles; bars: 95 % intervals")
