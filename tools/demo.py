@@ -118,17 +118,13 @@ def make_empty(out: Path) -> None:
 
 
 def import_recordings(folder: str, out: Path) -> str:
-    """Import BMW i3 recordings into a store and return its path."""
-    files = sorted([*Path(folder).glob("*.csv"), *Path(folder).glob("*.csv.gz")])
-    if not files:
-        raise UserError(f"{folder}: no .csv or .csv.gz in it; give that of the BMW i3 recordings, or leave DRIVES out")
-    step(0, f"{len(files)} recorded trips of a BMW i3 become drives")
-    run(
-        *(sys.executable, "tools/import_bmw_i3.py", *files, "--layout", LAYOUT, "--out", out / "store"),
-        shown=f"python tools/import_bmw_i3.py {folder}/*.csv.gz --layout {LAYOUT} --out {out / 'store'}",
-        may_fail=True,
-    )
-    return str(out / "store")
+    """Import BMW i3 recordings into a store and return its path; trips that cannot be used are left out."""
+    step(0, "recorded trips of a BMW i3 become drives")
+    store, tool = out / "store", "tools/import_bmw_i3.py"
+    run(sys.executable, tool, folder, "--layout", LAYOUT, "--out", store, may_fail=True)
+    if not store.exists():
+        raise UserError(f"{folder}: not the BMW i3 recordings; give their folder, or leave DRIVES out")
+    return str(store)
 
 
 def faulty_vehicles(truth: FleetTruth) -> list[str]:
@@ -219,38 +215,29 @@ def put_in(truth: FleetTruth, vehicle: str) -> str:
 def draw_side_by_side(table: Path, picture: Path) -> None:
     """Draw the currents and their sum, as measured and as corrected: the picture of the README."""
     found = pd.read_csv(table, index_col="time_s")
+    names = found.loc[:, :"sum_a"].columns.str.removesuffix("_a")
     figure = Figure(figsize=(9.0, 3.2), layout="constrained")
     for axis, after in zip(figure.subplots(1, 2, sharey=True), ("", "_corrected"), strict=True):
-        for name in found.loc[:, :"sum_a"].columns.str.removesuffix("_a"):
-            is_sum = name == "sum"
-            axis.plot(found[f"{name}{after}_a"], label=name, color="black" if is_sum else None, linewidth=1 + is_sum)
-        rms_a = (found[f"sum{after}_a"] ** 2).mean() ** 0.5
-        axis.set(title=f"{after[1:] or 'measured'}: sum {rms_a:.1f} A RMS", xlabel="time [s]")
-        axis.grid(alpha=0.3)
+        shown = found[[f"{name}{after}_a" for name in names]].set_axis(names, axis=1)
+        title = f"{after[1:] or 'measured'}: sum {(shown['sum'] ** 2).mean() ** 0.5:.1f} A RMS"
+        shown.plot(ax=axis, title=title, style={"sum": "k"}, lw=1.0, grid=True, legend=False, xlabel="time [s]")
     figure.axes[0].set_ylabel("current into the junction [A]")
     figure.axes[1].legend(loc="lower left")
     figure.savefig(picture, dpi=120)
 
 
-def run(*command: object, shown: str | None = None, may_fail: bool = False) -> None:
-    """Run a command of the project and show it; stop the demo if it fails."""
-    text = shown or shlex.join(["python" if word == sys.executable else str(word) for word in command])
-    print(f"\n$ {text}", flush=True)
-    code = subprocess.run(words(*command), cwd=ROOT, check=False).returncode
+def run(*command: object, may_fail: bool = False) -> None:
+    """Run a command of the project, as it is in this environment, and show it; stop the demo if it fails."""
+    say(f"\n$ {shlex.join(['python' if word == sys.executable else str(word) for word in command])}")
+    first, *rest = map(str, command)
+    code = subprocess.run([Path(sys.executable).parent / first, *rest], cwd=ROOT, check=False).returncode
     if code and not may_fail:
         raise SystemExit(code)
 
 
-def words(*command: object) -> list[str]:
-    """Command line with the project's commands taken from this environment."""
-    first, *rest = map(str, command)
-    own = Path(sys.executable).parent / first
-    return [str(own) if own.exists() else first, *rest]
-
-
 def step(number: int, text: str) -> None:
     """Announce a step."""
-    print(f"\n=== {number}. {text}", flush=True)
+    say(f"\n=== {number}. {text}")
 
 
 def say(text: str) -> None:

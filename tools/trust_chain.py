@@ -19,7 +19,7 @@ import pandas as pd
 import typer
 from msgspec.structs import replace
 
-from calibrator.artificial.command import MAX_MINUTES, CurrentsOption, UnmeasuredOption
+from calibrator.artificial.command import MAX_MINUTES, UnmeasuredOption
 from calibrator.fleet_truth import VehicleTruth, read_truth
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.recordings.frames import read_frames
@@ -27,7 +27,6 @@ from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.options import (
     MAX_VEHICLES,
     SeedOption,
-    SparsityOption,
     WorkersOption,
     number_option,
     whole_option,
@@ -61,10 +60,7 @@ app = command_app()
 def main(
     *,
     layout: Annotated[Path, typer.Option(help="Layout of the vehicles.")] = Path("dbc/hv_powertrain.toml"),
-    drives: Annotated[str, typer.Option(help="Drive store with the trips to drive, or 'builtin'.")] = "builtin",
     vehicles: Annotated[int, whole_option("--vehicles", 8, MAX_VEHICLES, "Vehicles of the fleet")] = 500,
-    currents: CurrentsOption = 3,
-    sparsity: SparsityOption = 80,
     unmeasured: UnmeasuredOption = (0.0, 0.0),
     minutes: Annotated[
         float, number_option("--minutes", 2, MAX_MINUTES, "Least length of each trip to learn from [min]")
@@ -82,8 +78,15 @@ def main(
         raise UserError(
             f"--unseen-minutes {unseen_minutes:g}: the trial of {layout} alone takes {trial_s:g} s; give more"
         )
-    drawn = {"vehicles": vehicles, "currents": currents, "sparsity": sparsity, "seed": seed, "drives": drives}
-    drawn |= {"minutes": minutes, "unseen-minutes": unseen_minutes, "delay": 100, "workers": workers}
+    drawn: dict[str, float] = {
+        "vehicles": vehicles,
+        "currents": 3,
+        "sparsity": 80,
+        "seed": seed,
+        "delay": 100,
+        "workers": workers,
+    }
+    drawn |= {"minutes": minutes, "unseen-minutes": unseen_minutes}
     with tempfile.TemporaryDirectory(prefix="chain-") as name:
         folder, where = Path(name), ("--layout", layout)
         options = [word for option, value in drawn.items() for word in (f"--{option}", value)]

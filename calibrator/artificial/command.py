@@ -24,7 +24,7 @@ from calibrator.terminal.options import (
 from calibrator.terminal.text import dumps
 from ecu_node.program import write_output
 
-__all__ = ["MAX_MINUTES", "CurrentsOption", "UnmeasuredOption", "simulate"]
+__all__ = ["MAX_MINUTES", "UnmeasuredOption", "simulate"]
 
 MAX_MINUTES = 240.0
 """A trip's log is made in memory, at some 250 frames per second. [min]"""
@@ -42,7 +42,6 @@ def _unmeasured(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-CurrentsOption = Annotated[int, whole_option("--currents", 2, MAX_CURRENTS, "Number of branches K")]
 UnmeasuredOption = Annotated[
     tuple[float, float],
     typer.Option(
@@ -65,7 +64,7 @@ def simulate(
     drives: Annotated[
         str, typer.Option("--drives", help="Drive store with the trips to drive, or 'builtin'.")
     ] = "builtin",
-    currents: CurrentsOption = 2,
+    currents: Annotated[int, whole_option("--currents", 2, MAX_CURRENTS, "Number of branches K")] = 2,
     sparsity: SparsityOption = 80.0,
     magnitude: MagnitudeOption = (0.05, 0.25),
     common_drive: Annotated[bool, typer.Option("--common-drive", help="One trip for all vehicles.")] = False,

@@ -33,5 +33,5 @@ def test_a_folder_that_is_not_the_demos_is_not_emptied(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"no \.csv or \.csv\.gz in it"):
+    with pytest.raises(UserError, match="not the BMW i3 recordings; give their folder, or leave DRIVES out"):
         demo.main(drives=str(tmp_path), out=tmp_path / "out")
