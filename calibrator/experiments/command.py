@@ -51,7 +51,6 @@ def experiment(
     that an experiment does not heed are refused.
     """
     with importing():
-        from calibrator.errors import FleetError
         from calibrator.experiments.experiments import (
             CALIBRATION,
             EXPERIMENTS,
@@ -76,11 +75,9 @@ def experiment(
         reason = "calibration runs nothing, it pools what is recorded in --out"
     if not recorded and (given := given_options(context, unheeded)):
         raise typer.BadParameter(reason, param_hint=given[0])
-    first = "first run 'calibrator experiment all --out {}', or some experiments by their names"
     if rows == [CALIBRATION] and out is None:
-        raise typer.BadParameter(
-            f"calibration pools what is recorded there; {first.format('FOLDER')}", param_hint="--out"
-        )
+        first = "first run 'calibrator experiment all --out FOLDER', or some experiments by their names"
+        raise typer.BadParameter(f"calibration pools what is recorded there; {first}", param_hint="--out")
     if out is not None:
         require_possible_folder(out)
         require_possible_folder(out.absolute().parent)
@@ -91,12 +88,7 @@ def experiment(
     for number, row in enumerate(rows, start=1):
         with one_pass(number, len(rows)):
             if row is CALIBRATION:
-                others = read_records(out, EXPERIMENTS) if out else [*done.values()]
-                if not others:
-                    raise FleetError(
-                        f"{out}: no experiment is recorded that calibration could pool; {first.format(out)}"
-                    )
-                result = pool_confidences(others)
+                result = pool_confidences(read_records(out, EXPERIMENTS) if out else [*done.values()])
             else:
                 fleet = trips if row.recorded and trips is not None else fleet_for(row, quick=quick)
                 small = row.small() if quick else row

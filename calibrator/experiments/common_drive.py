@@ -22,7 +22,7 @@ from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, builtin_trip
 from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.artificial.trips import with_branches
 from calibrator.drive import Array
-from calibrator.errors import DriveError
+from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, densest_clusters
 from calibrator.experiments.trial import CommonEvidence, Trial, UnseenDrive, drawn_distribution
 from calibrator.faults import Faults, slopes_and_intercepts
@@ -122,8 +122,10 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
     Raises
     ------
     FleetError
-        If fastsim is not installed.
+        If the built-in vehicle has not so many branches, or fastsim is not installed.
     """
+    if not 2 <= branches <= len(BUILTIN_BRANCHES):
+        raise FleetError(f"{branches} branches: the built-in vehicle has 2 to {len(BUILTIN_BRANCHES)}")
     trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, seed), duration_s=duration_s, name=f"builtin-{seed}")
     unseen = builtin_trip(random_stream(Purpose.UNSEEN_TRIP, seed), duration_s=duration_s, name="unseen")
     x = trip.inputs

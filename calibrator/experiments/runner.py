@@ -74,7 +74,8 @@ def run_experiment(
     Raises
     ------
     FleetError
-        If there is no repetition, methods share a name, or one returns what cannot be judged.
+        If there is no repetition, methods share a name or settings their place in the table, or a method returns what
+        cannot be judged.
     """
     if repetitions < 1:
         raise FleetError(f"an experiment needs at least 1 repetition, not {repetitions}")
@@ -86,6 +87,9 @@ def run_experiment(
         for count in {each.case.branches for each in experiment.settings if isinstance(each.case, RecordedCase)}:
             fleet.with_branches(count)
     rows = [(setting, setting.methods or usual) for setting in experiment.settings]
+    keys = [(setting.series, setting.x, method.name) for setting, own in rows for method in own]
+    if not keys or len({*keys}) < len(keys):
+        raise FleetError(f"{experiment.name}: expected a method, and settings that differ in x or series")
     tasks = [(setting.case, own, seed + number) for setting, own in rows for number in range(repetitions)]
     judged = run_many(partial(_run_trial, fleet), tasks, Workers(processes=workers))
     trials = list(shown(judged, experiment.name, len(tasks), "trials"))

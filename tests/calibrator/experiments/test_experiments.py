@@ -147,6 +147,8 @@ def test_only_columns_that_are_there_are_explained(snr: ExperimentResult) -> Non
 def test_common_drive_has_the_branches_of_the_row() -> None:
     drive = fleet_for(replace(EXPERIMENTS["snr"], branches=4), quick=True)
     assert drive.record["branches"] == 4
+    with pytest.raises(FleetError, match="9 branches: the built-in vehicle has 2 to 5"):
+        fleet_for(replace(EXPERIMENTS["snr"], branches=9), quick=True)
 
 
 def test_damaged_record_is_named(tmp_path: Path) -> None:
@@ -178,17 +180,21 @@ def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkey
     assert fleet_for(EXPERIMENTS["real"], quick=True, layout=LAYOUT).record["trips"] == 8
 
 
-def test_wrong_fleet_and_no_repetition_are_refused(fleet: RecordedFleet) -> None:
+def test_wrong_fleet_and_what_makes_no_table_are_refused(fleet: RecordedFleet) -> None:
     with pytest.raises(FleetError, match="CommonCase cannot be run on a RecordedFleet"):
         run_experiment(EXPERIMENTS["snr"].small(), fleet, repetitions=1)
     with pytest.raises(FleetError, match="at least 1 repetition, not 0"):
         run_experiment(EXPERIMENTS["snr"], smooth_drive(), repetitions=0)
+    twice = (Setting(x=1.0, case=CommonCase()), Setting(x=1.0, case=CommonCase()))
+    for change in ({"settings": ()}, {"methods": ()}, {"settings": twice}):
+        with pytest.raises(FleetError, match=r"^snr: expected a method, and settings that differ in x or series$"):
+            run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive())
 
 
 def test_command_runs_records_and_pools(tmp_path: Path) -> None:
     out = ("--out", str(tmp_path / "results"))
     ran = CliRunner().invoke(app, ["experiment", "calibration", *out])
-    assert re.search("no experiment is recorded .* 'calibrator experiment all --out", str(ran.exception))
+    assert "no experiment has a confidence to check; run 'calibrator experiment all --out" in str(ran.exception)
     assert not (tmp_path / "results").exists()
     ran = CliRunner().invoke(app, ["experiment", "snr", "--quick", "--repetitions", "1", "--workers", "1", *out])
     assert ran.exit_code == 0, ran.output
