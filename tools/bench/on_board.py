@@ -1,18 +1,13 @@
-"""What a node's own summaries cost, and what the calibrator makes of them beside the logs of the same drives.
+"""What a node's own summaries cost.
 
-The drives of an artificial fleet, 230 frames a second, are read as logs and replayed to the node's summary; both stores
-are calibrated. ``python -m bench.on_board --vehicles 24 --minutes 60`` prints the figures that the documents name.
+The drives of an artificial fleet, 230 frames a second, are replayed to the node's summary.
+``python -m bench.on_board --vehicles 2 --minutes 60`` prints the figures that the documents name.
 """
 
 import argparse
-import json
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
-
-import numpy as np
 
 from bench.row import LAYOUT, Row, show
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
@@ -27,26 +22,14 @@ from ecu_node.layout import read_layout
 
 __all__ = ["rows"]
 
-FEWEST = 8
-"""Vehicles that are calibrated."""
-
 
 def rows(*, vehicles: int, minutes: float) -> list[Row]:
-    """Measure share of a core and size, and how much the parameters of the two ways differ.
-
-    Parameters
-    ----------
-    vehicles : int
-        Of the fleet; below 8 none is calibrated.
-    minutes : float
-        Of each drive. [min]
-    """
+    """Measure share of a core and size, of so many vehicles that drive so long each. [min]"""
     database, trips = read_database(read_layout(LAYOUT)), BuiltinTrips(seed=0, duration_s=60 * minutes, unseen_s=60.0)
     plan = FleetPlan(vehicles=vehicles, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.1)
     with tempfile.TemporaryDirectory() as place:
         simulate_fleet(plan, trips, database, Path(place) / "fleet", workers=1)
-        found = _replayed(Path(place), database)
-        return found + _compared(Path(place)) if vehicles >= FEWEST else found
+        return _replayed(Path(place), database)
 
 
 def _replayed(folder: Path, database: VehicleDatabase) -> list[Row]:
@@ -79,30 +62,8 @@ def _replayed(folder: Path, database: VehicleDatabase) -> list[Row]:
     ]
 
 
-def _compared(folder: Path) -> list[Row]:
-    """Differences of the drifts and offsets between both ways, over their standard deviations."""
-    found = []
-    for name, source in (("of_logs", "fleet"), ("of_nodes", "on_board")):
-        words = ("calibrate", folder / source, "--layout", LAYOUT, "--out", folder / name, "--workers", "1")
-        subprocess.run([sys.executable, "-m", "calibrator", *words], check=True, stdout=subprocess.DEVNULL)
-        files = sorted((folder / name / "params").glob("*.json"))
-        found.append([json.loads(path.read_text()) for path in files])
-    far = [
-        (values[key] - other["branches"][branch][key]) / values[sd]
-        for one, other in zip(*found, strict=True)
-        for branch, values in one["branches"].items()
-        for key, sd in (("drift", "drift_sd"), ("offset_a", "offset_sd_a"))
-        if values[sd]
-    ]
-    verdicts = sum(one["verdict"] != other["verdict"] for one, other in zip(*found, strict=True))
-    return [
-        Row(name="difference of parameters, root mean square", value=float(np.std(far)), unit="standard deviations"),
-        Row(name="vehicles with another verdict", value=verdicts, unit="vehicles"),
-    ]
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--vehicles", type=int, default=24)
-    parser.add_argument("--minutes", type=float, default=20.0)
+    parser.add_argument("--vehicles", type=int, default=2)
+    parser.add_argument("--minutes", type=float, default=60.0)
     show(rows(**vars(parser.parse_args())))

@@ -1,10 +1,11 @@
 """One figure of the benchmarks, beside that of its peer in the same run; how it is shown, and how it is asked for."""
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import pandas as pd
 
 __all__ = ["LAYOUT", "MEBIBYTE", "Row", "run", "show"]
 
@@ -39,14 +40,8 @@ class Row:
 
 def show(rows: Sequence[Row]) -> None:
     """Print a table."""
-    from rich.console import Console  # noqa: PLC0415  # slow, and tests do not need it
-    from rich.table import Table  # noqa: PLC0415
-
-    table = Table("what", "figure", "unit", "peer", "times better")
-    for row in rows:
-        ratio = "" if row.ratio is None else f"{row.ratio:.3g}"
-        table.add_row(row.name, f"{row.value:.4g}", row.unit, row.peer or "", ratio)
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    table = pd.DataFrame(map(vars, rows)).astype({"ratio": float}).fillna({"peer": ""})
+    print(table.to_string(index=False, na_rep="", float_format="{:.4g}".format))
 
 
 def run(rows: Callable[..., Sequence[Row]]) -> None:
