@@ -62,6 +62,8 @@ def main(
     ),
 ) -> None:
     """Simulate a fleet, calibrate it, drive one vehicle through the node, and show the Kirchhoff sum."""
+    if Path.cwd() != ROOT:
+        raise UserError(f"the commands of the demo are those of a checkout: run it in {ROOT}")
     started = time.monotonic()
     show(drives, out)
     say(f"done in {time.monotonic() - started:.0f} s; everything is in {out}")
@@ -230,7 +232,7 @@ def run(*command: object, may_fail: bool = False) -> None:
     """Run a command of the project, as it is in this environment, and show it; stop the demo if it fails."""
     say(f"\n$ {shlex.join(['python' if word == sys.executable else str(word) for word in command])}")
     first, *rest = map(str, command)
-    code = subprocess.run([Path(sys.executable).parent / first, *rest], cwd=ROOT, check=False).returncode
+    code = subprocess.run([Path(sys.executable).parent / first, *rest], check=False).returncode
     if code and not may_fail:
         raise SystemExit(code)
 

@@ -5,16 +5,11 @@ import runpy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
-from calibrator.drive import Channel, Drive
-from calibrator.drives.store import write_drive
 from calibrator.experiments import experiments
-from ecu_node.layout import read_layout
-from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
+from tests.calibrator.experiments.small_trials import small_fleet, write_store
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "own_estimator.py"
@@ -32,20 +27,6 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(experiments, "fleet_for", partial(experiments.fleet_for, quick=True))
 
 
-def write_store(store: Path) -> None:
-    """Trips of a car as ``calibrator import`` leaves them."""
-    for trip in small_fleet(trips=6, samples=1800).trips:
-        channels: Any = [
-            {
-                name: Channel(time_s=trip.time_s, value=values, good=np.isfinite(values))
-                for name, values in group.items()
-            }
-            for group in (trip.currents_a, trip.inputs)
-        ]
-        drive = Drive(vehicle=trip.name, name="d", branches=channels[0], inputs=channels[1])
-        write_drive(store, drive, read_layout(LAYOUT))
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("small")
 def test_it_stands_beside_the_published_method_and_the_default_also_on_recorded_trips(
@@ -55,7 +36,7 @@ def test_it_stands_beside_the_published_method_and_the_default_also_on_recorded_
     shown = capsys.readouterr().out
     for name in ("perfect", "posterior", "own"):
         assert name in shown
-    write_store(tmp_path / "build" / "i3")
+    write_store(tmp_path / "build" / "i3", small_fleet(trips=6, samples=1800).trips)
     (tmp_path / "dbc").symlink_to(ROOT / "dbc")
     monkeypatch.chdir(tmp_path)
     (recorded,) = RECORDED

@@ -1,12 +1,14 @@
 """Small drives and trials for the tests of the experiments."""
 
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
 
 from calibrator.artificial.trips import GroundTruth
-from calibrator.drive import Array
+from calibrator.drive import Array, Channel, Drive
+from calibrator.drives.store import write_drive
 from calibrator.experiments.common_drive import CommonDrive
 from calibrator.experiments.recorded_trips import RecordedFleet
 from ecu_node.database import read_database
@@ -28,6 +30,20 @@ def small_fleet(trips: int = 12, samples: int = 3000) -> RecordedFleet:
     """Trips of a car of which the model explains nearly all, with what it needs for two or three branches."""
     made = tuple(_trip(np.random.default_rng(k), f"trip-{k}", samples) for k in range(trips))
     return RecordedFleet(name="small", trips=made, database=read_database(read_layout(LAYOUT)))
+
+
+def write_store(folder: Path, trips: Iterable[GroundTruth], *, lacking: Collection[str] = ()) -> Path:
+    """A drive store of trips as ``calibrator import`` leaves it; the third may lack channels."""
+    for number, trip in enumerate(trips):
+        channels = {
+            name: Channel(time_s=trip.time_s, value=x, good=np.isfinite(x))
+            for name, x in {**trip.currents_a, **trip.inputs}.items()
+            if number != 2 or name not in lacking
+        }
+        inputs = {name: channels.pop(name) for name in trip.inputs if name in channels}
+        drive = Drive(vehicle=f"trip-{number:02d}", name="d", branches=channels, inputs=inputs)
+        write_drive(folder, drive, read_layout(LAYOUT))
+    return folder
 
 
 def _trip(rng: np.random.Generator, name: str, samples: int) -> GroundTruth:

@@ -1,6 +1,5 @@
 """Fleets of the experiments in memory, and ``simulate`` -> logs -> ``calibrate``: same vehicles, same result."""
 
-from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +7,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from calibrator.artificial.trips import GroundTruth
 from calibrator.cli import app
-from calibrator.drive import Channel, Drive
-from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
 from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import POSTERIOR
@@ -20,25 +16,9 @@ from calibrator.faults import Faults
 from calibrator.score import recovered
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
-from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
+from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, write_store
 
 VEHICLES = 12
-
-
-def write_store(folder: Path, trips: Iterable[GroundTruth], *, lacking: Collection[str] = ()) -> Path:
-    """Trips as ``calibrator import`` leaves them, of which the third may lack channels."""
-    for number, trip in enumerate(trips):
-        branches, inputs = (
-            {
-                name: Channel(time_s=trip.time_s, value=x, good=np.isfinite(x))
-                for name, x in group.items()
-                if number != 2 or name not in lacking
-            }
-            for group in (trip.currents_a, trip.inputs)
-        )
-        drive = Drive(vehicle=f"trip-{number:02d}", name="d", branches=branches, inputs=inputs)
-        write_drive(folder, drive, read_layout(LAYOUT))
-    return folder
 
 
 @pytest.fixture(scope="module")
