@@ -22,6 +22,8 @@ class Purpose(IntEnum):
     TRAINING_FAULTS = 6
     TRAINING_ERROR = 7
     COMMON_DRIVE = 8
+    ATTACK = 9
+    START_OF_RUN = 10
 
 
 def random_stream(purpose: Purpose, *numbers: int) -> np.random.Generator:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults
+from calibrator.random_streams import Purpose, random_stream
 
 __all__ = ["WORLDS", "Attack", "World", "draw_attack"]
 
@@ -146,7 +147,7 @@ class Attack:
         return changed
 
     def _scene(self, vehicle: int, samples: int, *, unseen: bool, peak_a: float = 0.0) -> Scene:
-        rng = np.random.default_rng([self.seed, vehicle, int(unseen)])
+        rng = random_stream(Purpose.ATTACK, self.seed, vehicle, int(unseen))
         warm = 1.0 - np.exp(-2.0 * np.linspace(0.0, 1.0, samples))
         return Scene(
             size=float(self.size[vehicle]),
@@ -177,7 +178,7 @@ def draw_attack(name: str, vehicles: int, *, full_scale_a: float, seed: int) -> 
     Attack
         Of the N vehicles.
     """
-    world, rng = WORLDS[name], np.random.default_rng([seed, vehicles, *name.encode()])
+    world, rng = WORLDS[name], random_stream(Purpose.ATTACK, seed, vehicles, *name.encode())
     signed = world.sensor is not None or world.disturbance is not None
     sign = rng.choice([-1.0, 1.0], vehicles) if signed else 1.0
     return Attack(

@@ -296,7 +296,7 @@ def _runs(fleet: RecordedFleet, minutes: float, vehicles: int, seed: int) -> tup
     """Drives of so many minutes, each from a random start on; vehicles may share trips, but hardly ever a start."""
     trips, samples, runs = fleet.trips, int(60.0 * minutes / fleet.period_s), []
     for number in range(vehicles):
-        rng = random_stream(Purpose.CALIBRATION_TRIP, seed, number)
+        rng = random_stream(Purpose.START_OF_RUN, seed, number)
         k = int(rng.integers(len(trips)))
         parts = [trips[k].part(int(rng.integers(len(trips[k]))), len(trips[k]))]
         while sum(map(len, parts)) < samples:

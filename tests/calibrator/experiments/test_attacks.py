@@ -19,7 +19,7 @@ def fleet() -> RecordedFleet:
 @pytest.mark.parametrize("world", WORLDS)
 def test_world_changes_the_currents_of_those_that_have_it_alone(fleet: RecordedFleet, world: str) -> None:
     trips, case = fleet.with_branches(2), RecordedCase(sparsity=100.0, world=world)
-    plain, attacked = (record_vehicles(fleet, one, trips, 3) for one in (SOUND, case))
+    plain, attacked = (record_vehicles(fleet, one, trips, 2) for one in (SOUND, case))
     pairs = zip(plain.samples, attacked.samples, strict=True)
     changed = [not np.array_equal(a.currents_a, b.currents_a) for a, b in pairs]
     assert attacked.attack is not None
@@ -29,13 +29,13 @@ def test_world_changes_the_currents_of_those_that_have_it_alone(fleet: RecordedF
 
 def test_truth_and_unseen_drive_are_those_of_the_world(fleet: RecordedFleet) -> None:
     def trial_of(world: str):  # type: ignore[no-untyped-def]
-        trial = recorded_trial(fleet, RecordedCase(sparsity=100.0, world=world), 3)
+        trial = recorded_trial(fleet, RecordedCase(sparsity=100.0, world=world), 2)
         return trial, trial.attacked
 
     inverted, attacked = trial_of("inverted in 10%")
     np.testing.assert_array_equal(np.any(inverted.truth.drift == -2.0, axis=1), attacked)
     load, attacked = trial_of("load 5 A in 30%")
-    more_a = load.unseen.mean_a - recorded_trial(fleet, SOUND, 3).unseen.mean_a
+    more_a = load.unseen.mean_a - recorded_trial(fleet, SOUND, 2).unseen.mean_a
     np.testing.assert_allclose(more_a[:, 0], 5.0 * attacked, atol=1e-9)
     np.testing.assert_allclose(load.unseen.error_mean_square_a2, 0.0, atol=1e-18)
     quadratic, attacked = trial_of("quadratic 5-20 %")
@@ -46,7 +46,7 @@ def test_truth_and_unseen_drive_are_those_of_the_world(fleet: RecordedFleet) -> 
 
 
 def test_nothing_is_sure_of_a_vehicle_with_an_inverted_sensor(fleet: RecordedFleet) -> None:
-    trial = recorded_trial(fleet, RecordedCase(sparsity=100.0, world="inverted in 10%"), 3)
+    trial = recorded_trial(fleet, RecordedCase(sparsity=100.0, world="inverted in 10%"), 2)
     confidence, attacked = POSTERIOR.estimate(trial).confidence, trial.attacked
     assert attacked is not None
     assert confidence is not None
@@ -56,7 +56,7 @@ def test_nothing_is_sure_of_a_vehicle_with_an_inverted_sensor(fleet: RecordedFle
 
 def test_step_is_half_way_and_over_on_the_unseen_drive(fleet: RecordedFleet) -> None:
     trips = fleet.with_branches(2)
-    vehicles = record_vehicles(fleet, RecordedCase(sparsity=100.0, world="gain step of 15 % midway"), trips, 3)
+    vehicles = record_vehicles(fleet, RecordedCase(sparsity=100.0, world="gain step of 15 % midway"), trips, 2)
     assert vehicles.attack is not None
     j = int(np.flatnonzero(vehicles.attack.has)[0])
     k, size, half = vehicles.attack.branch[j], vehicles.attack.size[j], len(trips[j]) // 2

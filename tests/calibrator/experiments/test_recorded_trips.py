@@ -9,10 +9,12 @@ from calibrator.experiments.recorded_trips import (
     NOISE,
     RecordedCase,
     RecordedFleet,
+    builtin_fleet,
     record_vehicles,
     recorded_trial,
 )
 from calibrator.experiments.trial import drawn_distribution
+from calibrator.random_streams import Purpose
 from tests.calibrator.experiments.small_trials import small_fleet
 
 
@@ -86,6 +88,23 @@ def test_faults_of_the_own_prior_are_drawn_anew_for_the_same_trips(fleet: Record
     values = judge(POSTERIOR.estimate(own), own)
     assert values["recovery_rate"].mean() >= 0.8
     assert not values["harmed"].any()
+
+
+def test_streams_of_chance_name_their_purpose_and_none_serves_two(
+    fleet: RecordedFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make, seeds = np.random.default_rng, list[tuple[int, ...]]()
+
+    def noted(seed: list[int]) -> np.random.Generator:
+        seeds.append(tuple(seed))
+        return make(seed)
+
+    monkeypatch.setattr(np.random, "default_rng", noted)
+    builtin_fleet(fleet.database, trips=4, duration_s=30.0)
+    of_trips = set(seeds)
+    recorded_trial(fleet, RecordedCase(vehicles=4, minutes=1.0, world="inverted in 10%"), 0)
+    assert of_trips.isdisjoint(seeds[len(of_trips) :])
+    assert all(purpose in [*Purpose] and count == len(rest) for purpose, count, *rest in seeds)
 
 
 def test_case_with_minutes_has_the_vehicles_asked_for(fleet: RecordedFleet) -> None:
