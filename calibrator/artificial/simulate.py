@@ -238,7 +238,7 @@ def _current_signal(branch: Branch) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class FleetPlan(FaultSettings):
-    """What an artificial fleet is like; beside what its faults are like:
+    """What an artificial fleet is like, beside how its faults are drawn.
 
     Attributes
     ----------

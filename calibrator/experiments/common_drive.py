@@ -143,7 +143,7 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonCase(FaultSettings):
-    """How a fleet on the common drive is drawn, section IV-B of [1]_, and simulated; beside what its faults are like:
+    """How a fleet on the common drive is simulated, beside how its faults are drawn, section IV-B of [1]_.
 
     Attributes
     ----------

@@ -134,11 +134,12 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
         File of its picture, as the page is to link it; empty: there is none.
     """
     experiment, names, owner = result.experiment, _names(result), _owner(result)
+    also = f"; then figures of {owner}" if owner else ""
     written = f"Written by `calibrator experiment {experiment.name} --out FOLDER`." if result.made else ""
     sections = [
         f"# {experiment.title}",
         f"{written} {_notes(result)}".strip(),
-        f"Share of vehicles recovered within 10 %, by method, with 95 % intervals; then figures of {owner or 'none'}:",
+        f"Share of vehicles recovered within 10 %, by method, with 95 % intervals{also}:",
         _markdown(headline(result)),
         f"![{experiment.title}]({picture})" if picture else "",
         f"All figures{'; after a stroke the paper' if experiment.paper else ''}. {_explained(names)}.",

@@ -173,7 +173,7 @@ def builtin_fleet(
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedCase(FaultSettings):
-    """How vehicles are made of trips; beside what their faults are like:
+    """How vehicles are made of trips, beside how their faults are drawn.
 
     Attributes
     ----------

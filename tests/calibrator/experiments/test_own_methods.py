@@ -52,7 +52,9 @@ def test_own_methods_stand_beside_the_paper_and_confidence_is_of_the_first_that_
     assert table.iloc[:, :3].to_numpy().tolist() == [["", "60", "0.91"], ["3 of 6", "60", "0.91"]]
     assert table["confidence"].iloc[0] == "0.800"
     assert "then figures of own:" in result_markdown(result)
-    assert list(headline(run(Own("silent"))).columns[2:]) == ["paper", "silent"]
+    silent = run(Own("silent"))
+    assert list(headline(silent).columns[2:]) == ["paper", "silent"]
+    assert "with 95 % intervals:" in result_markdown(silent)
     both = run(sure, POSTERIOR)
     default = both.value("confidence", x=60.0, method=POSTERIOR.name)
     assert headline(both)["confidence"].iloc[0] == f"{default:.3f}"
