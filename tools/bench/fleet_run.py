@@ -249,7 +249,7 @@ def write_drives(folder: Path, drives: int, *, per_vehicle: int = 10) -> float:
     """Write drives of ten minutes with frames at 10 and 20 Hz into a store; how long they are together. [h]"""
     database, rng, seconds = read_database(read_layout(LAYOUT)), np.random.default_rng(0), 0.0
     trips = BuiltinTrips(seed=0, duration_s=DRIVE_S, unseen_s=60.0)
-    plan = FleetPlan(vehicles=-(-drives // per_vehicle), currents=len(BRANCHES), sparsity=SPARSITY, magnitude=MAGNITUDE)
+    plan = FleetPlan(vehicles=-(-drives // per_vehicle), currents=len(BRANCHES), sparsity=SPARSITY)
     base: list[Drive] = []
     for number, vehicle in enumerate(draw_vehicles(plan, database.layout, BRANCHES)):
         for trip in range(per_vehicle):
