@@ -14,15 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inlined
+from calibrator.compiled import compiled
 from calibrator.drive import Array, Channel, Mask
 
 __all__ = ["Band", "ChargeCurve", "charge_curve", "covered"]
 
-_Curve = tuple[Array, Array, NDArray[np.int64]]
-"""Instants and pieces of a :class:`ChargeCurve`, and which line each place of the windows was found on last."""
 GAP_PERIODS = 3.5
 """Good samples farther apart than this many median distances leave a gap: two lost frames in a row are bridged. [1]"""
 
@@ -78,7 +75,10 @@ class ChargeCurve:
         x, slope : ndarray of shape (T,)
             Band of the current [A] and its derivative by time [A/s].
         """
-        return _band(time_s, self.time_s, self.pieces, (band.short_s, band.long_s))
+        w, W = band.short_s, band.long_s
+        shift_s = np.array([0.0, w, -w, W, -W])
+        weight = np.array([2.0 / W**2 - 2.0 / w**2, 1.0 / w**2, 1.0 / w**2, -1.0 / W**2, -1.0 / W**2])
+        return _band(time_s, self.time_s, self.pieces, shift_s, weight)
 
     def covers(self, time_s: Array, margin_s: float) -> Mask:
         """Whether this much time on both sides of each instant lies within the samples and touches no gap."""
@@ -94,43 +94,25 @@ def covered(curves: Sequence[ChargeCurve], time_s: Array, margin_s: float) -> Ma
 
 
 @compiled
-def _band(time_s: Array, known_s: Array, pieces: Array, windows_s: tuple[float, float]) -> tuple[Array, Array]:
-    """Band and its slope, shape (T,) each; of increasing instants each finds its lines beside those of the last."""
-    x, slope = np.empty(len(time_s)), np.empty(len(time_s))
-    curve = (known_s, pieces, np.zeros(5, np.int64))
-    short_s, long_s = windows_s
-    for j in range(len(time_s)):
-        t = time_s[j]
-        p, q = _integrals(t, curve, 0)
-        near_p, near_q = _outside(t, short_s, curve, 1)
-        far_p, far_q = _outside(t, long_s, curve, 3)
-        x[j] = (near_p - 2.0 * p) / short_s**2 - (far_p - 2.0 * p) / long_s**2
-        slope[j] = (near_q - 2.0 * q) / short_s**2 - (far_q - 2.0 * q) / long_s**2
+def _band(time_s: Array, known_s: Array, pieces: Array, shift_s: Array, weight: Array) -> tuple[Array, Array]:
+    """Band and its slope, shape (T,) each: sums of P and Q at shifted instants with weights.
+
+    Of increasing instants each finds its lines beside those of the last.
+    """
+    x, slope = np.zeros(len(time_s)), np.zeros(len(time_s))
+    for place in range(len(shift_s)):
+        k, last = 0, len(known_s) - 2
+        for j in range(len(time_s)):
+            t = time_s[j] + shift_s[place]
+            while k < last and known_s[k + 1] <= t:
+                k += 1
+            while k > 0 and known_s[k] > t:
+                k -= 1
+            h = t - known_s[k]
+            integral, charge, current, rise = pieces[0, k], pieces[1, k], pieces[2, k], pieces[3, k]
+            x[j] += weight[place] * (integral + h * (charge + h * (current / 2.0 + h * rise / 6.0)))
+            slope[j] += weight[place] * (charge + h * (current + h * rise / 2.0))
     return x, slope
-
-
-@inlined
-def _outside(t: float, half_s: float, curve: _Curve, place: int) -> tuple[float, float]:
-    """Sums of both integrals at the two ends of a window around t."""
-    after_p, after_q = _integrals(t + half_s, curve, place)
-    before_p, before_q = _integrals(t - half_s, curve, place + 1)
-    return after_p + before_p, after_q + before_q
-
-
-@inlined
-def _integrals(t: float, curve: _Curve, place: int) -> tuple[float, float]:
-    """Integral of the charge, and charge, at t within the samples."""
-    known_s, pieces, lines = curve
-    k, last = lines[place], len(known_s) - 2
-    while k < last and known_s[k + 1] <= t:
-        k += 1
-    while k > 0 and known_s[k] > t:
-        k -= 1
-    lines[place] = k
-    h = t - known_s[k]
-    integral, charge, current, slope = pieces[0, k], pieces[1, k], pieces[2, k], pieces[3, k]
-    p = integral + h * (charge + h * (current / 2.0 + h * slope / 6.0))
-    return p, charge + h * (current + h * slope / 2.0)
 
 
 def charge_curve(channel: Channel) -> ChargeCurve | None:

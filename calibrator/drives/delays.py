@@ -58,7 +58,7 @@ GAIN_RANGE = (1.0 / 3.0, 3.0)
 """Ratios of two sensors' gains, each within 0.6 to 1.4, and some loss to noise; outside, it is not the branch's own
 current that was found. [1]"""
 
-LAG_STEP_S = 0.02
+LAG_STEP_S = 0.05
 """Grid of the search, far finer than the windows: the true delay lies in the neighbourhood of the best lag. [s]"""
 SEARCHED_INSTANTS = 1200
 """Instants at which the search, and what is usual, looks at most. [1]"""
