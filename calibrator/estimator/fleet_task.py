@@ -44,6 +44,8 @@ LEAST_PROBABILITY = 1e-4
 MOVED_SD, MOVED_PROBABILITY = 4.0, 1e-3
 """Standard deviations within which earlier and new faults of a sensor are the same [1]; a sensor has moved if the
 explanations near the earlier faults are less probable than this. [1]"""
+AT_ONCE = 32
+"""Vehicles of a bucket that are estimated together: what they take of memory for the time. [1]"""
 NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
 
 
@@ -286,12 +288,13 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
             raise
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
             left_out[name] = internal_error(error)
-    for name, found in task.calibrate(todo).items():
-        if isinstance(found, str):
-            left_out[name] = found
-        else:
-            parameters.append(found[0])
-            evidence[name] = found[1]
+    for first in range(0, len(todo), AT_ONCE):
+        for name, found in task.calibrate(todo[first : first + AT_ONCE]).items():
+            if isinstance(found, str):
+                left_out[name] = found
+            else:
+                parameters.append(found[0])
+                evidence[name] = found[1]
     return encode_chunk(parameters, left_out, moved=moved, drives=digests, evidence=evidence)
 
 

@@ -57,9 +57,10 @@ from ecu_node.layout import Layout
 
 __all__ = ["Census", "calibrate_fleet", "read_sample", "require_fleet", "take_census"]
 
-MOST_LEARNT = 2000
-"""Vehicles that the reference is learnt from. With so many its centre is known to a fortieth of what faultless vehicles
-differ by, so more would not tell any vehicle's faults better. [1]"""
+MOST_LEARNT, MOST_BLOCKS = 2000, 50_000
+"""Vehicles that the reference is learnt from, and about how many blocks of their drives. With so many vehicles its
+centre is known to a fortieth of what faultless vehicles differ by, so more would not tell any vehicle's faults better;
+so many blocks take about half a GiB, and are 200 vehicles with two hours of driving or more. [1]"""
 MOST_REASONS = 20
 """Reasons of vehicles left out that are kept for messages."""
 Calibrate: TypeAlias = Callable[..., tuple[Equipment, bytes, dict[str, object], Sequence[str]]]
@@ -270,23 +271,25 @@ def read_sample(
     Returns
     -------
     list of VehicleSummary
-        Trusted and checked ones, and others, by hash of their names, up to :data:`MOST_LEARNT` that may be learnt from.
+        Trusted and checked ones, and others, by hash of their names, up to :data:`MOST_LEARNT` that may be learnt from,
+        or :data:`MOST_BLOCKS` of them.
     """
     wanted = settings.trusted | frozenset(checked)
     apart = {store.bucket_of(name) for name in wanted}
     found: list[VehicleSummary] = []
-    learners = 0
+    learners = blocks = 0
     for bucket in census.usable:
-        if learners >= MOST_LEARNT and bucket not in apart:
+        if (learners >= MOST_LEARNT or blocks >= MOST_BLOCKS) and bucket not in apart:
             continue
         for name, records in store.read(bucket).items():
             learns = name not in settings.hold_out
-            if name in wanted or (learns and learners < MOST_LEARNT):
+            if name in wanted or (learns and learners < MOST_LEARNT and blocks < MOST_BLOCKS):
                 try:
                     found.append(joined_records(records))
                 except DriveError:  # left out, with the reason, in the second pass
                     continue
                 learners += learns
+                blocks += learns * len(found[-1].summary.moments)
     require_learning([item.vehicle for item in found], settings, census.reasons, left_out_count=census.left_out)
     return found
 

@@ -18,11 +18,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 from bench.row import LAYOUT, MEBIBYTE, Row
 from calibrator.artificial.random_fleet import FaultSettings
@@ -105,7 +107,7 @@ def calibrate(given: Path, out: Path, command: str = "calibrate") -> list[str]:
 
 
 def watched(command: Sequence[str]) -> tuple[float, float]:
-    """Run a command: its time [s], and the largest sum of the resident memory of its processes [byte]."""
+    """Run a command: its time [s], and the largest resident memory of its processes [byte]."""
     start_s, peak = time.monotonic(), 0.0
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
         while run.poll() is None:
@@ -118,20 +120,15 @@ def watched(command: Sequence[str]) -> tuple[float, float]:
 
 
 def resident_bytes(process: int) -> float:
-    """Resident memory of a process and all that descend from it; what processes share is counted in each. [byte]"""
-    parents, resident = dict[int, int](), dict[int, float]()
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdecimal():
-            try:
-                fields = (entry / "stat").read_text().rpartition(")")[2].split()
-                pages = int((entry / "statm").read_text().split()[1])
-            except (OSError, IndexError):
-                continue
-            parents[int(entry.name)], resident[int(entry.name)] = int(fields[1]), pages * os.sysconf("SC_PAGE_SIZE")
-    family = {process}
-    while more := {child for child, parent in parents.items() if parent in family} - family:
-        family |= more
-    return sum(resident.get(member, 0.0) for member in family)
+    """Resident memory of a process and all that descend from it; a page that several share counts once. [byte]"""
+    kibibytes = 0
+    with suppress(psutil.NoSuchProcess):
+        root = psutil.Process(process)
+        for member in (root, *root.children(recursive=True)):
+            with suppress(OSError):
+                text = Path(f"/proc/{member.pid}/smaps_rollup").read_text()
+                kibibytes += int(text.partition("\nPss:")[2].split()[0])
+    return 1024.0 * kibibytes
 
 
 def killed_runs(folder: Path, vehicles: int, kills: int, command: str = "calibrate") -> int:

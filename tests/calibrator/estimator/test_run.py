@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from calibrator.errors import FleetError
+from calibrator.estimator import run
 from calibrator.estimator.fleet_task import FleetTask, calibrate_bucket, learn_task
 from calibrator.estimator.results import left_out_of, read_results, read_run
 from calibrator.estimator.run import read_sample, take_census
@@ -79,6 +80,15 @@ def task(store: SummaryStore, database: VehicleDatabase) -> FleetTask:
     settings = CalibrationSettings()
     sample = read_sample(store, take_census(store, ONE), settings, ())
     return learn_task(sample, settings, {}, branches=BRANCHES, identity=identity, fleet_size=VEHICLES)[0]
+
+
+def test_no_more_blocks_are_learnt_from_than_memory_holds(store: SummaryStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    census, settings = take_census(store, ONE), CalibrationSettings()
+    whole = read_sample(store, census, settings, ())
+    monkeypatch.setattr(run, "MOST_BLOCKS", sum(len(item.summary.moments) for item in whole[:10]))
+    assert [item.vehicle for item in read_sample(store, census, settings, ())] == [item.vehicle for item in whole[:10]]
+    trusted = CalibrationSettings(trusted=frozenset([whole[-1].vehicle]))
+    assert read_sample(store, census, trusted, ())[-1].vehicle == whole[-1].vehicle
 
 
 def texts(chunk: bytes) -> dict[str, bytes]:
