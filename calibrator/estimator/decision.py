@@ -29,6 +29,7 @@ __all__ = [
     "FleetEstimate",
     "Points",
     "best_estimate",
+    "decided",
     "estimate_rows",
     "harm_probability",
     "posterior_points",
@@ -463,3 +464,25 @@ def _identifiable(rows: EvidenceRows) -> Mask:
     best = np.minimum(sd[:, at.slopes], sd[:, at.gain_reads])
     best[:, 1:] = np.minimum(best[:, 1:], sd[:, at.ratios])
     return np.asarray(best < MOST_GAIN_SD)
+
+
+def decided(
+    faulty: Mask, *, unfit: Mask, in_doubt: Mask, still: Mask, harmful: Mask, beyond: Mask, sound: Mask
+) -> tuple[NDArray[np.str_], Mask, list[str]]:
+    """Why faults are not corrected (N, K), which branches are (N, K), and the verdicts of N vehicles.
+
+    Of the reasons, arrays that broadcast to (N, K), the first that applies is reported; ``sound`` (N,) says which
+    vehicles have no sensor fault.
+    """
+    reasons = {
+        "": ~faulty,
+        "does not fit": unfit,
+        "reference in doubt": in_doubt,
+        "moved too little": still,
+        "harm limit": harmful,
+        "beyond the limits": beyond,
+    }
+    held_back = np.select([np.broadcast_to(each, faulty.shape) for each in reasons.values()], list(reasons), "")
+    corrected = faulty & (held_back == "")
+    verdicts = np.select([corrected.any(axis=1), sound], ["corrected", "no sensor fault"], "cannot tell")
+    return held_back, corrected, verdicts.tolist()

@@ -10,12 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.checks import UsualMisfits, find_misfits, learn_usual_misfits
-from calibrator.estimator.decision import FleetEstimate, estimate_rows
+from calibrator.estimator.decision import FleetEstimate, decided, estimate_rows
 from calibrator.estimator.evidence import (
     EvidenceRows,
     FleetMoments,
@@ -36,7 +35,7 @@ from calibrator.summaries.moments import DriveSummary
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.parameters import Explanation, SensorFinding
 
-__all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "decided", "estimate_vehicles", "learn_fleet"]
+__all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "estimate_vehicles", "learn_fleet"]
 
 CONFIDENT, SUSPECTED = 0.95, 0.5
 """Confidence from which on a vehicle counts as sound, and probability from which on hardware is suspected. [1]"""
@@ -437,28 +436,6 @@ def estimate_vehicles(
             full_scale_a=scale_a,
         ),
     )
-
-
-def decided(
-    faulty: Mask, *, unfit: Mask, in_doubt: Mask, still: Mask, harmful: Mask, beyond: Mask, sound: Mask
-) -> tuple[NDArray[np.str_], Mask, list[str]]:
-    """Why faults are not corrected (N, K), which branches are (N, K), and the verdicts of N vehicles.
-
-    Of the reasons, arrays that broadcast to (N, K), the first that applies is reported; ``sound`` (N,) says which
-    vehicles have no sensor fault.
-    """
-    reasons = {
-        "": ~faulty,
-        "does not fit": unfit,
-        "reference in doubt": in_doubt,
-        "moved too little": still,
-        "harm limit": harmful,
-        "beyond the limits": beyond,
-    }
-    held_back = np.select([np.broadcast_to(each, faulty.shape) for each in reasons.values()], list(reasons), "")
-    corrected = faulty & (held_back == "")
-    verdicts = np.select([corrected.any(axis=1), sound], ["corrected", "no sensor fault"], "cannot tell")
-    return held_back, corrected, verdicts.tolist()
 
 
 def _shared_findings(found: FleetEstimate, reference: FleetReference) -> list[list[SensorFinding]]:

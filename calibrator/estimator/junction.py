@@ -29,9 +29,9 @@ from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.checks import CAUSES, UsualMisfits, find_misfits
-from calibrator.estimator.decision import Points, harm_probability, recovery_probability
+from calibrator.estimator.decision import FleetEstimate, Points, decided, harm_probability, recovery_probability
 from calibrator.estimator.evidence import junction_regression, stack_summaries
-from calibrator.estimator.fleet_estimate import SUSPECTED, FleetEstimate, decided
+from calibrator.estimator.fleet_estimate import SUSPECTED
 from calibrator.estimator.readings import (
     CONTRADICTION,
     TRUSTED_DRIFT_SD,

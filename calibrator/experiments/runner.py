@@ -86,6 +86,8 @@ def run_experiment(
     if isinstance(fleet, RecordedFleet):  # too few branches are said before anything is run
         for count in {each.case.branches for each in experiment.settings if isinstance(each.case, RecordedCase)}:
             fleet.with_branches(count)
+    elif fleet.branches != experiment.branches:
+        raise FleetError(f"{experiment.name}: expected a drive of {experiment.branches} branches, not {fleet.branches}")
     rows = [(setting, setting.methods or usual) for setting in experiment.settings]
     keys = [(setting.series, setting.x, method.name) for setting, own in rows for method in own]
     if not keys or len({*keys}) < len(keys):

@@ -198,7 +198,7 @@ def require_possible(drive: Drive, layout: Layout) -> None:
 
 
 def most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
-    """Branches by falling variance; the order asked for where a drive lacks one, as is noticed later."""
+    """Branches by falling variance; of one that a drive lacks, which is noticed later, that of the others."""
 
     def variance_a2(name: str) -> float:
         channels = [drive.branches[name] for drive in drives if name in drive.branches]

@@ -93,7 +93,7 @@ def test_more_branches_than_the_trips_have_are_refused_before_anything_is_run(fl
 )
 def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
     row = EXPERIMENTS[name].small()
-    result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
+    result = run_experiment(row, fleet if row.recorded else smooth_drive(row.branches, samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")
     write_page(tmp_path / "results", result)
     found = dict.fromkeys(zip(result.figures["series"], result.figures["x"], result.figures["method"], strict=True))
@@ -185,6 +185,8 @@ def test_wrong_fleet_and_what_makes_no_table_are_refused(fleet: RecordedFleet) -
         run_experiment(EXPERIMENTS["snr"].small(), fleet, repetitions=1)
     with pytest.raises(FleetError, match="at least 1 repetition, not 0"):
         run_experiment(EXPERIMENTS["snr"], smooth_drive(), repetitions=0)
+    with pytest.raises(FleetError, match=r"^snr: expected a drive of 4 branches, not 2$"):
+        run_experiment(replace(EXPERIMENTS["snr"], branches=4), smooth_drive())
     twice = (Setting(x=1.0, case=CommonCase()), Setting(x=1.0, case=CommonCase()))
     for change in ({"settings": ()}, {"methods": ()}, {"settings": twice}):
         with pytest.raises(FleetError, match=r"^snr: expected a method, and settings that differ in x or series$"):
