@@ -201,15 +201,16 @@ class _Learner:
             apart = rows.values[known, slope] - rows.values[known, first] + rows.values[known, ratio]
             centre[slope] = np.median(apart) if known.any() else 0.0
         known, sd = rows.known[:, at.slopes], np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2)[:, at.slopes])
-        common = densest_clusters((rows.values[:, at.slopes] - centre[at.slopes])[known], sd[known], most=MOST_COMMON)
+        agreeing = densest_clusters((rows.values[:, at.slopes] - centre[at.slopes])[known], sd[known], most=MOST_COMMON)
+        common = [cluster.centre for cluster in agreeing] or [0.0]
         centre[at.intercepts] = [self.clusters(at.intercept(k))[0] for k in range(K)]
         others = centre[at.intercepts].sum() - centre[intercept]
         zeros = [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         found: list[Array] = []
         # The junction shows its constant most exactly.
-        for constant, cluster in product((*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0, *zeros), common):
+        for constant, slope in product((*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0, *zeros), common):
             start = centre.copy()
-            start[at.slopes] += cluster.centre
+            start[at.slopes] += slope
             start[intercept], start[at.junction] = constant - others, constant
             start = np.where(np.isnan(self.fixed), start, self.fixed)
             if not any(np.abs(start - other).max() < SAME_START for other in found):

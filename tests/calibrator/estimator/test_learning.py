@@ -168,3 +168,11 @@ def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors(K: int) ->
     carried = [model.spread.covariance[row, 4 * K - 1] for row in (3 * K - 1, 4 * K - 1)]
     np.testing.assert_allclose(np.sqrt(carried), load.std(), rtol=0.3)
     assert not model.spread.shared.any()
+
+
+def test_fleet_of_which_no_slope_is_known_is_learnt_all_the_same() -> None:
+    """As drives of a minute are: it was an error of the program."""
+    rows = rows_of(random_faults(1, vehicles=12, branches=2), seed=1)
+    known = rows.known.copy()
+    known[:, RowPlaces(2).slopes] = False
+    assert np.isfinite(learned(replace(rows, known=known, values=np.where(known, rows.values, 0.0))).log_evidence)
