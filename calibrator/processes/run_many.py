@@ -8,6 +8,7 @@ Every worker process has a pool of one of its own (pebble): processes that share
 do, can take each other along when one is killed.
 """
 
+import asyncio
 import logging
 import math
 import multiprocessing
@@ -68,6 +69,7 @@ PRELOADED = [
 ]
 """Slow to import, so imported once, for all processes. Not this package: the fork server may find another copy."""
 MEGABYTE = 1_000_000
+AGAIN = ", and run the same command again"
 REMEDY = "remove the file if it is damaged, cut it if it is long"
 
 _Item = TypeVar("_Item")
@@ -422,7 +424,11 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
                         continue  # with as many items
                     while unsent := list(islice(flight, len(futures), len(futures) + SENT_AT_ONCE)):
                         futures.extend(client.map(partial(_on_worker, job), unsent, pure=False))
-                    error = futures[0].exception()  # waits for it
+                    try:
+                        error = futures[0].exception(timeout=CONNECT_S)  # waits for it
+                    except TimeoutError:
+                        _wait_for_worker(client, address)
+                        continue
                     # many at a time, as each request to the scheduler costs milliseconds; the others keep workers busy
                     done = list(takewhile(lambda future: future.status == "finished", islice(futures, workers)))
                     outcomes = client.gather(done)
@@ -434,7 +440,8 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
                     futures.clear()
                     continue
                 if isinstance(error, KilledWorker):
-                    outcomes = [Failed(reason=f"{address}: it killed its workers one after the other, as by memory")]
+                    why = "out of memory, or without this package"
+                    outcomes = [Failed(reason=f"{address}: its workers ended one after the other, {why}")]
                 elif error is not None:
                     futures[0].result()  # raises it
                 for outcome in outcomes:
@@ -445,22 +452,41 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
 
 
 def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
-    from distributed import Client  # noqa: PLC0415
+    from distributed import Client  # noqa: PLC0415 (an extra)
+    from distributed.utils import LoopRunner  # noqa: PLC0415
 
-    again = ", and run the same command again"
     try:
+        LoopRunner().run_sync(_handshake, address, patience_s)
         client = Client(address, timeout=patience_s, set_as_default=False)
     except (OSError, ValueError) as error:
-        reason = str(error).partition("\n")[0]
+        reason = str(error).partition("\n")[0] or "a server of another kind listens there"
         if lost:
-            raise FleetError(f"{address}: the scheduler is gone; start it and its workers again{again}") from None
+            raise FleetError(f"{address}: the scheduler is gone; start it and its workers again{AGAIN}") from None
         raise FleetError(f"{address}: no Dask scheduler answers: {reason}; start one with 'dask scheduler'") from None
+    try:
+        _wait_for_worker(client, address)
+    except FleetError:
+        client.close()
+        raise
+    return client
+
+
+async def _handshake(address: str, patience_s: float) -> None:
+    """Raise OSError where no server of Dask answers; Client waits for ever for what another one says."""
+    from distributed.comm.core import connect  # noqa: PLC0415 (an extra)
+    from distributed.security import Security  # noqa: PLC0415
+
+    arguments = Security().get_connection_args("client")
+    comm = await asyncio.wait_for(connect(address, timeout=patience_s, **arguments), patience_s + 1.0)
+    comm.abort()
+
+
+def _wait_for_worker(client: Any, address: str) -> None:
     try:
         client.wait_for_workers(1, timeout=RETURN_S)
     except TimeoutError:
-        client.close()
-        raise FleetError(f"{address}: the scheduler has no worker; start some with 'dask worker'{again}") from None
-    return client
+        advice = f"start some with 'dask worker' on machines with this package of this version{AGAIN}"
+        raise FleetError(f"{address}: the scheduler has no worker; {advice}") from None
 
 
 def _on_worker(job: _Job, item: Any) -> Any:

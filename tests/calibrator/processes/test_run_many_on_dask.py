@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -77,6 +78,27 @@ def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypat
         cluster.scheduler.kill()
         with pytest.raises(FleetError, match=r"the scheduler is gone; start it .*, and run the same command again"):
             list(results)
+
+
+def test_run_whose_workers_all_end_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As workers do that lack this package: what they are sent ends them."""
+    monkeypatch.setattr(module, "CONNECT_S", 3.0)
+    monkeypatch.setattr(module, "RETURN_S", 3.0)
+    with DaskCluster(tmp_path) as cluster:
+        results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
+        assert next(results) == 0
+        for worker in cluster.workers:
+            worker.kill()
+        with pytest.raises(FleetError, match=r"no worker; start .* with this package .*, and run the same command"):
+            list(results)
+
+
+def test_server_that_is_no_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CONNECT_S", 2.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(FleetError, match=r"no Dask scheduler answers: .*other kind.*; start one"):
+            list(run_many(abs, range(3), Workers(scheduler=address)))
 
 
 @pytest.fixture(scope="module")
