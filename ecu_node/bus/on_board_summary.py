@@ -567,7 +567,9 @@ def on_board_summary(
     found = parameters.branches if parameters is not None else {}
     delays = {name: (branch.delay_s or 0.0, branch.delay_sd_s) for name, branch in found.items()}
     summary = OnBoardSummary(options.summary, vehicle, database, delays=delays, say=say)
-    opened = partial(connect, filters=filters_of(summary.messages), **bus)
+    # python-can's own filter ends a look at the first frame that does not pass it
+    filters = filters_of(summary.messages) if bus["interface"] == "socketcan" else None
+    opened = partial(connect, filters=filters, **bus)
     sys.setswitchinterval(_LONGEST_TURN_S)
     summary.listen(SteadyBus(opened, Counters(), listen_only=True))
     return summary
