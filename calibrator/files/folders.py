@@ -37,7 +37,7 @@ def require_possible_file(out: Path) -> None:
         raise FleetError(f"{out}: is a folder; name a file in it")
     if out.exists() and not out.is_file():
         raise FleetError(f"{out}: is no file but a device, pipe or socket, which would be replaced; name a file")
-    require_possible_folder(out.absolute().parent)
+    _require_possible(out.absolute().parent, out)
 
 
 def require_new_folder(out: Path) -> None:
@@ -59,6 +59,8 @@ def _partial(out: Path) -> Path:
 
 def _require_possible(folder: Path, out: Path) -> None:
     """Make a folder in a hidden one, and remove both; `out` is what the user calls it."""
+    if out.parts and out.parts[0].endswith(":"):
+        raise FleetError(f"{out}: is a URL; name a folder of this machine, as nothing else can be written to")
     nearest = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
     if not nearest.is_dir():
         raise FleetError(f"{out}: cannot be made: {nearest} is a file; choose another folder")

@@ -7,7 +7,13 @@ from pathlib import Path
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.files.folders import require_new_folder, require_possible_folder, whole_folder, write_files
+from calibrator.files.folders import (
+    require_new_folder,
+    require_possible_file,
+    require_possible_folder,
+    whole_folder,
+    write_files,
+)
 from ecu_node.errors import UserError
 
 
@@ -63,6 +69,13 @@ def test_folder_in_which_the_system_makes_nothing_is_refused(require: Callable[[
     # No right forbids it to root; only trying tells.
     with pytest.raises(FleetError, match=rf"^/proc/{name}: nothing can be made in /proc: .*; choose another folder$"):
         require(Path("/proc") / name)
+
+
+@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder, require_possible_file])
+def test_url_is_refused_where_only_a_path_can_be_written(require: Callable[[Path], None]) -> None:
+    """Else a folder ``s3:`` is made here."""
+    with pytest.raises(FleetError, match=r"^s3:/bucket/result: is a URL; name a folder of this machine"):
+        require(Path("s3://bucket/result"))
 
 
 def test_link_is_not_replaced_wherever_it_leads(tmp_path: Path) -> None:
