@@ -203,6 +203,9 @@ def _logs_in(storage: Storage, shown: str, problems: list[str]) -> Iterator[tupl
     if storage.is_local and path.is_file():
         yield from _in_archive(path) if path.suffix.lower() == ".zip" else [(str(path.parent), [_entry(path)], None)]
         return
+    folder_url, _, name = storage.url.rpartition("/")
+    if not storage.is_local and _is_log(storage, name):
+        yield from ((folder_url, [log], None) for log in open_storage(folder_url).contents(name)[1] if log.name == name)
     for folder, files in walk(storage, problems):
         if logs := [entry for entry in files if _is_log(folder, entry.name)]:
             yield folder.url, logs, folder

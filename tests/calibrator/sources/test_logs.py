@@ -4,7 +4,8 @@ import zipfile
 from pathlib import Path
 
 from calibrator.drive import FleetSource
-from calibrator.sources.fleet_source import find_logs
+from calibrator.files.storage import open_storage
+from calibrator.sources.fleet_source import find_fleet, find_logs
 
 
 def drives(found: FleetSource) -> list[tuple[str, str]]:
@@ -38,6 +39,15 @@ def test_a_log_that_is_named_itself_is_of_its_folder_whatever_lies_beside_it(tmp
     assert drives(found) == [("V1", "a"), ("old", "b")]
     assert not found.left_out
     assert len(find_logs([tmp_path / "V1"]).left_out) == 1
+
+
+def test_log_at_a_url_is_of_its_folder_too() -> None:
+    for name in ("a.log.gz", "b.log.gz"):
+        open_storage("memory://logs/V1").write(name, b"")
+    assert drives(find_logs(["memory://logs/V1/a.log.gz"])) == [("V1", "a")]
+    assert drives(find_fleet("memory://logs/V1/b.log.gz")) == [("V1", "b")]
+    (problem,) = find_logs(["memory://logs/V1/c.log.gz"]).left_out.values()
+    assert problem.startswith("memory://logs/V1/c.log.gz: no logs in it")
 
 
 def test_a_file_named_twice_is_read_once(tmp_path: Path) -> None:
