@@ -7,7 +7,7 @@ import pytest
 
 from calibrator.drive import Array
 from calibrator.estimator import learning
-from calibrator.estimator.evidence import EvidenceRows, RowPlaces
+from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces
 from calibrator.estimator.learning import learn_fault_models
 from calibrator.estimator.posterior import FaultModel, Spread, explain
 from calibrator.estimator.prior import Prior, first_prior
@@ -173,6 +173,8 @@ def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors(K: int) ->
 def test_fleet_of_which_no_slope_is_known_is_learnt_all_the_same() -> None:
     """As drives of a minute are: it was an error of the program."""
     rows = rows_of(random_faults(1, vehicles=12, branches=2), seed=1)
-    known = rows.known.copy()
-    known[:, RowPlaces(2).slopes] = False
-    assert np.isfinite(learned(replace(rows, known=known, values=np.where(known, rows.values, 0.0))).log_evidence)
+    covariance = rows.covariance.copy()
+    for row in np.arange(10)[RowPlaces(2).slopes]:
+        covariance[:, row], covariance[:, :, row] = 0.0, 0.0
+        covariance[:, row, row] = UNKNOWN_VARIANCE
+    assert np.isfinite(learned(replace(rows, covariance=covariance)).log_evidence)
