@@ -208,9 +208,9 @@ class _Learner:
         zeros = [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         found: list[Array] = []
         # The junction shows its constant most exactly.
-        for constant, slope in product((*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0, *zeros), common):
+        for constant, excess in product((*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0, *zeros), common):
             start = centre.copy()
-            start[at.slopes] += slope
+            start[at.slopes] += excess
             start[intercept], start[at.junction] = constant - others, constant
             start = np.where(np.isnan(self.fixed), start, self.fixed)
             if not any(np.abs(start - other).max() < SAME_START for other in found):
