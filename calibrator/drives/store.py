@@ -127,7 +127,7 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
     try:
         folder.write(f"{drive.name}.parquet", buffer.getvalue())
     except StorageError as error:
-        raise DriveError(f"{error}; choose another folder") from None
+        raise DriveError(str(error)) from None
     return f"{folder.url}/{drive.name}.parquet"
 
 

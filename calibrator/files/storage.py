@@ -220,9 +220,14 @@ class Storage:
 
     def _failed(self, name: str, what: str, error: Exception) -> StorageError:
         reason = getattr(error, "strerror", None) or str(error).partition("\n")[0] or type(error).__name__
-        remedy = "; make room, and run the same command again to go on, or choose another place"
-        full = getattr(error, "errno", None) in DISK_FULL
-        return StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}{remedy if full else ''}")
+        remedy = ""
+        if getattr(error, "errno", None) in DISK_FULL:
+            remedy = "; make room, and run the same command again to go on, or choose another place"
+        elif not self.is_local:
+            remedy = "; check the credentials, the address of the storage, the bucket, and what this user may do there"
+        elif what == "write":
+            remedy = "; choose another folder"
+        return StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}{remedy}")
 
 
 def is_url(place: str) -> bool:

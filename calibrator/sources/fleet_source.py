@@ -167,7 +167,8 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
             if beside and not is_found:
                 add(storage.url, beside, storage)
             elif not is_found:
-                raise LogError(f"{argument}: no logs in it; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
+                what = "no logs in it" if storage.is_local else "nothing is there, or no logs in it"
+                raise LogError(f"{argument}: {what}; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
             for entry in beside if is_found else ():
                 strays[f"{storage.url}/{entry.name}"] = (
                     f"{storage.url}/{entry.name}: lies beside folders with logs; move it into that of its vehicle, or "

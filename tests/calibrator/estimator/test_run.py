@@ -213,7 +213,11 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
         (tmp_path / "file", 1, "file: not a known log format; expected .log"),
         (tmp_path / "both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them"),
         (tmp_path / "empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
-        ("memory://none", 1, "memory://none: no drive in it; problem 1: memory://none: no logs in it; expected .log"),
+        (
+            "memory://none",
+            1,
+            "memory://none: no drive in it; problem 1: memory://none: nothing is there, or no logs",
+        ),
         ("", 2, "an empty name; give the path"),
         ("file://", 1, "'file://': names no place"),
     ):

@@ -97,6 +97,6 @@ def test_storage_that_lets_nobody_in_is_told_in_one_line(monkeypatch: pytest.Mon
         raise RuntimeError("Unable to locate credentials")
 
     monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "open", no_credentials)
-    expected = r"^memory://x/y: cannot read it: Unable to locate credentials$"
+    expected = r"^memory://x/y: cannot read it: Unable to locate credentials; check the credentials, "
     with pytest.raises(StorageError, match=expected), open_storage("memory://x").opened("y"):
         pass

@@ -47,7 +47,7 @@ def test_log_at_a_url_is_of_its_folder_too() -> None:
     assert drives(find_logs(["memory://logs/V1/a.log.gz"])) == [("V1", "a")]
     assert drives(find_fleet("memory://logs/V1/b.log.gz")) == [("V1", "b")]
     (problem,) = find_logs(["memory://logs/V1/c.log.gz"]).left_out.values()
-    assert problem.startswith("memory://logs/V1/c.log.gz: no logs in it")
+    assert problem.startswith("memory://logs/V1/c.log.gz: nothing is there, or no logs in it")
 
 
 def test_a_file_named_twice_is_read_once(tmp_path: Path) -> None:
