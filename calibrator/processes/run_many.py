@@ -8,7 +8,6 @@ Every worker process has a pool of one of its own (pebble): processes that share
 do, can take each other along when one is killed.
 """
 
-import asyncio
 import logging
 import math
 import multiprocessing
@@ -16,6 +15,7 @@ import os
 import pickle
 import resource
 import signal
+import socket
 import sys
 import tempfile
 import threading
@@ -68,6 +68,8 @@ PRELOADED = [
     "typer",
 ]
 """Slow to import, so imported once, for all processes. Not this package: the fork server may find another copy."""
+LARGEST_GREETING = 1 << 20
+"""With which a scheduler begins, at most. [byte]"""
 MEGABYTE = 1_000_000
 AGAIN = ", and run the same command again"
 REMEDY = "remove the file if it is damaged, cut it if it is long"
@@ -453,13 +455,12 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
 
 def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
     from distributed import Client  # noqa: PLC0415 (an extra)
-    from distributed.utils import LoopRunner  # noqa: PLC0415
 
     try:
-        LoopRunner().run_sync(_handshake, address, patience_s)
+        _require_scheduler(address, patience_s)
         client = Client(address, timeout=patience_s, set_as_default=False)
     except (OSError, ValueError) as error:
-        reason = str(error).partition("\n")[0] or "a server of another kind listens there"
+        reason = str(error).partition("\n")[0]
         if lost:
             raise FleetError(f"{address}: the scheduler is gone; start it and its workers again{AGAIN}") from None
         raise FleetError(f"{address}: no Dask scheduler answers: {reason}; start one with 'dask scheduler'") from None
@@ -471,14 +472,15 @@ def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
     return client
 
 
-async def _handshake(address: str, patience_s: float) -> None:
-    """Raise OSError where no server of Dask answers; Client waits for ever for what another one says."""
-    from distributed.comm.core import connect  # noqa: PLC0415 (an extra)
-    from distributed.security import Security  # noqa: PLC0415
+def _require_scheduler(address: str, patience_s: float) -> None:
+    """Raise OSError where another kind of server listens: for what it says, Client waits for ever."""
+    from distributed.comm.addressing import get_address_host_port  # noqa: PLC0415 (an extra)
 
-    arguments = Security().get_connection_args("client")
-    comm = await asyncio.wait_for(connect(address, timeout=patience_s, **arguments), patience_s + 1.0)
-    comm.abort()
+    if address.startswith("tcp://"):
+        with socket.create_connection(get_address_host_port(address), patience_s) as server:
+            first = server.recv(8)  # a scheduler speaks first, and begins with a length
+        if not 0 < int.from_bytes(first, "little") < LARGEST_GREETING:
+            raise OSError("another kind of server listens there")
 
 
 def _wait_for_worker(client: Any, address: str) -> None:

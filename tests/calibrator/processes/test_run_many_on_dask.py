@@ -7,8 +7,10 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -93,12 +95,25 @@ def test_run_whose_workers_all_end_says_so(tmp_path: Path, monkeypatch: pytest.M
             list(results)
 
 
-def test_server_that_is_no_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("greeting", "reason"), [(b"", "timed out"), (b"SSH-2.0-OpenSSH", "another kind of server")])
+def test_server_that_is_no_scheduler_is_named(greeting: bytes, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CONNECT_S", 2.0)
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(FleetError, match=r"no Dask scheduler answers: .*other kind.*; start one"):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(10.0)
+
+        def greet() -> None:
+            with server.accept()[0] as connection:
+                connection.sendall(greeting)
+                connection.settimeout(10.0)
+                with suppress(ConnectionResetError):
+                    connection.recv(1)  # until it is closed
+
+        greeter = Thread(target=greet)
+        greeter.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(FleetError, match=rf"no Dask scheduler answers: {reason}.*; start one"):
             list(run_many(abs, range(3), Workers(scheduler=address)))
+        greeter.join()
 
 
 @pytest.fixture(scope="module")
