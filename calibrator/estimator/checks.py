@@ -344,10 +344,13 @@ class _Checked:
             alone = square - _dot(_solve(gram, with_all[..., z]), with_all[..., z])
             with_r = with_all[..., self.y] - np.einsum("nksi,ni->nks", with_all[..., z], self.law)
             if not self.has_fleet:
-                # Levels are wide: of a current that is switched between two of them noise moves no sample. So of what
-                # is there with its part and without it the smaller counts.
-                without = with_r + self.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count)
-                with_r = np.where(with_r > 0.0, 1.0, -1.0) * np.clip(np.sign(with_r) * without, 0.0, np.abs(with_r))
+                # Noise moves no sample of a current that is switched between two levels, as they are wide. So the product
+                # counts with the part of the noise in it or without, whichever is smaller.
+                clean, sign = (
+                    with_r + self.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count),
+                    np.sign(with_r),
+                )
+                with_r = sign * np.clip(sign * clean, 0.0, np.abs(with_r))
             beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
             usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)
             size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)

@@ -45,7 +45,7 @@ MOVED_SD, MOVED_PROBABILITY = 4.0, 1e-3
 """Standard deviations within which earlier and new faults of a sensor are the same [1]; a sensor has moved if the
 explanations near the earlier faults are less probable than this. [1]"""
 AT_ONCE = 32
-"""Vehicles of a bucket that are estimated together: what they take of memory for the time. [1]"""
+"""Vehicles of a bucket that are estimated together: more take more memory at a time. [1]"""
 NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
 
 

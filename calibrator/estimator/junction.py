@@ -740,7 +740,7 @@ def _charges(
         raise FleetError(
             f"--charge is of the recordings of one vehicle, and there are {len(fleet.vehicles)}; give those of one"
         )
-    found, duration_s = {}, sum(drive.duration_s for mine in drives for drive in mine)
+    found, duration_s = {}, sum(drive.duration_s for drive in drives[0])
     for branch, (charge_ah, sd_ah) in settings.charge_ah.items():
         measured_as = span_s = missing_s = 0.0
         for drive in drives[0]:

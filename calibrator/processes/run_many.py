@@ -476,11 +476,16 @@ def _require_scheduler(address: str, patience_s: float) -> None:
     """Raise OSError where another kind of server listens: for what it says, Client waits for ever."""
     from distributed.comm.addressing import get_address_host_port  # noqa: PLC0415 (an extra)
 
-    if address.startswith("tcp://"):
-        with socket.create_connection(get_address_host_port(address), patience_s) as server:
-            first = server.recv(8)  # a scheduler speaks first, and begins with a length
-        if not 0 < int.from_bytes(first, "little") < LARGEST_GREETING:
-            raise OSError("another kind of server listens there")
+    if not address.startswith("tcp://"):
+        return
+    try:
+        server = socket.create_connection(get_address_host_port(address), patience_s)
+    except OSError:
+        return  # Client waits for a scheduler to come, and says why none did
+    with server:
+        first = server.recv(8)  # a scheduler speaks first, and begins with a length
+    if not 0 < int.from_bytes(first, "little") < LARGEST_GREETING:
+        raise OSError("another kind of server listens there")
 
 
 def _wait_for_worker(client: Any, address: str) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from threading import Thread
+from threading import Thread, Timer
 
 import pytest
 
@@ -70,9 +70,11 @@ def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypat
         for process in (cluster.scheduler, *cluster.workers):
             process.send_signal(signal.SIGKILL)
             process.wait()
-        cluster.start()
+        restart = Timer(3.0, cluster.start)
+        restart.start()
         (tmp_path / "go").touch()
         assert list(results) == list(range(2, 20))
+        restart.join()
         (tmp_path / "go").unlink()
         results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
         next(results)
