@@ -59,7 +59,8 @@ GAIN_RANGE = (1.0 / 3.0, 3.0)
 current that was found. [1]"""
 
 LAG_STEP_S = 0.05
-"""Grid of the search, a quarter of the shortest window: the true delay lies in the neighbourhood of the best lag. [s]"""
+"""Grid of the search, a quarter of the shortest window: the true delay lies in the neighbourhood of the best lag.
+[s]"""
 SEARCHED_INSTANTS = 1200
 """Instants at which the search, and what is usual, looks at most. [1]"""
 SWEEPS = 2

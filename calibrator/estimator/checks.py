@@ -344,12 +344,11 @@ class _Checked:
             alone = square - _dot(_solve(gram, with_all[..., z]), with_all[..., z])
             with_r = with_all[..., self.y] - np.einsum("nksi,ni->nks", with_all[..., z], self.law)
             if not self.has_fleet:
-                # Noise moves no sample of a current that is switched between two levels, as they are wide. So the product
-                # counts with the part of the noise in it or without, whichever is smaller.
-                clean, sign = (
-                    with_r + self.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count),
-                    np.sign(with_r),
-                )
+                # Noise moves no sample of a current that is switched between two levels, as levels are wide. So the
+                # product counts with the noise's part or without it, whichever is nearer to 0, and not if they differ
+                # in sign.
+                sign = np.sign(with_r)
+                clean = with_r + self.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count)
                 with_r = sign * np.clip(sign * clean, 0.0, np.abs(with_r))
             beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
             usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)

@@ -63,6 +63,16 @@ def test_errors_of_function_and_items_are_not_taken_for_a_lost_scheduler(tmp_pat
             list(run_many(of_no_disk, items(), where))
 
 
+def test_scheduler_that_starts_only_now_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that is started again after it was lost."""
+    monkeypatch.setattr(module, "CONNECT_S", 60.0)
+    with DaskCluster(tmp_path, at_once=False) as cluster:
+        start = Timer(1.0, cluster.start)
+        start.start()
+        assert list(run_many(abs, range(3), Workers(scheduler=cluster.address))) == [0, 1, 2]
+        start.join()
+
+
 def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with DaskCluster(tmp_path) as cluster:
         results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
@@ -70,11 +80,9 @@ def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypat
         for process in (cluster.scheduler, *cluster.workers):
             process.send_signal(signal.SIGKILL)
             process.wait()
-        restart = Timer(3.0, cluster.start)
-        restart.start()
+        cluster.start()
         (tmp_path / "go").touch()
         assert list(results) == list(range(2, 20))
-        restart.join()
         (tmp_path / "go").unlink()
         results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
         next(results)
