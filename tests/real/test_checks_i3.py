@@ -10,7 +10,9 @@ from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.estimator.checks import find_misfits, learn_usual_misfits
 from calibrator.estimator.evidence import fit_fleet_model, stack_summaries
-from calibrator.experiments.recorded_trips import RecordedFleet, read_fleet
+from calibrator.experiments.figures import judge
+from calibrator.experiments.methods import POSTERIOR
+from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, read_fleet, recorded_trial
 from calibrator.faults import measured_currents, true_currents
 from calibrator.files.layout_files import vehicle_database
 from calibrator.summaries.summariser import summarise_samples
@@ -79,3 +81,12 @@ def test_sensors_that_are_not_linear_are_named(fleet: RecordedFleet, branches: i
     named = {j: (found[j][0].cause, found[j][0].branch) for j in put if found[j]}
     assert named == {j: (cause, "battery") for j, cause in put.items()}
     assert not any(mine for j, mine in enumerate(found) if j not in put)
+
+
+@pytest.mark.parametrize("seed", [5, 13])
+def test_small_errors_of_sound_sensors_make_no_correction_harmful(fleet: RecordedFleet, seed: int) -> None:
+    trial = recorded_trial(fleet, RecordedCase(world="small errors in 30%"), seed)
+    found = judge(POSTERIOR.estimate(trial), trial)
+    assert np.all(found["recovery_rate"])
+    assert not np.any(found["harmed"])
+    assert np.mean(found["deployed"]) > 0.8
