@@ -65,6 +65,7 @@ def test_ctrl_c_and_sigterm_while_logs_are_read_end_readers_too_in_one_line(
         *("--layout", str(LAYOUT), "--out", str(tmp_path / "store")),
     ]
     environment = {**os.environ, "TMPDIR": str(temporary)}
+    environment.pop("COVERAGE_PROCESS_CONFIG", None)  # tracing holds up the end until threads miss their workers
     options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True, "env": environment}
     with subprocess.Popen(command, **options) as process:
         while not list(temporary.iterdir()):  # the folder of the readers: they are about to start
