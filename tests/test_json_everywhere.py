@@ -15,8 +15,7 @@ from calibrator.terminal.command_line import run_app
 from ecu_node import cli as node_cli
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
-from tests.calibrator.export.exports import parameters_for
-from tests.ecu_node.vehicles import LAYOUT
+from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "json.md"
 WITHOUT = {

@@ -11,8 +11,7 @@ from ecu_node import cli as node_cli
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
-from tests.calibrator.export.exports import parameters_for
-from tests.ecu_node.vehicles import LAYOUT
+from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
 MISTAKES = [
     # layouts

@@ -2,12 +2,12 @@
 
 The calibration holds the node's own integer plans, each multiplied so that all have 58 bits below one code: the same
 results, bit by bit, and one conversion for all gains. It is written as a C struct, or as its image at the address of
-``hv_calibration`` in a compiled program, in Intel HEX or Motorola S-records.
+``hv_calibration`` in a compiled program, in Intel HEX.
 """
 
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -29,7 +29,7 @@ from ecu_node.bus.wiring import (
     wire,
 )
 from ecu_node.core.correction import SensorFault, correction_plan
-from ecu_node.core.signals import BitPlace, Codes, PlacedSignal, placed_signal, writable_range
+from ecu_node.core.signals import BitPlace, Codes, placed_signal, writable_range
 from ecu_node.database import VehicleDatabase
 from ecu_node.documents import text_digest
 from ecu_node.errors import ParameterError
@@ -48,7 +48,6 @@ __all__ = [
     "image_bytes",
     "intel_hex",
     "read_checked",
-    "s_records",
     "scaled_plan",
 ]
 
@@ -58,6 +57,7 @@ _BRANCHES, _DATA_IDS = 16, 16
 _SYMBOL = "hv_calibration"
 _LEAST, _GREATEST = -(1 << 63), (1 << 63) - 1
 _WIDE = 1 << 127
+_RECORD_BYTES = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,13 +173,12 @@ def branch_values(database: VehicleDatabase, branch: Branch, fault: SensorFault)
         If the core's integers are too small for them.
     """
     found, signals = scaled_plan(database, branch, fault), branch_signals(database, branch, Mode.GATEWAY)
-    codes = [signals.source.lowest, signals.source.highest] if fault.applied else []
-    voltages = (
-        [signals.voltage.lowest, signals.voltage.highest] if fault.applied and signals.voltage is not None else []
-    )
-    largest = abs(found.gain) * max(map(abs, codes), default=0) + ((abs(found.bias) + 1) << FRACTION_BITS)
-    largest += abs(found.voltage_gain) * max(map(abs, voltages), default=0)
-    if largest >= _WIDE or not all(_LEAST <= number <= _GREATEST for number in (*codes, *voltages, *found[:3])):
+    largest, numbers = (abs(found.bias) + 1) << FRACTION_BITS, [*found[:3]]
+    for gain, codes in ((found.gain, signals.source), (found.voltage_gain, signals.voltage)):
+        if fault.applied and codes is not None:
+            numbers += [codes.lowest, codes.highest]
+            largest += abs(gain) * max(abs(codes.lowest), abs(codes.highest))
+    if largest >= _WIDE or not all(_LEAST <= number <= _GREATEST for number in numbers):
         raise _too_large(branch, signals.source)
     return found
 
@@ -276,85 +275,48 @@ def find_image(elf: Path, database: VehicleDatabase) -> Image:
             symbols = (table.get_symbol_by_name(_SYMBOL) or []) if isinstance(table, SymbolTableSection) else []
             found = [(symbol["st_value"], symbol["st_size"]) for symbol in symbols if symbol["st_size"]]
             order: Literal["little", "big"] = "little" if program.little_endian else "big"
-            kind, content = program["e_type"], _content_at(program, found[0][0]) if found else b""
-    except OSError as error:
-        raise ExportError(f"{elf}: cannot be read: {error.strerror}; name the linked program (ELF)") from None
-    except ELFError as error:
-        raise ExportError(f"{elf}: not an ELF file: {error}; name the linked program") from None
+            places = [*program.address_offsets(*found[0])] if found else []
+            file.seek(places[0] if places else 0)
+            kind, compiled = program["e_type"], int.from_bytes(file.read(8), order)
+    except (OSError, ELFError) as error:
+        why = error.strerror if isinstance(error, OSError) else f"it is no ELF file: {error}"
+        raise ExportError(f"{elf}: cannot be read: {why}; name the linked program (ELF)") from None
     if len(found) != 1:
         raise ExportError(
             f"{elf}: has no symbol {_SYMBOL}; link the core with a calibration ('--format c'), and do not strip it"
-        )
-    ((address, size),) = found
-    if size != _BYTES:
-        raise ExportError(
-            f"{elf}: {_SYMBOL} has {size} bytes, and {_BYTES} are expected; compile it with the hv_correction.h of "
-            f"this version"
         )
     if kind != "ET_EXEC":
         raise ExportError(
             f"{elf}: has no fixed addresses ({kind}: an object file, or position independent); link it, on a computer "
             f"with -no-pie, and name the program"
         )
-    compiled, wanted = int.from_bytes(content, order), _layout_digest(database)
-    if compiled != wanted:
+    ((address, size),) = found
+    if size != _BYTES or compiled != _layout_digest(database):
         raise ExportError(
-            f"{elf}: was compiled with layout {compiled:016X}, and the one given is {wanted:016X}; write its "
+            f"{elf}: was compiled with another layout, or with the hv_correction.h of another version; write its "
             f"'--format c' anew and build it again, or give the layout that it was built with"
         )
     return Image(address=address, order=order)
 
 
-def _content_at(program: ELFFile, address: int) -> bytes:
-    """The eight bytes at an address of a program: the digest of the layout, where the calibration stands."""
-    for section in program.iter_sections():
-        start = section["sh_addr"]
-        if section["sh_type"] == "SHT_PROGBITS" and start <= address < start + section["sh_size"]:
-            return bytes(section.data()[address - start :][:8])
-    return b""
-
-
-_RECORD_BYTES = 32
-
-
-def _chunks(address: int, data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Parts of the data that do not cross a boundary of 32 bytes, so none of 64 KiB either."""
-    if address + len(data) > 1 << 32:
-        raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; HEX and S-records reach to 0xFFFFFFFF, link it below")
-    start = 0
-    while start < len(data):
-        end = start + _RECORD_BYTES - (address + start) % _RECORD_BYTES
-        yield address + start, data[start:end]
-        start = end
-
-
 def intel_hex(address: int, data: bytes) -> str:
-    """Data at an address as Intel HEX."""
+    """Data at an address as Intel HEX, in records of 32 bytes that do not cross a boundary of 32."""
+    if address + len(data) > 1 << 32:
+        raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; Intel HEX reaches to 0xFFFFFFFF, link it below")
 
     def record(kind: int, at: int, content: bytes) -> str:
         line = bytes([len(content)]) + at.to_bytes(2) + bytes([kind]) + content
-        return f":{line.hex()}{-sum(line) & 0xFF:02x}".upper()
+        return f":{line.hex()}{-sum(line) & 0xFF:02x}\n".upper()
 
-    lines, above = [], None
-    for at, content in _chunks(address, data):
-        if at >> 16 != above:
-            above = at >> 16
-            lines.append(record(4, 0, above.to_bytes(2)))
-        lines.append(record(0, at & 0xFFFF, content))
-    return "\n".join([*lines, record(1, 0, b""), ""])
-
-
-def s_records(address: int, data: bytes) -> str:
-    """Data at an address as Motorola S-records, of the smallest kind that reaches it: S19, S28 or S37."""
-    size = max(2, ((address + len(data) - 1).bit_length() + 7) // 8)
-
-    def record(kind: int, at: int, content: bytes) -> str:
-        line = at.to_bytes(size if kind else 2) + content
-        line = bytes([len(line) + 1]) + line
-        return f"S{kind}{line.hex()}{~sum(line) & 0xFF:02x}".upper()
-
-    lines = [record(size - 1, *chunk) for chunk in _chunks(address, data)]
-    return "\n".join([record(0, 0, b"HV"), *lines, record(11 - size, 0, b""), ""])
+    text, above, start = "", -1, address
+    while start < address + len(data):
+        end = start + _RECORD_BYTES - start % _RECORD_BYTES
+        if start >> 16 != above:
+            above = start >> 16
+            text += record(4, 0, above.to_bytes(2))
+        text += record(0, start & 0xFFFF, data[start - address : end - address])
+        start = end
+    return text + record(1, 0, b"")
 
 
 def foreign_protection(database: VehicleDatabase) -> list[str]:
@@ -385,27 +347,16 @@ def c_text(checked: Checked) -> str:
     values = _all_values(checked)
     messages, carriers = received(database), rewritten(database)
     numbers = {key: number for number, key in enumerate(messages)}
-    tables: list[str] = []
     branches: list[str] = []
-
-    def number_of(signal: str) -> int:
-        return numbers[key_of(database.signal(signal)[0])]
-
     for branch in database.layout.branch:
-        signals, name = branch_signals(database, branch, Mode.GATEWAY), f"current_{len(branches)}"
-        current, message, voltage = (
-            _Signal(database, branch.source, signals.source),
-            number_of(branch.source),
-            "0U, NULL",
-        )
-        tables += current.tables(name)
+        signals, voltage = branch_signals(database, branch, Mode.GATEWAY), "0U, NULL"
         if branch.voltage is not None and signals.voltage is not None:
-            read, net = _Signal(database, branch.voltage, signals.voltage), f"voltage_{len(branches)}"
-            tables += [*read.tables(net), f"static const hv_signal_t {net} =", f"    {read.initialiser(net)};"]
-            voltage = f"{number_of(branch.voltage)}U, &{net}"
+            number = numbers[key_of(database.signal(branch.voltage)[0])]
+            voltage = f"{number}U, &(const hv_signal_t){_signal(database, branch.voltage, signals.voltage)}"
         ends = ", ".join(_int(min(end, _GREATEST)) for end in writable_range(signals.target, branch.source))
+        number = numbers[key_of(database.signal(branch.source)[0])]
         branches.append(
-            f"    {{{message}U, {current.initialiser(name)},\n     {voltage}, {ends}}}, "
+            f"    {{{number}U, {_signal(database, branch.source, signals.source)},\n     {voltage}, {ends}}}, "
             f"/* {_comment(branch.name)}: {_comment(branch.source)} */"
         )
     entries = [_message(database, message, key in carriers) for key, message in messages.items()]
@@ -424,7 +375,6 @@ def c_text(checked: Checked) -> str:
             " */",
             '#include "hv_correction.h"',
             "",
-            *tables,
             "static const hv_message_t messages[] = {",
             *entries,
             "};",
@@ -444,34 +394,23 @@ def c_text(checked: Checked) -> str:
     )
 
 
-class _Signal:
-    """A signal of the layout as C."""
+def _signal(database: VehicleDatabase, name: str, codes: Codes) -> str:
+    """Initialiser of a ``hv_signal_t``."""
+    placed, highest = placed_signal(*database.signal(name)), min(codes.highest, _GREATEST)
+    named = [_int(code) for code in sorted(codes.named) if codes.lowest <= code <= highest]
+    selectors = [
+        f"{{{_place(item.place)}, {_array('int64_t', map(_int, sorted(item.codes)))}, {len(item.codes)}U}}"
+        for item in placed.above
+    ]
+    return (
+        f"{{{_place(placed.place)}, {_array('hv_selector_t', selectors)}, {len(selectors)}U, "
+        f"{_int(codes.lowest)}, {_int(highest)}, {_array('int64_t', named)}, {len(named)}U}}"
+    )
 
-    def __init__(self, database: VehicleDatabase, name: str, codes: Codes) -> None:
-        self._placed: PlacedSignal = placed_signal(*database.signal(name))
-        self._codes = codes
-        self._named = sorted(code for code in codes.named if codes.lowest <= code <= min(codes.highest, _GREATEST))
 
-    def tables(self, name: str) -> Iterator[str]:
-        """Arrays that the initialiser refers to."""
-        if self._named:
-            yield f"static const int64_t {name}_named[] = {{{', '.join(map(_int, self._named))}}};"
-        for number, selector in enumerate(self._placed.above):
-            yield f"static const int64_t {name}_{number}[] = {{{', '.join(map(_int, sorted(selector.codes)))}}};"
-        if self._placed.above:
-            yield f"static const hv_selector_t {name}_selectors[] = {{"
-            for number, selector in enumerate(self._placed.above):
-                yield f"    {{{_place(selector.place)}, {name}_{number}, {len(selector.codes)}U}},"
-            yield "};"
-
-    def initialiser(self, name: str) -> str:
-        """Of a ``hv_signal_t``."""
-        above, named = len(self._placed.above), len(self._named)
-        return (
-            f"{{{_place(self._placed.place)}, {f'{name}_selectors' if above else 'NULL'}, {above}U, "
-            f"{_int(self._codes.lowest)}, {_int(min(self._codes.highest, _GREATEST))}, "
-            f"{f'{name}_named' if named else 'NULL'}, {named}U}}"
-        )
+def _array(kind: str, items: Iterable[str]) -> str:
+    content = ", ".join(items)
+    return f"(const {kind}[]){{{content}}}" if content else "NULL"
 
 
 def _message(database: VehicleDatabase, message: Message, has_branches: bool) -> str:

@@ -8,10 +8,11 @@ into the junction. CSV (RFC 4180) has one row per branch, of one vehicle or many
 import csv
 import io
 import itertools
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from typing import NamedTuple
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from calibrator.errors import ExportError
 from calibrator.export.core import FRACTION_BITS, BranchValues, Checked, Image, branch_values, scaled_plan
@@ -77,6 +78,11 @@ class Characteristic(NamedTuple):
     branch: str
     unit: str
     value: float | bool
+
+    @property
+    def full_text(self) -> str:
+        """With whose it is."""
+        return f"{self.branch or 'vehicle'}: {self.text}"
 
 
 def characteristics(checked: Checked) -> list[Characteristic]:
@@ -181,7 +187,7 @@ def dcm_text(checked: Checked) -> str:
     for item in characteristics(checked):
         value = str(int(item.value)) if isinstance(item.value, bool) else repr(item.value)
         blocks.append(
-            f'FESTWERT {item.name}\n  LANGNAME "{item.branch or "vehicle"}: {item.text}"\n  FUNKTION {_FUNCTION}\n'
+            f'FESTWERT {item.name}\n  LANGNAME "{item.full_text}"\n  FUNKTION {_FUNCTION}\n'
             f'  EINHEIT_W "{item.unit}"\n  WERT {value}\nEND'
         )
     return "\n\n".join(blocks) + "\n"
@@ -208,69 +214,26 @@ def cdfx_document(checked: Checked) -> bytes:
     ExportError
         As :func:`dcm_text`.
     """
-    notes, known, number = _notes(checked), checked.provenance, checked.parameters.number
-
-    def add(parent: ET.Element, path: str, text: str | None = None) -> ET.Element:
-        for tag in path.split("/"):
-            parent = ET.SubElement(parent, tag)
-        parent.text = text
-        return parent
-
-    root = ET.Element("MSRSW", {"CREATOR": "calibrator", "CREATOR-VERSION": __version__})
-    add(root, "SHORT-NAME", _FUNCTION)
-    add(root, "CATEGORY", "CDF20")
-    system = add(root, "SW-SYSTEMS/SW-SYSTEM")
-    add(system, "SHORT-NAME", printable(checked.database.layout.name))
-    tree = add(system, "SW-INSTANCE-SPEC/SW-INSTANCE-TREE")
-    add(tree, "SHORT-NAME", known["vehicle"])
-    add(tree, "CATEGORY", "NO_VCD")
-    origin = add(tree, "SW-INSTANCE-TREE-ORIGIN")
-    add(origin, "SYMBOLIC-FILE", printable(checked.database.layout.path.name))
-    add(origin, "DATA-FILE", printable(checked.name))
-    collections = add(tree, "SW-CS-COLLECTIONS")
-    for name in ("general", *(f"HV.{branch}" for branch in checked.database.layout.branch_names)):
-        collection = add(collections, "SW-CS-COLLECTION")
-        add(collection, "CATEGORY", "FEATURE")
-        add(collection, "SW-FEATURE-REF", name)
-        add(collection, "REVISION", str(number))
-
-    rows: list[tuple[str, str, str, str, str | None, str]] = [
-        (f"HV.{key}", key, "ASCII", "general", None, value) for key, value in notes.items()
-    ]
+    rows = [(f"HV.{key}", key, "ASCII", "general", "", value) for key, value in _notes(checked).items()]
     for item in characteristics(checked):
         is_truth, feature = isinstance(item.value, bool), f"HV.{item.branch}" if item.branch else "general"
-        value, text = (
-            str(item.value).lower() if is_truth else repr(item.value),
-            f"{item.branch or 'vehicle'}: {item.text}",
-        )
-        rows.append((item.name, text, "BOOLEAN" if is_truth else "VALUE", feature, item.unit, value))
-    for name, text, category, feature, unit, value in rows:
-        instance = add(tree, "SW-INSTANCE")
-        add(instance, "SHORT-NAME", name)
-        add(instance, "LONG-NAME", text)
-        add(instance, "CATEGORY", category)
-        add(instance, "SW-FEATURE-REF", feature)
-        container = add(instance, "SW-VALUE-CONT")
-        if unit is not None:
-            add(container, "UNIT-DISPLAY-NAME", unit)
-        add(container, "SW-VALUES-PHYS/V" if category == "VALUE" else "SW-VALUES-PHYS/VT", value)
-        entry = add(instance, "SW-CS-HISTORY/CS-ENTRY")
-        history = {
-            "STATE": "calibrated",
-            "DATE": known["created"],
-            "CSUS": known["tool"],  # user, project, work package, test object, program, data
-            "CSPR": known["fleet"],
-            "CSWP": known["method"],
-            "CSTO": known["vehicle"],
-            "CSPI": known["layout_sha256"],
-            "CSDI": f"{number} {known['parameters_sha256']}",
-            "REMARK/P": f"verdict: {known['verdict']}",
-        }
-        for tag, content in history.items():
-            add(entry, tag, content)
-    ET.indent(root)
-    document: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
-    return document + b"\n"
+        category, value = ("BOOLEAN", str(item.value).lower()) if is_truth else ("VALUE", repr(item.value))
+        rows.append((item.name, item.full_text, category, feature, item.unit, value))
+    environment = Environment(
+        loader=PackageLoader("calibrator.export"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    environment.filters["printable"] = printable
+    layout = checked.database.layout
+    document = environment.get_template("parameters.cdfx").render(
+        version=__version__,
+        function=_FUNCTION,
+        layout=layout,
+        file=checked.name,
+        known=checked.provenance,
+        features=["general", *(f"HV.{branch}" for branch in layout.branch_names)],
+        rows=rows,
+    )
+    return f"{document}\n".encode()
 
 
 _A2L_HEAD = """\

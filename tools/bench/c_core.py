@@ -1,8 +1,7 @@
 """The C core beside the node: the same bits, and how large and how fast it is.
 
-python -m bench.c_core golden OUT       a file of a million frames and what the node makes of them; its SHA-256
-python -m bench.c_core compare          all codes of all signals of 8 to 24 bits, and 10^7 random frames
-python -m bench.c_core measure          bytes and instructions per frame (gcc, binutils, valgrind)
+python -m bench.c_core compare            all codes of all signals of 8 to 24 bits, and 10^7 random frames
+python -m bench.c_core measure            bytes and instructions per frame (gcc, binutils, valgrind)
 python -m bench.c_core fuzz --seconds S   libFuzzer with the sanitizers of memory and undefined behaviour (clang)
 """
 
@@ -12,7 +11,6 @@ import subprocess
 import tempfile
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from hashlib import sha256
 from itertools import islice, product
 from pathlib import Path
 from random import Random
@@ -35,7 +33,6 @@ from ecu_node.parameters import BranchParameters
 __all__ = [
     "CORE",
     "FLAGS",
-    "GOLDEN_SHA256",
     "RECORD",
     "all_codes",
     "build",
@@ -43,7 +40,6 @@ __all__ = [
     "drawn_vehicles",
     "frames",
     "fuzz",
-    "golden",
     "measure",
     "run",
     "vehicle",
@@ -51,8 +47,6 @@ __all__ = [
 
 CORE = Path(ecu_node.__file__).parent / "c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
-GOLDEN_SHA256 = "64786cf7221c7a3fd03264b9d5656859594a10fb78b2e550033f6bde24c8c7e7"
-"""Of :func:`golden`; changes only when what the node does with a frame is meant to change."""
 RECORD = Struct("<IBB64s")
 """A frame: identifier (bit 31: of 29 bits), length, result (0 as it was, 1 changed, 2 held back), payload."""
 
@@ -64,7 +58,7 @@ _SILENCE_S = 1e7  # longer than any time-out
 
 def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
     """A vehicle with a fault of each sensor but one; by default one with all that the core knows."""
-    database, rng = read_database(read_layout(layout)), _seeded(1)
+    database, rng = read_database(read_layout(layout)), Random(1)
     limit, offset_a = database.layout.limits.drift, 0.1 * database.layout.full_scale_a
     faults = {
         name: BranchParameters(
@@ -74,10 +68,6 @@ def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
         if name != "passed"
     }
     return Checked(name="bench", digest="0" * 64, parameters=true_parameters(database, faults), database=database)
-
-
-def _seeded(seed: int) -> Random:
-    return Random(seed)  # noqa: S311  # no secrets
 
 
 def frames(database: VehicleDatabase, rng: Random, count: int) -> Iterator[tuple[int, bytes | None]]:
@@ -153,15 +143,6 @@ def check_frames(checked: Checked, program: Path, rng: Random, count: int) -> in
     return sum(record[5] == 1 for record in wanted)
 
 
-def golden(parts: Iterable[int] = range(10)) -> Iterator[bytes]:
-    """The golden frames, each as it came and as the node passes it on, in parts of 10^5 that begin with a silence."""
-    checked = vehicle()
-    for part in parts:
-        given = [(0, None), *frames(checked.database, _seeded(2026 + part), 100_000)]
-        for (identifier, payload), made in zip(given, by_the_node(checked, given), strict=True):
-            yield _record(identifier, payload) + made
-
-
 def _record(identifier: int, payload: bytes | None) -> bytes:
     return RECORD.pack(identifier, _SILENCE if payload is None else len(payload), 0, payload or b"")
 
@@ -230,9 +211,7 @@ def drawn_vehicles(rng: Random, folder: Path) -> Iterator[Checked]:
     """Random vehicles without end, of which the core has room for all signals and knows all protections."""
     while True:
         drawn = draw_vehicle(rng)
-        for message in (*drawn.sources, *drawn.targets):
-            if message.protection is not None and not re.search('"P0[12]"', message.protection.toml):
-                message.protection = None
+        drawn.layout["e2e"] = [entry for entry in drawn.layout["e2e"] if entry["profile"] in {"P01", "P02"}]
         database, parameters = drawn.load(folder)
         checked = Checked(name="drawn", digest="0" * 64, parameters=parameters, database=database)
         try:
@@ -246,7 +225,7 @@ def compare(folder: Path, count: int) -> list[Row]:
     """All codes, and random frames of the vehicle with everything and of random ones."""
     codes = sum(all_codes(checked, build(checked, folder)) for checked in widths(folder))
     whole = vehicle()
-    program, rng, done, changed = build(whole, folder), _seeded(3), 0, 0
+    program, rng, done, changed = build(whole, folder), Random(3), 0, 0
     codes += all_codes(whole, program) + sum(all_codes(whole, program, voltage=u) for u in (0, 1, 4000, 8000, 16383))
     for checked in drawn_vehicles(rng, folder):
         for subject in (whole, checked):
@@ -273,7 +252,7 @@ def measure(folder: Path, count: int = 10_000, flags: Sequence[str] = ("-Os", "-
             total = sum(map(int, size.splitlines()[1].split()[:3]))
             yield Row(name=f"C core, gcc {flag}, {part}.o", value=total, unit="byte")
         battery = checked.database.message("HV_Battery").frame_id
-        given = (_record(*frame) for frame in frames(checked.database, _seeded(4), 40 * count) if frame[0] == battery)
+        given = (_record(*frame) for frame in frames(checked.database, Random(4), 40 * count) if frame[0] == battery)
         options = ("--collect-atstart=no", "--toggle-collect=hv_forward", "--quiet", f"--callgrind-out-file={out}")
         command: list[str | Path] = ["valgrind", "--tool=callgrind", *options, program]
         subprocess.run(command, input=b"".join(islice(given, count)), capture_output=True, check=True)
@@ -288,7 +267,7 @@ def fuzz(folder: Path, seconds: int) -> None:
     flags = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all", f"-I{CORE}")
     subprocess.run(["clang", *flags, *sources, "-o", folder / "fuzz"], check=True)
     (folder / "corpus").mkdir()
-    whole = b"".join(data[:64] for _, data in frames(vehicle().database, _seeded(5), 60) if data)
+    whole = b"".join(data[:64] for _, data in frames(vehicle().database, Random(5), 60) if data)
     (folder / "corpus" / "one").write_bytes(whole)
     words = (f"-max_total_time={seconds}", "-max_len=4096", "-print_final_stats=1", "-verbosity=0", "corpus")
     subprocess.run([folder / "fuzz", *words], cwd=folder, check=True)
@@ -297,24 +276,17 @@ def fuzz(folder: Path, seconds: int) -> None:
 def main() -> None:
     """Do what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("golden", "compare", "measure", "fuzz"))
-    parser.add_argument("out", nargs="?", type=Path, help="file of the golden frames")
+    parser.add_argument("what", choices=("compare", "measure", "fuzz"))
     parser.add_argument("--frames", type=int, default=10_000_000, help="random ones to compare; 10^7 without it")
     parser.add_argument("--seconds", type=int, default=60)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
-        match arguments.what:
-            case "golden":
-                content = b"".join(golden())
-                if arguments.out is not None:
-                    arguments.out.write_bytes(content)
-                print(sha256(content).hexdigest())
-            case "fuzz":
-                fuzz(Path(name), arguments.seconds)
-            case "compare":
-                show(compare(Path(name), arguments.frames))
-            case _:
-                show(list(measure(Path(name))))
+        if arguments.what == "fuzz":
+            fuzz(Path(name), arguments.seconds)
+        elif arguments.what == "compare":
+            show(compare(Path(name), arguments.frames))
+        else:
+            show(list(measure(Path(name))))
 
 
 if __name__ == "__main__":

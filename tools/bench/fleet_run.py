@@ -165,7 +165,7 @@ def killed_runs(folder: Path, vehicles: int, kills: int, command: str = "calibra
                 os.killpg(process.pid, signal.SIGKILL)
         return time.monotonic() - start_s
 
-    whole_s, chance, same = run(folder / "whole"), random.Random(0), 0  # noqa: S311 (moments, no secrets)
+    whole_s, chance, same = run(folder / "whole"), random.Random(0), 0
     for _ in range(kills):
         out = folder / "killed"
         run(out, chance.uniform(0.0, whole_s))

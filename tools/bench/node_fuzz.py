@@ -12,24 +12,36 @@ rounded, halves up; the node may come out as if the value were greater by less t
 import argparse
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
+from math import floor
 from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
+from cantools.database.can import Message, Signal
+from cantools.database.utils import start_bit
+from e2e import p01
+from fastcrc import crc8
+
 from bench.c_core import frames as random_frames
-from bench.fuzz_vehicles import FuzzBranch, FuzzMessage, FuzzVehicle, draw_vehicle
+from bench.fuzz_vehicles import PROFILES, Codes, FuzzVehicle, draw_vehicle, mask_of
 from calibrator.terminal.progress import shown
 from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.status import Quality
-from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import BranchParameters
 
 __all__ = ["Oracle", "WrongFrameError", "fuzz"]
 
 FRAMES_PER_VEHICLE = 20_000
-_HALF, _TOLERANCE = Fraction(1, 2), Fraction(1, 1024)
+_TOLERANCE = Fraction(1, 1024)
 """Of a code."""
+_MODES = {
+    "both": p01.E2E_P01_DATAID_BOTH,
+    "alternating": p01.E2E_P01_DATAID_ALT,
+    "low": p01.E2E_P01_DATAID_LOW,
+    "nibble": p01.E2E_P01_DATAID_NIBBLE,
+}
 
 
 class WrongFrameError(Exception):
@@ -43,16 +55,28 @@ class _Outcome(NamedTuple):
     quality: Quality
 
 
+def _end(message: Message, signal: Signal) -> int:
+    """Bytes that a frame needs to have a signal, and the selector that tells whether it is there."""
+    selectors = [item for item in message.signals if item.is_multiplexer and signal.multiplexer_ids]
+    return max((mask_of(item).bit_length() + 7) // 8 for item in (signal, *selectors))
+
+
 class _Branch:
     """One branch in one mode: what must come of its last frame."""
 
-    def __init__(self, branch: FuzzBranch, mode: Mode) -> None:
-        self.branch, self.source = branch, branch.source
-        self.out = branch.target if mode is Mode.OVERLAY and branch.target is not None else branch.source
-        self.corrects = branch.known and branch.apply and (branch.drift, branch.offset_a) != (0.0, 0.0)
+    def __init__(self, vehicle: FuzzVehicle, entry: dict[str, Any], mode: Mode) -> None:
+        self.sign, self.is_power = entry["sign"], "power" in entry
+        self.message, self.source = vehicle.signal(entry.get("power") or entry["signal"])
+        self.codes = Codes(self.source, entry["no_value"])
+        self.target = vehicle.signal(entry["corrected"]) if "corrected" in entry else None
+        self.quality = vehicle.signal(entry["quality"])[1] if "quality" in entry else None
+        self._published_as = self.codes
+        if mode is Mode.OVERLAY and self.target is not None:
+            self._published_as = Codes(self.target[1])
+        fault = vehicle.faults.get(entry["name"], BranchParameters(drift=0.0, offset_a=0.0, apply=False))
+        self._drift, self._offset_a = (Fraction(str(number)) for number in (fault.drift, fault.offset_a))
+        self.corrects = fault.apply and bool(self._drift or self._offset_a)
         self.outcome, self._seen = _Outcome(None, Quality.NOT_AVAILABLE), False
-        selector = branch.source.message.selector if branch.source.above is not None else None
-        self.least_size = max(branch.source.end, selector.end if selector is not None else 0)
 
     def spoil(self) -> None:
         """A frame came that must not be used."""
@@ -61,34 +85,90 @@ class _Branch:
 
     def take(self, code: int, volts: Fraction | None) -> None:
         """Take the code of an intact frame, at a voltage, if it is known."""
-        branch, self._seen = self.branch, True
-        if not self.source.is_value(code):
-            named = code in self.source.named or code in self.source.unnamed
-            self.outcome = _Outcome(None, Quality.NOT_AVAILABLE if named else Quality.INVALID)
-        elif self.corrects and branch.voltage is not None and branch.offset_a and volts is None:
+        self._seen = True
+        if not self.codes.is_value(code):
+            is_named = code in self.codes.gaps
+            self.outcome = _Outcome(None, Quality.NOT_AVAILABLE if is_named else Quality.INVALID)
+        elif self.corrects and self.is_power and self._offset_a and volts is None:
             self.outcome = _Outcome(None, Quality.NOT_AVAILABLE)
-        elif not self.corrects and self.out is self.source:
+        elif not self.corrects and self._published_as is self.codes:
             self.outcome = _Outcome((code, code), Quality.PASSED_THROUGH)
         else:
-            self.outcome = self._published(self.source.worth(code), volts)
+            self.outcome = self._published(self.codes.worth(code), volts)
 
     def _published(self, measured: Fraction, volts: Fraction | None) -> _Outcome:
         """Of a current, in the sensor's own sign, i = (i_m - o) / (1 + d); of a power the same times the voltage."""
         if self.corrects:
-            u = Fraction(1) if self.branch.voltage is None else volts or Fraction(0)
-            offset = self.branch.sign * Fraction(str(self.branch.offset_a)) * u
-            measured = (measured - offset) / (1 + Fraction(str(self.branch.drift)))
-        exact = self.out.exact_code(measured) + _HALF
-        lowest, highest = self.out.ends
-        least, most = (min(max(value.__floor__(), lowest), highest) for value in (exact, exact + _TOLERANCE))
+            u = (volts or Fraction(0)) if self.is_power else Fraction(1)
+            measured = (measured - self.sign * self._offset_a * u) / (1 + self._drift)
+        exact = self._published_as.exact_code(measured) + Fraction(1, 2)
+        lowest, highest = self._published_as.ends
+        least, most = (min(max(floor(value), lowest), highest) for value in (exact, exact + _TOLERANCE))
         return _Outcome((least, most), Quality.CORRECTED if self.corrects else Quality.PASSED_THROUGH)
+
+
+class _Protection:
+    """How the frames of one message are protected, by its entry in the layout."""
+
+    def __init__(self, message: Message, entry: dict[str, Any]) -> None:
+        self.max_step = entry["max_delta_counter"]
+        self.windows = [entry[state] for state in ("init", "valid", "invalid")]
+        self.seal: Callable[[bytearray], None]
+        """Writes all but the counter into a payload."""
+        if entry["profile"] == "counter CRC8":
+            self._by_signals(message, entry)
+        else:
+            self._by_profile(message, entry)
+        self.least = (self.mask.bit_length() + 7) // 8
+
+    def _by_signals(self, message: Message, entry: dict[str, Any]) -> None:
+        crc, counter = message.get_signal_by_name("Crc"), message.get_signal_by_name("Counter")
+        at, place, self.modulus = crc.start // 8, start_bit(counter), entry["counter_modulus"]
+        self.mask = mask_of(crc) | mask_of(counter)
+        self._place = (place // 8, 1, place % 8, 4)
+        digest, identity = getattr(crc8, entry["algorithm"]), message.frame_id & 0xFFFF
+        first = identity.to_bytes(2, "little")[: entry["data_id_bytes"]]
+        before, after = (first, b"") if entry["data_id_at"] == "before" else (b"", first)
+
+        def seal(payload: bytearray) -> None:
+            payload[at] = digest(before + bytes(payload[:at] + payload[at + 1 :]) + after)
+
+        self.seal = seal
+
+    def _by_profile(self, message: Message, entry: dict[str, Any]) -> None:
+        name, mode, offset = entry["profile"], entry.get("data_id_mode"), entry.get("offset", 0)
+        protect, bits, counter_byte, counter_bits, self.modulus = PROFILES[name]
+        self.mask = (1 << bits + 4 * (mode == "nibble")) - 1 << 8 * offset
+        self._place = (offset + counter_byte, (counter_bits + 7) // 8, 0, counter_bits)
+        options = {} if name == "P02" else {"offset": offset}
+        options |= {"data_id_mode": _MODES[mode]} if mode else {}
+        own = message.frame_id & (0xFFFFFFFF if name in {"P04", "P07"} else 0xFFFF)
+        identity = entry.get("data_id", {}).get(message.name, own)
+        if name == "P02":
+            identity = bytes(entry["data_id_list"][message.name])
+
+        def seal(payload: bytearray) -> None:
+            protect(payload, identity, increment_counter=False, **options)
+
+        self.seal = seal
+
+    def counter(self, payload: bytes) -> int:
+        """The counter of a payload."""
+        byte, count, shift, bits = self._place
+        return int.from_bytes(payload[byte : byte + count], "big") >> shift & (1 << bits) - 1
+
+    def is_sound(self, payload: bytes) -> bool:
+        """Whether all but the counter is right."""
+        sealed = bytearray(payload)
+        self.seal(sealed)
+        return sealed == payload
 
 
 class _E2E:
     """What a receiver remembers of one message: AUTOSAR's counter check and state machine."""
 
-    def __init__(self, message: FuzzMessage) -> None:
-        self._protection, self._last, self._state = message.protection, -1, 0
+    def __init__(self, protection: _Protection | None) -> None:
+        self.protection, self._last, self._state = protection, -1, 0
         self._past: list[str] = []
 
     @property
@@ -98,7 +178,7 @@ class _E2E:
 
     def take(self, payload: bytes) -> str:
         """Look at a frame: "usable", "corrupt", or intact but "out of order"."""
-        protection = self._protection
+        protection = self.protection
         if protection is None:
             return "usable"
         found, counter = "corrupt", protection.counter(payload)
@@ -109,11 +189,11 @@ class _E2E:
         if found == "corrupt" and not self._past and not self._state:
             return found  # nothing was received yet
         self._past.append(found)
-        window, min_ok, max_error = protection.windows[self._state]
-        seen = self._past[-window:]
-        if seen.count("corrupt") > max_error:
+        state = protection.windows[self._state]
+        seen = self._past[-state["window"] :]
+        if seen.count("corrupt") > state["max_error"]:
             self._state = 2
-        elif seen.count("usable") >= min_ok:
+        elif seen.count("usable") >= state["min_ok"]:
             self._state = 1
         elif self._state == 1:
             self._state = 2
@@ -121,29 +201,20 @@ class _E2E:
 
 
 class Oracle:
-    """Follows the frames of a vehicle in one mode.
+    """Follows the frames of a vehicle in one mode."""
 
-    Parameters
-    ----------
-    vehicle : FuzzVehicle
-        Whose frames they are.
-    database : VehicleDatabase
-        The same for cantools.
-    mode : Mode
-        What the node does.
-    """
-
-    def __init__(self, vehicle: FuzzVehicle, database: VehicleDatabase, mode: Mode) -> None:
-        self._gateway, self._passes_invalid = mode is Mode.GATEWAY, vehicle.on_bad_frame == "invalid"
-        self._database, self._branches = database, [_Branch(branch, mode) for branch in vehicle.branches]
-        self._voltage = next((branch.voltage for branch in vehicle.branches if branch.voltage is not None), None)
-        self._sources = {message.number: (message, _E2E(message)) for message in vehicle.sources}
-        self._targets = {
-            branch.target.message.number: branch.target.message
-            for branch in vehicle.branches
-            if branch.target is not None
+    def __init__(self, vehicle: FuzzVehicle, mode: Mode) -> None:
+        self._gateway, self._passes_invalid = mode is Mode.GATEWAY, vehicle.layout["on_bad_frame"] == "invalid"
+        self._messages = {m.frame_id | m.is_extended_frame << 31: m for m in vehicle.messages.values()}
+        self._branches = [_Branch(vehicle, entry, mode) for entry in vehicle.layout["branch"]]
+        protections = {
+            entry["messages"][0]: _Protection(vehicle.messages[entry["messages"][0]], entry)
+            for entry in vehicle.layout["e2e"]
         }
-        self._counters = dict.fromkeys(self._targets, -1)
+        self._e2e = {name: _E2E(protections.get(name)) for name in vehicle.messages}
+        self._counters = dict.fromkeys(vehicle.messages, -1)
+        powers = [entry["voltage"] for entry in vehicle.layout["branch"] if "voltage" in entry]
+        self._voltage = vehicle.signal(powers[0]) if powers else None
         self._volts: Fraction | None = None
 
     def problem(self, identifier: int, data: bytes, sent: Sequence[tuple[int, bytes]]) -> str | None:
@@ -163,16 +234,17 @@ class Oracle:
         str or None
             What is wrong; None if all is well.
         """
-        message, e2e = self._sources[identifier]
-        own = [item for item in self._branches if item.source.message is message]
-        found, codes = e2e.take(data), self._codes(message, data)
-        voltage = self._voltage
-        if found == "usable" and voltage is not None and voltage.message is message and voltage.name in codes:
-            code = codes[voltage.name]  # it comes before the branches of the same frame
-            self._volts = voltage.worth(code) if voltage.is_value(code) else None
+        message = self._messages[identifier]
+        own, e2e = [item for item in self._branches if item.message is message], self._e2e[message.name]
+        found, codes = e2e.take(data), _codes(message, data)
+        if found == "usable" and self._voltage is not None and self._voltage[0] is message:
+            net = self._voltage[1]  # it comes before the branches of the same frame
+            if net.name in codes:
+                is_value = Codes(net).is_value(codes[net.name])
+                self._volts = Codes(net).worth(codes[net.name]) if is_value else None
         used = found == "usable" or (self._gateway and self._passes_invalid and found == "out of order")
         for item in own if used else ():
-            if len(data) < item.least_size:  # bits are beyond the end
+            if len(data) < _end(message, item.source):  # bits are beyond the end
                 item.spoil()
             elif item.source.name in codes:
                 item.take(codes[item.source.name], self._volts)
@@ -186,42 +258,31 @@ class Oracle:
         if not used or e2e.is_invalid:
             for item in own:
                 item.spoil()
-        wanted = {item.branch.target.message.number for item in own if item.branch.target is not None}
-        if sorted(number for number, _ in sent) != sorted(wanted):
-            return f"frames {[f'{number:X}' for number, _ in sent]} were sent, must be {sorted(map(hex, wanted))}"
-        answers = (self._wrong_answer(self._targets[number], answer) for number, answer in sent)
-        return next((text for text in answers if text is not None), None)
-
-    def _codes(self, message: FuzzMessage, data: bytes) -> dict[str, int]:
-        """Codes of the signals that are whole in a payload, by cantools."""
-        definition, selector = self._database.message(message.name), message.selector
-        whole = data.ljust(message.size, b"\0")
-        found: Any = definition.decode(whole, decode_choices=False, scaling=False)
-        selected = selector is not None and selector.end <= len(data)
-        return {
-            signal.name: found[signal.name]
-            for signal in message.signals
-            if signal.name in found and signal.end <= len(data) and (selected or signal.above is None)
-        }
+        wanted = {item.target[0].name for item in own if item.target is not None}
+        answered = [self._messages[number].name for number, _ in sent]
+        if sorted(answered) != sorted(wanted):
+            return f"frames {answered} were sent, must be {sorted(wanted)}"
+        problems = (self._wrong_answer(self._messages[number], answer) for number, answer in sent)
+        return next((text for text in problems if text is not None), None)
 
     def _rewritten(
         self,
-        message: FuzzMessage,
+        message: Message,
         codes: dict[str, int],
         own: Sequence[_Branch],
         data: bytes,
         sent: Sequence[tuple[int, bytes]],
     ) -> str | None:
-        if len(sent) != 1 or sent[0][0] != message.number or len(sent[0][1]) != len(data):
+        if len(sent) != 1 or self._messages.get(sent[0][0]) is not message or len(sent[0][1]) != len(data):
             return "another frame was sent"
         made = sent[0][1]
-        there, mask, protection = self._codes(message, made), 0, message.protection
+        there, mask, protection = _codes(message, made), 0, self._e2e[message.name].protection
         for item in own:
             if (name := item.source.name) in codes:
                 lowest, highest = item.outcome.allowed or (codes[name], codes[name])
                 if not lowest <= there[name] <= highest:
                     return f"{name} is {there[name]}, must be {lowest} to {highest}, was {codes[name]}"
-                mask |= item.source.mask
+                mask |= mask_of(item.source)
         if made != data and protection is not None:
             mask |= protection.mask
             if not protection.is_sound(made) or protection.counter(made) != protection.counter(data):
@@ -229,24 +290,35 @@ class Oracle:
         changed = (int.from_bytes(data, "little") ^ int.from_bytes(made, "little")) & ~mask
         return f"bits {changed:X} changed, which are nobody's business" if changed else None
 
-    def _wrong_answer(self, message: FuzzMessage, data: bytes) -> str | None:
-        codes, protection, mask = self._codes(message, data), message.protection, 0
+    def _wrong_answer(self, message: Message, data: bytes) -> str | None:
+        codes, protection, mask = _codes(message, data), self._e2e[message.name].protection, 0
         for item in self._branches:
-            target, quality = item.branch.target, item.branch.quality
-            if target is None or target.message is not message:
+            if item.target is None or item.target[0] is not message:
                 continue
-            missing = next(code for code, text in target.named.items() if text == "SNA")
+            target, quality = item.target[1], item.quality
+            missing = next(code for code, text in (target.choices or {}).items() if text == "SNA")
             lowest, highest = item.outcome.allowed or (missing, missing)
             told = codes[quality.name] if quality is not None else item.outcome.quality
             if not lowest <= codes[target.name] <= highest or told != item.outcome.quality:
                 return f"{target.name} is {codes[target.name]} of quality {told}, must be {item.outcome}"
-            mask |= target.mask | (quality.mask if quality is not None else 0)
+            mask |= mask_of(target) | (mask_of(quality) if quality is not None else 0)
         if protection is not None:
             mask |= protection.mask
-            self._counters[message.number] = (self._counters[message.number] + 1) % protection.modulus
-            if not protection.is_sound(data) or protection.counter(data) != self._counters[message.number]:
+            self._counters[message.name] = (self._counters[message.name] + 1) % protection.modulus
+            if not protection.is_sound(data) or protection.counter(data) != self._counters[message.name]:
                 return f"{message.name}: wrong CRC or counter"
         return f"{message.name}: a bit that is nobody's is set" if int.from_bytes(data, "little") & ~mask else None
+
+
+def _codes(message: Message, data: bytes) -> dict[str, int]:
+    """Codes of the signals that are whole in a payload, by cantools."""
+    whole = data.ljust(message.length, b"\0")
+    found: Any = message.decode(whole, decode_choices=False, scaling=False)
+    return {
+        signal.name: found[signal.name]
+        for signal in message.signals
+        if signal.name in found and _end(message, signal) <= len(data)
+    }
 
 
 def fuzz(frames: int, seed: int = 0, frames_per_vehicle: int = FRAMES_PER_VEHICLE) -> Iterator[int]:
@@ -272,16 +344,13 @@ def fuzz(frames: int, seed: int = 0, frames_per_vehicle: int = FRAMES_PER_VEHICL
         At the first frame of which something else came than must.
     """
     for done in range(0, frames, frames_per_vehicle):
-        rng, count = Random(f"{seed} {done}"), min(frames_per_vehicle, frames - done)  # noqa: S311 (no secrets)
+        rng, count = Random(f"{seed} {done}"), min(frames_per_vehicle, frames - done)
         vehicle = draw_vehicle(rng)
         with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
             database, parameters = vehicle.load(Path(folder))
         drawn = list(random_frames(database, rng, count))
         for mode in Mode:
-            oracle, corrector = (
-                Oracle(vehicle, database, mode),
-                wire(database, InForce(parameters=parameters), 0.0, mode=mode),
-            )
+            oracle, corrector = Oracle(vehicle, mode), wire(database, InForce(parameters=parameters), 0.0, mode=mode)
             sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}
             for number, (identifier, data) in enumerate(drawn):
                 if data is None:  # a silence, after which the node forgets

@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """A repository of many vehicles: time and memory to publish all of them, size of a bundle, time to verify it on board.
 
     python -m bench.repository --vehicles 1000000        (in tools/)
@@ -8,11 +7,7 @@ the second time, and a vehicle that took the first publication verifies the bund
 """
 
 import argparse
-import json
-import os
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -25,7 +20,8 @@ from msgspec.structs import replace
 from securesystemslib.signer import SSlibKey
 from tuf.api.metadata import SuccinctRoles
 
-from bench.row import LAYOUT
+from bench.published import Publisher
+from bench.row import LAYOUT, Row, show
 from bench.true_parameters import true_parameters
 from calibrator.repository.repository import BIN_BITS
 from ecu_node.database import VehicleDatabase, read_database
@@ -33,18 +29,8 @@ from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, encode_parameters
 from ecu_node.update.client import provision, update
 
-KEYS = {"root": "root", "targets": "targets", "snapshot": "online", "timestamp": "online"}
-"""By role."""
 UPDATES = 20
 """Of which the quickest counts: others on the machine make it longer, nothing makes it shorter."""
-
-
-def calibrator(*words: object) -> float:
-    """Run ``calibrator repository``; its time. [s]"""
-    start_s = time.perf_counter()
-    command = [sys.executable, "-m", "calibrator", "repository", *map(str, words)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - start_s
 
 
 def sampled(vehicles: int) -> list[int]:
@@ -69,26 +55,37 @@ def write_parameters(database: VehicleDatabase, folder: Path, vehicles: Iterable
         (folder / f"{number:07d}.json").write_bytes(content.replace(b"VEHICLE", b"V%07d" % number))
 
 
-def measured(folder: Path, vehicles: Iterable[int]) -> dict[str, float]:
+def measured(folder: Path, vehicles: Iterable[int]) -> list[Row]:
     """Publish twice, and verify one bundle."""
-    database, now, found = read_database(read_layout(LAYOUT)), datetime.now(UTC), dict[str, float]()
-    repository, keys, params, state = (folder / name for name in ("repository", "keys", "params", "state"))
-    for name in sorted({*KEYS.values()}):
-        calibrator("key", name, "--no-passphrase", "--out", keys)
-    calibrator("init", repository, *(w for role, name in KEYS.items() for w in (f"--{role}", keys / f"{name}.pub")))
-    private = [word for name in sorted({*KEYS.values()}) for word in ("--key", keys / f"{name}.key")]
+    database, now, found = read_database(read_layout(LAYOUT)), datetime.now(UTC), list[Row]()
+    publisher, params, state = Publisher(folder / "repository"), folder / "params", folder / "state"
     for name, drift in (("first", 0.05), ("all changed", 0.06)):
         write_parameters(database, params, vehicles, drift)
-        found[f"{name}: add [s]"] = calibrator("add", repository, params)
-        found[f"{name}: publish [s]"] = calibrator("publish", repository, *private)
-        print(found, file=sys.stderr)
+        times_s = [time.perf_counter()]
+        publisher.add(sorted(params.iterdir()))
+        times_s.append(time.perf_counter())
+        publisher.publish()
+        times_s.append(time.perf_counter())
+        found.append(Row(name=f"{name}: add", value=times_s[1] - times_s[0], unit="s"))
+        found.append(Row(name=f"{name}: publish", value=times_s[2] - times_s[1], unit="s"))
         if name == "first":
-            provision(state, "V0000000", repository / "metadata" / "1.root.json", now)
-            update(state, str(repository), database, now)
-    found["memory [GiB]"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-    calibrator("bundle", repository, "V0000000", "--out", folder)
+            provision(state, "V0000000", publisher.root, now)
+            update(state, str(publisher.folder), database, now)
+    peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     bundle = folder / "V0000000.json.xz"
-    found["bundle [KiB]"] = bundle.stat().st_size / 1024
+    bundle.write_bytes(publisher.bundle("V0000000"))
+    whole_s, signatures_s = verify_times_s(state, bundle, database)
+    return [
+        *found,
+        Row(name="memory", value=peak_gib, unit="GiB"),
+        Row(name="bundle", value=bundle.stat().st_size / 1024, unit="KiB"),
+        Row(name="verify", value=1e3 * whole_s, unit="ms"),
+        Row(name="verify without signatures", value=1e3 * (whole_s - signatures_s), unit="ms"),
+    ]
+
+
+def verify_times_s(state: Path, bundle: Path, database: VehicleDatabase) -> tuple[float, float]:
+    """Processor time of the quickest update, and how much of it went into signatures. [s]"""
     times_s, signatures_s, verify = [], list[float](), SSlibKey.verify_signature
 
     def timed(*arguments: Any) -> None:
@@ -102,22 +99,18 @@ def measured(folder: Path, vehicles: Iterable[int]) -> dict[str, float]:
             start_s = time.process_time()
             update(state, str(bundle), database, datetime.now(UTC), dry_run=True)
             times_s.append((time.process_time() - start_s, sum(signatures_s)))
-    whole_s, of_signatures_s = min(times_s)
-    found["verify [ms]"], found["verify without signatures [ms]"] = 1e3 * whole_s, 1e3 * (whole_s - of_signatures_s)
-    return found
+    return min(times_s)
 
 
 def main() -> None:
-    """Measure, and print as JSON."""
+    """Measure, and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--vehicles", type=int, default=10_000)
     parser.add_argument("--sampled", action="store_true", help="one bin of the fleet alone: bundle and time to verify")
     parser.add_argument("--folder", type=Path, help="where to work; needs about 15 GB for 10^6 vehicles")
     options = parser.parse_args()
-    os.environ.pop("CALIBRATOR_KEY_PASSPHRASE", None)
     with tempfile.TemporaryDirectory(prefix="repository-", dir=options.folder) as folder:
-        found = measured(Path(folder), sampled(options.vehicles) if options.sampled else range(options.vehicles))
-    print(json.dumps({name: round(value, 3) for name, value in found.items()}, indent=2))
+        show(measured(Path(folder), sampled(options.vehicles) if options.sampled else range(options.vehicles)))
 
 
 if __name__ == "__main__":

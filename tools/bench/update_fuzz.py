@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Bundles that were changed, each given to a vehicle: none is accepted, each is refused in one line.
 
     python -m bench.update_fuzz --bundles 1000000        (in tools/)
@@ -26,12 +25,11 @@ from typing import Any
 
 import msgspec
 from msgspec.structs import replace
-from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata
 
+from bench.published import Publisher
 from bench.row import LAYOUT
 from bench.true_parameters import true_parameters
-from calibrator.repository.repository import ROLES, NewKeys, Repository
 from calibrator.terminal.progress import shown
 from ecu_node.core.status import UnfitError
 from ecu_node.database import read_database
@@ -63,23 +61,18 @@ class Vehicle:
 
     def __init__(self, folder: Path) -> None:
         self._state, self._bundle = folder / "state", folder / "bundle.json.xz"
-        self._database, now = read_database(read_layout(LAYOUT)), datetime.now(UTC)
-        signers: dict[str, Any] = {role: CryptoSigner.generate_ed25519() for role in ROLES}
-        keys = {role: NewKeys([signer.public_key], 1) for role, signer in signers.items()}
-        found, self.bundles = Repository.create(folder / "repository", keys), list[bytes]()
+        self._database, self.bundles = read_database(read_layout(LAYOUT)), list[bytes]()
+        publisher = Publisher(folder / "repository")
         for drift in (0.05, 0.06):
+            branch = BranchParameters(drift=drift, offset_a=1.0, apply=True)
+            parameters = true_parameters(self._database, {"battery": branch})
             for name in ("bench", "other"):
-                branch = BranchParameters(drift=drift, offset_a=1.0, apply=True)
-                parameters = true_parameters(self._database, {"battery": branch})
-                path = folder / f"{name}.json"
-                path.write_bytes(encode_parameters(replace(parameters, vehicle=name), "fuzz"))
-                found.add([path], days=365, allow_large_step=False)
-            list(found.sign(list(signers.values())))
-            found.publish(list(signers.values()))
-            found = Repository(folder / "repository")
-            self.bundles.append(found.bundle("bench"))
+                (folder / f"{name}.json").write_bytes(encode_parameters(replace(parameters, vehicle=name), "fuzz"))
+            publisher.add([folder / "bench.json", folder / "other.json"])
+            publisher.publish()
+            self.bundles.append(publisher.bundle("bench"))
             if drift == 0.05:
-                provision(self._state, "bench", folder / "repository" / "metadata" / "1.root.json", now)
+                provision(self._state, "bench", publisher.root, datetime.now(UTC))
                 self.update(self.bundles[0])
         self._files = [msgspec.json.decode(lzma.decompress(item), type=dict[str, str]) for item in self.bundles]
         self._held = (self._state / "state.json").read_bytes()
@@ -142,30 +135,25 @@ class Vehicle:
 
 
 def changed_bytes(rng: Random, content: bytes) -> bytes:
-    """Bytes with a bit turned, a byte replaced, a piece cut out, repeated or moved, or the end missing."""
+    """Bytes with a bit turned, a piece replaced, cut out, repeated or put in, or the end missing."""
     found = bytearray(content)
     for _ in range(rng.choice((1, 1, 1, 2, 5))):
         place = rng.randrange(max(len(found), 1))
         length = min(rng.choice((1, 2, 16, 200)), len(found) - place)
-        match rng.randrange(6):
-            case 0 if found:
-                found[place] ^= 1 << rng.randrange(8)
-            case 1 if found:
-                found[place] = rng.randrange(256)
-            case 2:
-                del found[place : place + length]
-            case 3:
-                found[place:place] = found[place : place + length]
-            case 4:
-                found[place:place] = rng.randbytes(length)
-            case _:
-                del found[place:]
+        piece = found[place : place + length]
+        others = (b"", 2 * piece, rng.randbytes(length), rng.randbytes(length) + piece)
+        if rng.random() < 0.2:
+            del found[place:]
+        elif rng.random() < 0.2 and found:
+            found[place] ^= 1 << rng.randrange(8)
+        else:
+            found[place : place + length] = rng.choice(others)
     return bytes(found)
 
 
 def changed_value(rng: Random, document: Any) -> Any:
     """A JSON document with one value changed, removed, or put in the place of another."""
-    places: list[tuple[Any, Any]] = []
+    places = list[tuple[Any, Any]]()
 
     def collect(value: Any) -> None:
         keys = list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else []
@@ -175,18 +163,16 @@ def changed_value(rng: Random, document: Any) -> Any:
 
     collect(document)
     container, key = rng.choice(places)
-    match rng.randrange(4):
-        case 0:
-            container[key] = rng.choice(_ODD)
-        case 1:
-            del container[key]
-        case 2 if isinstance(container[key], str):
-            container[key] = changed_bytes(rng, container[key].encode()).decode(errors="replace")
-        case 2 if isinstance(container[key], int):
-            container[key] += rng.choice((-1, 1, 2**31))
-        case _:
-            other, name = rng.choice(places)
-            container[key] = json.loads(json.dumps(other.get(name) if isinstance(other, dict) else None))
+    other, other_key = rng.choice(places)
+    values = [rng.choice(_ODD), json.loads(json.dumps(other[other_key]))]
+    if isinstance(container[key], str):
+        values.append(changed_bytes(rng, container[key].encode()).decode(errors="replace"))
+    elif isinstance(container[key], int):
+        values.append(container[key] + rng.choice((-1, 1, 2**31)))
+    if rng.random() < 0.25:
+        del container[key]
+    else:
+        container[key] = rng.choice(values)
     return document
 
 
@@ -215,7 +201,7 @@ def fuzz(numbers: Iterable[int], folder: Path, seed: int = 0) -> int:
     vehicle, refused = _vehicle(folder), 0
     for number in numbers:
         for attempt in itertools.count():
-            content = vehicle.changed(Random(f"{seed} {number} {attempt}"))  # noqa: S311  # no secrets
+            content = vehicle.changed(Random(f"{seed} {number} {attempt}"))
             where = f"seed {seed}, bundle {number}, attempt {attempt}"
             if content not in vehicle.bundles and vehicle.require_refused(content, where):
                 break

@@ -4,17 +4,16 @@ import shutil
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 from typer.testing import CliRunner, Result
 
 from calibrator.cli import app
 from calibrator.export.core import Checked, read_checked
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
-from ecu_node.parameters import BranchParameters, VehicleParameters, write_parameters
-from tests.ecu_node.vehicles import LAYOUT, MakeDatabase, parameters_for
+from ecu_node.parameters import VehicleParameters, write_parameters
+from tests.ecu_node.vehicles import LAYOUT
 
-__all__ = ["MakeDatabase", "checked_with", "export", "held_back", "needs", "parameters_for", "refused"]
+__all__ = ["checked_with", "export", "needs", "refused"]
 
 
 def needs(*programs: str) -> pytest.MarkDecorator:
@@ -27,12 +26,6 @@ def checked_with(database: VehicleDatabase, parameters: VehicleParameters, folde
     """Parameters written to a file and read as the export reads them."""
     write_parameters(parameters, folder / "v1.json")
     return read_checked(folder / "v1.json", database, None)
-
-
-def held_back(parameters: VehicleParameters, name: str) -> VehicleParameters:
-    """The same parameters, one branch not applied."""
-    found = BranchParameters(drift=0.2, offset_a=7.0, drift_sd=0.01, apply=False, held_back="harm limit")
-    return replace(parameters, branches={**parameters.branches, name: found})
 
 
 def export(*arguments: object, layout: Path = LAYOUT) -> Result:

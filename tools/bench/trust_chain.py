@@ -1,11 +1,14 @@
-#!/usr/bin/env python3
 """From a fleet to corrected vehicles: drives are calibrated, signed, activated and tried, and what comes out is judged.
+
+    python -m bench.trust_chain --vehicles 500        (in tools/)
 
 Vehicles with known faults drive; the calibrator learns from their drives, two people sign what it found, each vehicle's
 node takes its signed file, tries it, and corrects a drive that nobody has seen. Beside each right set two wrong ones
-are on trial: with signs turned, and of another vehicle.
+are on trial: with signs turned, and of another vehicle. Prints how many vehicles came how far, as JSON.
 """
 
+import argparse
+import json
 import subprocess
 import sys
 import tempfile
@@ -13,26 +16,17 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pandas as pd
-import typer
 from msgspec.structs import replace
 
-from calibrator.artificial.command import MAX_MINUTES, UnmeasuredOption
+from bench.published import Publisher
+from bench.row import LAYOUT
 from calibrator.fleet_truth import VehicleTruth, read_truth
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.recordings.frames import read_frames
-from calibrator.terminal.command_line import command_app, run_tool
-from calibrator.terminal.options import (
-    MAX_VEHICLES,
-    SeedOption,
-    WorkersOption,
-    number_option,
-    whole_option,
-)
 from calibrator.terminal.progress import shown
-from calibrator.terminal.text import dumps, table
 from ecu_node.bus.wiring import Mode, branch_signals, key_of, wire
 from ecu_node.core.signals import Codes, FrameKey
 from ecu_node.core.status import State
@@ -40,107 +34,79 @@ from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout, split_signal
 from ecu_node.parameters import VehicleParameters, read_parameters
-from ecu_node.program import write_output
 from ecu_node.update.client import provision, update
 from ecu_node.update.store import ParameterStore
 from ecu_node.update.trial import ParameterTrial
 
-SIGNERS = ("anna", "ben")
 LEAST_DIFFERENCE_A = 0.02
 """Errors that differ by less are the same: rounding to the codes of the corrected signal. [A]"""
 LOOK_EVERY_S = 0.1
 """As often the node looks at the junction. [s]"""
-WRONG = ("signs turned", "of another vehicle")
+WRONG = ("signs_turned", "of_another_vehicle")
 """Kinds of wrong sets."""
 
-app = command_app()
 
-
-@app.command()
-def main(
-    *,
-    layout: Annotated[Path, typer.Option(help="Layout of the vehicles.")] = Path("dbc/hv_powertrain.toml"),
-    vehicles: Annotated[int, whole_option("--vehicles", 8, MAX_VEHICLES, "Vehicles of the fleet")] = 500,
-    unmeasured: UnmeasuredOption = (0.0, 0.0),
-    minutes: Annotated[
-        float, number_option("--minutes", 2, MAX_MINUTES, "Least length of each trip to learn from [min]")
-    ] = 10.0,
-    unseen_minutes: Annotated[
-        float, number_option("--unseen-minutes", 2, MAX_MINUTES, "Length of each unseen trip, with trial [min]")
-    ] = 10.0,
-    seed: SeedOption = 0,
-    workers: WorkersOption = 2,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
-) -> None:
+def main() -> None:
     """Drive a fleet through the whole chain, and count what became of its vehicles."""
-    trial_s = read_layout(layout).activation.trial_s
-    if 60.0 * unseen_minutes <= trial_s:
-        raise UserError(
-            f"--unseen-minutes {unseen_minutes:g}: the trial of {layout} alone takes {trial_s:g} s; give more"
-        )
-    drawn: dict[str, float] = {
-        "vehicles": vehicles,
-        "currents": 3,
-        "sparsity": 80,
-        "seed": seed,
-        "delay": 100,
-        "workers": workers,
-    }
-    drawn |= {"minutes": minutes, "unseen-minutes": unseen_minutes}
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--layout", type=Path, default=LAYOUT)
+    parser.add_argument("--vehicles", type=int, default=500)
+    parser.add_argument("--unmeasured", nargs=2, default=("0", "0"), help="as of calibrator simulate [A]")
+    parser.add_argument("--minutes", type=float, default=10.0, help="least length of each trip to learn from [min]")
+    parser.add_argument("--unseen-minutes", type=float, default=10.0, help="of each unseen trip, with trial [min]")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    given = parser.parse_args()
+    trial_s = read_layout(given.layout).activation.trial_s
+    if 60.0 * given.unseen_minutes <= trial_s:
+        parser.error(f"--unseen-minutes: the trial of {given.layout} alone takes {trial_s:g} s; give more")
     with tempfile.TemporaryDirectory(prefix="chain-") as name:
-        folder, where = Path(name), ("--layout", layout)
-        options = [word for option, value in drawn.items() for word in (f"--{option}", value)]
-        pairs = ("--magnitude", 0.02, 0.1, "--unmeasured", *unmeasured)
-        _run("simulate", *where, *options, *pairs, "--out", folder / "fleet")
-        _run("calibrate", folder / "fleet", *where, "--out", folder / "result", "--workers", workers)
-        names = [path.stem for path in sorted((folder / "result" / "params").glob("*.json"))]
-        publish(folder)
-        driven = run_many(
-            partial(drive, folder, layout), zip(names, [*names[1:], names[0]], strict=True), Workers(processes=workers)
-        )
-        outcomes = pd.DataFrame(shown(driven, "drive, corrected", len(names), "vehicles"))
-    counts, errors_a = score(outcomes)
-    if as_json:
-        figures = {**counts, **{f"{name} a": value for name, value in errors_a.items()}}
-        write_output(dumps({name.replace(",", "").replace(" ", "_"): value for name, value in figures.items()}))
-        return
-    rows = [(name, f"{count}") for name, count in counts.items()]
-    rows += [(f"{name} [A]", f"{value:.2f}") for name, value in errors_a.items()]
-    ends = [f"{found.vehicle}: {found.end}" for found in outcomes.itertuples() if found.end]
-    write_output("\n".join([table(("", ""), rows), *ends]))
+        print(json.dumps(score(driven_fleet(Path(name), given)), indent=2))
 
 
-def score(outcomes: pd.DataFrame) -> tuple[dict[str, int], dict[str, float]]:
+def driven_fleet(folder: Path, given: argparse.Namespace) -> pd.DataFrame:
+    """What became of each vehicle of a fleet that is simulated, calibrated, published and driven."""
+    fleet, result = folder / "fleet", folder / "result"
+    common = ("--layout", given.layout, "--workers", given.workers)
+    lengths = ("--minutes", given.minutes, "--unseen-minutes", given.unseen_minutes)
+    faults = ("--currents", 3, "--sparsity", 80, "--magnitude", 0.02, 0.1, "--unmeasured", *given.unmeasured)
+    some = ("--vehicles", given.vehicles, "--seed", given.seed, "--delay", 100)
+    for words in (
+        ("simulate", *some, *lengths, *faults, *common, "--out", fleet),
+        ("calibrate", fleet, *common, "--out", result),
+    ):
+        command = [sys.executable, "-m", "calibrator", *map(str, words)]
+        subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
+    files = sorted((result / "params").glob("*.json"))
+    publisher = Publisher(folder / "repository", people=2)
+    publisher.add(files)
+    publisher.publish()
+    names = [path.stem for path in files]
+    pairs = zip(names, [*names[1:], names[0]], strict=True)
+    driven = run_many(partial(drive, folder, given.layout), pairs, Workers(processes=given.workers))
+    return pd.DataFrame(shown(driven, "drive, corrected", len(names), "vehicles"))
+
+
+def score(outcomes: pd.DataFrame) -> dict[str, float]:
     """How many vehicles came how far, how many wrong sets passed; and the largest errors, median and worst. [A]"""
     corrected = outcomes[outcomes["corrected"]]
-    masks = {
-        "refused": corrected["refused"],
-        "passed their trial": corrected["passed"],
-        "deployed": corrected["passed"] & ~corrected["fell_back"],
-        "made worse": corrected["worse"],
+    tried = corrected[corrected["passed"]]
+    found: dict[str, float] = {
+        "vehicles": len(outcomes),
+        "with_corrections": len(corrected),
+        "refused": int(corrected["refused"].sum()),
+        "passed_their_trial": len(tried),
+        "deployed": int((~tried["fell_back"]).sum()),
+        "made_worse": int(corrected["worse"].sum()),
     }
     for kind in WRONG:
-        bad = corrected[f"{kind}: worse"]
-        masks |= {f"wrong sets on trial, {kind}": bad, f"of these passed, {kind}": bad & corrected[f"{kind}: passed"]}
-    counts = {"vehicles": len(outcomes), "with corrections": len(corrected)}
-    tried = corrected[corrected["passed"]]
-    errors_a = {
-        f"error, {name}, {what}": float(getattr(tried[f"{what}_a"], method)())
-        for name, method in (("median", "median"), ("worst", "max"))
-        for what in ("measured", "published")
-    }
-    return counts | {name: int(mask.sum()) for name, mask in masks.items()}, errors_a if len(tried) else {}
-
-
-def publish(folder: Path) -> None:
-    """Two signers make their keys, and publish all parameter files."""
-    keys, repository = folder / "keys", folder / "repository"
-    for name in SIGNERS:
-        _run("repository", "key", name, "--no-passphrase", "--out", keys)
-    roles = [(role, name) for role in ("root", "targets", "snapshot", "timestamp") for name in SIGNERS]
-    _run("repository", "init", repository, *(w for r, name in roles for w in (f"--{r}", keys / f"{name}.pub")))
-    _run("repository", "add", repository, folder / "result" / "params")
-    _run("repository", "publish", repository, *(w for name in SIGNERS for w in ("--key", keys / f"{name}.key")))
+        bad = corrected[corrected[f"{kind}: worse"]]
+        found[f"wrong_sets_on_trial_{kind}"] = len(bad)
+        found[f"of_these_passed_{kind}"] = int(bad[f"{kind}: passed"].sum())
+    for what in ("measured", "published") if len(tried) else ():
+        found[f"error_median_{what}_a"] = float(tried[f"{what}_a"].median())
+        found[f"error_worst_{what}_a"] = float(tried[f"{what}_a"].max())
+    return found
 
 
 def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
@@ -164,7 +130,7 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
     own, others = (read_parameters(folder / "result" / "params" / f"{each}.json") for each in names)
     repository, state = folder / "repository", folder / "states" / name
     corrected = [branch for branch, found in own.branches.items() if found.apply]
-    outcome: dict[str, Any] = {"vehicle": name, "corrected": bool(corrected), "end": ""}
+    outcome: dict[str, Any] = {"vehicle": name, "corrected": bool(corrected)}
     outcome |= dict.fromkeys(("refused", "passed", "fell_back", "worse"), False)
     outcome |= {f"{kind}: {what}": False for kind in WRONG for what in ("passed", "worse")}
     if not corrected:
@@ -173,9 +139,9 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
     try:
         update(state, str(repository), database, now)
     except UserError as error:
-        return outcome | {"refused": True, "end": str(error)}
-    said: list[str] = []
-    store = ParameterStore(state, database, mode=Mode.OVERLAY, say=said.append, now=lambda: datetime.now(UTC))
+        print(f"{name}: {error}", file=sys.stderr)
+        return outcome | {"refused": True}
+    store = ParameterStore(state, database, mode=Mode.OVERLAY, say=lambda _: None, now=lambda: datetime.now(UTC))
     corrector = wire(database, store.in_force, 0.0)
     turned = {key: replace(b, drift=-b.drift, offset_a=-b.offset_a) for key, b in own.branches.items()}
     sets = dict(zip(WRONG, (replace(own, branches=turned), replace(others, vehicle=name)), strict=True))
@@ -206,17 +172,15 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
                     seen[each].append((time_s, branch.sign * measured_a, branch.sign * published_a))
     truth = read_truth(folder / "fleet" / "truth.json").vehicles[name]
     traces = {each: _trace(rows, truth, each) for each, rows in seen.items()}
-    for kind, found in sets.items():
-        outcome[f"{kind}: worse"] = _makes_worse(found, traces)
-    outcome["passed"], outcome["end"] = in_force_s < float("inf"), next((x for x in said if "its trial" in x), "")
-    outcome["fell_back"] = corrector.state()[0] is not State.CORRECTING
-    if not outcome["passed"]:
-        return outcome | {"end": outcome["end"] or "the trial did not end"}
-    after = {each: _errors_a(trace, in_force_s) for each, trace in traces.items()}
-    worse = [each for each, errors in after.items() if _is_worse(errors)]
-    outcome |= {f"{what}_a": max(after[each][what] for each in corrected) for what in ("measured", "published")}
-    fell_back = "passing measured values through after all" if outcome["fell_back"] else ""
-    return outcome | {"worse": bool(worse), "end": f"worse: {', '.join(worse)}" if worse else fell_back}
+    outcome |= {f"{kind}: worse": _makes_worse(found, traces) for kind, found in sets.items()}
+    outcome |= {"passed": in_force_s < float("inf"), "fell_back": corrector.state()[0] is not State.CORRECTING}
+    if outcome["passed"]:
+        after = {each: _errors_a(trace, in_force_s) for each, trace in traces.items()}
+        outcome["worse"] = any(_is_worse(errors) for errors in after.values())
+        outcome |= {f"{what}_a": max(after[each][what] for each in corrected) for what in ("measured", "published")}
+    if not outcome["passed"] or outcome["fell_back"] or outcome["worse"]:
+        print(f"{name}: {outcome}", file=sys.stderr)
+    return outcome
 
 
 def _current_a(codes: Codes, payload: bytes | bytearray) -> float:
@@ -254,17 +218,7 @@ def _makes_worse(parameters: VehicleParameters, traces: Mapping[str, pd.DataFram
     return False
 
 
-def _run(*words: object) -> None:
-    """Run a command of the calibrator, with its own progress if it calibrates; its last line if it fails."""
-    errors = None if words[0] == "calibrate" else subprocess.PIPE
-    command = [sys.executable, "-m", "calibrator", *map(str, words)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=errors, text=True, check=False)
-    if done.returncode:
-        last = ((done.stderr or "").strip() or done.stdout.strip() or "it said why").splitlines()[-1]
-        raise UserError(f"calibrator {words[0]}: ended with {done.returncode}: {last}")
-
-
 if __name__ == "__main__":
-    import trust_chain  # processes of run_many find its functions by this name
+    from bench import trust_chain  # processes of run_many find its functions by this name
 
-    run_tool(trust_chain.app, "trust_chain")
+    trust_chain.main()

@@ -1,0 +1,35 @@
+"""A repository of signed parameters whose keys lie in memory."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from securesystemslib.signer import CryptoSigner
+
+from calibrator.repository.repository import ROLES, NewKeys, Repository
+
+__all__ = ["Publisher"]
+
+
+class Publisher:
+    """People who sign for every role, all of them, and their repository in a folder that is new or empty."""
+
+    def __init__(self, folder: Path, people: int = 1) -> None:
+        self.folder, self.root = folder, folder / "metadata" / "1.root.json"
+        self._signers: Sequence[CryptoSigner] = [CryptoSigner.generate_ed25519() for _ in range(people)]
+        keys = NewKeys([signer.public_key for signer in self._signers], people)
+        Repository.create(folder, dict.fromkeys(ROLES, keys))
+
+    def add(self, files: Iterable[Path]) -> None:
+        """Stage parameter files."""
+        Repository(self.folder).add(files, days=365, allow_large_step=False)
+
+    def publish(self) -> None:
+        """Sign what is staged, and let vehicles see it."""
+        repository = Repository(self.folder)
+        for _ in repository.sign(self._signers):
+            pass
+        repository.publish(self._signers)
+
+    def bundle(self, vehicle: str) -> bytes:
+        """What one vehicle needs of the repository."""
+        return Repository(self.folder).bundle(vehicle)
