@@ -61,26 +61,26 @@ bus-gateway bus-node: vcan-fleet # each on a kernel of its own, most of the time
 check-long: setup        ## the long tests: whole fleets, soak, power cuts, fuzz of many seeds (half an hour)
 	$(TEST) -m long --durations 20
 
-coverage: setup          ## all tests, and which lines and branches they reach: all of ecu_node, 95 % of calibrator
+coverage: setup          ## which lines and branches the tests reach, without the long ones: all of ecu_node, 95 % of calibrator
 	rm -rf build/coverage
-	$(TEST) --cov --cov-report=
+	$(TEST) -m "not long" --cov --cov-report=
 	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
 	$(VCAN) $(BIN)/python -m pytest --cov=ecu_node --cov-append --cov-report= tests/vcan
 	$(BIN)/coverage report --include='ecu_node/*' --fail-under=100
 	$(BIN)/coverage report --include='calibrator/*' --fail-under=95
 
 bench: setup             ## how long each step takes, beside its peers; also build/bench.json (long)
-	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all
+	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench
 
 bench-quick: setup       ## the same at small sizes, within five minutes
-	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --quick
+	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench --quick
 
 experiments: setup       ## docs/results anew, ten repetitions from SEED on; TRIPS=folder of the recorded BMW i3 trips (hours)
 	$(BIN)/python tools/import_bmw_i3.py $(TRIPS) --layout dbc/hv_powertrain.toml --out build/i3
 	$(BIN)/calibrator experiment all --seed $(SEED) --drives build/i3 --layout dbc/hv_powertrain.toml --out docs/results
 
 soak: setup              ## the node at the full load of a CAN FD bus, 10^7 frames; its watch on 24 h of real drives (hours)
-	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --only node --out build/soak.json
+	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench node --out build/soak.json
 	HV_WATCH_HOURS=24 $(BIN)/python -m pytest -n 2 tests/real/test_watch_on_real_drives.py
 
 fuzz: setup              ## 10^7 random frames through node and C core, 10^6 changed bundles (hours)
@@ -102,10 +102,12 @@ lint: $(VENV)/.installed  ## ruff, formatting included
 types: $(VENV)/.installed ## mypy --strict
 	$(BIN)/mypy
 
+LOADED := <(script|link|img|iframe|source|video|object|embed)[^>]*(src|srcset|href|data)=.?(https?:)?//[^ >]*|(url\(|@import )[^a-z/]?(https?:)?//[^ )]*
 docs: setup              ## the documentation, in build/docs; its examples are run
 	rm -rf build/docs docs/reference/api docs/gallery
 	PYTHONPATH=tools $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --fresh-env --conf-dir docs \
 		--doctree-dir build/doctrees . build/docs
+	! grep -rnoE --include='*.html' --include='*.css' '$(LOADED)' build/docs # from another server
 
 notebook: setup          ## run the notebook of the examples, and keep its outputs in it
 	OMP_NUM_THREADS=1 $(BIN)/jupyter execute --inplace --timeout 1800 examples/fleet_to_node.ipynb

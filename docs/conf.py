@@ -27,7 +27,6 @@ extensions = [
     "docs_site.command_reference",
     "docs_site.docstrings",
     "docs_site.mathml",
-    "docs_site.self_contained",
 ]
 
 highlight_language = "text"

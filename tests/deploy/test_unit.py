@@ -1,6 +1,7 @@
 """The systemd unit: what systemd itself says of it, and the properties that the documentation promises."""
 
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -14,16 +15,6 @@ DEPLOY = ROOT / "deploy"
 UNIT = DEPLOY / "ecu-node@.service"
 LARGEST_EXPOSURE = 1.5
 """Of 10, where 10 is a service that may do everything."""
-
-
-def settings(path: Path) -> dict[str, list[str]]:
-    """Settings of a unit or network file in the order of their lines; a key may come more than once."""
-    found: dict[str, list[str]] = {}
-    for line in path.read_text().splitlines():
-        if line and not line.startswith(("#", "[")):
-            key, _, value = line.partition("=")
-            found.setdefault(key, []).append(value)
-    return found
 
 
 @pytest.fixture
@@ -51,19 +42,15 @@ def run(*command: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_systemd_finds_nothing_wrong_with_it(analyze: str, unit: Path) -> None:
+@pytest.mark.parametrize("additions", [[], [*DEPLOY.glob("*.conf")]], ids=["alone", "with its additions"])
+def test_systemd_finds_nothing_wrong_with_it(analyze: str, unit: Path, additions: list[Path]) -> None:
+    folder = unit.with_name(f"{unit.name}.d")
+    folder.mkdir()
+    for path in additions:
+        shutil.copy(path, folder)
     result = run(analyze, "verify", "--man=no", "--recursive-errors=no", str(unit))
     about_it = [line for line in result.stderr.splitlines() if "ecu-node" in line]
     assert (result.returncode, about_it) == (0, []), result.stderr
-
-
-def test_systemd_finds_nothing_wrong_with_its_additions(analyze: str, unit: Path) -> None:
-    folder = unit.with_name(f"{unit.name}.d")
-    folder.mkdir()
-    for path in DEPLOY.glob("*.conf"):
-        shutil.copy(path, folder)
-    result = run(analyze, "verify", "--man=no", "--recursive-errors=no", str(unit))
-    assert (result.returncode, [line for line in result.stderr.splitlines() if "ecu-node" in line]) == (0, [])
 
 
 def test_it_may_do_next_to_nothing(analyze: str, unit: Path) -> None:
@@ -74,9 +61,8 @@ def test_it_may_do_next_to_nothing(analyze: str, unit: Path) -> None:
 
 def test_the_command_of_the_unit_is_one_that_the_node_takes(capsys: pytest.CaptureFixture[str]) -> None:
     """With the example environment: all that keeps it from running is the layout that is not there."""
-    environment = settings(DEPLOY / "ecu-node.env")
-    values = {key: value for key, (value,) in environment.items()}
-    (line,) = settings(UNIT)["ExecStart"]
+    values = dict(re.findall(r"(?m)^(\w+)=(.*)$", (DEPLOY / "ecu-node.env").read_text()))
+    (line,) = re.findall(r"(?m)^ExecStart=(.*)$", UNIT.read_text())
     command = line.replace("%i", "can0").split()[1:]
     for key, value in values.items():
         command = [word.replace(f"${{{key}}}", value) for word in command]

@@ -59,19 +59,6 @@ def test_every_command_of_calibrator_has_examples_that_it_accepts() -> None:
             command.make_context(name, used)
 
 
-def test_commands_stand_in_the_order_of_use() -> None:
-    text = dict(command_help("calibrator"))["calibrator"]
-    first, second, third, last = ("look at a recording:", "to calibrate:", "to bring parameters", "for research:")
-    assert text.index(first) < text.index(second) < text.index(third) < text.index(last)
-    assert text.index("  layout ") < text.index("  doctor ") < text.index("  kirchhoff ") < text.index(second)
-
-
-def test_options_that_may_be_repeated_say_so() -> None:
-    text = " ".join(dict(command_help("calibrator"))["calibrator calibrate"].split())
-    for option in ("--trusted", "--hold-out", "--charge"):
-        assert "May be repeated." in text.partition(f" {option} ")[2].partition(" --")[0], option
-
-
 def test_shell_completes_commands() -> None:
     words = {"_CALIBRATOR_COMPLETE": "complete_bash", "COMP_WORDS": "calibrator ki", "COMP_CWORD": "1"}
     shown = subprocess.run(

@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+import time
 from pathlib import Path
 
 import can
@@ -10,7 +11,6 @@ import pytest
 
 from tests.package.clean_venv import CleanVenv
 from tests.package.conftest import VEHICLE, Installed
-from tests.package.processes import started, until
 
 EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "mf4", "update")
 LAYOUT = ("--layout", "my_car.toml")
@@ -81,15 +81,23 @@ def test_c_core_of_the_wheel_compiles_with_its_export(installed: Installed, car:
 
 def test_cluster_calibrates_on_workers(installed: Installed, car: Path, fleet: Path, tmp_path: Path) -> None:
     venv, file = installed("cluster"), tmp_path / "scheduler.json"
-    common = ("--no-dashboard", "--scheduler-file", file)
-    scheduler = ("--host", "127.0.0.1", "--port", "0", "--no-jupyter")
-    with (
-        started(venv, "dask", "scheduler", *scheduler, *common, folder=tmp_path),
-        started(venv, "dask", "worker", "--nthreads", "1", "--no-nanny", *common, folder=tmp_path),
-    ):
-        address = until(lambda: json.loads(file.read_text())["address"] if file.exists() else None, "scheduler")
-        layout = ("--layout", car / "my_car.toml")
-        calibrator(venv, tmp_path, "calibrate", fleet, *layout, "--scheduler", address, "--out", "result")
+    code = (
+        "import sys, time; from distributed import LocalCluster\n"
+        "if __name__ == '__main__':\n"
+        "    cluster = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)\n"
+        "    open(sys.argv[1], 'w').write(cluster.scheduler_address); time.sleep(600)\n"
+    )
+    (tmp_path / "cluster.py").write_text(code)
+    command = [venv.program("python"), "cluster.py", str(file)]
+    with subprocess.Popen(command, cwd=tmp_path, env=venv.environment) as cluster:
+        try:
+            while not (file.exists() and file.read_text()):
+                assert cluster.poll() is None
+                time.sleep(0.1)
+            options = ("--layout", car / "my_car.toml", "--scheduler", file.read_text(), "--out", "result")
+            calibrator(venv, tmp_path, "calibrate", fleet, *options)
+        finally:
+            cluster.terminate()
     assert (tmp_path / "result" / "results.parquet").is_file()
 
 
@@ -102,7 +110,7 @@ def test_mf4_logs_are_read(installed: Installed, car: Path, drive: Path, tmp_pat
 
 
 def test_bench_compares_with_its_peer(installed: Installed, unpacked: Path) -> None:
-    command = ("-m", "bench.all", "--quick", "--only", "posterior")
+    command = ("-m", "bench", "posterior", "--quick")
     done = installed("bench").run("python", *command, folder=unpacked / "tools")
     assert done.returncode == 0, done.stderr
     found = json.loads((unpacked / "tools" / "build" / "bench.json").read_text())
@@ -111,21 +119,10 @@ def test_bench_compares_with_its_peer(installed: Installed, unpacked: Path) -> N
 
 def test_docs_are_built_from_the_source(installed: Installed, unpacked: Path) -> None:
     venv = installed("docs")
-    tools = {
-        **venv.environment,
-        "PYTHONPATH": str(unpacked / "tools"),
-        "PATH": os.pathsep.join([str(venv.folder / "bin"), venv.environment["PATH"]]),
-    }
-    options = (
-        "--quiet",
-        "--fail-on-warning",
-        "--conf-dir",
-        "docs",
-        "--doctree-dir",
-        "build/doctrees",
-        ".",
-        "build/docs",
-    )
-    done = CleanVenv(folder=venv.folder, environment=tools).run("sphinx-build", *options, folder=unpacked)
+    path = os.pathsep.join([str(venv.folder / "bin"), venv.environment["PATH"]])
+    environment = {**venv.environment, "PYTHONPATH": str(unpacked / "tools"), "PATH": path}
+    options = ("--quiet", "--fail-on-warning", "--conf-dir", "docs", "--doctree-dir", "build/doctrees")
+    with_tools = CleanVenv(folder=venv.folder, environment=environment)
+    done = with_tools.run("sphinx-build", *options, ".", "build/docs", folder=unpacked)
     assert done.returncode == 0, done.stderr
     assert (unpacked / "build" / "docs" / "docs" / "index.html").is_file()

@@ -47,14 +47,6 @@ def test_currents_are_corrected_on_a_virtual_bus(node: CleanVenv, car: Path, dri
     assert "Traceback" not in done.stderr
 
 
-def test_a_bus_is_watched(node: CleanVenv, car: Path) -> None:
-    bus = ("--interface", "virtual", "--channel", "nobody")
-    done = node.run("ecu-node", "monitor", *LAYOUT, *bus, "--once", "0.2", "--json", folder=car)
-    assert done.returncode == 1
-    assert "no branch of my_car.toml was seen" in done.stderr
-    assert json.loads(done.stdout)["node"] is None
-
-
 def test_updates_without_their_extra_are_refused_in_one_line(node: CleanVenv, car: Path) -> None:
     for words in (("provision", "--vehicle", VEHICLE, "--root", "x"), ("update", "x", *LAYOUT)):
         done = node.run("ecu-node", *words, "--state", "state", folder=car)

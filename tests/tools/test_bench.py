@@ -46,6 +46,4 @@ def test_both_ways_of_reading_give_the_same_channels_and_a_figure_each() -> None
 
 @pytest.mark.long
 def test_posterior_stands_beside_basis_pursuit() -> None:
-    found = {row.name: row for row in posterior.rows(quick=True)}
-    assert list(found) == [f"posterior, K = {K}, S = {S} %" for K in (2, 4) for S in (80, 60)]
-    assert all(row.peer is not None for row in found.values())
+    assert all("basis pursuit" in (row.peer or "") for row in posterior.rows(quick=True))

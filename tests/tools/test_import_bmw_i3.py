@@ -1,11 +1,10 @@
 import gzip
 import json
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from calibrator.drive import Array
 from calibrator.drives.store import list_drives
@@ -61,10 +60,8 @@ def with_text(path: Path, old: str, new: str, line: int) -> Path:
     return path
 
 
-def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
-    """Run the tool in this process."""
-    ran = CliRunner().invoke(app, [*map(str, arguments)])
-    return subprocess.CompletedProcess((), ran.exit_code, ran.stdout, f"{ran.stderr}{ran.exception}")
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments)])
 
 
 def test_currents_are_positive_into_the_junction_and_sum_to_zero(tmp_path: Path) -> None:
@@ -133,9 +130,9 @@ def test_one_bad_file_does_not_stop_the_others_and_the_exit_code_says_so(tmp_pat
     with_text(write_csv(tmp_path / "in" / "C.csv", columns()), "Throttle", "Trottle", line=1)
     write_csv(tmp_path / "B.csv", columns())
     done = run(tmp_path / "in", tmp_path / "B.csv", "--layout", LAYOUT, "--out", tmp_path / "store")
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert [entry.vehicle for entry in list_drives(tmp_path / "store")] == ["A"]
-    errors = done.stderr.splitlines()
+    errors = [line for line in done.stderr.splitlines() if line.startswith("import_bmw_i3: ")]  # besides progress
     assert "two files for one trip" in errors[0]
     assert "C.csv: there is no column 'Throttle [%]'" in errors[1]
     assert "1 trips imported, 0.0 h; 0 already there; 2 left out" in done.stdout
@@ -146,8 +143,8 @@ def test_a_layout_without_these_branches_is_refused(tmp_path: Path) -> None:
     (tmp_path / "l.toml").write_text(text.replace('"hv_powertrain.dbc"', f'"{LAYOUT.parent / "hv_powertrain.dbc"}"'))
     path = write_csv(tmp_path / "A.csv", columns())
     done = run(path, "--layout", tmp_path / "l.toml", "--out", tmp_path / "store")
-    assert done.returncode == 1
-    assert "no branch or input named auxiliary" in done.stderr
+    assert done.exit_code == 1
+    assert "no branch or input named auxiliary" in str(done.exception)
 
 
 def test_values_beyond_the_range_of_the_dbc_are_labelled_with_what_is_computed_from_them(tmp_path: Path) -> None:
@@ -156,36 +153,22 @@ def test_values_beyond_the_range_of_the_dbc_are_labelled_with_what_is_computed_f
     values["voltage"][200] = 1500.0
     values["accelerator"][300] = 250.0
     trip = imported(write_csv(tmp_path / "a.csv", values))
-    bad = {
-        name: np.flatnonzero(~channel.good).tolist()
-        for name, channel in {**trip.drive.branches, **trip.drive.inputs}.items()
-    }
-    assert {name: rows for name, rows in bad.items() if rows} == {
-        "battery": [100],
-        "motor": [100, 200],
-        "auxiliary": [200],
-        "voltage": [200],
-        "accelerator": [300],
-    }
+    channels = {**trip.drive.branches, **trip.drive.inputs}
+    bad = {name: np.flatnonzero(~channel.good).tolist() for name, channel in channels.items()}
+    inputs = {"voltage": [200], "accelerator": [300]}
+    wanted = {"battery": [100], "motor": [100, 200], "auxiliary": [200], **inputs}
+    assert {name: rows for name, rows in bad.items() if rows} == wanted
     assert "accelerator: 1 samples beyond the DBC's 0 to 100; labelled as not good" in trip.notices
 
 
 def test_trips_that_are_there_stay_as_they_are(tmp_path: Path) -> None:
     path, store = write_csv(tmp_path / "A.csv", columns()), tmp_path / "store"
     done = run(path, "--layout", LAYOUT, "--out", store, "--json")
-    assert done.returncode == 0
+    assert done.exit_code == 0
     assert json.loads(done.stdout)["drives"]["A"]["duration_s"] == pytest.approx(59.9)
     before = Path(list_drives(store)[0].place).read_bytes()
     write_csv(path, columns() | {"speed": np.full(SAMPLES, 50.0)})
     again = run(path, "--layout", LAYOUT, "--out", store)
-    assert again.returncode == 0
+    assert again.exit_code == 0
     assert "0 trips imported, 0.0 h; 1 already there; 0 left out" in again.stdout
     assert Path(list_drives(store)[0].place).read_bytes() == before
-
-
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
-    path = write_csv(tmp_path / "A.csv", columns())
-    (tmp_path / "file").write_text("mine")
-    done = run(path, "--layout", LAYOUT, "--out", tmp_path / "file")
-    assert done.returncode == 1
-    assert "file is a file; choose another" in done.stderr

@@ -30,21 +30,6 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters
 
-__all__ = [
-    "CORE",
-    "FLAGS",
-    "RECORD",
-    "all_codes",
-    "build",
-    "check_frames",
-    "drawn_vehicles",
-    "frames",
-    "fuzz",
-    "measure",
-    "run",
-    "vehicle",
-]
-
 CORE = Path(ecu_node.__file__).parent / "c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
 RECORD = Struct("<IBB64s")

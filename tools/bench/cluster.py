@@ -1,14 +1,12 @@
 """How many workers of a cluster the process that is started, and the Dask scheduler, can keep busy.
 
-    python -m bench.cluster --workers 1000          (in tools/)
-
 The workers are those of Dask, all in one process, and only wait: each item brings back a record of the usual size.
 Of the two processes at the top the time on a core per item is measured: the slower one limits a fleet, and both have a
 core of their own in a real cluster.
 """
 
-import argparse
 import asyncio
+import logging
 import multiprocessing
 import os
 import socket
@@ -19,10 +17,12 @@ import dask
 import psutil
 from distributed import Client, Scheduler, Worker
 
+from bench.row import Row
 from calibrator.processes.run_many import Workers, run_many
 
-__all__ = ["core_seconds"]
+__all__ = ["rows"]
 
+WORKERS, QUICK_WORKERS, ITEMS_PER_WORKER = 1000, 20, 5
 READING_S = 10.0
 """Of one item; a vehicle with ten hours of driving takes 2.5 s, but here one process is all workers. [s]"""
 TASK_BYTES, RECORD_BYTES = 4_000, 16_000
@@ -45,7 +45,18 @@ def read(_: bytes, seconds: float) -> bytes:
     return bytes(RECORD_BYTES)
 
 
-def core_seconds(workers: int, items_per_worker: int = 5) -> tuple[float, float]:
+def rows(*, quick: bool) -> list[Row]:
+    """Measure the time on a core per item of both processes at the top, and what follows from the slower one."""
+    workers = QUICK_WORKERS if quick else WORKERS
+    own_s, scheduler_s = core_seconds(workers)
+    return [
+        Row(name=f"{workers} workers, process that was started", value=1e3 * own_s, unit="ms per item"),
+        Row(name=f"{workers} workers, scheduler", value=1e3 * scheduler_s, unit="ms per item"),
+        Row(name="so one scheduler hands out at most", value=1.0 / max(own_s, scheduler_s), unit="vehicles/s"),
+    ]
+
+
+def core_seconds(workers: int) -> tuple[float, float]:
     """Time on a core, per item, of the process that was started and of the scheduler. [s]"""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -57,7 +68,7 @@ def core_seconds(workers: int, items_per_worker: int = 5) -> tuple[float, float]
             process.start()
         with Client(address, timeout=60, set_as_default=False) as client:
             client.wait_for_workers(workers, timeout=600)
-        tasks = (os.urandom(TASK_BYTES) for _ in range(workers * items_per_worker))
+        tasks = (os.urandom(TASK_BYTES) for _ in range(workers * ITEMS_PER_WORKER))
         watched = (psutil.Process(), psutil.Process(processes[0].pid))
         before_s = [sum(process.cpu_times()[:2]) for process in watched]
         found = sum(1 for _ in run_many(partial(read, seconds=READING_S), tasks, Workers(scheduler=address)))
@@ -79,22 +90,6 @@ def _serve(workers: int | None, port: int) -> None:
                 await asyncio.gather(*(Worker(address, nthreads=1) for _ in range(first, min(first + 50, workers))))
         await asyncio.Event().wait()
 
+    logging.getLogger("distributed").setLevel(logging.WARNING)
     with dask.config.set(IDLE):
         asyncio.run(serve())
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--workers", type=int, default=1000)
-    arguments = parser.parse_args()
-    own_s, scheduler_s = core_seconds(arguments.workers)
-    print(
-        f"{arguments.workers} workers: {1e3 * own_s:.2f} ms per item in the process that was started, "
-        f"{1e3 * scheduler_s:.2f} ms in the scheduler: at most {1.0 / max(own_s, scheduler_s):.0f} vehicles per second"
-    )
-
-
-if __name__ == "__main__":
-    from bench import cluster
-
-    cluster.main()

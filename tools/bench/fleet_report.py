@@ -10,7 +10,7 @@ from selenium import webdriver
 from selenium.webdriver.support.wait import WebDriverWait
 
 from bench.fleet_run import calibrate, make_store, watched
-from bench.row import Row, run
+from bench.row import Row
 from calibrator.report.page import fleet_report
 
 __all__ = ["rows"]
@@ -56,7 +56,3 @@ def ready_times_s(page: Path) -> list[float]:
             )
             found.append(float(ready) / 1e3)
     return found
-
-
-if __name__ == "__main__":
-    run(rows)

@@ -18,7 +18,7 @@ import numpy as np
 import psutil
 from threadpoolctl import threadpool_limits
 
-from bench.row import LAYOUT, Row, run
+from bench.row import LAYOUT, Row
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.drive import Channel, DriveFile, Equipment
@@ -161,7 +161,3 @@ def _processor_s() -> float:
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     living = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
     return sum(each.ru_utime + each.ru_stime for each in used) + sum(float(each.user + each.system) for each in living)
-
-
-if __name__ == "__main__":
-    run(rows)

@@ -15,7 +15,7 @@ from statistics import median
 from typing import Any
 
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle, plain_job
-from bench.row import Row, run
+from bench.row import Row
 from ecu_node.bus.wiring import Mode
 
 __all__ = ["core_rows", "process_rows", "rows"]
@@ -135,7 +135,3 @@ def _watched(vehicle: BenchVehicle, frames: int) -> dict[str, Any]:
     if done.returncode or "received" not in done.stdout:
         raise RuntimeError(f"the node did not run: {done.stdout}{done.stderr}")
     return dict(json.loads(done.stdout))
-
-
-if __name__ == "__main__":
-    run(rows)

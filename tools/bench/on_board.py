@@ -1,15 +1,10 @@
-"""What a node's own summaries cost.
+"""What a node's own summaries cost: the drives of an artificial fleet, 230 frames a second, are replayed to them."""
 
-The drives of an artificial fleet, 230 frames a second, are replayed to the node's summary.
-``python -m bench.on_board --vehicles 2 --minutes 60`` prints the figures that the documents name.
-"""
-
-import argparse
 import tempfile
 import time
 from pathlib import Path
 
-from bench.row import LAYOUT, Row, show
+from bench.row import LAYOUT, Row
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.recordings.frames import read_frames
@@ -23,8 +18,9 @@ from ecu_node.layout import read_layout
 __all__ = ["rows"]
 
 
-def rows(*, vehicles: int, minutes: float) -> list[Row]:
-    """Measure share of a core and size, of so many vehicles that drive so long each. [min]"""
+def rows(*, quick: bool) -> list[Row]:
+    """Measure share of a core and size."""
+    vehicles, minutes = (1, 10.0) if quick else (2, 60.0)
     database, trips = read_database(read_layout(LAYOUT)), BuiltinTrips(seed=0, duration_s=60 * minutes, unseen_s=60.0)
     plan = FleetPlan(vehicles=vehicles, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.1)
     with tempfile.TemporaryDirectory() as place:
@@ -60,10 +56,3 @@ def _replayed(folder: Path, database: VehicleDatabase) -> list[Row]:
         Row(name="on-board summary, share of a core", value=100.0 * spent_s / driven_s, unit="%"),
         Row(name="on-board summary, size", value=3.6 * size / driven_s, unit="kB per hour"),
     ]
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--vehicles", type=int, default=2)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    show(rows(**vars(parser.parse_args())))

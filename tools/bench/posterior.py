@@ -13,7 +13,7 @@ from time import process_time
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bench.row import Row, run
+from bench.row import Row
 from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.estimator.decision import estimate_rows
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces, row_design
@@ -95,7 +95,3 @@ def _simulated(branches: int, vehicles: int, sparsity: float) -> EvidenceRows:
     made[:, at.constant] *= np.concatenate([factor, factor[:, :1], factor], axis=1)
     covariance = np.tile(np.diag(sd**2), (vehicles, 1, 1))
     return EvidenceRows(values=made, covariance=covariance, means=np.zeros((vehicles, 2, K)))
-
-
-if __name__ == "__main__":
-    run(rows)

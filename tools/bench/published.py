@@ -1,6 +1,6 @@
 """A repository of signed parameters whose keys lie in memory."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from securesystemslib.signer import CryptoSigner
@@ -11,13 +11,14 @@ __all__ = ["Publisher"]
 
 
 class Publisher:
-    """People who sign for every role, all of them, and their repository in a folder that is new or empty."""
+    """People who all sign, with a key for each role, and their repository in a folder that is new or empty."""
 
     def __init__(self, folder: Path, people: int = 1) -> None:
         self.folder, self.root = folder, folder / "metadata" / "1.root.json"
-        self._signers: Sequence[CryptoSigner] = [CryptoSigner.generate_ed25519() for _ in range(people)]
-        keys = NewKeys([signer.public_key for signer in self._signers], people)
-        Repository.create(folder, dict.fromkeys(ROLES, keys))
+        signers = {role: [CryptoSigner.generate_ed25519() for _ in range(people)] for role in ROLES}
+        keys = {role: NewKeys([signer.public_key for signer in some], people) for role, some in signers.items()}
+        self._signers = [signer for some in signers.values() for signer in some]
+        Repository.create(folder, keys)
 
     def add(self, files: Iterable[Path]) -> None:
         """Stage parameter files."""

@@ -1,13 +1,12 @@
-"""One figure of the benchmarks, beside that of its peer in the same run; how it is shown, and how it is asked for."""
+"""One figure of the benchmarks, beside that of its peer in the same run, and how it is shown."""
 
-import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
-__all__ = ["LAYOUT", "MEBIBYTE", "Row", "run", "show"]
+__all__ = ["LAYOUT", "MEBIBYTE", "Row", "show"]
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 MEBIBYTE = 1024.0**2
@@ -42,10 +41,3 @@ def show(rows: Sequence[Row]) -> None:
     """Print a table."""
     table = pd.DataFrame(map(vars, rows)).astype({"ratio": float}).fillna({"peer": ""})
     print(table.to_string(index=False, na_rep="", float_format="{:.4g}".format))
-
-
-def run(rows: Callable[..., Sequence[Row]]) -> None:
-    """Measure one group of benchmarks from the command line."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--quick", action="store_true", help="small sizes: shows that all works")
-    show(rows(quick=parser.parse_args().quick))

@@ -8,7 +8,8 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import redirect_stdout, suppress
+from unittest.mock import patch
 
 from docutils import nodes
 from sphinx.application import Sphinx
@@ -51,25 +52,10 @@ def command_help(program: str, *path: str) -> Iterator[tuple[str, str]]:
 
 
 def _printed(program: str, arguments: list[str]) -> str:
-    printed = io.StringIO()
-    with _as_process([program, *arguments]), redirect_stdout(printed), suppress(SystemExit):
+    printed, terminal = io.StringIO(), patch.dict(os.environ, COLUMNS=_WIDTH)
+    with patch.object(sys, "argv", [program, *arguments]), terminal, redirect_stdout(printed), suppress(SystemExit):
         PROGRAMS[program]()
     return printed.getvalue()
-
-
-@contextmanager
-def _as_process(argv: list[str]) -> Iterator[None]:
-    """Arguments of this process, and the width of its terminal, for a while."""
-    arguments, width = sys.argv, os.environ.get("COLUMNS")
-    sys.argv, os.environ["COLUMNS"] = argv, _WIDTH
-    try:
-        yield
-    finally:
-        sys.argv = arguments
-        if width is None:
-            del os.environ["COLUMNS"]
-        else:
-            os.environ["COLUMNS"] = width
 
 
 class _CommandReference(SphinxDirective):
