@@ -15,6 +15,7 @@ from calibrator.export.core import (
     image_bytes,
     intel_hex,
     read_checked,
+    s_records,
 )
 from calibrator.export.tool_formats import a2l_text, cdfx_document, csv_text, dcm_text
 from calibrator.files.folders import require_possible_file, write_files
@@ -28,12 +29,14 @@ from ecu_node.program import say_error, write_output
 
 __all__ = ["export"]
 
+_S_RECORDS = (".s19", ".s28", ".s37", ".srec", ".mot")
+
 
 def export(
     params: Annotated[list[Path], typer.Argument(help="Parameter file; of several vehicles for csv.")],
     layout: LayoutOption,
     format_: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
-    output: Annotated[Path, typer.Option("--output", "--out", help="File to write.")],
+    output: Annotated[Path, typer.Option("--output", "--out", help="File to write; *.s19 is S-records for hex.")],
     elf: Annotated[
         Path | None, typer.Option("--elf", help="The control unit's linked program, for hex and a2l.")
     ] = None,
@@ -54,7 +57,7 @@ def export(
     database = node_database(layout)
     reading = shown(params, "read parameters", len(params), "files") if len(params) > 1 else params
     tables = [read_checked(path, database, vehicle) for path in reading]
-    content = _content(tables, format_, elf)
+    content = _content(tables, format_, output, elf)
     require_possible_file(output)
     if output.exists() and not replace and output.read_bytes() != content:
         raise ExportError(f"{output}: exists; choose another --output, or replace it with --replace")
@@ -73,7 +76,7 @@ def export(
     write_output(printable(str(output)))
 
 
-def _content(tables: Sequence[Checked], format_: ExportFormat, elf: Path | None) -> bytes:
+def _content(tables: Sequence[Checked], format_: ExportFormat, output: Path, elf: Path | None) -> bytes:
     if format_ is ExportFormat.CSV:
         return csv_text(tables).encode()
     if len(tables) != 1:
@@ -90,4 +93,5 @@ def _content(tables: Sequence[Checked], format_: ExportFormat, elf: Path | None)
     image = find_image(elf, checked.database)
     if format_ is ExportFormat.A2L:
         return a2l_text(checked.database, image).encode()
-    return intel_hex(image.address, image_bytes(checked, image.order)).encode()
+    write = s_records if output.suffix.lower() in _S_RECORDS else intel_hex
+    return write(image.address, image_bytes(checked, image.order)).encode()
