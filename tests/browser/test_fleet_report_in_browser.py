@@ -21,32 +21,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import Explanation, SensorFinding
 from tests.calibrator.report.results_at_hand import sensor, six_vehicle_result, vehicle, write_result
 
-LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 PATIENCE_S = 60.0
-LEAST_CONTRAST = 4.5
-"""Of text to its background, WCAG 2.2 level AA. [1]"""
-
-CONTRAST = """
-const channel = (c) => { c /= 255; return c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4; };
-const light = (rgb) => 0.2126 * channel(rgb[0]) + 0.7152 * channel(rgb[1]) + 0.0722 * channel(rgb[2]);
-const numbers = (text) => text.match(/[0-9.]+/g).map(Number);
-const paper = (node) => {
-  for (let at = node; at; at = at.parentElement) {
-    const colour = numbers(getComputedStyle(at).backgroundColor);
-    if (colour.length < 4 || colour[3] > 0) return colour;
-  }
-  return [255, 255, 255];
-};
-const found = [];
-for (const node of document.querySelectorAll("body *:not(script):not(style)")) {
-  if (node.closest("svg") || !node.getClientRects().length) continue;
-  if (![...node.childNodes].some((child) => child.nodeType === 3 && child.textContent.trim())) continue;
-  if (node.disabled) continue;
-  const [a, b] = [light(numbers(getComputedStyle(node).color)), light(paper(node))].sort((x, y) => y - x);
-  found.push([(a + 0.05) / (b + 0.05), node.tagName, node.textContent.trim().slice(0, 40)]);
-}
-return found;
-"""
 
 
 @pytest.fixture(scope="module")
@@ -201,14 +176,6 @@ def test_headings_are_in_order_and_controls_have_names(page: webdriver.Chrome) -
     assert [control.get_attribute("id") for control in controls if not control.accessible_name] == []
     assert page.execute_script("return document.documentElement.lang") == "en"
     assert "at hand" in page.title
-
-
-def test_text_can_be_read_against_its_background(page: webdriver.Chrome) -> None:
-    page.execute_script("location.hash = 'vehicle=V4'")
-    until(page, "return document.getElementById('vehicle').dataset.vehicle === 'V4'")
-    found = page.execute_script(CONTRAST)
-    assert len(found) > 100
-    assert [item for item in found if item[0] < LEAST_CONTRAST] == []
 
 
 def test_junction_opens_without_an_error(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:

@@ -1,12 +1,16 @@
 """The recorded trips of a BMW i3, imported once for all tests."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from tests.calibrator.command_here import once
-from tests.real.delay_trips import import_trips
+
+ROOT = Path(__file__).parents[2]
+LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 
 
 @pytest.fixture(scope="session")
@@ -15,7 +19,9 @@ def i3_store(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
     def make(folder: Path) -> None:
         folder.mkdir()
-        (folder / "account.json").write_text(import_trips(shared_data, folder / "store"))
+        command: list[str | Path] = [sys.executable, ROOT / "tools" / "import_bmw_i3.py", shared_data / "bmw_i3_summer"]
+        command += ["--layout", LAYOUT, "--out", folder / "store", "--json"]
+        (folder / "account.json").write_bytes(subprocess.run(command, capture_output=True, check=True).stdout)
 
     return once(tmp_path_factory, "i3", make) / "store"
 

@@ -18,7 +18,7 @@ from calibrator.files.layout_files import vehicle_database
 from calibrator.summaries.summariser import summarise_samples
 from ecu_node.parameters import SensorFinding
 from tests.calibrator.estimator.simulated_rows import random_faults
-from tests.real.delay_trips import LAYOUT
+from tests.real.conftest import LAYOUT
 
 Bend = Callable[[Array, Array], Array]
 """What a sensor shows of its currents [A], given the share of the time that has passed."""

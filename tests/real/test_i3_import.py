@@ -13,9 +13,7 @@ from calibrator.experiments.methods import POSTERIOR
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, read_fleet, recorded_trial
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
-
-ROOT = Path(__file__).parents[2]
-LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
+from tests.real.conftest import LAYOUT
 
 STUCK_HEATER = {"TripA03", "TripA05", "TripA06", "TripA13", "TripA18"}
 """Known from the energy balance. TripA20, also said to be implausible, agrees with its balance but for the defaults."""

@@ -30,11 +30,6 @@ TIME_S = np.arange(0.0, 10.0, 0.05)
 TABLE_S = np.arange(0.0, 120.0, 0.1)
 MOTOR_A = 60.0 * np.sin(0.7 * TABLE_S) + 25.0 * np.sin(2.3 * TABLE_S + 1.0) + 20.0
 
-LAYOUT_OF_TABLE = (
-    'schema = 1\nname = "t"\nfull_scale_a = 100\n[[branch]]\nname = "battery"\nsignal = "battery"\nsign = 1\n'
-    '[[branch]]\nname = "motor"\nsignal = "motor"\nsign = 1\n'
-)
-
 
 def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
     return calibrator("kirchhoff", *arguments)
@@ -181,15 +176,6 @@ def test_next_step_is_one_that_works(tmp_path: Path) -> None:
     for column, is_told in (("motor", True), ("motor*1", False)):  # a layout is not made of formulas
         done = run(path, "--branches", f"battery=battery,motor={column}")
         assert ("next: calibrator layout init" in done.stderr) is is_told
-
-
-def test_no_figure_is_more_exact_than_its_unit_allows(tmp_path: Path) -> None:
-    path, *_ = table(tmp_path, battery=MOTOR_A - 0.002, motor=-MOTOR_A)
-    (tmp_path / "layout.toml").write_text(f"{LAYOUT_OF_TABLE}[unmeasured_load]\nmean_a = 0.00123\nsd_a = 0.1\n")
-    text = run(path, "--layout", tmp_path / "layout.toml").stdout
-    assert "right sensors would sum to 0 +- 0.1 A" in text
-    assert "-0.00" not in text
-    assert "RMSE of the sum: 0.00 A measured" in text
 
 
 # ---- parameters

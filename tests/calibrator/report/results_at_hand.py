@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from calibrator.drive import Array
 from calibrator.estimator.evidence import evidence_names
 from calibrator.estimator.results import (
     PARTS,
@@ -103,27 +102,6 @@ def six_vehicles(database: VehicleDatabase) -> list[VehicleParameters]:
     ]
 
 
-def evidence_of(item: VehicleParameters) -> Array:
-    """What a noise-free vehicle with these faults shows."""
-    battery, motor = (item.branches[name] for name in BRANCHES)
-    hardware = 1.0 + item.hardware_fault.drift
-    ratio = (1.0 + battery.drift) / (1.0 + motor.drift)
-    constant_a = (1.0 + battery.drift) * (battery.offset_a / (1.0 + battery.drift) + motor.offset_a / (1 + motor.drift))
-    told = [
-        (1.0 + battery.drift) * hardware,
-        (1.0 + motor.drift) * hardware,
-        ratio,
-        *(1.0 + battery.drift, 1.0 + motor.drift),
-        battery.offset_a + (1.0 + battery.drift) * item.hardware_fault.offset_a.get("battery", 0.0),
-        motor.offset_a + (1.0 + motor.drift) * item.hardware_fault.offset_a.get("motor", 0.0),
-        constant_a,
-        *(battery.offset_a, motor.offset_a),
-    ]
-    evidence = np.stack([told, np.where(np.arange(10) < 5, 0.002, 0.2), told])
-    evidence[:2, [3, 4, 8, 9]] = np.nan
-    return evidence
-
-
 def write_result(
     folder: Path,
     vehicles: Sequence[VehicleParameters],
@@ -135,7 +113,9 @@ def write_result(
 ) -> Path:
     """A result folder as ``calibrator calibrate`` writes it."""
     (folder / PARTS).mkdir(parents=True)
-    told = {item.vehicle: evidence_of(item) for item in vehicles} if evidence else {}
+    rows = np.ones((3, len(evidence_names(BRANCHES))))
+    rows[:2, [3, 4, 8, 9]] = np.nan  # no bench has seen these sensors
+    told = {item.vehicle: rows for item in vehicles} if evidence else {}
     part = encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
     part_file(folder, 0).write_bytes(part)
     join_rows(folder, {})
