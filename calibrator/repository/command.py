@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,7 +15,7 @@ from calibrator.files.storage import open_storage
 from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption, whole_option
 from calibrator.terminal.progress import shown
-from calibrator.terminal.text import dumps
+from calibrator.terminal.text import dumps, few
 from ecu_node.errors import UserError, printable
 from ecu_node.program import write_output
 
@@ -93,35 +93,31 @@ def key(
         raise ContradictionError(f"${_PASSPHRASE}: at least {_SHORTEST_PASSPHRASE} characters are expected")
     if not name or not name.isprintable() or "/" in name or name.startswith("."):
         raise ContradictionError(f"{name!r}: a name for a file is expected")
-    encryption = (
-        serialization.BestAvailableEncryption(os.fsencode(passphrase))
-        if passphrase is not None
-        else serialization.NoEncryption()
-    )
+    pem, encryption = serialization.Encoding.PEM, serialization.NoEncryption()
+    if passphrase is not None:
+        encryption = serialization.BestAvailableEncryption(os.fsencode(passphrase))  # type: ignore[assignment]
     made = Ed25519PrivateKey.generate()
-    pem = serialization.Encoding.PEM
     private, public = out / f"{name}.key", out / f"{name}.pub"
-    exists = "there is a key already; take another name, it cannot be made again"
-    if os.path.lexists(public):
-        raise UserError(f"{public}: {exists}")
+    contents = {
+        public: (made.public_key().public_bytes(pem, serialization.PublicFormat.SubjectPublicKeyInfo), 0o644),
+        private: (made.private_bytes(pem, serialization.PrivateFormat.PKCS8, encryption), 0o600),
+    }
+    path, written = out, list[Path]()
     try:
         out.mkdir(parents=True, exist_ok=True)
-        handle = os.open(private, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except FileExistsError:
-        raise UserError(f"{private}: {exists}") from None
+        for path, (content, mode) in contents.items():
+            with open(path, "xb", opener=partial(os.open, mode=mode)) as file:
+                written.append(path)
+                file.write(content)
     except OSError as error:
-        raise UserError(f"{private}: cannot be written: {error.strerror}") from None
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(made.private_bytes(pem, serialization.PrivateFormat.PKCS8, encryption))
-        write_files({public: made.public_key().public_bytes(pem, serialization.PublicFormat.SubjectPublicKeyInfo)})
-    except (OSError, UserError) as error:
-        private.unlink()
-        if isinstance(error, OSError):
-            raise UserError(f"{private}: cannot be written: {error.strerror}") from None
-        raise
+        for left in written:
+            left.unlink()
+        if isinstance(error, FileExistsError) and path != out:
+            advice = "there is a key already; take another name, it cannot be made again"
+            raise UserError(f"{path}: {advice}") from None
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
     facts = {"signer": name, "private_key": str(private), "public_key": str(public)}
-    _tell(facts, f"{private}\n{public}".replace("\n", "  "), json=json)
+    _tell(facts, f"{private}  {public}", json=json)
 
 
 @repository.command(
@@ -181,9 +177,11 @@ def add(
     if not files:
         raise RepositoryStateError(f"{params[0]}: no parameter files (*.json) in it")
     reading = shown(files, "add", len(files), "files")
-    bins = found.add(reading, days=days, allow_large_step=allow_large_step, database=database)
-    facts = {"added": len(files), "bins": bins}
-    _tell(facts, f"{folder}: {len(files)} parameter files added, {bins} bins changed; to be published", json=json)
+    bins, lifted = found.add(reading, days=days, allow_large_step=allow_large_step, database=database)
+    facts = {"added": len(files), "bins": bins, "no_longer_revoked": lifted}
+    words = f"; revoked before, and no longer: the files of {few(lifted)}" if lifted else ""
+    text = f"{folder}: {len(files)} parameter files added, {bins} bins changed{words}; to be published"
+    _tell(facts, text, json=json)
 
 
 @repository.command("publish", epilog=example("calibrator repository publish repo --key anna.key --key online.key"))

@@ -11,6 +11,7 @@ it in place, timestamp last. So signers may sign one after the other, each on a 
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from hashlib import sha256
 from pathlib import Path
@@ -64,15 +65,6 @@ class NewKeys(NamedTuple):
 
     keys: Sequence[SSlibKey]
     threshold: int
-
-
-class _File(NamedTuple):
-    """A parameter file in the repository."""
-
-    path: str
-    length: int
-    sha256: str
-    facts: TargetFacts
 
 
 def _expiry(role: str) -> datetime:
@@ -141,14 +133,10 @@ class Repository:
         return cls(folder)
 
     def _read(self, path: Path, kind: type[_Signed]) -> Metadata[Any]:
-        try:
+        with _readable(path):
             found: Metadata[Any] = Metadata.from_file(str(path))
-        except (RepositoryError, OSError, ValueError) as error:
-            raise RepositoryStateError(
-                f"{path}: cannot be read as metadata: {error}; take a copy of the repository"
-            ) from None
-        if not isinstance(found.signed, kind):
-            raise RepositoryStateError(f"{path}: metadata of another role; take a copy of the repository")
+            if not isinstance(found.signed, kind):
+                raise ValueError("it is of another role")
         return found
 
     def _live(self, role: str, kind: type[_Signed]) -> _Signed | None:
@@ -179,7 +167,7 @@ class Repository:
 
     def add(
         self, files: Iterable[Path], *, days: int, allow_large_step: bool, database: VehicleDatabase | None = None
-    ) -> int:
+    ) -> tuple[int, list[str]]:
         """Stage parameter files, each in the place of what its vehicle had before.
 
         Parameters
@@ -195,8 +183,10 @@ class Repository:
 
         Returns
         -------
-        int
+        bins : int
             Number of bins that are staged now.
+        lifted : list of str
+            Vehicles whose file was revoked, and is so no more.
 
         Raises
         ------
@@ -204,8 +194,7 @@ class Repository:
             If one is no parameter file, does not fit, or is a second one of its vehicle; nothing is staged then.
         """
         expires = (datetime.now(UTC) + timedelta(days=days)).replace(microsecond=0)
-        bins: dict[str, list[_File]] = defaultdict(list)
-        seen: set[str] = set()
+        bins: dict[str, dict[str, tuple[int, str, TargetFacts]]] = defaultdict(dict)
         for path in files:
             content = parameter_bytes(path)
             parameters = decode_parameters(content, str(path))
@@ -215,9 +204,9 @@ class Repository:
                 except UnfitError as error:
                     raise RepositoryStateError(f"{path}: no vehicle will take it: {error}") from None
             target, digest = target_path(parameters.vehicle), sha256(content).hexdigest()
-            if target in seen:
+            added = bins[_BINS.get_role_for_target(target)]
+            if target in added:
                 raise RepositoryStateError(f"{path}: a second file for vehicle {parameters.vehicle}; add one of them")
-            seen.add(target)
             facts = TargetFacts(
                 vehicle=parameters.vehicle,
                 layout=parameters.layout.sha256,
@@ -226,15 +215,19 @@ class Repository:
                 allow_large_step=allow_large_step,
             )
             _write(self._folder / "targets" / f"{digest}.{target}", content)
-            bins[_BINS.get_role_for_target(target)].append(_File(target, len(content), digest, facts))
+            added[target] = len(content), digest, facts
+        lifted = []
         for role, added in bins.items():
             targets = self._latest(role, Targets) or Targets()
-            for file in added:
-                before = targets.targets.get(file.path)
-                revoked = [item for item in _facts(before).revoked if item != file.sha256] if before else []
-                _set_target(targets, file.path, file.length, file.sha256, replace(file.facts, revoked=revoked))
+            for target, (length, digest, facts) in added.items():
+                before = targets.targets.get(target)
+                revoked = _facts(before).revoked if before else []
+                if digest in revoked:
+                    lifted.append(facts.vehicle)
+                others = [item for item in revoked if item != digest]
+                _set_target(targets, target, length, digest, replace(facts, revoked=others))
             self._stage(role, targets)
-        return len(bins)
+        return len(bins), lifted
 
     def revoke(self, vehicles: Sequence[str], digest: str | None) -> None:
         """Stage that a file of these vehicles must not be used any more: the present one, or another by its SHA-256."""
@@ -316,12 +309,8 @@ class Repository:
 
     def _live_expiry(self, name: str) -> datetime:
         path = self._metadata / f"{name}.json"
-        try:
+        with _readable(path):
             return expiry_of(path.read_bytes())
-        except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise RepositoryStateError(
-                f"{path}: cannot be read as metadata: {error}; take a copy of the repository"
-            ) from None
 
     def sign(self, signers: Sequence[Signer]) -> Iterator[str]:
         """Sign what is staged; what lacks signatures after that stands in :attr:`waiting`.
@@ -443,6 +432,16 @@ class Repository:
                 f"{self._folder}: a root or the parameters of vehicle {vehicle!r} are damaged; take a copy of the "
                 f"repository"
             ) from None
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (RepositoryError, OSError, ValueError) as error:
+        raise RepositoryStateError(
+            f"{path}: cannot be read as metadata: {error}; take a copy of the repository"
+        ) from None
 
 
 def missing_text(missing: Mapping[str, str]) -> str:

@@ -7,7 +7,6 @@ where our own checks then refuse the set; whatever TUF refuses leaves the state 
 """
 
 import os
-from collections.abc import Callable
 from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
@@ -51,6 +50,10 @@ _WORK = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
 """Where TUF's client works: in memory where there is such a folder, which spares time and flash."""
 _ROLES = ("root", "timestamp", "snapshot")
 """Metadata that a client keeps, against replays."""
+_FOREIGN = (
+    "another repository than the one that this vehicle trusts, or it was changed on the way; "
+    "all N.root.json belong to it"
+)
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
 
@@ -139,8 +142,7 @@ def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
     except OSError as error:
         raise UserError(f"{root}: cannot read the root: {error.strerror}") from None
     except (exceptions.RepositoryError, ValueError):
-        hint = "a key set of version 1.0; " if content.startswith(b'{"keys":') else ""
-        raise UserError(f"{root}: {hint}1.root.json of 'calibrator repository init' is expected") from None
+        raise UserError(f"{root}: 1.root.json of 'calibrator repository init' is expected") from None
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -153,15 +155,7 @@ def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
     return metadata.signed.version
 
 
-def update(
-    folder: Path,
-    source: str,
-    database: VehicleDatabase,
-    now: datetime,
-    *,
-    dry_run: bool = False,
-    on_wait: Callable[[str], None] = lambda _: None,
-) -> str:
+def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, *, dry_run: bool = False) -> str:
     """Take what a repository offers to this vehicle: a set goes on trial, a revocation holds at once.
 
     Parameters
@@ -176,8 +170,6 @@ def update(
         Time of day.
     dry_run : bool
         Check all, change nothing.
-    on_wait : callable
-        Takes one line for the user if another process holds the state for more than a second.
 
     Returns
     -------
@@ -191,7 +183,7 @@ def update(
     UserError
         If the state cannot be written.
     """
-    with nullcontext() if dry_run else locked(folder, on_wait=on_wait):
+    with nullcontext() if dry_run else locked(folder):
         state = read_state(folder)
         try:
             offer = _verified_offer(state, source, max(now, state.latest))
@@ -257,34 +249,26 @@ def _require_fresh(path: Path, source: str, now: datetime) -> None:
         )
 
 
+_REFUSALS: tuple[tuple[type[Exception], Reason, str], ...] = (
+    (exceptions.ExpiredMetadataError, Reason.NOT_VALID_NOW, "get a newer one, or set the clock"),
+    (exceptions.BadVersionNumberError, Reason.REPLAYED, "older than what was accepted before"),
+    (exceptions.UnsignedMetadataError, Reason.NOT_SIGNED, _FOREIGN),
+    (exceptions.LengthOrHashMismatchError, Reason.NOT_SIGNED, _FOREIGN),
+    (exceptions.RepositoryError, Reason.MALFORMED_PARAMETERS, "copy it again"),
+    (exceptions.DownloadLengthMismatchError, Reason.MALFORMED_PARAMETERS, "copy it again"),
+    (exceptions.DownloadHTTPError, Reason.NO_PARAMETERS, "is it complete, and for vehicle {vehicle!r}, which this is?"),
+    (Exception, Reason.NO_PARAMETERS, "check address and connection, or whether it can be read"),
+)
+"""Errors of TUF's client: why a set is refused, and what there is to do; the first kind counts."""
+
+
 def _refusal(error: Exception, source: str, vehicle: str) -> TrustError:
     """Translate an error of TUF's client into one line with a reason."""
-    hint = {
-        Reason.NOT_VALID_NOW: "; get a newer one, or set the clock",
-        Reason.REPLAYED: "; older than what was accepted before",
-        Reason.NOT_SIGNED: "; another repository than the one that this vehicle trusts, or it was changed on the way; "
-        "all N.root.json belong to it",
-        Reason.NO_PARAMETERS: f"; is it complete, and for vehicle {vehicle!r}, which this is?",
-        Reason.MALFORMED_PARAMETERS: "; copy it again",
-    }
-    kinds = (
-        (exceptions.ExpiredMetadataError, Reason.NOT_VALID_NOW),
-        (exceptions.BadVersionNumberError, Reason.REPLAYED),
-        (exceptions.UnsignedMetadataError, Reason.NOT_SIGNED),
-        (exceptions.LengthOrHashMismatchError, Reason.NOT_SIGNED),
-        (exceptions.DownloadLengthMismatchError, Reason.MALFORMED_PARAMETERS),
-        (exceptions.DownloadError, Reason.NO_PARAMETERS),
-        (HTTPError, Reason.NO_PARAMETERS),
-        (exceptions.RepositoryError, Reason.MALFORMED_PARAMETERS),
-    )
-    reason = next(reason for kind, reason in kinds if isinstance(error, kind))
-    advice = hint[reason]
-    if source.startswith(("http://", "https://")) and isinstance(error, exceptions.DownloadError | HTTPError):
-        if not isinstance(error, exceptions.DownloadHTTPError):
-            advice = "; check address and connection"
-        while error.__context__ is not None:  # the innermost says what it was, such as a name that is not known
-            error = error.__context__  # type: ignore[assignment]
-    return TrustError(reason, f"{source}: {str(error) or type(error).__name__}{advice}")
+    reason, advice = next(found[1:] for found in _REFUSALS if isinstance(error, found[0]))
+    is_of_web = source.startswith("http") and isinstance(error, exceptions.DownloadError | HTTPError)
+    while is_of_web and error.__context__ is not None:  # the innermost says what it was, such as an unknown name
+        error = error.__context__  # type: ignore[assignment]
+    return TrustError(reason, f"{source}: {str(error) or type(error).__name__}; {advice.format(vehicle=vehicle)}")
 
 
 def _without_revoked(state: VehicleState, offer: _Offer, now: datetime) -> tuple[VehicleState, str]:

@@ -98,14 +98,7 @@ def _update(options: argparse.Namespace) -> int:
     from ecu_node.update.state import read_state  # noqa: PLC0415
 
     client, database = _client(), node_database(options.layout)
-    text = client.update(
-        options.state,
-        options.source,
-        database,
-        datetime.now(UTC),
-        dry_run=options.dry_run,
-        on_wait=lambda line: say_error(f"ecu-node: {line}"),
-    )
+    text = client.update(options.state, options.source, database, datetime.now(UTC), dry_run=options.dry_run)
     text = f"dry run, nothing is changed: {text}" if options.dry_run else text
     facts = {"taken": not options.dry_run, "text": text, **_facts(read_state(options.state))}
     write_result(facts, printable(text), as_json=options.json)

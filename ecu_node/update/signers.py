@@ -11,6 +11,7 @@ import os
 import stat
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from getpass import getpass
 from pathlib import Path
 
@@ -72,16 +73,12 @@ def signer_of(text: str) -> Signer:
     except OSError as error:
         raise UserError(f"{path}: cannot read the private key: {error.strerror}; give NAME.key of a signer") from None
     is_encrypted = b"ENCRYPTED" in content
-    why = "it is none, or damaged"
     for secret in _secrets(f"passphrase of {path}") if is_encrypted else (None,):
-        try:
+        with suppress(ValueError, TypeError, UnsupportedAlgorithm):
             signer = CryptoSigner(load_pem_private_key(content, os.fsencode(secret) if secret else None))
             break
-        except (ValueError, TypeError, UnsupportedAlgorithm):
-            why = f"it is damaged, or ${PASSPHRASE_VARIABLE} is not its passphrase" if is_encrypted else why
     else:
-        if is_encrypted and not os.environ.get(PASSPHRASE_VARIABLE):
-            raise UserError(f"{path}: the private key is encrypted; give its passphrase in ${PASSPHRASE_VARIABLE}")
+        why = f"it is encrypted; give its passphrase in ${PASSPHRASE_VARIABLE}" if is_encrypted else "none, or damaged"
         raise UserError(f"{path}: cannot be used as a private key (PEM, PKCS #8): {why}")
     if rights & 0o066:
         raise UserError(

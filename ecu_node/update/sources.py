@@ -31,8 +31,6 @@ _MOST_MEMORY_BYTES = 64_000_000
 """That the decompressor may take."""
 _LONGEST_DOWNLOAD_S = 300.0
 """Of one file from a web server. [s]"""
-_OF_1_0 = (b'{"payload":', b'{"keys":')
-"""How signed files and key sets of version 1.0 begin."""
 
 
 def open_source(text: str) -> FetcherInterface:
@@ -79,12 +77,6 @@ def _bundle_files(path: Path) -> dict[str, str]:
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else "no file has such a name"
         raise TrustError(Reason.NO_PARAMETERS, f"{path}: cannot be read: {why}; name a bundle, folder or URL") from None
-    if content.startswith(_OF_1_0):
-        raise TrustError(
-            Reason.NOT_SIGNED,
-            f"{path}: signed by version 1.0; publish its parameters with 'calibrator repository add' and 'publish', "
-            f"and take their bundle",
-        )
     try:
         reader = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MOST_MEMORY_BYTES)
         text = reader.decompress(content, _LARGEST_TEXT_BYTES)

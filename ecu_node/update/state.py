@@ -2,7 +2,8 @@
 
 All of it is one file, ``state.json``, which is replaced whole: after a power cut at any moment the state is that of
 before a change or that of after it. Its first line is the SHA-256 of the rest, so that a bit that the disk has changed
-is noticed. ``decisions.log`` is a log for people: one line of JSON for each decision, only ever added to.
+is noticed. ``decisions.log`` is a log for people: one line of JSON for each decision; a full one is kept as
+``decisions.log.1`` until the next is full.
 """
 
 import errno
@@ -11,7 +12,7 @@ import hashlib
 import os
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -43,8 +44,8 @@ _CAREFUL = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """Root writes into a folder that belongs to the node's user: no link is followed, and no pipe blocks."""
 _LONGEST_WAIT_S = 30.0
 """For another process that holds the lock; one that was stopped never ends. [s]"""
-_ASK_EVERY_S = 0.01
-"""[s]"""
+_LARGEST_LOG_BYTES = 1_000_000
+"""Some thousand decisions: years of them."""
 
 
 class ParameterSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -135,18 +136,14 @@ def read_state(folder: Path) -> VehicleState:
         raise TrustError(Reason.MALFORMED_PARAMETERS, f"{path}: {error}; {_REPLACE}") from None
     except OSError as error:
         raise TrustError(Reason.NO_PARAMETERS, f"{path}: cannot read the state: {error.strerror}") from None
-    if content.startswith(b'{"sha256":"'):
-        raise TrustError(
-            Reason.MALFORMED_PARAMETERS, f"{path}: state of version 1.0, which trusts no TUF root; {_REPLACE}"
-        )
     digest, _, document = content.partition(b"\n")
-    if digest != hashlib.sha256(document).hexdigest().encode():
-        raise TrustError(Reason.MALFORMED_PARAMETERS, f"{path}: damaged, its digest is another one; {_REPLACE}")
     try:
+        if digest != hashlib.sha256(document).hexdigest().encode():
+            raise ValueError("its digest is another one")
         return msgspec.json.decode(document, type=VehicleState)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:  # msgspec's are such
         raise TrustError(
-            Reason.MALFORMED_PARAMETERS, f"{path}: not a state that this version knows: {error}; {_REPLACE}"
+            Reason.MALFORMED_PARAMETERS, f"{path}: damaged, or of another version: {error}; {_REPLACE}"
         ) from None
 
 
@@ -181,16 +178,17 @@ def add_decision(folder: Path, event: str, text: str, now: datetime, *, reason: 
     """Add a line to the log of decisions; raises UserError if it cannot be written."""
     line = {"time": time_text(now), "event": event, "text": text[:1000].encode(errors="backslashreplace").decode()}
     line |= {"reason": reason.name.title().replace("_", "")} if reason is not None else {}
+    path = folder / "decisions.log"
     try:
-        _write(folder / "decisions.log", os.O_CREAT | os.O_APPEND, msgspec.json.encode(line) + b"\n")
+        if os.path.lexists(path) and path.lstat().st_size > _LARGEST_LOG_BYTES:
+            path.replace(folder / "decisions.log.1")
+        _write(path, os.O_CREAT | os.O_APPEND, msgspec.json.encode(line) + b"\n")
     except OSError as error:
-        raise UserError(
-            f"{folder / 'decisions.log'}: cannot be written: {error.strerror}; '{event}' holds all the same"
-        ) from None
+        raise UserError(f"{path}: cannot be written: {error.strerror}; '{event}' holds all the same") from None
 
 
 @contextmanager
-def locked(folder: Path, *, wait: bool = True, on_wait: Callable[[str], None] = lambda _: None) -> Iterator[None]:
+def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
     """Keep other processes from changing a state folder.
 
     Parameters
@@ -199,8 +197,6 @@ def locked(folder: Path, *, wait: bool = True, on_wait: Callable[[str], None] = 
         It must exist.
     wait : bool
         Wait for another process, 30 s at most; else that is an error at once.
-    on_wait : callable
-        Takes one line for the user, once, if the wait takes more than a second.
 
     Raises
     ------
@@ -214,19 +210,15 @@ def locked(folder: Path, *, wait: bool = True, on_wait: Callable[[str], None] = 
         advice = "; name a folder made by 'ecu-node provision'" if is_missing else ""
         raise UserError(f"{folder}: cannot be used as state: {error.strerror}{advice}") from None
     try:
-        start_s, is_told = time.monotonic(), False
+        until_s = time.monotonic() + (_LONGEST_WAIT_S if wait else 0.0)
         while True:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                waited_s = time.monotonic() - start_s
-                if not wait or waited_s >= _LONGEST_WAIT_S:
+                if time.monotonic() >= until_s:
                     raise UserError(f"{folder}: another process changes it now; try again") from None
-                if waited_s >= 1.0 and not is_told:
-                    is_told = True
-                    on_wait(f"{folder}: another process changes it now; waiting for it, {_LONGEST_WAIT_S:g} s at most")
-                time.sleep(_ASK_EVERY_S)
+                time.sleep(0.01)
         yield
     finally:
         os.close(handle)
@@ -250,14 +242,10 @@ def _open(path: Path, flags: int) -> int:
 
 
 def _write(path: Path, flags: int, content: bytes) -> None:
-    handle = _open(path, os.O_WRONLY | flags)
-    try:
-        done = 0
-        while done < len(content):
-            done += os.write(handle, content[done:])
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    with os.fdopen(_open(path, os.O_WRONLY | flags), "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

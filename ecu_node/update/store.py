@@ -139,7 +139,6 @@ class ParameterStore:
         self._no_trial: Reason | None = None
         self._expired_since: datetime | None = None
         self._writing: Future[VehicleState] | None = None
-        self._after_writing: Callable[[VehicleState], None] = lambda _: None
         try:
             self._state = read_state(folder)
         except TrustError as error:
@@ -225,17 +224,14 @@ class ParameterStore:
         if self._state is None or on_trial is None:
             return
         if self._result is not None:
-            result = self._result
-            work = partial(conclude, self._folder, on_trial, passed=result.passed, text=result.text, now=self._now())
-            self._write(work, partial(self._say_result, on_trial, result), now_s)
+            passed, text = self._result
+            self._write(partial(conclude, self._folder, on_trial, passed=passed, text=text, now=self._now()), now_s)
         elif self._trial is not None:
             if corrector.watch.is_whole(now_s):
                 self._result = self._trial.look(now_s)
         elif now_s >= self._retry_due_s:
             try:
-                require_not_expired(on_trial, self._state, self._now())
-                parameters = on_trial.parameters
-                check_fit(parameters, self._database, self._vehicle or self._state.vehicle)
+                parameters = self._usable(self._state, on_trial)
             except UnfitError as error:
                 self._retry_due_s = now_s + _RETRY_EVERY_S
                 if error.reason is not self._no_trial:
@@ -245,13 +241,6 @@ class ParameterStore:
             self._say(f"{on_trial} is on trial")
             self._trial = ParameterTrial(parameters, self._database, corrector.branches)
 
-    def _say_result(self, tried: ParameterSet, result: TrialResult, state: VehicleState) -> None:
-        self._result = None
-        if result.passed and state.in_force != tried:
-            self._say(f"{tried} is not in force, though its trial went well: the end of decisions.log says why")
-        else:
-            self._say(f"{tried} has {'passed' if result.passed else 'failed'} its trial: {result.text}")
-
     def _end_expired(self, state: VehicleState, now_s: float) -> None:
         """Once the set in force is seen to be expired for a minute, it is so for good."""
         found, now = state.in_force, self._now()
@@ -260,13 +249,12 @@ class ParameterStore:
             return
         self._expired_since = self._expired_since or now
         if now - self._expired_since >= _SURELY_EXPIRED:
-            self._write(partial(end_expired, self._folder, found, now), lambda _: None, now_s)
+            self._write(partial(end_expired, self._folder, found, now), now_s)
 
-    def _write(self, work: Callable[[], VehicleState], after: Callable[[VehicleState], None], now_s: float) -> None:
+    def _write(self, work: Callable[[], VehicleState], now_s: float) -> None:
         """Write a decision in the background, unless one is being written or could not be a moment ago."""
         if self._writing is not None or now_s < self._retry_due_s:
             return
-        self._after_writing = after
         if self._background is not None:
             self._writing = self._background.submit(work)
         else:
@@ -292,7 +280,12 @@ class ParameterStore:
             )
             return
         self._due_s = float("-inf")
-        self._after_writing(self._state)
+        if self._result is not None and self._state.on_trial != self._tried:
+            tried, result, self._result = self._tried, self._result, None
+            if result.passed and self._state.in_force != tried:
+                self._say(f"{tried} is not in force, though its trial went well: the end of decisions.log says why")
+            else:
+                self._say(f"{tried} has {'passed' if result.passed else 'failed'} its trial: {result.text}")
 
 
 def _why_nothing(state: VehicleState) -> TrustError:

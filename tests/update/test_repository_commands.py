@@ -79,17 +79,14 @@ def test_rotation_keeps_the_threshold(repo: Repo) -> None:
     assert "1 of 1 (was 2)" in repo.done("rotate", repo.path, "targets", *public[:2], "--threshold", 1)
 
 
-def test_files_that_no_vehicle_would_take_are_not_added(repo: Repo, parameters: VehicleParameters) -> None:
-    battery = replace(parameters.branches["battery"], drift=0.9)
-    wild = replace(parameters, branches={**parameters.branches, "battery": battery})
-    write_parameters(wild, repo.folder / "wild.json")
-    command = ("add", repo.path, repo.folder / "wild.json", "--layout", LAYOUT)
-    failed(repo, "wild.json: no vehicle will take it: branch battery: drift +0.9 is beyond", *command)
-
-
-def test_bundle_of_expired_metadata_is_refused(repo: Repo) -> None:
-    repo.forge("timestamp", expired, "timestamp")
-    failed(repo, "when its metadata expired; publish first", "bundle", repo.path, "v1", "--out", repo.folder / "b")
+def test_revoked_file_that_is_added_again_is_no_longer_revoked_and_add_says_so(repo: Repo, state: Path) -> None:
+    repo.done("revoke", repo.path, "v1")
+    repo.publish()
+    repo.updated(state)
+    (path,) = (repo.path / "targets").glob("*.v1.json")
+    assert "; revoked before, and no longer: the files of v1; to be" in repo.done("add", repo.path, path)
+    repo.publish()
+    assert repo.updated(state).startswith("on trial: ")
 
 
 def test_publication_that_was_cut_goes_on(
@@ -106,13 +103,6 @@ def test_publication_that_was_cut_goes_on(
     assert repo.updated(new).startswith("on trial: parameter set 301")
 
 
-def test_publishing_nothing_renews_the_timestamp(repo: Repo, state: Path) -> None:
-    repo.updated(state)
-    repo.publish("snapshot", "timestamp")
-    repo.updated(state)
-    assert "timestamp 2, snapshot 2" in repo.node("inspect", "--state", state)[1]
-
-
 def test_key_by_uri_signs_as_its_file_does(repo: Repo, new: Path, other: VehicleParameters) -> None:
     """The same way leads to security modules and cloud services."""
     repo.add(other)
@@ -126,20 +116,20 @@ def test_key_by_uri_signs_as_its_file_does(repo: Repo, new: Path, other: Vehicle
     assert repo.updated(new).startswith("on trial: parameter set 301")
 
 
-def test_key_that_cannot_be_had_is_one_line(repo: Repo, monkeypatch: pytest.MonkeyPatch) -> None:
-    public = repo.folder / "keys" / "t1.pub"
+def test_key_that_cannot_be_had_is_one_line(repo: Repo) -> None:
+    public, none = repo.folder / "keys" / "t1.pub", repo.folder / "none"
     (repo.folder / "empty").touch()
+    repo.key("t1").chmod(0o644)
     for key, words in (
-        (repo.folder / "none", "cannot read the private key"),
+        (none, "cannot read the private key"),
         (repo.folder / "empty", "cannot be used as a private key"),
         (public, "cannot be used as a private key"),
-        (f"{public}=file2:{repo.folder / 'none'}", "the key cannot be used"),
+        (f"{public}=file2:{none}", "the key cannot be used"),
         (f"{public}=pigeon:1", "the key cannot be used"),
-        (f"{repo.folder / 'none'}=file2:x", "cannot read the public key"),
+        (f"{none}=file2:x", "cannot read the public key"),
+        (repo.key("t1"), "others than its owner can read"),
     ):
         failed(repo, words, "publish", repo.path, "--key", key)
-    repo.key("t1").chmod(0o644)
-    failed(repo, "others than its owner can read", "publish", repo.path, *keys(repo, "t1"))
 
 
 def test_encrypted_key_signs_with_its_passphrase_alone(
@@ -155,22 +145,18 @@ def test_encrypted_key_signs_with_its_passphrase_alone(
     assert subprocess.run(read, capture_output=True, check=True).stdout == (tmp_path / "dora.pub").read_bytes()
     failed(repo, "belongs to no role here", "publish", repo.path, "--key", private)
     monkeypatch.setenv(PASSPHRASE_VARIABLE, "another passphrase")
-    failed(repo, "is not its passphrase", "publish", repo.path, "--key", private)
+    failed(repo, "it is encrypted; give its passphrase in", "publish", repo.path, "--key", private)
     monkeypatch.delenv(PASSPHRASE_VARIABLE)
     failed(repo, "give its passphrase in", "publish", repo.path, "--key", private)
     failed(repo, "give either a passphrase", "key", "e", "--out", tmp_path, code=2)
 
 
-def test_key_is_never_replaced(repo: Repo) -> None:
-    before = repo.key("t1").read_bytes()
-    failed(repo, "there is a key already", "key", "t1", "--no-passphrase", "--out", repo.folder / "keys")
-    for name in ("a/b", ""):
-        failed(repo, "a name for a file is expected", "key", name, "--no-passphrase", "--out", repo.folder, code=2)
-    assert repo.key("t1").read_bytes() == before
-    (repo.folder / "keys" / "anna.pub").write_text("the public key of somebody else")
-    failed(repo, "anna.pub: there is a key already", "key", "anna", "--no-passphrase", "--out", repo.folder / "keys")
-    assert (repo.folder / "keys" / "anna.pub").read_text() == "the public key of somebody else"
-    assert not repo.key("anna").exists()
+@pytest.mark.parametrize("kind", ["key", "pub"])
+def test_key_is_never_replaced(kind: str, repo: Repo) -> None:
+    path = repo.folder / f"anna.{kind}"
+    path.write_text("of somebody else")
+    failed(repo, f"{path}: there is a key already", "key", "anna", "--no-passphrase", "--out", repo.folder)
+    assert [item.read_text() for item in repo.folder.glob("anna.*")] == ["of somebody else"]
 
 
 @pytest.mark.parametrize("free_bytes", [0, 115])
@@ -185,25 +171,26 @@ def test_mistakes_are_one_line_and_change_nothing(repo: Repo, other: VehiclePara
         return {path: path.read_bytes() for path in repo.path.rglob("*") if path.is_file()}
 
     repo.add(other)
-    before, public = files(), repo.folder / "keys" / "t1.pub"
+    before, public, good = files(), repo.folder / "keys" / "t1.pub", repo.folder / "v1.json"
     (tmp_path / "bad.json").write_text("{}")
+    battery = replace(other.branches["battery"], drift=0.9)
+    write_parameters(replace(other, branches={**other.branches, "battery": battery}), tmp_path / "wild.json")
     roles = [word for role in ("--root", "--targets", "--snapshot", "--timestamp") for word in (role, public)]
-    failed(repo, "no repository; make one", "add", tmp_path, repo.folder / "v1.json")
+    failed(repo, "no repository; make one", "add", tmp_path, good)
     failed(repo, "exists and is not empty", "init", repo.path, *roles)
     failed(repo, "3 signatures of 1 keys", "init", tmp_path / "x", *roles, "--root-threshold", 3, code=2)
     failed(repo, "no public key", "rotate", repo.path, "root", "--public", tmp_path / "bad.json")
-    failed(repo, "bad.json: ", "add", repo.path, repo.folder / "v1.json", tmp_path / "bad.json")
-    failed(repo, "a second file for vehicle v1", "add", repo.path, repo.folder / "v1.json", repo.folder / "v1.json")
+    failed(repo, "bad.json: ", "add", repo.path, good, tmp_path / "bad.json")
+    failed(repo, "no vehicle will take it: branch", "add", repo.path, tmp_path / "wild.json", "--layout", LAYOUT)
+    failed(repo, "a second file for vehicle v1", "add", repo.path, good, good)
     failed(repo, "no parameters of vehicle 'v9' here", "revoke", repo.path, "v1", "v9")
+    failed(repo, "no parameters of vehicle", "revoke", repo.path, b"\xff")
     failed(repo, "vehicle 'v1' never had a file 00000000...", "revoke", repo.path, "v1", "--sha256", 64 * "0")
     failed(repo, "64 digits", "revoke", repo.path, "v1", "--sha256", "12", code=2)
     failed(repo, "no parameters of vehicle 'v9' are published here", "bundle", repo.path, "v9", "--out", tmp_path / "b")
+    for name in ("a/b", ""):
+        failed(repo, "a name for a file is expected", "key", name, "--no-passphrase", "--out", tmp_path, code=2)
     assert files() == before
-
-
-def test_damaged_repository_is_one_line(repo: Repo) -> None:
-    repo.live("snapshot").write_text("{}")
-    failed(repo, "cannot be read as metadata", "publish", repo.path, *keys(repo, *ALL))
 
 
 def test_full_disk_leaves_what_vehicles_see(repo: Repo, new: Path, other: VehicleParameters) -> None:
@@ -225,20 +212,21 @@ def test_root_that_expires_before_the_timestamp_is_told(repo: Repo) -> None:
     assert f"valid until {day}; 1 roles staged: root has 0 of 2 signatures" in repo.done("status", repo.path)
 
 
-def test_files_of_a_repository_that_are_no_text_are_one_line(repo: Repo) -> None:
+def test_damaged_or_expired_repository_is_one_line(repo: Repo) -> None:
+    bundle, publish = ("bundle", repo.path, "v1", "--out", repo.folder / "b"), ("publish", repo.path, *keys(repo, *ALL))
+    repo.forge("timestamp", expired, "timestamp")
+    failed(repo, "when its metadata expired; publish first", *bundle)
+    repo.publish()
     (repo.metadata / "copy of 1.root.json").write_text("")
     assert "valid until" in repo.done("status", repo.path)
     next((repo.path / "targets").glob("*.v1.json")).write_bytes(b"\xff")
-    failed(repo, "'v1' are damaged; take a copy", "bundle", repo.path, "v1", "--out", repo.folder / "b")
+    failed(repo, "'v1' are damaged; take a copy", *bundle)
     repo.live(repo.bin).write_bytes(b"\xff")
-    failed(repo, "cannot be read as metadata", "publish", repo.path, *keys(repo, "snapshot", "timestamp"))
+    failed(repo, "cannot be read as metadata", *publish)
+    repo.live("targets").write_bytes(repo.live("timestamp").read_bytes())
+    failed(repo, "cannot be read as metadata: it is of another role; take a copy", "status", repo.path)
     repo.live("targets").write_bytes(b"\xff")
     failed(repo, "cannot be read as metadata", "status", repo.path)
-
-
-@pytest.mark.parametrize("command", [("revoke",), ("bundle", "--out", "b")])
-def test_vehicle_whose_name_is_no_text_is_one_line(command: tuple[str, ...], repo: Repo) -> None:
-    failed(repo, "no parameters of vehicle", command[0], repo.path, b"\xff", *command[1:])
 
 
 def test_commands_that_write_wait_for_each_other(repo: Repo) -> None:

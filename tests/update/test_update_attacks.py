@@ -1,8 +1,10 @@
 """The attacks that TUF lists, each through the command line: one line, and nothing has changed."""
 
 import lzma
+import os
 import shutil
 from collections.abc import Callable
+from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -12,7 +14,7 @@ from urllib.parse import unquote
 import msgspec
 import pytest
 from msgspec.structs import replace
-from tuf.api.metadata import Key, Root, Snapshot, SuccinctRoles, TargetFile, Targets, Timestamp
+from tuf.api.metadata import Key, Snapshot, SuccinctRoles, TargetFile, Targets
 
 from ecu_node.parameters import VehicleParameters, encode_parameters
 from ecu_node.update.signers import public_key_of
@@ -36,12 +38,6 @@ def evil_target(repo: Repo) -> Callable[[Targets], None]:
     return change
 
 
-def test_honest_update_is_taken(repo: Repo, new: Path, state: Path, other: VehicleParameters) -> None:
-    assert repo.updated(new).startswith("on trial: parameter set 300 (")
-    repo.offer(other)
-    assert repo.updated(state, repo.bundle()).startswith("on trial: parameter set 301 (")
-
-
 def test_arbitrary_file_is_refused(repo: Repo, new: Path) -> None:
     (target,) = (repo.path / "targets").glob("*.v1.json")
     content = target.read_bytes()
@@ -61,11 +57,12 @@ def test_metadata_of_foreign_keys_is_refused(role: str, repo: Repo, state: Path,
     repo.refused(state, "was signed by 0/")
 
 
-def test_rollback_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
-    old, new_bundle = repo.bundle().read_bytes(), repo.folder / "new.json.xz"
-    repo.offer(other)
-    new_bundle.write_bytes(repo.bundle().read_bytes())
-    repo.updated(state, new_bundle)
+def test_rollback_is_refused(repo: Repo, state: Path) -> None:
+    """Else a revocation could be held back by an old bundle."""
+    old = repo.bundle().read_bytes()
+    repo.done("revoke", repo.path, "v1")
+    repo.publish()
+    assert "nothing is in force now" in repo.updated(state, repo.bundle())
     repo.bundle().write_bytes(old)
     repo.refused(state, "older than what was accepted before", repo.folder / "bundles" / "v1.json.xz")
 
@@ -94,40 +91,21 @@ def test_freeze_is_noticed_when_metadata_expires(role: str, repo: Repo, new: Pat
 
 def test_freeze_with_the_clock_set_back_is_noticed(repo: Repo, state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The time of an earlier update is kept, and no clock before it is believed."""
-    found = read_state(state)
-    later = msgspec.structs.replace(
-        found, latest=msgspec.json.decode(b'"2099-01-01T00:00:00Z"', type=type(found.latest))
-    )
+    later = replace(read_state(state), latest=datetime(2099, 1, 1, tzinfo=UTC))
     monkeypatch.setattr("ecu_node.update.client.read_state", lambda _: later)
     repo.refused(state, "expired at")
 
 
-def test_fast_forward_is_bounded_by_the_keys_of_a_role(repo: Repo, state: Path) -> None:
-    """Whoever has no key cannot raise a version; see test_update_recovery for who has."""
-
-    def far(timestamp: Timestamp) -> None:
-        timestamp.version = 2**31
-
-    repo.forge("timestamp", far, "mallory")
-    repo.refused(state, "timestamp was signed by 0/1 keys")
-
-
 def test_endless_data_is_refused(repo: Repo, new: Path) -> None:
-    with (repo.metadata / "timestamp.json").open("ab") as file:
-        file.truncate(1 << 30)
+    os.truncate(repo.metadata / "timestamp.json", 1 << 30)
     repo.refused(new, "larger than")
-    with (repo.metadata / "timestamp.json").open("ab") as file:
-        file.truncate(100_000)
+    os.truncate(repo.metadata / "timestamp.json", 100_000)
     repo.refused(new, "exceeding the maximum allowed length")
-
-
-def test_decompression_bomb_is_refused(repo: Repo, new: Path) -> None:
     bomb = repo.folder / "bomb.json.xz"
     bomb.write_bytes(lzma.compress(b'{"a": "' + bytes(50_000_000) + b'"}', check=lzma.CHECK_SHA256))
     assert bomb.stat().st_size < 20_000
     repo.refused(new, "not a whole bundle", bomb)
-    with bomb.open("ab") as file:
-        file.truncate(1 << 30)
+    os.truncate(bomb, 1 << 30)
     repo.refused(new, "larger than", bomb)
 
 
@@ -146,9 +124,11 @@ def test_mix_and_match_is_refused(repo: Repo, new: Path, other: VehicleParameter
     repo.refused(new, "Observed ")
 
 
-def test_bundle_of_another_vehicle_is_refused(repo: Repo, new: Path) -> None:
+def test_what_has_no_parameters_of_this_vehicle_is_refused(repo: Repo, new: Path, tmp_path: Path) -> None:
     words = "is not in the bundle, which has v2.json; is it complete, and for vehicle 'v1', which this is?"
     repo.refused(new, words, repo.bundle("v2"))
+    repo.provision(tmp_path / "v9", "v9")
+    repo.refused(tmp_path / "v9", "part of snapshot")
 
 
 def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, new: Path) -> None:
@@ -162,55 +142,14 @@ def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, n
     repo.refused(new, "the parameters are for 'v2', this is 'v1'")
 
 
-def test_missing_vehicle_is_refused(repo: Repo, tmp_path: Path) -> None:
-    repo.provision(tmp_path / "v9", "v9")
-    repo.refused(tmp_path / "v9", "part of snapshot")
-
-
-@pytest.mark.parametrize("key", ["timestamp", "snapshot", "t1", "r1"])
-def test_one_stolen_key_brings_no_parameters(key: str, repo: Repo, new: Path) -> None:
-    """Whoever has one key and the repository signs all that the key can sign."""
-    repo.forge(repo.bin, evil_target(repo), key, "mallory")
-    repo.relist(repo.bin, key, "mallory")
+@pytest.mark.parametrize(
+    "keys", [("timestamp", "mallory"), ("snapshot", "mallory"), ("t1", "mallory"), ("r1",), ("snapshot", "timestamp")]
+)
+def test_one_stolen_key_brings_no_parameters(keys: tuple[str, ...], repo: Repo, new: Path) -> None:
+    """Nor do all online keys: their thief signs all that they can sign."""
+    repo.forge(repo.bin, evil_target(repo), *keys)
+    repo.relist(repo.bin, *keys)
     repo.refused(new, "was signed by ")
-
-
-def test_stolen_online_keys_bring_no_parameters(repo: Repo, new: Path) -> None:
-    repo.forge(repo.bin, evil_target(repo), "snapshot", "timestamp")
-    repo.relist(repo.bin, "snapshot", "timestamp")
-    repo.refused(new, "was signed by 0/2 keys")
-
-
-def test_stolen_keys_of_targets_bring_nothing_beyond_the_limits(
-    repo: Repo, state: Path, parameters: VehicleParameters
-) -> None:
-    """Even with all keys but the root's there are limits, the largest step and the trial."""
-    battery = msgspec.structs.replace(parameters.branches["battery"], drift=0.5)
-    wild = msgspec.structs.replace(parameters, branches={**parameters.branches, "battery": battery})
-    repo.offer(wild)
-    code, _, err = repo.update(state)
-    assert code == 1
-    assert "drift" in err
-    assert read_state(state).on_trial is None
-
-
-def test_root_that_too_few_have_signed_is_refused(repo: Repo, new: Path) -> None:
-    def take_over(root: Root) -> None:
-        key = public_key_of(repo.folder / "keys" / "mallory.pub")
-        for role in list(root.roles):
-            root.add_key(key, role)
-
-    repo.forge("root", take_over, "r1", "mallory")
-    repo.refused(new, "root was signed by 1/2 keys")
-
-
-def test_revocation_cannot_be_held_back_by_an_old_bundle(repo: Repo, state: Path) -> None:
-    old = repo.folder / "old.json.xz"
-    old.write_bytes(repo.bundle().read_bytes())
-    repo.done("revoke", repo.path, "v1")
-    repo.publish()
-    assert "nothing is in force now" in repo.updated(state)
-    repo.refused(state, "older than what was accepted before", old)
 
 
 @pytest.mark.parametrize("name", ["bins/../../..", "../../../secret"])
@@ -290,7 +229,9 @@ def test_web_server_has_files_of_vehicles_with_any_name(
 
 
 def test_web_server_that_is_not_there_is_one_line(repo: Repo, new: Path) -> None:
-    repo.refused(new, "Connection refused; check address and connection", "http://127.0.0.1:1/x")
+    repo.refused(
+        new, "Connection refused; check address and connection, or whether it can be read", "http://127.0.0.1:1/x"
+    )
     repo.refused(new, "only http:// and https:// are known", "ftp://127.0.0.1/x")
 
 

@@ -1,4 +1,4 @@
-"""What a vehicle makes of an honest repository: our own checks, revocation, time, and files of version 1.0."""
+"""What a vehicle makes of an honest repository: our own checks, revocation, time, and damaged files."""
 
 import math
 import os
@@ -19,46 +19,51 @@ from tuf.api.metadata import Metadata, Targets
 
 from ecu_node.core.status import TrustError
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
 from ecu_node.parameters import FileReference, VehicleParameters
 from ecu_node.update.client import update
 from ecu_node.update.signers import public_key_of
 from ecu_node.update.sources import open_source
-from ecu_node.update.state import VehicleState, add_decision, read_state
+from ecu_node.update.state import ParameterSet, add_decision, read_state
 from ecu_node.update.store import conclude, end_expired
+from tests.ecu_node.vehicles import LAYOUT
 from tests.update.damage import a_folder, a_pipe, cut, huge, without, zeros
 from tests.update.repo import Repo, pass_trial
 
 DIGEST = "0" * 64
 
 
-def numbers(state: Path) -> tuple[int | None, int | None]:
-    """Parameter sets in force and on trial."""
+def held_set(state: Path, place: str = "in_force") -> ParameterSet:
+    found = getattr(read_state(state), place)
+    assert isinstance(found, ParameterSet)
+    return found
+
+
+def numbers(state: Path) -> list[int | None]:
+    """Parameter sets in force, on trial and before."""
     found = read_state(state)
-    return tuple(item.parameters.number if item else None for item in (found.in_force, found.on_trial))  # type: ignore[return-value]
+    return [item.parameters.number if item else None for item in (found.in_force, found.on_trial, found.before)]
 
 
 def test_set_is_on_trial_then_in_force_and_the_one_before_is_kept(
     repo: Repo, new: Path, other: VehicleParameters
 ) -> None:
     repo.updated(new)
-    assert numbers(new) == (None, 300)
+    assert numbers(new)[:2] == [None, 300]
     pass_trial(new)
     repo.offer(other)
     repo.updated(new)
-    assert numbers(new) == (300, 301)
+    assert numbers(new)[:2] == [300, 301]
     assert "301 (" in repo.updated(new), "again: nothing new"
     pass_trial(new)
-    before = read_state(new).before
-    assert numbers(new) == (301, None)
-    assert before is not None
-    assert before.parameters.number == 300
+    assert numbers(new) == [301, None, 300]
 
 
 def test_failed_set_is_gone_and_not_tried_again(repo: Repo, state: Path, other: VehicleParameters) -> None:
     repo.offer(other)
     repo.updated(state)
     pass_trial(state, passed=False)
-    assert numbers(state) == (300, None)
+    assert numbers(state)[:2] == [300, None]
     code, _, err = repo.update(state)
     assert code == 1
     assert "has failed its trial here" in err
@@ -71,12 +76,11 @@ def test_end_of_a_trial_that_another_set_has_replaced_changes_nothing(
 ) -> None:
     repo.offer(other)
     repo.updated(state)
-    tried = read_state(state).on_trial
+    tried = held_set(state, "on_trial")
     repo.offer(replace(other, number=302))
     repo.updated(state)
-    assert tried is not None
     conclude(state, tried, passed=True, text="seen", now=datetime.now(UTC))
-    assert numbers(state) == (300, 302)
+    assert numbers(state)[:2] == [300, 302]
 
 
 @pytest.mark.parametrize(
@@ -100,7 +104,7 @@ def test_set_that_does_not_fit_is_refused(
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert words in err
     assert str(repo.path) in err
-    assert numbers(state) == (300, None)
+    assert numbers(state)[:2] == [300, None]
     assert words in (state / "decisions.log").read_text().splitlines()[-1]
 
 
@@ -121,37 +125,36 @@ def test_revoked_set_gives_way_to_the_one_before(repo: Repo, state: Path, other:
     repo.done("revoke", repo.path, "v1")
     repo.publish()
     assert "parameter set 300 (" in repo.updated(state)
-    assert numbers(state) == (300, None)
+    assert numbers(state)[:2] == [300, None]
     assert repo.updated(state).startswith("nothing new: ")
 
 
 def test_revoked_set_in_force_gives_way_and_a_new_one_goes_on_trial(
     repo: Repo, state: Path, other: VehicleParameters
 ) -> None:
-    found = read_state(state).in_force
-    assert found is not None
+    found = held_set(state)
     repo.add(other)
     repo.done("revoke", repo.path, "v1", "--sha256", found.sha256)
     repo.publish()
     text = repo.updated(state)
     assert "nothing is in force now" in text
     assert "on trial: parameter set 301" in text
-    assert numbers(state) == (None, 301)
+    assert numbers(state)[:2] == [None, 301]
 
 
-def test_revocation_holds_although_the_new_set_is_refused(
+def test_revocation_holds_although_the_new_set_is_refused_and_both_are_logged(
     repo: Repo, state: Path, parameters: VehicleParameters
 ) -> None:
-    found = read_state(state).in_force
-    assert found is not None
+    found = held_set(state)
     repo.add(drifting(parameters, 0.5))
     repo.done("revoke", repo.path, "v1", "--sha256", found.sha256)
     repo.publish()
     code, _, err = repo.update(state)
-    assert code == 1
-    assert err.count("\n") == 1
-    assert "nothing is in force now" in err
-    assert numbers(state) == (None, None)
+    assert (code, err.count("\n"), "nothing is in force now" in err) == (1, 1, True)
+    assert numbers(state)[:2] == [None, None]
+    lines = [msgspec.json.decode(line) for line in (state / "decisions.log").read_text().splitlines()[-2:]]
+    events = [(line["event"], line.get("reason")) for line in lines]
+    assert events == [("revoked", None), ("refused", "ImplausibleParameters")]
 
 
 def test_many_revocations_push_none_out(repo: Repo, state: Path) -> None:
@@ -164,33 +167,16 @@ def test_many_revocations_push_none_out(repo: Repo, state: Path) -> None:
     assert "nothing is in force now" in repo.updated(state)
 
 
-def test_former_set_that_is_published_again_ends_the_trial_of_its_successor(
+def test_same_file_with_a_later_expiry_needs_no_trial_and_ends_that_of_another(
     repo: Repo, state: Path, parameters: VehicleParameters, other: VehicleParameters
 ) -> None:
+    assert repo.updated(state).startswith("nothing new: parameter set 300 (")
     repo.offer(other)
     repo.updated(state)
-    repo.offer(parameters)
-    repo.updated(state)
-    assert numbers(state)[0] == 300
-    assert numbers(state)[1] != 301
-
-
-def test_same_file_with_a_later_expiry_needs_no_trial(repo: Repo, state: Path, parameters: VehicleParameters) -> None:
     repo.offer(parameters, "--days", 800)
     assert repo.updated(state).startswith("extended: parameter set 300")
-    assert numbers(state) == (300, None)
-    found = read_state(state).in_force
-    assert found is not None
-    assert found.expires > datetime.now(UTC) + timedelta(days=799)
-
-
-def test_set_on_trial_that_has_expired_is_refused(
-    repo: Repo, new: Path, database: VehicleDatabase, other: VehicleParameters
-) -> None:
-    repo.offer(other, "--days", 1)
-    repo.updated(new)
-    with pytest.raises(TrustError, match="expired at"):
-        update(new, str(repo.path), database, datetime.now(UTC) + timedelta(days=2))
+    assert numbers(state)[:2] == [300, None]
+    assert held_set(state).expires > datetime.now(UTC) + timedelta(days=799)
 
 
 def test_dry_run_says_the_same_and_writes_nothing(repo: Repo, new: Path) -> None:
@@ -207,17 +193,15 @@ def test_set_expires_for_good_and_a_clock_behind_is_not_believed(
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
     update(state, str(repo.path), database, now)
-    tried = read_state(state).on_trial
-    assert tried is not None
+    tried = held_set(state, "on_trial")
     conclude(state, tried, passed=True, text="seen", now=now + timedelta(days=2))
-    assert numbers(state) == (300, None), "it expired before its trial ended"
+    assert numbers(state)[:2] == [300, None], "it expired before its trial ended"
     assert read_state(state).latest < now + timedelta(days=1), "a clock that jumped ahead is not kept"
     with pytest.raises(TrustError, match="expired at"):
         update(state, str(repo.path), database, now + timedelta(days=40))  # the timestamp has expired by then
-    found = read_state(state).in_force
-    assert found is not None
+    found = held_set(state)
     end_expired(state, found, found.expires)
-    assert numbers(state) == (None, None)
+    assert numbers(state)[:2] == [None, None]
     assert read_state(state).ended == "expired"
 
 
@@ -235,59 +219,31 @@ def test_time_of_an_update_is_kept(
 def test_canonical_json_is_that_of_securesystemslib(offered: Repo) -> None:
     """What is signed is written quickly here; keys, numbers, escapes and odd letters come out the same."""
     documents = [Metadata.from_file(str(path)).signed.to_dict() for path in offered.metadata.glob("*.json")]
-    odd = {
-        "b": [],
-        "a": {},
-        "é": "\x7f€\U0001f697/<&'",
-        "": [True, False, 0, -1, 2**63],
-        "A": [[{"z": "", "y": 1}]],
-    }
+    odd = {"b": [], "a": {}, "é": "\x7f€\U0001f697/<&'", "": [True, False, 0, -1, 2**63], "A": [[{"z": "", "y": 1}]]}
     for document in (*documents, odd, {**odd, "n": None}, {**odd, "c": 'a "b"\\\n\x00'}):
         assert tuf_json.encode_canonical(document) == encode_canonical(document)
     with pytest.raises(FormatError):
         tuf_json.encode_canonical({"length": math.nan})
 
 
-OLD = {
-    "signed.json": b'{"payload":"e30=","payloadType":"x","signatures":[]}',
-    "keys-1.json": b'{"keys":{},"schema_version":1,"threshold":1,"version":1}\n',
-}
+def test_vehicle_is_provisioned_once_with_a_root_that_is_signed(repo: Repo, state: Path, tmp_path: Path) -> None:
+    place, root = tmp_path / "fresh", tmp_path / "root.json"
 
+    def refused(words: str, path: Path = root, folder: Path = place) -> None:
+        code, out, err = repo.node("provision", "--vehicle", "v1", "--root", path, "--state", folder)
+        assert (code, out, err.count("\n"), words in err) == (1, "", 1, True), err
 
-@pytest.mark.parametrize("name", OLD)
-def test_files_of_version_1_0_are_refused_with_the_way_on(name: str, repo: Repo, state: Path) -> None:
-    path = repo.folder / name
-    path.write_bytes(OLD[name])
-    repo.refused(state, "signed by version 1.0; publish its parameters with 'calibrator repository add'", path)
-    code, _, err = repo.node("provision", "--vehicle", "v", "--root", path, "--state", repo.folder / "s")
-    assert code == 1
-    assert "1.root.json of 'calibrator repository init' is expected" in err
-    assert not (repo.folder / "s").exists()
-
-
-def test_state_of_version_1_0_is_refused_with_the_way_on(repo: Repo, state: Path) -> None:
-    (state / "state.json").write_bytes(b'{"sha256":"00","state":{}}')
-    code, _, err = repo.update(state)
-    assert code == 1
-    assert "state of version 1.0, which trusts no TUF root; remove the folder" in err
-
-
-def test_vehicle_is_provisioned_once_with_a_root_that_is_signed(repo: Repo, tmp_path: Path) -> None:
-    place = tmp_path / "fresh"
+    refused("cannot read the root: No such file")
     for content in (b"", b"{}", b"\xff", repo.live("targets").read_bytes()):
-        (tmp_path / "root.json").write_bytes(content)
-        code, out, err = repo.node("provision", "--vehicle", "v", "--root", tmp_path / "root.json", "--state", place)
-        assert (code, out, err.count("\n")) == (1, "", 1)
-        assert not place.exists()
+        root.write_bytes(content)
+        refused("1.root.json of 'calibrator repository init' is expected")
+    a_pipe(root)
+    refused("cannot read the root: it is a pipe")
+    refused("there is a state already; a new root comes with 'ecu-node update'", repo.live("root"), state)
+    refused("cannot be made: Not a directory; choose another --state", repo.live("root"), state / "state.json" / "x")
     repo.forge("root", lambda _: None, "r1", "mallory", bump=False)
-    code, _, err = repo.node("provision", "--vehicle", "v", "--root", repo.live("root"), "--state", place)
-    assert "is expected" in err
+    refused("is expected", repo.live("root"))
     assert not place.exists()
-    code, _, err = repo.node("provision", "--vehicle", "v", "--root", tmp_path / "none", "--state", place)
-    assert (code, "cannot read the root: No such file" in err) == (1, True)
-    os.mkfifo(tmp_path / "pipe")
-    code, _, err = repo.node("provision", "--vehicle", "v", "--root", tmp_path / "pipe", "--state", place)
-    assert (code, "cannot read the root: it is a pipe" in err) == (1, True)
 
 
 def test_expiry_without_time_zone_is_refused(repo: Repo, new: Path) -> None:
@@ -299,26 +255,11 @@ def test_expiry_without_time_zone_is_refused(repo: Repo, new: Path) -> None:
     repo.refused(new, "custom fields of v1.json: Expected `datetime` with a timezone component")
 
 
-def test_what_is_refused_with_a_revocation_is_logged_with_its_own_reason(
-    repo: Repo, state: Path, other: VehicleParameters
-) -> None:
-    repo.done("revoke", repo.path, "v1")
-    repo.offer(replace(other, layout=replace(other.layout, sha256="0" * 64)))
-    assert repo.update(state)[0] == 1
-    lines = [msgspec.json.decode(line) for line in (state / "decisions.log").read_text().splitlines()[-2:]]
-    assert [(line["event"], line.get("reason")) for line in lines] == [("revoked", None), ("refused", "WrongLayout")]
-
-
-def test_second_provisioning_is_refused(offered: Repo, state: Path) -> None:
-    code, _, err = offered.node(
-        "provision", "--vehicle", "v1", "--root", offered.metadata / "1.root.json", "--state", state
-    )
-    assert code == 1
-    assert "there is a state already; a new root comes with 'ecu-node update'" in err
-
-
 @pytest.mark.parametrize("damage", [without, cut, zeros, a_folder, a_pipe, huge])
 def test_damaged_state_is_one_line(damage: Callable[[Path], None], repo: Repo, state: Path) -> None:
+    bundle = repo.bundle()
+    damage(bundle)
+    repo.refused(state, str(bundle), bundle)
     damage(state / "state.json")
     for code, out, err in (repo.update(state), repo.node("inspect", "--state", state)):
         assert (code, out, err.count("\n")) == (1, "", 1)
@@ -335,24 +276,12 @@ def test_no_bit_of_the_state_can_be_another_one(state: Path) -> None:
             read_state(state)
 
 
-@pytest.mark.parametrize("damage", [without, cut, zeros, a_folder, a_pipe, huge])
-def test_damaged_bundle_is_one_line(damage: Callable[[Path], None], repo: Repo, state: Path) -> None:
-    bundle = repo.bundle()
-    damage(bundle)
-    code, out, err = repo.update(state, bundle)
-    assert (code, out, err.count("\n")) == (1, "", 1)
-    assert str(bundle) in err
-
-
 def test_every_byte_of_a_bundle_counts(repo: Repo, new: Path) -> None:
     content = repo.bundle().read_bytes()
-    changed = [
-        content[:place] + bytes([content[place] ^ 1 << place % 8]) + content[place + 1 :]
-        for place in range(len(content))
-    ]
-    cuts = [content[:length] for length in range(len(content))] + [content + b"\0", content + content]
+    lengths = range(len(content))
+    changed = [content[:k] + bytes([content[k] ^ 1 << k % 8]) + content[k + 1 :] for k in lengths]
     path = repo.folder / "changed"
-    for item in (*changed, *cuts):
+    for item in (*changed, *(content[:length] for length in lengths), content + b"\0", content + content):
         path.write_bytes(item)
         with pytest.raises(TrustError, match="not a whole bundle") as caught:
             open_source(str(path))
@@ -375,18 +304,24 @@ def test_root_leaves_files_to_the_owner_of_the_folder_and_follows_no_link(repo: 
     assert {(new / name).stat().st_uid for name in ("state.json", "decisions.log")} == {65534}
     (new / "decisions.log").unlink()
     (new / "decisions.log").symlink_to(repo.folder / "victim")
-    with pytest.raises(Exception, match="cannot be written"):
+    with pytest.raises(UserError, match="cannot be written"):
         add_decision(new, "x", "y", datetime.now(UTC))
     assert not (repo.folder / "victim").exists()
 
 
+def test_full_log_of_decisions_is_kept_until_the_next_is_full(state: Path) -> None:
+    path = state / "decisions.log"
+    for content in (b"first", b"second"):
+        path.write_bytes(content.ljust(1_000_001))
+        add_decision(state, "x", "y", datetime.now(UTC))
+        assert path.read_bytes().count(b"\n") == 1
+        assert (state / "decisions.log.1").read_bytes().startswith(content)
+
+
 def test_two_commands_at_once_are_both_done(repo: Repo, new: Path) -> None:
-    layout = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
-    words = ["update", str(repo.path), "--state", str(new), "--layout", str(layout)]
-    command = [sys.executable, "-m", "ecu_node", *words]
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) for _ in range(2)]
-    outputs = sorted(process.communicate(timeout=120)[0].decode()[:8] for process in both)
-    assert outputs == ["nothing ", "on trial"]
+    command = [sys.executable, "-m", "ecu_node", "update", repo.path, "--state", new, "--layout", LAYOUT]
+    both = [subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE) for _ in range(2)]
+    assert sorted(process.communicate(timeout=120)[0][:8] for process in both) == [b"nothing ", b"on trial"]
 
 
 def test_inspect_and_report_say_what_the_vehicle_holds(repo: Repo, state: Path, other: VehicleParameters) -> None:
@@ -407,9 +342,7 @@ def test_inspect_and_report_say_what_the_vehicle_holds(repo: Repo, state: Path, 
 def test_inspect_fails_where_the_set_in_force_has_expired(
     state: Path, repo: Repo, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = read_state(state)
-    assert found.in_force is not None
-    late: VehicleState = replace(found, latest=found.in_force.expires)
+    late = replace(read_state(state), latest=held_set(state).expires)
     monkeypatch.setattr("ecu_node.update.state.read_state", lambda _: late)
     code, _, err = repo.node("inspect", "--state", state)
     assert code == 1

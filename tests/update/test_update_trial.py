@@ -63,6 +63,9 @@ class Drive:
             self.corrector.look(now_s + 0.01)
             self.store.look(self.corrector, now_s + 0.01)
 
+    def has_said(self, words: str) -> bool:
+        return any(words in line for line in self.said)
+
     @property
     def told(self) -> tuple[State, Reason]:
         return self.corrector.state()
@@ -73,6 +76,17 @@ def right(database: VehicleDatabase, drift: float = DRIFT, offset_a: float = OFF
     return replace(found, junction_residual=JunctionResidual(measured_a=4.0, corrected_a=0.5, correction_a=4.0))
 
 
+PASSED, FAILED = "has passed its trial", "has failed its trial"
+
+
+def tried(vehicle: Path, parameters: VehicleParameters, database: VehicleDatabase, **conditions: float) -> Drive:
+    """A drive that is longer than a trial takes."""
+    put_on_trial(vehicle, parameters)
+    drive = Drive(vehicle, database)
+    drive.go_on(330.0, **conditions)  # type: ignore[arg-type]
+    return drive
+
+
 def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, database: VehicleDatabase) -> None:
     put_on_trial(vehicle, right(database))
     drive = Drive(vehicle, database)
@@ -81,7 +95,7 @@ def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, dat
     drive.go_on(30.0)
     assert drive.told == (State.CORRECTING, Reason.NONE)
     assert read_state(vehicle).in_force is not None
-    assert any("has passed its trial" in line for line in drive.said)
+    assert drive.has_said(PASSED)
     drive.go_on(10.0)
     assert drive.corrector.watch.sums is not None
     assert abs(drive.corrector.watch.sums.corrected_a) < 0.1
@@ -93,73 +107,54 @@ def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, dat
 def test_wrong_set_never_comes_in_force(
     vehicle: Path, database: VehicleDatabase, drift: float, offset_a: float
 ) -> None:
-    put_on_trial(vehicle, right(database, drift, offset_a))
-    drive = Drive(vehicle, database)
-    drive.go_on(330.0)
+    drive = tried(vehicle, right(database, drift, offset_a), database)
     assert drive.told == (State.PASSING_THROUGH, Reason.NO_PARAMETERS)
     assert (read_state(vehicle).in_force, read_state(vehicle).on_trial) == (None, None)
-    assert any("has failed its trial" in line for line in drive.said)
+    assert drive.has_said(FAILED)
 
 
 def test_set_before_stays_in_force_during_a_trial(vehicle: Path, database: VehicleDatabase) -> None:
-    put_on_trial(vehicle, right(database))
-    drive = Drive(vehicle, database)
-    drive.go_on(330.0)
+    drive = tried(vehicle, right(database), database)
     put_on_trial(vehicle, right(database, -DRIFT, 0.0))
     drive.go_on(100.0)
     assert drive.told == (State.CORRECTING, Reason.NONE)
     assert drive.corrector.branches[0].fault.drift == DRIFT
     drive.go_on(250.0)
     assert drive.told == (State.CORRECTING, Reason.NONE)
-    assert any("has failed its trial" in line for line in drive.said)
+    assert drive.has_said(FAILED)
 
 
 def test_set_that_promises_less_passes_with_less(vehicle: Path, database: VehicleDatabase) -> None:
     """A load that no sensor sees is half of the change: the share is about 0."""
-    half = replace(
-        right(database), junction_residual=JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0)
-    )
-    results = []
-    for parameters in (right(database), half):
-        put_on_trial(vehicle, parameters)
-        drive = Drive(vehicle, database)
-        drive.go_on(330.0, load_a=-3.0)
-        results.append(any("has passed" in line for line in drive.said))
-    assert results == [False, True]
+    residual = JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0)
+    promising_half = replace(right(database), junction_residual=residual)
+    assert not tried(vehicle, right(database), database, load_a=-3.0).has_said(PASSED)
+    assert tried(vehicle, promising_half, database, load_a=-3.0).has_said(PASSED)
 
 
 def test_set_is_tried_about_the_expected_sum(vehicle: Path, database: VehicleDatabase) -> None:
     """A load that no sensor sees hides no error, and is no error itself."""
     expected = replace(right(database).junction_residual, expected_a=3.0, measured_mean_a=7.0, corrected_mean_a=3.0)
-    takes_load_for_offset = right(database, 0.0, 3.0)
-    results = []
-    for parameters in (right(database), takes_load_for_offset):
-        put_on_trial(vehicle, replace(parameters, junction_residual=expected))
-        drive = Drive(vehicle, database)
-        faulty = parameters is not takes_load_for_offset
-        drive.go_on(360.0, load_a=3.0, drift=DRIFT if faulty else 0.0, offset_a=OFFSET_A if faulty else 0.0)
-        results.append(any("has passed" in line for line in drive.said))
-        if faulty:
-            assert drive.told == (State.CORRECTING, Reason.NONE), "the watch does not take the load for an error either"
-    assert results == [True, False]
+    found = replace(right(database), junction_residual=expected)
+    drive = tried(vehicle, found, database, load_a=3.0)
+    drive.go_on(30.0, load_a=3.0)
+    assert drive.told == (State.CORRECTING, Reason.NONE), "the watch does not take the load for an error either"
+    takes_load_for_offset = replace(right(database, 0.0, 3.0), junction_residual=expected)
+    drive = tried(vehicle, takes_load_for_offset, database, load_a=3.0, drift=0.0, offset_a=0.0)
+    assert drive.has_said(FAILED)
 
 
 def test_set_that_leaves_an_error_fails(vehicle: Path, database: VehicleDatabase) -> None:
-    put_on_trial(vehicle, right(database, DRIFT / 2.0, OFFSET_A / 2.0))
-    drive = Drive(vehicle, database)
-    drive.go_on(330.0)
-    (told,) = (line for line in drive.said if "its trial" in line)
-    assert "has failed" in told
+    drive = tried(vehicle, right(database, DRIFT / 2.0, OFFSET_A / 2.0), database)
+    (told,) = (line for line in drive.said if FAILED in line)
     assert "at most 2 A were to be left" in told
 
 
 def test_set_without_a_predicted_change_may_leave_anything(vehicle: Path, database: VehicleDatabase) -> None:
     """As one that was written by hand: what is taken away is measured all the same."""
     unknown = JunctionResidual(measured_a=4.0, corrected_a=0.5)
-    put_on_trial(vehicle, replace(right(database), junction_residual=unknown))
-    drive = Drive(vehicle, database)
-    drive.go_on(330.0, load_a=-0.5)
-    assert any("has passed its trial" in line for line in drive.said)
+    parameters = replace(right(database), junction_residual=unknown)
+    assert tried(vehicle, parameters, database, load_a=-0.5).has_said(PASSED)
 
 
 def test_trial_waits_while_a_current_is_not_measured(vehicle: Path, database: VehicleDatabase, tmp_path: Path) -> None:
@@ -168,25 +163,19 @@ def test_trial_waits_while_a_current_is_not_measured(vehicle: Path, database: Ve
     text = database.layout.path.read_text() + '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
     (tmp_path / "watched.toml").write_text(text)
     own = read_database(read_layout(tmp_path / "watched.toml"))
-    put_on_trial(vehicle, right(own))
-    drive = Drive(vehicle, own)
-    drive.go_on(330.0, contactor=1)
+    drive = tried(vehicle, right(own), own, contactor=1)
     assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
     drive.go_on(330.0, contactor=2)
     assert drive.told == (State.CORRECTING, Reason.NONE)
 
 
 def test_trial_needs_current(vehicle: Path, database: VehicleDatabase) -> None:
-    put_on_trial(vehicle, right(database))
-    drive = Drive(vehicle, database)
-    drive.go_on(400.0, moving=False)
+    drive = tried(vehicle, right(database), database, moving=False)
     assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
 
 
 def test_revocation_holds_at_once_in_a_running_node(vehicle: Path, database: VehicleDatabase) -> None:
-    put_on_trial(vehicle, right(database))
-    drive = Drive(vehicle, database)
-    drive.go_on(330.0)
+    drive = tried(vehicle, right(database), database)
     write_state(vehicle, replace(read_state(vehicle), in_force=None, ended="revoked"))
     drive.go_on(2.0)
     assert drive.told == (State.PASSING_THROUGH, Reason.REVOKED)
@@ -196,9 +185,7 @@ def test_revocation_holds_at_once_in_a_running_node(vehicle: Path, database: Veh
 def test_set_that_expires_is_not_used_and_does_not_come_back_with_the_clock(
     vehicle: Path, database: VehicleDatabase
 ) -> None:
-    put_on_trial(vehicle, right(database))
-    drive = Drive(vehicle, database)
-    drive.go_on(330.0)
+    drive = tried(vehicle, right(database), database)
     drive.time = NOW + timedelta(days=366)
     drive.go_on(2.0)
     assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)
