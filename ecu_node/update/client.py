@@ -184,27 +184,24 @@ def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, 
         If the state cannot be written.
     """
     with nullcontext() if dry_run else locked(folder):
-        state = read_state(folder)
+        before = state = read_state(folder)
+        refusal: UnfitError | None = None
+        told = ""
         try:
-            offer = _verified_offer(state, source, max(now, state.latest))
-            kept, told = _without_revoked(state, offer, now)
+            offer = _verified_offer(before, source, max(now, before.latest))
+            state, told = _without_revoked(before, offer, now)
+            state, event, text = _judged(state, offer, source, database, now)
         except UnfitError as error:
-            if not dry_run:
-                add_decision(folder, "refused", str(error), now, reason=error.reason)
-            raise
-        refusal = None
-        try:
-            taken, event, text = _judged(kept, offer, source, database, now)
-        except UnfitError as error:
-            refusal, taken, event, text = error, kept, "refused", str(error)
+            refusal, event, text = error, "refused", str(error)
         if not dry_run:
-            write_state(folder, taken)
+            if state != before:
+                write_state(folder, state)
             if told:
                 add_decision(folder, "revoked", told, now)
             if event != "nothing new":
                 add_decision(folder, event, text, now, reason=refusal.reason if refusal else None)
         if refusal is not None:
-            raise type(refusal)(refusal.reason, f"{refusal}; {told}" if told else str(refusal))
+            raise type(refusal)(refusal.reason, f"{text}; {told}" if told else text)
     return f"revoked: {told}; {event}: {text}" if told else f"{event}: {text}"
 
 
