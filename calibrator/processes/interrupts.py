@@ -14,33 +14,22 @@ from types import FrameType
 
 from ecu_node.program import ending_at_interrupt
 
-__all__ = ["TERMINATED", "ending_at_sigterm", "importing", "interrupted_message", "terminated_message"]
+__all__ = ["ENDED", "TERMINATED", "ending_at_sigterm", "importing", "interrupted_message"]
 
 TERMINATED = 143
 """Exit code that shells give to a program ended by SIGTERM."""
+ENDED = "ended by SIGTERM"
 SHOW_CURSOR = "\x1b[?25h"
 """A bar hides the cursor of a terminal."""
 GO_ON = ("import", "summarise")
 """Commands that go on where they were."""
-KEEP_NOTHING = ("experiment", "kirchhoff", "replay")
-"""Commands of which nothing is left but what they have printed, sent, or written as a whole."""
 
 
-def interrupted_message(arguments: Sequence[str]) -> str:
-    """What is said of Ctrl-C, with what there is to do, which the command among the arguments decides."""
-    return f"calibrator: interrupted; {_afterwards(arguments)}"
-
-
-def terminated_message(arguments: Sequence[str]) -> str:
-    """The same of SIGTERM."""
-    return f"calibrator: ended by SIGTERM; {_afterwards(arguments)}"
-
-
-def _afterwards(arguments: Sequence[str]) -> str:
+def interrupted_message(arguments: Sequence[str], how: str = "interrupted") -> str:
+    """What is said of Ctrl-C, or of another way to end a command, which is the first of the arguments."""
     command = next((argument for argument in arguments if not argument.startswith("-")), "")
-    if command in KEEP_NOTHING:
-        return "nothing is kept of what was under way"
-    return f"run the same command again{'; it goes on with what it had read' if command in GO_ON else ''}"
+    kept = "; it goes on with what it had read" if command in GO_ON else ""
+    return f"calibrator: {how}; run the same command again{kept}"
 
 
 def ending_at_sigterm() -> None:
@@ -48,7 +37,7 @@ def ending_at_sigterm() -> None:
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
-        os.write(sys.stderr.fileno(), f"{shown}{terminated_message(sys.argv[1:])}\n".encode())
+        os.write(sys.stderr.fileno(), f"{shown}{interrupted_message(sys.argv[1:], ENDED)}\n".encode())
         for process in _descendants():
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)  # a worker that lost its parent would wait, or print a traceback

@@ -41,8 +41,9 @@ from threadpoolctl import threadpool_limits
 from calibrator.errors import FleetError, internal_error
 from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.progress import progress_bar
+from ecu_node import __version__
 from ecu_node.errors import UserError
-from ecu_node.program import load_python_can
+from ecu_node.program import load_python_can, say_error
 
 __all__ = ["Failed", "Workers", "run_many", "try_many", "try_many_shown"]
 
@@ -206,7 +207,7 @@ def _attempt(function: Callable[[_Item], _Result], item: _Item) -> "_Result | Fa
 def _outcomes(
     function: Callable[[Any], Any], items: Iterable[Any], workers: Workers, *, limit_s: float | None
 ) -> Generator[tuple[Any, Any], None, None]:
-    job = _Job(function=pickle.dumps(function), limit_s=limit_s)
+    job = _Job(function=pickle.dumps(function), limit_s=limit_s, version=__version__)
     if workers.scheduler is not None:
         yield from _on_cluster(workers.scheduler, job, items)
         return
@@ -232,6 +233,7 @@ class _Job:
 
     function: bytes
     limit_s: float | None
+    version: str
 
 
 class _Processes:
@@ -271,10 +273,6 @@ class _Processes:
         self._folder.cleanup()
 
 
-_UNKNOWN = 255
-"""Exit code by which multiprocessing says that it does not know it, as where two threads ask at the same time."""
-
-
 class _Process:
     """One process, replaced when it dies or takes too long."""
 
@@ -303,15 +301,9 @@ class _Process:
                 self.join()
                 why = f"reading took more than {job.limit_s:g} s and was ended; {REMEDY}, or allow more with"
                 return Failed(reason=f"{why} --time-limit")
-            except ProcessExpired as error:
-                if error.exitcode < 0:
-                    how = f"was killed by {signal.Signals(-error.exitcode).name}"
-                elif error.exitcode == _UNKNOWN:
-                    how = "ended, or was killed"
-                else:
-                    how = f"ended ({error.exitcode})"
-            except BrokenProcessPool:
-                how = "was killed"
+            except (ProcessExpired, BrokenProcessPool) as error:
+                code = getattr(error, "exitcode", 0)  # not always known
+                how = f"was killed by {signal.Signals(-code).name}" if code < 0 else "ended, or was killed"
             self.join()
         if job.limit_s is None:
             return Failed(reason=f"a worker process {how}, and another one again, as by a lack of memory")
@@ -489,6 +481,8 @@ def _require_scheduler(address: str, patience_s: float) -> None:
 
 
 def _wait_for_worker(client: Any, address: str) -> None:
+    if not client.nthreads():
+        say_error(f"calibrator: {address}: the scheduler has no worker now; waiting {RETURN_S:g} s for one")
     try:
         client.wait_for_workers(1, timeout=RETURN_S)
     except TimeoutError:
@@ -498,6 +492,9 @@ def _wait_for_worker(client: Any, address: str) -> None:
 
 def _on_worker(job: _Job, item: Any) -> Any:
     """What a worker of a cluster does; files of strangers are read by a process of its own, which it can kill."""
+    if job.version != __version__:
+        advice = f"install version {job.version} there"
+        raise FleetError(f"a worker of the cluster has version {__version__} of hv-current-correction; {advice}")
     if job.limit_s is not None:
         return _own_processes().run(job, item)
     _one_thread()

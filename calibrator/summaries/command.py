@@ -19,7 +19,8 @@ from calibrator.terminal.options import (
     TimeLimitOption,
     WorkersOption,
 )
-from calibrator.terminal.text import end_if_internal, print_report
+from calibrator.terminal.text import counted, dumps, end_if_internal, print_report
+from ecu_node.program import write_output
 
 __all__ = ["store_app", "summarise"]
 
@@ -84,4 +85,7 @@ def compact(store: StoreArgument, json: JsonOption = False) -> None:
     with importing():
         from calibrator.summaries.store import compact_store
 
-    print_report(compact_store(store), json=json)
+    buckets, removed = compact_store(store)
+    text = f"{counted(buckets, 'bucket')} written anew, {counted(removed, 'damaged record')} removed"
+    facts = {"store": store, "buckets": buckets, "removed": removed}
+    write_output(dumps(facts) if json else f"{store}: {text}")

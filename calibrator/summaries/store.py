@@ -10,7 +10,7 @@ do not count if a run was killed before.
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from calibrator.drive import Equipment, FleetSource
@@ -20,16 +20,16 @@ from calibrator.files.storage import Storage, open_storage
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity, bucket_of, read_identity, store_identity, write_identity
 from calibrator.summaries.record import Outline, Record, decode_records, encode_records
-from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.progress import shown
 from calibrator.terminal.text import counted, dumps, few, reasons_text
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 
 __all__ = [
-    "CompactReport",
     "StoreReport",
     "SummaryStore",
     "compact_store",
+    "existing_store",
     "look_at_store",
     "open_store",
     "require_store_or_nothing",
@@ -141,21 +141,18 @@ class SummaryStore:
         """What there is of each vehicle of a bucket; raises as :meth:`read`."""
         return [Outline.of(records) for records in self.read(bucket, whole=False).values()]
 
-    def write(self, bucket: int, records: Records) -> None:
-        """Replace a bucket, whole or not at all; UserError if it cannot be written."""
-        self._put(bucket, records, whole=True)
-
-    def append(self, bucket: int, records: Records) -> None:
-        """Add records to a bucket, whole or not at all; UserError if they cannot be written."""
-        self._put(bucket, records, whole=False)
-
-    def _put(self, bucket: int, records: Records, *, whole: bool) -> None:
+    def append(self, bucket: int, records: Records, *, whole: bool = False) -> None:
+        """Add records to a bucket, or replace it, whole or not at all; UserError if they cannot be written."""
         old = [name for names in self.files(bucket)[::-1] for name in names]
         number = int(old[-1][6:11]) + 1 if old else 0
         content = encode_records([record for name in sorted(records) for record in records[name]], self.identity)
         self._files.write(f"{bucket:05d}-{number:05d}{'.whole' * whole}.parquet", content)
         for name in old if whole else ():
             self._files.remove(name)
+
+    def write(self, bucket: int, records: Records) -> None:
+        """Replace a bucket; as :meth:`append`."""
+        self.append(bucket, records, whole=True)
 
     def change(
         self, bucket: int, change: Callable[[Record], Record | None], new: Sequence[Record] = (), *, whole: bool = False
@@ -176,7 +173,8 @@ class SummaryStore:
                 name: [left for record in items if (left := change(record)) is not None]
                 for name, items in self.read(bucket).items()
             }
-            self.write(bucket, records | {name: [*records.get(name, ()), *items] for name, items in added.items()})
+            records |= {name: [*records.get(name, ()), *items] for name, items in added.items()}
+            self.write(bucket, records)
 
 
 def require_store_or_nothing(storage: Storage) -> None:
@@ -251,7 +249,7 @@ def open_store(
 # ---- ``calibrator store``
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class StoreReport:
     """What a store holds; sizes in bytes, durations in hours."""
 
@@ -259,13 +257,13 @@ class StoreReport:
     layout: str
     branches: tuple[str, ...]
     inputs: tuple[str, ...]
-    vehicles: int
-    unusable: int
-    drives: int
-    hours: float
-    files: int
+    vehicles: int = 0
+    unusable: int = 0
+    drives: int = 0
+    hours: float = 0.0
+    files: int = 0
     size_bytes: int
-    faults: Mapping[str, str]
+    faults: dict[str, str] = field(default_factory=dict)
 
     def as_json(self) -> str:
         """The report as JSON."""
@@ -303,74 +301,54 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
     FleetError
         If it is no store.
     """
-    store, faults, seen, files = _open(place), dict[str, str](), list[tuple[bool, int, float]](), 0
-    owners, buckets = dict[str, str](), store.buckets()
-    with progress_bar("look at vehicles", len(buckets), "buckets") as progress:
-        for done, bucket in enumerate(buckets, 1):
-            current, old = store.files(bucket)
-            files += len(current) + len(old)
-            faults |= dict.fromkeys(old, "does not count any more, as a run was killed: 'calibrator store compact'")
-            try:
-                for name, records in store.read(bucket, whole=whole).items():
-                    outline = Outline.of(records)
-                    seen.append((bool(outline.problem), len(outline.drives), sum(r.duration_s for r in records)))
-                    for record in records if whole else ():
-                        if record.damaged:
-                            faults[name] = record.problem
-                        for digest in record.digests if not record.problem else ():
-                            if (other := owners.setdefault(digest, name)) != name:
-                                faults[name] = f"has a recording that {other} has as well; remove it where it is wrong"
-            except UserError as error:
-                faults[f"bucket {bucket:05d}"] = str(error)
-            progress(done)
-    return StoreReport(
+    store, owners = existing_store(place), dict[str, str]()
+    about, buckets = store.identity, store.buckets()
+    report = StoreReport(
         store=place,
-        layout=store.identity.layout,
-        branches=store.identity.branches,
-        inputs=store.identity.fleet_inputs,
-        vehicles=len(seen),
-        unusable=sum(unusable for unusable, _, _ in seen),
-        drives=sum(drives for _, drives, _ in seen),
-        hours=sum(duration_s for _, _, duration_s in seen) / 3600.0,
-        files=files,
+        layout=about.layout,
+        branches=about.branches,
+        inputs=about.fleet_inputs,
         size_bytes=store.size_bytes(),
-        faults=faults,
     )
+    for bucket in shown(buckets, "look at vehicles", len(buckets), "buckets"):
+        current, old = store.files(bucket)
+        report.files += len(current) + len(old)
+        report.faults |= dict.fromkeys(old, "does not count any more, as a run was killed: 'calibrator store compact'")
+        try:
+            found = store.read(bucket, whole=whole)
+        except UserError as error:
+            report.faults[f"bucket {bucket:05d}"] = str(error)
+            continue
+        for name, records in found.items():
+            outline = Outline.of(records)
+            report.vehicles += 1
+            report.unusable += bool(outline.problem)
+            report.drives += len(outline.drives)
+            report.hours += sum(record.duration_s for record in records) / 3600.0
+            for record in records if whole else ():
+                if record.damaged:
+                    report.faults[name] = record.problem
+                for digest in record.digests if not record.problem else ():
+                    if (other := owners.setdefault(digest, name)) != name:
+                        problem = f"has a recording that {other} has as well; remove it where it is wrong"
+                        report.faults[name] = problem
+    return report
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompactReport:
-    """What was put together: numbers of buckets written anew and of damaged records removed."""
-
-    store: str
-    buckets: int
-    removed: int
-
-    def as_json(self) -> str:
-        """The report as JSON."""
-        return dumps(vars(self))
-
-    def as_text(self) -> str:
-        """The report for people."""
-        done = f"{counted(self.buckets, 'bucket')} written anew, {counted(self.removed, 'damaged record')} removed"
-        return f"{self.store}: {done}"
-
-
-def compact_store(place: str) -> CompactReport:
-    """Make one file of each bucket, without damaged records. FleetError if it is no store."""
-    store, merged, removed = _open(place), 0, 0
+def compact_store(place: str) -> tuple[int, int]:
+    """Make one file of each bucket, without damaged records; how many buckets and records. FleetError if no store."""
+    store, merged, removed = existing_store(place), 0, 0
     buckets = store.buckets()
-    with progress_bar("put files together", len(buckets), "buckets") as progress:
-        for done, bucket in enumerate(buckets, 1):
-            damaged = sum(record.damaged for records in store.read(bucket).values() for record in records)
-            if damaged or sum(map(len, store.files(bucket))) > 1:
-                store.change(bucket, lambda record: None if record.damaged else record, whole=True)
-                merged, removed = merged + 1, removed + damaged
-            progress(done)
-    return CompactReport(store=place, buckets=merged, removed=removed)
+    for bucket in shown(buckets, "put files together", len(buckets), "buckets"):
+        damaged = sum(record.damaged for records in store.read(bucket).values() for record in records)
+        if damaged or sum(map(len, store.files(bucket))) > 1:
+            store.change(bucket, lambda record: None if record.damaged else record, whole=True)
+            merged, removed = merged + 1, removed + damaged
+    return merged, removed
 
 
-def _open(place: str) -> SummaryStore:
+def existing_store(place: str | Path) -> SummaryStore:
+    """Open a store; FleetError if there is none."""
     storage = open_storage(place)
     identity = read_identity(storage)
     if identity is None:

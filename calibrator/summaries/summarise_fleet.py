@@ -195,13 +195,14 @@ def add_drives(
 class _Task(NamedTuple):
     """What is read at a time: new drives of one vehicle.
 
-    ``digests`` are those of its other recordings, ``versions`` of all its drives, ``size`` that of the fleet since the
-    task before. [byte]
+    ``digests`` and ``known_s`` are those of its other recordings [s], ``versions`` of all its drives, ``size`` that of
+    the fleet since the task before. [byte]
     """
 
     bucket: int
     drives: tuple[DriveFile, ...]
     digests: frozenset[str]
+    known_s: float
     versions: Mapping[str, str]
     size: int
 
@@ -247,7 +248,7 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator
             size += fleet.sizes.get(name, 0)
             known = {drive for record in kept for drive in record.drives}
             if wanted := tuple(drive for drive in drives if drive.name not in known):
-                yield _Task(bucket, wanted, digests, versions, size)
+                yield _Task(bucket, wanted, digests, sum(r.duration_s for r in kept), versions, size)
                 size = 0
 
 
@@ -270,7 +271,9 @@ def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase
             digests.append(recording_digest(drive))
             drives[digests[-1]] = drive
     new = [drive for digest, drive in drives.items() if digest not in task.digests]
-    parts = [summarise_drives(new, store.equipment, database, bank=store.bank)] if new else []
+    parts = []
+    if new:
+        parts.append(summarise_drives(new, store.equipment, database, bank=store.bank, known_s=task.known_s))
     parts += [summary for digest, summary in made.items() if digest not in task.digests]
     if not parts:
         return _record(task.drives, digests, problem=f"{COPY} one that this vehicle has already; it counts once")
@@ -377,20 +380,16 @@ def _read_onboard(
         summary = _onboard_summary(record, store.bank.identity)
     except (ValueError, IndexError) as error:
         raise DriveError(f"{path}: damaged: {error}; copy it again from the vehicle") from None
-    delay_sd_s, zero_a, zero_sd_a = (
-        np.array([missing if x is None else x for x in values])
-        for values, missing in ((record.delay_sd_s, np.inf), (record.zero_offset_a, np.nan), (record.zero_sd_a, np.nan))
-    )
     place = [record.branches.index(branch) for branch in store.branches]
-    sd_s = delay_sd_s[place]
+    of_branches = (record.delay_s, record.delay_sd_s, record.zero_offset_a, record.zero_sd_a)
+    delay_s, sd_s, zero_a, zero_sd_a = (np.array(values, np.float64)[place] for values in of_branches)  # None is NaN
+    sd_s[np.isnan(sd_s)] = np.inf
     return VehicleSummary(
         vehicle=vehicle,
         drives=(name,),
         summary=summary.take_branches(place, [record.inputs.index(each) for each in store.fleet_inputs]),
-        delays=BranchDelays(
-            branches=store.branches, delay_s=np.array(record.delay_s)[place], sd_s=sd_s, known=np.isfinite(sd_s)
-        ),
-        zero_current=ZeroCurrent(offset_a=zero_a[place], sd_a=zero_sd_a[place]),
+        delays=BranchDelays(branches=store.branches, delay_s=delay_s, sd_s=sd_s, known=np.isfinite(sd_s)),
+        zero_current=ZeroCurrent(offset_a=zero_a, sd_a=zero_sd_a),
     )
 
 

@@ -101,7 +101,12 @@ def added_summaries(parts: Sequence[VehicleSummary]) -> VehicleSummary:
 
 
 def summarise_drives(
-    drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, *, bank: FilterBank | None = None
+    drives: Sequence[Drive],
+    equipment: Equipment,
+    database: VehicleDatabase,
+    *,
+    bank: FilterBank | None = None,
+    known_s: float = 0.0,
 ) -> VehicleSummary:
     """Summarise the drives of one vehicle.
 
@@ -115,6 +120,8 @@ def summarise_drives(
         DBC and layout.
     bank : FilterBank or None
         Filters of the fleet model's inputs; None: the plain inputs.
+    known_s : float
+        Usable data of the vehicle besides, of which these drives may be a short addition. [s]
 
     Returns
     -------
@@ -126,7 +133,7 @@ def summarise_drives(
     DriveError
         If there is too little valid data; the message says how much.
     """
-    delays, samples = aligned_drives(drives, equipment, database)
+    delays, samples = aligned_drives(drives, equipment, database, known_s=known_s)
     name, temperatures_c = database.layout.temperature, None
     if name is not None:
         temperatures_c = [
@@ -142,7 +149,7 @@ def summarise_drives(
 
 
 def aligned_drives(
-    drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase
+    drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, *, known_s: float = 0.0
 ) -> tuple[BranchDelays, list[Samples]]:
     """Delays of the branches of one vehicle, and its drives on one time base without them; as summarise_drives."""
     layout = database.layout
@@ -155,7 +162,7 @@ def aligned_drives(
         align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.fleet_inputs)
         for drive in drives
     ]
-    if problem := too_short(layout.period_s * sum(int(part.valid.sum()) for part in samples), len(drives)):
+    if problem := too_short(known_s + layout.period_s * sum(int(part.valid.sum()) for part in samples), len(drives)):
         raise DriveError(problem)
     return delays, samples
 

@@ -170,11 +170,8 @@ class _ZeroCurrent:
         """Begin anew, but for a window that is open."""
         self._windows = {name: [] for name in self._windows}
 
-    def readings(self, branches: Sequence[str]) -> list[_Reading]:
-        """Offset of each branch and its standard deviation [A]; None if the windows are too short."""
-        return [self._reading(name, self._steps_a[name]) for name in branches]
-
-    def _reading(self, branch: str, step_a: float) -> _Reading:
+    def reading(self, branch: str) -> _Reading:
+        """Offset of a branch and its standard deviation [A]; None if the windows are too short."""
         windows = self._windows[branch]
         count = sum(window.samples for window in windows)
         if count < rule.FEWEST_ZERO_SAMPLES:
@@ -184,7 +181,7 @@ class _ZeroCurrent:
         white = math.sqrt(math.pi / 2.0 * variance / count)
         pieces = [piece for window in windows for piece in window.pieces]
         wander = stdev(pieces) / math.sqrt(len(windows)) if len(pieces) > 1 else 0.0
-        sd_a = math.sqrt(rule.ZERO_RESOLUTION_A**2 + step_a**2 / 12.0 + max(white, wander) ** 2)
+        sd_a = math.sqrt(rule.ZERO_RESOLUTION_A**2 + self._steps_a[branch] ** 2 / 12.0 + max(white, wander) ** 2)
         return sum(window.middle for window in windows) / len(windows), sd_a
 
 
@@ -416,7 +413,8 @@ class OnBoardSummary:
         warm = self._warm.until(last * self._period_s)
         self._next, self._due_s = last, (last + self._batch) * self._period_s + self._wait_s
         self._finish_job()
-        self._job = self._background.submit(self._sum, instants_s, samples, warm, self._zero.readings(self._branches))
+        readings = [self._zero.reading(name) for name in self._branches]
+        self._job = self._background.submit(self._sum, instants_s, samples, warm, readings)
 
     def _finish_job(self) -> None:
         """Say when writing fails, and when it does no more."""

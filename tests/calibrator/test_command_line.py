@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from calibrator.processes.interrupts import TERMINATED, interrupted_message, terminated_message
+from calibrator.processes.interrupts import ENDED, TERMINATED, interrupted_message
 from ecu_node.program import INTERRUPTED
 
 ROOT = Path(__file__).parents[2]
@@ -75,7 +75,7 @@ def test_ctrl_c_and_sigterm_while_logs_are_read_end_readers_too_in_one_line(
         process.send_signal(how) if how is signal.SIGTERM else os.killpg(process.pid, how)
         _, errors = process.communicate(timeout=60)  # also waits for all that have its stderr
     if how is signal.SIGTERM:
-        assert (process.returncode, errors) == (TERMINATED, f"{terminated_message(command[3:])}\n")
+        assert (process.returncode, errors) == (TERMINATED, f"{interrupted_message(command[3:], ENDED)}\n")
         return
     assert (process.returncode, errors) == (INTERRUPTED, f"{interrupted_message(command[3:])}\n")
     assert not list(temporary.iterdir())

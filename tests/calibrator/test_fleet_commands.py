@@ -11,7 +11,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from calibrator.estimator.results import read_results
-from calibrator.fleet_truth import read_truth
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import check_fit, read_parameters
@@ -32,13 +31,6 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def result(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = ("--method", "published", "--classifier", "perfect", "--truth", fleet / "truth.json")
     return made_once(tmp_path_factory, "symmetric_result", "calibrate", fleet, *options)
-
-
-def test_fleet_is_a_folder_of_logs_per_vehicle_with_the_truth_beside(fleet: Path) -> None:
-    truth = read_truth(fleet / "truth.json")
-    logs = sorted(path.parent.name for path in (fleet / "logs").glob("*/*.log.gz"))
-    assert logs == sorted(truth.vehicles)
-    assert truth.branches == ["battery", "motor"]
 
 
 def test_symmetric_fleet_with_known_classes_is_recovered(fleet: Path, result: Path) -> None:
@@ -161,34 +153,19 @@ def test_only_vehicle_that_drove_since_is_one_of_its_fleet(fleet: Path, tmp_path
     }
 
 
-def test_one_car_alone_is_no_fleet_of_the_published_method(fleet: Path, tmp_path: Path) -> None:
-    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "V001")
+def test_one_car_alone_and_copies_of_one_are_no_fleet(fleet: Path, tmp_path: Path) -> None:
     files = ["--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1]
+    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "one")
     run = calibrator("calibrate", tmp_path / "logs", "--method", "published", *files)
     assert run.returncode == 1
     (line,) = [line for line in run.stderr.splitlines() if line.startswith("calibrator:")]
     assert "1 usable vehicle to learn from; a fleet that is compared with itself needs 5 or more" in line
     assert "pass 1" not in run.stderr
     assert not (tmp_path / "x").exists()
-
-
-def test_a_fleet_of_copies_is_refused_with_the_reason_and_none_can_be_trusted(fleet: Path, tmp_path: Path) -> None:
-    for name in ("one", "other"):
-        shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / name)
-    run = calibrator("calibrate", tmp_path / "logs", "--layout", LAYOUT, "--out", tmp_path / "x")
+    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "other")
+    run = calibrator("calibrate", tmp_path / "logs", *files, "--trusted", "other")
     assert run.returncode == 1
-    assert "one: same recording as other; it cannot be told whose it is" in run.stderr
-    run = calibrator("calibrate", tmp_path / "logs", "--layout", LAYOUT, "--out", tmp_path / "x", "--trusted", "other")
-    assert run.returncode == 1
-    assert "vehicle other to trust; other: same recording as one" in run.stderr
-
-
-def test_result_folder_in_use_is_not_touched(fleet: Path, result: Path) -> None:
-    before = sorted(path.name for path in result.iterdir())
-    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", result)
-    assert run.returncode == 1
-    assert "exists and is not empty" in run.stderr
-    assert sorted(path.name for path in result.iterdir()) == before
+    assert "vehicle other to trust; other: same recording as one; it cannot be told whose it is" in run.stderr
 
 
 @pytest.mark.parametrize(
@@ -214,30 +191,18 @@ def other_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made_once(tmp_path_factory, "other_fleet", "simulate", *options)
 
 
-def test_score_refuses_the_truth_of_a_fleet_with_the_same_names(
+def test_truth_of_a_fleet_with_the_same_names_is_refused_before_the_work(
     fleet: Path, other_fleet: Path, result: Path, tmp_path: Path
 ) -> None:
-    copy = shutil.copytree(result, tmp_path / "result")
-    record = json.loads((copy / "run.json").read_text())
-    record["fleet_ids"] = [read_truth(fleet / "truth.json").fleet_id]
-    (copy / "run.json").write_text(json.dumps(record))
-    assert calibrator("score", copy, "--truth", fleet / "truth.json").returncode == 0
-    run = calibrator("score", copy, "--truth", other_fleet / "truth.json")
+    run = calibrator("score", result, "--truth", other_fleet / "truth.json")
     assert run.returncode == 1
     assert "give the truth.json that lies beside the logs of this fleet" in run.stderr
-
-
-def test_perfect_classifier_refuses_the_truth_of_another_fleet_before_the_work(
-    fleet: Path, other_fleet: Path, tmp_path: Path
-) -> None:
     store = tmp_path / "store"
     log = fleet / "logs" / "V001" / "drive.log.gz"
     assert calibrator("import", log, "--layout", LAYOUT, "--out", store).returncode == 0
+    perfect = ("--method", "published", "--classifier", "perfect", "--truth", other_fleet / "truth.json")
     for source in (fleet, fleet / "logs", store):
-        run = calibrator(
-            *("calibrate", source, "--layout", LAYOUT, "--method", "published", "--out", tmp_path / "x"),
-            *("--classifier", "perfect", "--truth", other_fleet / "truth.json"),
-        )
+        run = calibrator("calibrate", source, "--layout", LAYOUT, "--out", tmp_path / "x", *perfect)
         assert run.returncode == 1
         assert "the truth of fleet" in run.stderr
         assert "identify" not in run.stderr

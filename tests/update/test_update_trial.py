@@ -157,21 +157,19 @@ def test_set_without_a_predicted_change_may_leave_anything(vehicle: Path, databa
     assert tried(vehicle, parameters, database, load_a=-0.5).has_said(PASSED)
 
 
-def test_trial_waits_while_a_current_is_not_measured(vehicle: Path, database: VehicleDatabase, tmp_path: Path) -> None:
+def test_trial_waits_while_a_current_is_not_measured_and_while_none_flows(
+    vehicle: Path, database: VehicleDatabase, tmp_path: Path
+) -> None:
     """As while the vehicle charges, where the layout says so."""
     shutil.copy(database.layout.dbc_path, tmp_path)
     text = database.layout.path.read_text() + '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
     (tmp_path / "watched.toml").write_text(text)
     own = read_database(read_layout(tmp_path / "watched.toml"))
     drive = tried(vehicle, right(own), own, contactor=1)
+    drive.go_on(330.0, contactor=2, moving=False)
     assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
     drive.go_on(330.0, contactor=2)
     assert drive.told == (State.CORRECTING, Reason.NONE)
-
-
-def test_trial_needs_current(vehicle: Path, database: VehicleDatabase) -> None:
-    drive = tried(vehicle, right(database), database, moving=False)
-    assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
 
 
 def test_revocation_holds_at_once_in_a_running_node(vehicle: Path, database: VehicleDatabase) -> None:

@@ -1,46 +1,74 @@
 """Drives into a store: each is read once, changes are noticed, bad ones are tried again."""
 
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibrator.drive import Channel, Drive, Equipment
+from calibrator.drive import Array, Channel, Drive, Equipment
 from calibrator.drives.store import write_drive
-from calibrator.errors import FleetError
+from calibrator.errors import DriveError, FleetError
 from calibrator.files.storage import open_storage
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import find_fleet
+from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore, open_store
-from calibrator.summaries.summarise_fleet import SummariseReport, add_drives
+from calibrator.summaries.summarise_fleet import SummariseReport, add_drives, read_vehicle_summary
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.conftest import LAYOUT
 
-LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("speed",), fleet_inputs=("speed",), notices=())
 
 
-def write(store: Path, vehicle: str, name: str, database: VehicleDatabase, *, scale: float = 1.0) -> None:
+Change = Callable[[dict[str, Array]], object]
+
+
+def write(
+    store: Path,
+    vehicle: str,
+    name: str,
+    database: VehicleDatabase,
+    *,
+    samples: int = 3000,
+    change: Change = lambda _: None,
+) -> None:
+    """Write a drive whose channels may be changed first."""
     rng = np.random.default_rng([ord(letter) for letter in vehicle + name])
-    time_s = 0.1 * np.arange(3000)
+    time_s = 0.1 * np.arange(samples)
     speed = 30.0 + 20.0 * np.sin(0.3 * time_s + rng.random())
-
-    def channel(value: np.ndarray[tuple[int], np.dtype[np.float64]]) -> Channel:
-        return Channel(time_s=time_s, value=value, good=np.ones(len(time_s), bool))
-
-    battery = scale * (2.0 * speed + rng.normal(size=len(time_s)))
-    branches = {"battery": channel(battery), "motor": channel(-battery)}
-    inputs = {"speed": channel(speed), "torque": channel(speed), "voltage": channel(np.full(len(time_s), 350.0))}
-    write_drive(store, Drive(vehicle=vehicle, name=name, branches=branches, inputs=inputs), database.layout)
+    battery = 2.0 * speed + rng.normal(size=samples)
+    values = {
+        "battery": battery,
+        "motor": -battery,
+        "speed": speed,
+        "torque": speed,
+        "voltage": np.full(samples, 350.0),
+    }
+    change(values)
+    channels = {key: Channel(time_s=time_s, value=value, good=np.ones(samples, bool)) for key, value in values.items()}
+    branches = {key: channels.pop(key) for key in EQUIPMENT.branches}
+    write_drive(store, Drive(vehicle=vehicle, name=name, branches=branches, inputs=channels), database.layout)
 
 
 def add(drives: Path, out: Path, database: VehicleDatabase) -> tuple[SummariseReport, SummaryStore]:
     fleet = find_fleet(drives)
     store = open_store(open_storage(out), EQUIPMENT, database, fleet)
     return add_drives(store, fleet, database, workers=Workers()), store
+
+
+def turned_up(channels: dict[str, Array]) -> None:
+    for name in EQUIPMENT.branches:
+        channels[name] *= 1.5
+
+
+def total(store: SummaryStore, vehicle: str) -> DriveSummary:
+    return joined_records(store.read(store.bucket_of(vehicle))[vehicle]).summary
 
 
 def drives_in(store: SummaryStore) -> dict[str, list[tuple[str, ...]]]:
@@ -65,12 +93,12 @@ def test_each_drive_is_read_once_and_again_when_it_was_changed(tmp_path: Path, d
     assert drives_in(store) == {"V1": [("a",)], "V2": [("a",), ("b",)]}
     bucket = store.bucket_of("V2")
     assert store.files(bucket) == ([f"{bucket:05d}-00000.parquet", f"{bucket:05d}-00001.parquet"], [])
-    before = joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.total
-    write(drives, "V1", "a", database, scale=1.5)
+    before = total(store, "V1").total
+    write(drives, "V1", "a", database, change=turned_up)
     shutil.rmtree(drives / "drives" / "V2")
     changed, store = add(drives, out, database)
     assert (changed.drives, drives_in(store)) == (1, {"V1": [("a",)], "V2": [("a",), ("b",)]})
-    after = joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.total
+    after = total(store, "V1").total
     assert after[1, 1] == pytest.approx(2.25 * before[1, 1], rel=1e-6)
 
 
@@ -136,11 +164,41 @@ def test_recording_that_a_vehicle_has_twice_counts_once(tmp_path: Path, database
     copy(drives, "V1/a", "V1/b")
     added, store = add(drives, tmp_path / "at once", database)
     assert added.notices == ["vehicle V1: drives a, b hold the same recording, which counts once"]
-    (record,) = store.read(store.bucket_of("V1"))["V1"]
-    assert joined_records([record]).summary.duration_s < 301.0
+    assert total(store, "V1").duration_s < 301.0
     copy(drives, "V1/a", "V1/c")
     _, store = add(drives, tmp_path / "at once", database)
-    assert joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.duration_s < 301.0
+    assert total(store, "V1").duration_s < 301.0
+
+
+def test_short_drive_counts_where_its_vehicle_has_others(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    write(drives, "V1", "a", database)
+    add(drives, out, database)
+    for vehicle in ("V1", "V2"):
+        write(drives, vehicle, "short", database, samples=601)
+    added, store = add(drives, out, database)
+    assert list(added.left_out) == ["V2"]
+    assert added.left_out["V2"].endswith("s of usable data in 1 drive; at least 120 s are needed")
+    assert total(store, "V1").duration_s > 350.0
+
+
+def put(name: str, value: float) -> Change:
+    return lambda channels: channels[name].put(100, value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (put("motor", 1e12), "drive d: branch motor shows 1e+12 A, full scale of the junction being 400 A"),
+        (put("motor", np.nan), "drive d: branch motor shows nan A"),
+        (put("battery", -np.inf), "drive d: branch battery shows inf A"),
+        (put("speed", np.nan), "drive d: input speed has values that are no numbers"),
+    ],
+)
+def test_impossible_values_are_named(tmp_path: Path, database: VehicleDatabase, change: Change, message: str) -> None:
+    write(tmp_path, "V1", "d", database, change=change)
+    with pytest.raises(DriveError, match=re.escape(message)):
+        read_vehicle_summary(find_fleet(tmp_path).vehicles["V1"], EQUIPMENT, database)
 
 
 def test_a_fault_of_the_program_is_not_one_of_the_drives(
