@@ -1,7 +1,7 @@
 """What to say of vehicles: estimate, confidence, and whether correction could make a branch worse.
 
 :func:`estimate_rows` does it for N vehicles: fault models of the fleet -> weighted draws (:class:`Explained`) -> one
-posterior per vehicle (:class:`Points`) -> :class:`FleetEstimate`.
+posterior per vehicle (:class:`Points`) -> :class:`RowsEstimate`.
 
 The estimate is the point near which, within the tolerance of "recovered", most of the posterior lies; that share is
 the confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
@@ -13,7 +13,7 @@ with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,11 @@ from calibrator.score import TOLERANCE
 from ecu_node.parameters import Explanation, SensorFinding
 
 __all__ = [
+    "Estimate",
     "Explained",
     "FleetEstimate",
     "Points",
+    "RowsEstimate",
     "best_estimate",
     "decided",
     "estimate_rows",
@@ -218,13 +220,9 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
     return np.asarray(np.minimum(harm, 1.0))
 
 
-NOTHING: Any = None
-"""Of what was not looked for."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FleetEstimate:
-    """What the evidence rows of N vehicles with K branches say, branches in their own order.
+class Estimate:
+    """What is found of N vehicles with K branches, branches in their own order.
 
     Attributes
     ----------
@@ -238,32 +236,12 @@ class FleetEstimate:
         That the sensor is faulty; that its correction makes the branch worse. [1]
     identifiable : ndarray of bool of shape (N, K)
         Whether the branch moved enough for its gain to be known: some row shows it.
-    load_probability, load_a : ndarray of shape (N,)
-        That a load without a sensor is carried by the feeding branch in this vehicle alone, and its expected size. [1],
-        [A]
-    group_probability : ndarray of shape (N, g)
-        That the vehicle is one of each group that shares a constant of the feeding branch. [1]
-    supports : sequence of N sequences of (float, ndarray of shape (4, K))
-        Explanations by falling probability: this; hardware drift (first column), hardware offsets, drifts and offsets.
     points : sequence of N Points
         The posterior.
     order : tuple of int
-        Branches of supports and points, whose offsets are in fractions of full scale: position of each in their own
-        order.
+        Branches of the points, whose offsets are in fractions of full scale: position of each in their own order.
     full_scale_a : float
         Full scale of the junction. [A]
-    corrected : ndarray of bool of shape (N, K)
-        Whether the node is to correct the branch. This, and what follows, of whole vehicles alone, not of their rows.
-    held_back : ndarray of str of shape (N, K)
-        Why a fault that was found is not corrected; empty where it is, or where none was found.
-    verdicts : sequence of N str
-        Of each vehicle.
-    explanations : sequence of N sequences of Explanation
-        By falling probability, at least one.
-    findings : sequence of N sequences of SensorFinding
-        What no explanation fits.
-    evidence : ndarray of shape (N, 3, 5K)
-        For the pages of a report, see :func:`.reported_evidence`.
     """
 
     drift: Array
@@ -280,16 +258,6 @@ class FleetEstimate:
     points: Sequence[Points]
     order: tuple[int, ...]
     full_scale_a: float
-    supports: Sequence[Sequence[tuple[float, Array]]] = ()
-    load_probability: Array = NOTHING
-    load_a: Array = NOTHING
-    group_probability: Array = NOTHING
-    corrected: Mask = NOTHING
-    held_back: NDArray[np.str_] = NOTHING
-    verdicts: Sequence[str] = ()
-    explanations: Sequence[Sequence[Explanation]] = ()
-    findings: Sequence[Sequence[SensorFinding]] = ()
-    evidence: Array = NOTHING
 
     @property
     def faulty(self) -> Mask:
@@ -310,6 +278,56 @@ class FleetEstimate:
         return below[:, :K][:, place], below[:, K:][:, place]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RowsEstimate(Estimate):
+    """The same of evidence rows, before anything is decided.
+
+    Attributes
+    ----------
+    load_probability, load_a : ndarray of shape (N,)
+        That a load without a sensor is carried by the feeding branch in this vehicle alone, and its expected size. [1],
+        [A]
+    group_probability : ndarray of shape (N, g)
+        That the vehicle is one of each group that shares a constant of the feeding branch. [1]
+    supports : sequence of N sequences of (float, ndarray of shape (4, K))
+        Explanations by falling probability: this; hardware drift (first column), hardware offsets, drifts and offsets,
+        branches and units as those of the points.
+    """
+
+    load_probability: Array
+    load_a: Array
+    group_probability: Array
+    supports: Sequence[Sequence[tuple[float, Array]]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FleetEstimate(Estimate):
+    """The same of whole vehicles, with what is decided and said.
+
+    Attributes
+    ----------
+    corrected : ndarray of bool of shape (N, K)
+        Whether the node is to correct the branch.
+    held_back : ndarray of str of shape (N, K)
+        Why a fault that was found is not corrected; empty where it is, or where none was found.
+    verdicts : sequence of N str
+        Of each vehicle.
+    explanations : sequence of N sequences of Explanation
+        By falling probability, at least one.
+    findings : sequence of N sequences of SensorFinding
+        What no explanation fits.
+    evidence : ndarray of shape (N, 3, 5K)
+        For the pages of a report, see :func:`.reported_evidence`; of single junctions it has no rows.
+    """
+
+    corrected: Mask
+    held_back: NDArray[np.str_]
+    verdicts: Sequence[str]
+    explanations: Sequence[Sequence[Explanation]]
+    findings: Sequence[Sequence[SensorFinding]]
+    evidence: Array
+
+
 def estimate_rows(
     rows: EvidenceRows,
     models: Sequence[FaultModel],
@@ -320,7 +338,7 @@ def estimate_rows(
     usual: Array,
     order: Sequence[int] | None = None,
     full_scale_a: float = 1.0,
-) -> FleetEstimate:
+) -> RowsEstimate:
     """Estimate N vehicles from their evidence rows.
 
     Parameters
@@ -342,7 +360,7 @@ def estimate_rows(
 
     Returns
     -------
-    FleetEstimate
+    RowsEstimate
         In the order of the rows.
     """
     N, K = mean.shape
@@ -371,7 +389,7 @@ def estimate_rows(
         hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
     first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])
     load_probability, load, group_probability = _unmeasured(explained)
-    return FleetEstimate(
+    return RowsEstimate(
         drift=estimate[:, place],
         offset_a=estimate[:, K + place] * full_scale_a,
         drift_sd=sd[:, place],

@@ -7,14 +7,14 @@ What is said of a vehicle does not depend on which others are estimated with it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.checks import UsualMisfits, find_misfits, learn_usual_misfits
-from calibrator.estimator.decision import FleetEstimate, decided, estimate_rows
+from calibrator.estimator.decision import Estimate, FleetEstimate, RowsEstimate, decided, estimate_rows
 from calibrator.estimator.evidence import (
     EvidenceRows,
     FleetMoments,
@@ -195,7 +195,6 @@ def learn_fleet(
     readings: Array | None = None,
     trusted: Mask | None = None,
     load: UnmeasuredLoad | None = None,
-    expected_faults: float | None = None,
     known: Prior | None = None,
 ) -> FleetReference:
     """Learn what vehicles without faults are like, and which faults there are.
@@ -215,8 +214,6 @@ def learn_fleet(
         the junction law are not trusted, those that differ from the others do not carry.
     load : UnmeasuredLoad or None
         Load that no branch measures, if it is known; None: estimated from the fleet.
-    expected_faults : float or None
-        Share of vehicles with a sensor fault, if it is known. [1]
     known : Prior or None
         Prior of the faults, if it is known.
 
@@ -247,14 +244,13 @@ def learn_fleet(
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
 
-    def learn() -> tuple[list[FaultModel], FleetEstimate]:
+    def learn() -> tuple[list[FaultModel], RowsEstimate]:
         models = learn_fault_models(
             rows,
             feed=feed,
             fixed=_carried_centre(rows, carriers),
             load=None if load is None else load.mean_a / full_scale_a,
             known=known,
-            expected_faults=expected_faults,
         )
         return models, estimate_rows(rows, models, feed=feed, mean=mean, mean_square=square, usual=usual)
 
@@ -417,9 +413,9 @@ def estimate_vehicles(
         1.0 - max((each.probability for each in mine if each.cause not in LINEAR_CAUSES), default=0.0) for mine in unfit
     ]
     spread = reference.models[0].spread
-    return replace(
-        found,
-        confidence=found.confidence * linear,
+    estimate = {each.name: getattr(found, each.name) for each in fields(Estimate)}
+    return FleetEstimate(
+        **{**estimate, "confidence": found.confidence * linear},
         corrected=corrected,
         held_back=held_back,
         verdicts=verdicts,
@@ -438,7 +434,7 @@ def estimate_vehicles(
     )
 
 
-def _shared_findings(found: FleetEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
+def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
     """Loads without a sensor, batches and variants, of each vehicle: explained, and nothing of them is corrected."""
     feed, findings = reference.ordered[reference.feed], list[list[SensorFinding]]()
     sensor = sum(model.probability for model in reference.models if model.spread.shared[-1])

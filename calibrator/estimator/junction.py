@@ -491,6 +491,7 @@ def _estimate(
         verdicts=verdicts,
         explanations=[_explanations(each, branches, scale_a) for each in points],
         findings=findings,
+        evidence=np.zeros((N, 3, 0)),
     )
     deciding = [
         "; ".join(

@@ -192,9 +192,8 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) 
     alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
     if not (alone or of_branches or len(fleet.vehicles) == 1):
         return None
-    fleets = {"--hold-out": settings.hold_out, "--expected-faults": settings.expected_faults is not None}
-    for option in (option for option, given in fleets.items() if given):
-        raise ContradictionError(f"{option} is for a fleet that is compared with itself, not for single junctions")
+    if settings.hold_out:
+        raise ContradictionError("--hold-out is for a fleet that is compared with itself, not for single junctions")
     from calibrator.estimator.junction import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
 
     return calibrate_junctions
@@ -395,24 +394,19 @@ class _Run:
 
 def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:
     """Refuse an earlier result that a run cannot go on from."""
-    run, anew = read_run(folder), "calibrate it without --since"
-    if run.method != Method.POSTERIOR.value:
-        raise FleetError(f"{folder}: a result of the method {run.method}; --since goes on from one of the posterior")
-    if run.branches != list(store.branches):
-        have, need = ", ".join(run.branches), ", ".join(store.branches)
-        raise FleetError(f"{folder}: a result with branches {have}; this fleet has {need}: {anew}")
+    run = read_run(folder)
     if not (folder / PARTS).is_dir():
         raise FleetError(
             f"{folder / PARTS}: no such folder; expected the parameters of the earlier result: give the whole folder "
-            f"that 'calibrator calibrate' wrote, or {anew}"
+            f"that 'calibrator calibrate' wrote, or calibrate without --since"
         )
-    if (run.layout_sha256, run.dbc_sha256) != (database.layout.digest, database.digest):
-        raise FleetError(
-            f"{folder}: made with another version of layout or DBC than {database.layout.path}; the node would not "
-            f"accept its parameters: {anew}"
-        )
-    if run.buckets != store.buckets:
-        raise FleetError(
-            f"{folder}: made from a store of {run.buckets} buckets, and this one has {store.buckets}; give the same "
-            f"store, with the new drives added, or {anew}"
-        )
+    layout = database.layout
+    for what, was, now in (
+        ("the method", run.method, Method.POSTERIOR.value),
+        ("branches", ", ".join(run.branches), ", ".join(store.branches)),
+        (f"another version of {layout.path}:", run.layout_sha256[:8], layout.digest[:8]),
+        ("another version of the DBC:", run.dbc_sha256[:8], database.digest[:8]),
+        ("a number of buckets of", run.buckets, store.buckets),
+    ):
+        if was != now:
+            raise FleetError(f"{folder}: a result with {what} {was}, and now it is {now}; calibrate without --since")

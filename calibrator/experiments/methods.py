@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrator.drive import Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.decision import FleetEstimate, estimate_rows
+from calibrator.estimator import decision
 from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_vehicles, learn_fleet
 from calibrator.estimator.learning import learn_fault_models
 from calibrator.estimator.prior import Prior, known_prior
@@ -72,13 +72,13 @@ def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float)
     mean = recorded.mean_a / full_scale_a
     square = np.einsum("nkk->nk", recorded.covariance_a2) / full_scale_a**2 + mean**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
-    found = estimate_rows(
+    found = decision.estimate_rows(
         recorded.rows, models, feed=feed, mean=mean, mean_square=square, usual=usual, full_scale_a=full_scale_a
     )
     return _estimated(found, found.faulty & found.identifiable & (found.harm_probability < HARM_LIMIT), models[0].prior)
 
 
-def _estimated(found: FleetEstimate, corrected: Mask, prior: Prior) -> Estimate:
+def _estimated(found: decision.Estimate, corrected: Mask, prior: Prior) -> Estimate:
     return Estimate(
         faults=Faults(
             hardware_drift=found.hardware_drift,

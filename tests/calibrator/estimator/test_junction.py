@@ -11,10 +11,7 @@ import pytest
 
 from calibrator import Junction, JunctionCalibrator
 from calibrator.errors import ContradictionError, DriveError, FleetError
-from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator as command
-from tests.calibrator.conftest import LAYOUT
-from tests.calibrator.summaries.small_stores import random_faults, small_store
 
 JUNCTION = Junction(branches=["battery", "motor", "heater"], full_scale_a=400.0)
 SECONDS, PERIOD_S = 240.0, 0.1
@@ -46,19 +43,58 @@ def motor_off() -> pd.DataFrame:
     return recording(gain=(0.0, 0.05, 0.0))
 
 
-def test_trusted_sensor_gives_the_other_gains(motor_off: pd.DataFrame) -> None:
-    rows = found(motor_off, trusted=["battery"]).loc["vehicle"]
-    truth = pd.Series({"battery": 0.0, "motor": 0.05, "heater": 0.0})
-    assert ((rows.gain_error - truth).abs() < 3.0 * rows.gain_error_sd).all()
-    assert rows.gain_error_sd.max() < 0.005
-    assert rows.corrected.to_dict() == {"battery": False, "motor": True, "heater": False}
+MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
 
 
-def test_gains_equal_those_of_least_squares(motor_off: pd.DataFrame) -> None:
-    current_a = motor_off - motor_off.mean()
-    ratio = -np.linalg.lstsq(current_a[["motor", "heater"]], current_a["battery"], rcond=None)[0]
-    rows = found(motor_off, trusted=["battery"]).loc["vehicle"]
-    assert rows.gain_error[["motor", "heater"]].to_numpy() == pytest.approx(1.0 / ratio - 1.0, abs=2e-3)
+@pytest.mark.parametrize(
+    ("fault", "known", "corrected"),
+    [
+        ({"gain": (0.0, 0.05, 0.0)}, {"trusted": ["battery"]}, {"motor"}),
+        ({"gain": (0.03, 0.05, 0.0)}, {"readings": MOTOR_READ}, {"battery", "motor"}),
+        ({"offset_a": (0.0, 4.0, 0.0)}, {"trusted": ["battery"]}, set()),
+        # of two branches the declared load leaves one offset; of three the gain alone is corrected
+        (
+            {"offset_a": (0.0, 4.0, 0.0), "load_a": 3.0},
+            {"trusted": ["battery", "heater"], "load": (3.0, 0.2)},
+            {"motor"},
+        ),
+        (
+            {"gain": (0.0, 0.1, 0.0), "offset_a": (0.0, 0.0, 6.0)},
+            {"trusted": ["battery"], "load": (0.0, 0.1)},
+            {"motor"},
+        ),
+        ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
+    ],
+)
+def test_faults_are_within_their_deviations_and_what_is_known_well_is_corrected(
+    fault: dict[str, Any], known: dict[str, Any], corrected: set[str]
+) -> None:
+    rows = found(recording(**fault), **known).loc["vehicle"]
+    gain, offset_a = (np.array(fault.get(name, (0.0, 0.0, 0.0))) for name in ("gain", "offset_a"))
+    assert (np.abs(rows.gain_error - gain) < 3.0 * rows.gain_error_sd).all()
+    assert rows.gain_error_sd.max() < 0.01
+    assert set(rows.index[rows.corrected]) == corrected
+    assert (np.abs(rows.offset_a - offset_a) < 3.0 * rows.offset_sd_a).all()
+
+
+@pytest.mark.parametrize("missing", [0.0, 25.0])
+def test_charge_balance_tells_an_offset(missing: float) -> None:
+    """Also of a sensor with a gain error, and where a tenth of the samples of another branch are missing."""
+    frame = recording(offset_a=(5.0, 0.0, 0.0), gain=(0.1, 0.0, 0.0), load_a=30.0)
+    true_ah = float((frame["battery"] - 5.0).mean()) / 1.1 * SECONDS / 3600.0
+    frame.loc[100.0 : 100.0 + missing, "heater"] = np.nan
+    row = found(frame, trusted=["motor"], charge_ah={"battery": (true_ah, 0.01)}).loc["vehicle", "battery"]
+    assert row.offset_a == pytest.approx(5.0, abs=0.5)
+    assert row.offset_sd_a < 0.5
+
+
+def test_branch_that_is_off_keeps_its_gain_open() -> None:
+    frame = recording().assign(heater=0.0)
+    frame["battery"] = -frame["motor"] + np.random.default_rng(2).normal(0.0, 0.2, len(frame))
+    rows = found(frame, trusted=["battery"]).loc["vehicle"]
+    assert rows.gain_error_sd["heater"] > 0.1
+    assert rows.gain_error_sd["motor"] < 0.01
+    assert not rows.corrected["heater"]
 
 
 def test_ratios_alone_have_no_scale(motor_off: pd.DataFrame) -> None:
@@ -83,17 +119,6 @@ def test_unusable_vehicle_leaves_the_others_calibrated(motor_off: pd.DataFrame, 
     assert "next: calibrator report" in done.stderr
 
 
-def test_declared_load_tells_the_offset() -> None:
-    junction = Junction(branches=["battery", "motor"], full_scale_a=400.0)
-    frame = recording(offset_a=(0.0, 4.0, 0.0), load_a=3.0)
-    frame["motor"] += frame.pop("heater")
-    calibrator = JunctionCalibrator(trusted=["battery"], load=(3.0, 0.2)).fit(frame, junction)
-    row = calibrator.parameters_.set_index("branch").loc["motor"]
-    assert row.offset_a == pytest.approx(4.0, abs=3.0 * row.offset_sd_a)
-    assert row.offset_sd_a < 0.6
-    assert row.corrected
-
-
 def test_offset_of_one_of_two_has_two_explanations() -> None:
     calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(
         recording(offset_a=(0.0, 6.0, 0.0)), JUNCTION
@@ -106,15 +131,6 @@ def test_offset_of_one_of_two_has_two_explanations() -> None:
     assert re.search(r"offset (\+5\.\d|\+6\.\d) or 0 A: not corrected|offset 0 or \+[56]\.\d A: not corrected", motor)
     deciding = calibrator.vehicles_["vehicle"].parameters.deciding_evidence
     assert "the offset of motor, heater needs a zero-current window" in deciding
-
-
-def test_gain_is_corrected_alone_where_it_is_open_whose_an_offset_is() -> None:
-    frame = recording(gain=(0.0, 0.1, 0.0), offset_a=(0.0, 0.0, 6.0))
-    rows = found(frame, trusted=["battery"], load=(0.0, 0.1)).loc["vehicle"]
-    assert rows.corrected.to_dict() == {"battery": False, "motor": True, "heater": False}
-    assert rows.gain_error["motor"] == pytest.approx(0.1, abs=0.01)
-    assert rows.offset_a["motor"] == 0.0
-    assert rows.offset_sd_a["motor"] > 2.0
 
 
 def test_car_at_rest_tells_an_offset_and_no_gain() -> None:
@@ -146,22 +162,12 @@ def test_what_no_gain_and_offset_explain_is_found_from_the_size_that_the_documen
     spoil: Any, share: float
 ) -> None:
     """Of full scale, RMS; see docs/junction.md."""
-    for seed in range(300, 303):
+    for seed in (300, 301):
         frame = recording(seed, gain=(0.0, 0.1, 0.0))
         spoil(frame, share * 400.0)
         calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION)
         assert calibrator.vehicles_["vehicle"].parameters.findings
         assert not calibrator.parameters_.corrected.any()
-
-
-def test_charge_balance_tells_an_offset() -> None:
-    """Also of a sensor with a gain error, and where a tenth of the samples of another branch are missing."""
-    frame = recording(offset_a=(5.0, 0.0, 0.0), gain=(0.1, 0.0, 0.0), load_a=30.0)
-    true_ah = float((frame["battery"] - 5.0).mean()) / 1.1 * SECONDS / 3600.0
-    frame.loc[100.0:124.0, "heater"] = np.nan
-    row = found(frame, trusted=["motor"], charge_ah={"battery": (true_ah, 0.01)}).loc["vehicle", "battery"]
-    assert row.offset_a == pytest.approx(5.0, abs=0.5)
-    assert row.offset_sd_a < 0.5
 
 
 def test_meters_of_one_car_are_one_system() -> None:
@@ -192,24 +198,6 @@ def test_contradicting_knowledge_corrects_nothing() -> None:
     assert not calibrator.parameters_.corrected.any()
 
 
-def test_branch_that_stands_still_for_a_while_is_no_finding() -> None:
-    """While it does it has no noise either; taken for noisy, it once made a step of 10^10 A."""
-    frame = recording(90)
-    steady = frame["heater"].where(frame.index > 150.0, -2.0)
-    frame["battery"] -= steady - frame["heater"]
-    frame["heater"] = steady
-    assert not JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION).vehicles_["vehicle"].parameters.findings
-
-
-def test_load_that_is_switched_between_two_currents_is_no_finding() -> None:
-    """Of these any curve is straight; noise taken out of one once made an error of 10^5 % at full scale."""
-    frame, random = recording(), np.random.default_rng(3)
-    heater_a = np.repeat(random.choice([-1.0, -31.0], len(frame) // 75 + 1), 75)[: len(frame)]
-    frame["battery"] = -frame["motor"] - heater_a + random.normal(0.0, 0.2, len(frame))
-    frame["heater"] = heater_a + random.normal(0.0, 0.2, len(frame))
-    assert not JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION).vehicles_["vehicle"].parameters.findings
-
-
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
@@ -229,35 +217,56 @@ def test_sensor_that_is_not_linear_is_found_and_not_corrected(change: Any, cause
     assert set(calibrator.parameters_.verdict) == {"cannot tell"}
 
 
+def steady_heater(rng: np.random.Generator, frame: pd.DataFrame) -> None:
+    """While it stands still it has no noise either; taken for noisy, it once made a step of 10^10 A."""
+    steady = frame["heater"].where(frame.index > 150.0, -2.0)
+    frame["battery"] -= steady - frame["heater"]
+    frame["heater"] = steady
+
+
+def switched_heater(rng: np.random.Generator, frame: pd.DataFrame) -> None:
+    """Of two currents any curve is straight; noise taken out of one once made an error of 10^5 % at full scale."""
+    heater_a = np.repeat(rng.choice([-1.0, -31.0], len(frame) // 75 + 1), 75)[: len(frame)]
+    frame["battery"] = -frame["motor"] - heater_a + rng.normal(0.0, 0.2, len(frame))
+    frame["heater"] = heater_a + rng.normal(0.0, 0.2, len(frame))
+
+
+def noisy(branch: str, sd_a: float) -> Any:
+    def spoil(rng: np.random.Generator, frame: pd.DataFrame) -> None:
+        frame[branch] += rng.normal(0.0, sd_a, len(frame))
+
+    return spoil
+
+
+def second_motor(rng: np.random.Generator, frame: pd.DataFrame) -> None:
+    frame["battery"] += 30.0 * np.convolve(rng.normal(size=len(frame) + 19), np.full(20, 0.22), "valid")
+
+
 @pytest.mark.parametrize(
-    ("branch", "more_a", "causes"),
+    ("spoil", "causes"),
     [
-        ("motor", lambda rng, n: np.zeros(n), set()),
-        ("motor", lambda rng, n: rng.normal(0.0, 5.0, n), set()),
-        ("motor", lambda rng, n: rng.normal(0.0, 10.0, n), set()),
-        ("battery", lambda rng, n: rng.normal(0.0, 10.0, n), set()),
-        (
-            "battery",
-            lambda rng, n: 30.0 * np.convolve(rng.normal(size=n + 19), np.full(20, 0.22), "valid"),
-            {"switching"},
-        ),
+        (noisy("motor", 0.0), set()),
+        (noisy("motor", 10.0), set()),
+        (noisy("battery", 10.0), set()),
+        (steady_heater, set()),
+        (switched_heater, set()),
+        (second_motor, {"switching"}),
     ],
-    ids=["nothing", "noise", "more noise", "noise of the battery", "second motor"],
 )
-def test_no_sensor_is_blamed_for_noise_or_for_a_branch_that_is_not_measured(
-    branch: str, more_a: Any, causes: set[str]
+def test_no_sensor_is_blamed_for_noise_or_for_a_branch_that_is_switched_or_not_measured(
+    spoil: Any, causes: set[str]
 ) -> None:
-    for seed in range(3):
+    for seed in range(2):
         frame = recording(seed, gain=(0.0, 0.1, -0.2), offset_a=(0.0, 3.0, 0.0))
-        frame[branch] += more_a(np.random.default_rng(seed + 100), len(frame))
+        spoil(np.random.default_rng(seed + 100), frame)
         calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION)
         assert {each.cause for each in calibrator.vehicles_["vehicle"].parameters.findings} == causes
 
 
 def test_standard_deviations_are_right() -> None:
-    """Gains of twenty junctions are within their deviation about as often as normal errors, and never far."""
+    """Gains of twelve junctions are within their deviation about as often as normal errors, and never far."""
     errors = []
-    for seed in range(20):
+    for seed in range(12):
         gain = np.random.default_rng(seed).uniform(-0.2, 0.2, 2)
         rows = found(recording(seed, gain=(0.0, *gain), seconds=60.0), trusted=["battery"]).loc["vehicle"]
         errors += list((rows.gain_error[["motor", "heater"]] - gain) / rows.gain_error_sd[["motor", "heater"]])
@@ -321,31 +330,16 @@ def test_command_writes_what_python_finds(table: Path, tmp_path: Path, motor_off
     assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
 
 
-def test_store_of_summaries_is_no_junction(database: VehicleDatabase, tmp_path: Path) -> None:
-    store = small_store(tmp_path / "store", database, random_faults(2))
-    with pytest.raises(FleetError, match="a store of summaries, and a junction without a fleet needs the drives"):
-        JunctionCalibrator().fit(store.url, LAYOUT)
-
-
 def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:
     frame = recording(gain=(0.0, 0.05, 0.0), offset_a=(0.0, -1.5, 0.0), load_a=2.0)
-    frame = frame.rename(columns={"battery": "batterie"})
     frame.rename_axis("time_s").to_csv(tmp_path / "drive.csv")
     drive, layout = tmp_path / "drive.csv", write_layout(tmp_path, frame)
-    options = ["--trusted", "batterie", "--trusted", "heater", "--load", "2:0.1", "--out", tmp_path / "result"]
-    said = command("calibrate", drive, "--layout", layout, *options, "--json").stdout
-    found = json.loads(said)
+    options = ["--trusted", "battery", "--trusted", "heater", "--load", "2:0.1", "--out", tmp_path / "result"]
+    found = json.loads(command("calibrate", drive, "--layout", layout, *options, "--json").stdout)
     assert found["junction_rms_deployed_a"] < 0.5 < 2.0 < found["junction_rms_measured_a"]
     (parameters,) = (tmp_path / "result" / "params").iterdir()
     sums = command("kirchhoff", drive, "--layout", layout, "--parameters", parameters)
-    assert "right sensors would sum to 2 +- 0.3" in sums.stdout
     assert re.search(r"RMSE of the sum about the 2 A expected: 2.\d+ A measured, 0.4\d A corrected", sums.stdout)
-    (share,) = re.findall(r"corrected (\d+) % of the instants", sums.stdout)
-    assert float(share) > 90.0
-    command("report", tmp_path / "result", "--out", tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text()
-    assert "Kirchhoff sum after correction about the 2.00 A declared" in page
-    assert "No branch is called" not in page
 
 
 @pytest.mark.parametrize(
@@ -355,7 +349,6 @@ def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:
         (["--load=-3:0.1"], "expected what flows out of the junction"),
         (["--charge", "battery"], "expected a branch with its charge"),
         (["--charge", "battery=3"], "give its standard deviation"),
-        (["--trusted", "battery", "--expected-faults", "0.2"], "--expected-faults is for a fleet"),
         (["--trusted", "battery", "--hold-out", "car"], "--hold-out is for a fleet"),
     ],
 )
@@ -373,30 +366,3 @@ def test_gain_ratios_are_named_in_the_order_of_the_layout(motor_off: pd.DataFram
     (said,) = [each for each in JunctionCalibrator().fit(motor_off, turned).notices_ if "gain ratios" in each]
     assert "(heater / motor)" in said
     assert "1.05" in said.partition("(motor / battery)")[0]
-
-
-def test_offset_is_open_where_loads_are_not_known() -> None:
-    frame = recording(offset_a=(0.0, 4.0, 0.0))
-    rows = found(frame, trusted=["battery"]).loc["vehicle"]
-    assert rows.offset_sd_a["motor"] > 2.0
-    assert not rows.corrected.any()
-
-
-def test_right_sensors_are_said_to_be_right() -> None:
-    calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(recording(), JUNCTION)
-    assert set(calibrator.parameters_.verdict) == {"no sensor fault"}
-
-
-def test_bench_reading_of_one_branch_fixes_the_gain_of_another() -> None:
-    readings = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
-    rows = found(recording(gain=(0.03, 0.05, 0.0)), readings=readings).loc["vehicle"]
-    assert rows.gain_error["battery"] == pytest.approx(0.03, abs=3.0 * rows.gain_error_sd["battery"])
-
-
-def test_branch_that_is_off_keeps_its_gain_open() -> None:
-    frame = recording().assign(heater=0.0)
-    frame["battery"] = -frame["motor"] + np.random.default_rng(2).normal(0.0, 0.2, len(frame))
-    rows = found(frame, trusted=["battery"]).loc["vehicle"]
-    assert rows.gain_error_sd["heater"] > 0.1
-    assert rows.gain_error_sd["motor"] < 0.01
-    assert not rows.corrected["heater"]

@@ -1,14 +1,13 @@
 """From evidence rows to estimates: right where they are sure, each vehicle by itself, harmless in odd worlds."""
 
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.decision import FleetEstimate, estimate_rows
+from calibrator.estimator.decision import RowsEstimate, estimate_rows
 from calibrator.estimator.evidence import EvidenceRows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT
 from calibrator.estimator.learning import learn_fault_models
@@ -26,7 +25,7 @@ def moments(rows: EvidenceRows) -> dict[str, Any]:
     return {"mean": mean, "mean_square": mean**2 + VARIANCE, "usual": np.stack([ideal, ideal**2 + VARIANCE])}
 
 
-def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[FleetEstimate, Faults]:
+def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[RowsEstimate, Faults]:
     """Estimate, and what of it would be deployed."""
     rows = rows_of(faults, seed=seed, load=load)
     found = estimate_rows(rows, learn_fault_models(rows, feed=0), feed=0, **moments(rows))
@@ -61,7 +60,6 @@ def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitud
     [
         (0.0125, 1.0),
         (0.05, 0.6),
-        *(pytest.param(*each, marks=pytest.mark.long) for each in product((-0.03, 0.0125, 0.05), (0.6, 1.0))),
     ],
 )
 def test_batch_of_sensors_with_a_common_offset_makes_no_vehicle_worse(offset: float, share: float) -> None:
@@ -72,9 +70,7 @@ def test_batch_of_sensors_with_a_common_offset_makes_no_vehicle_worse(offset: fl
     assert np.abs(found.offset_a[:, 1] - faults.offset_a[:, 1]).max() < 0.01
 
 
-@pytest.mark.parametrize(
-    ("load", "share"), [pytest.param(0.0125, 0.3, marks=pytest.mark.long), (0.025, 0.15), (0.0125, 1.0)]
-)
+@pytest.mark.parametrize(("load", "share"), [(0.025, 0.15), (0.0125, 1.0)])
 def test_load_without_a_sensor_makes_no_vehicle_worse(load: float, share: float) -> None:
     faults = random_faults(3, vehicles=30, branches=3)
     found, deployed = estimated(faults, seed=3, load=load * (np.arange(30) < 30 * share))
@@ -82,11 +78,9 @@ def test_load_without_a_sensor_makes_no_vehicle_worse(load: float, share: float)
     assert np.abs(found.offset_a[:, 1:] - faults.offset_a[:, 1:]).max() < 0.01
 
 
-@pytest.mark.parametrize("gain", [0.04, pytest.param(-0.04, marks=pytest.mark.long)])
-@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_batch_of_sensors_with_a_common_gain_makes_no_vehicle_worse(K: int, gain: float) -> None:
-    faults = random_faults(4, vehicles=30, branches=K)
-    faults.drift[:, 1] = (1.0 + gain) * (1.0 + faults.drift[:, 1]) - 1.0
+def test_batch_of_sensors_with_a_common_gain_makes_no_vehicle_worse() -> None:
+    faults = random_faults(4, vehicles=30, branches=2)
+    faults.drift[:, 1] = 1.04 * (1.0 + faults.drift[:, 1]) - 1.0
     assert not worse(estimated(faults, seed=4)[1], faults).any()
 
 

@@ -7,11 +7,12 @@ import pytest
 from msgspec.structs import replace as changed
 
 from calibrator.drive import Array
-from calibrator.estimator.evidence import EvidenceRows, evidence_names, reported_evidence
+from calibrator.estimator.evidence import evidence_names, reported_evidence
 from calibrator.estimator.fleet_estimate import FleetEstimate
 from calibrator.estimator.vehicle_report import deciding_evidence, explained, impossible
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, SensorFinding
+from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
 from tests.ecu_node.vehicles import parameters_for
 
 NAMES = ("battery", "motor")
@@ -56,6 +57,7 @@ def estimate(
         verdicts=("cannot tell",),
         explanations=[explanations],
         findings=[findings],
+        evidence=np.zeros((1, 3, 10)),
         points=[],
         order=(0, 1),
         full_scale_a=FULL_SCALE_A,
@@ -153,39 +155,32 @@ def test_explanation_in_words_names_sensors_vehicle_and_findings(database: Vehic
         assert part in text
 
 
-def test_evidence_is_reported_in_the_units_of_the_sensors() -> None:
-    drift, offset_a = np.array([[0.1, 0.0]]), np.array([[0.0, 12.0]])
-    hardware, hardware_a = np.array([0.05]), np.array([[2.0, -2.0]])
-    gain = 1.0 + drift
-    ratios = [1.1 * 1.05, 1.05, 1.1, 1.1, 1.0]
-    seen = np.array([1.1, 1.0, 1.1, 1.0, 1.0]) * FULL_SCALE_A
-    constants_a = np.array([1.1 * 2.0, 12.0 - 2.0, 1.1 * 12.0, 0.0, 0.0])
-    variance = np.full(10, 1e-4)
-    variance[[3, 4, 8, 9]] = 100.0  # nothing was read on a bench
-    rows = EvidenceRows(
-        values=np.append(np.log(ratios), constants_a / FULL_SCALE_A)[None],
-        covariance=np.diag(variance)[None],
-        means=np.zeros((1, 2, 2)),
-    )
-    (found,) = reported_evidence(
+def test_evidence_without_errors_is_what_the_true_faults_make_of_it_in_the_units_of_the_sensors() -> None:
+    faults, scale = random_faults(3, vehicles=10, branches=2, sparsity=50.0), FULL_SCALE_A
+    rows = rows_of(faults, noise=0.0, errors=Errors(offset_read=0.001))
+    centre = np.zeros(10)
+    centre[7] = 2.0 / scale  # a load that no branch measures, in the junction constant
+    value, sd, made = reported_evidence(
         rows,
-        centre=np.concatenate([np.zeros(7), [2.0 / FULL_SCALE_A], np.zeros(2)]),
+        centre=centre,
         covariance=rows.covariance,
-        drift=drift,
-        offset_a=offset_a,
-        hardware_drift=hardware,
-        hardware_offset_a=hardware_a,
-        full_scale_a=FULL_SCALE_A,
-    )
-    names = evidence_names(NAMES)
-    value, sd, made = (dict(zip(names, values, strict=True)) for values in found)
-    assert np.isnan([value[name] for name in ("gain read battery", "offset read motor")]).all()
-    assert value["slope battery"] == pytest.approx(1.155) == made["slope battery"]
-    assert sd["slope battery"] == pytest.approx(0.01 * 1.155)
-    assert sd["junction constant"] == pytest.approx(0.01 * seen[2])
-    assert made["gain ratio battery / motor"] == pytest.approx(float(gain[0, 0]))
-    assert (made["intercept battery"], made["intercept motor"]) == pytest.approx((2.2, 10.0))
-    assert made["junction constant"] == pytest.approx(1.1 * (12.0 + 2.0))  # with the load that no branch measures
+        drift=faults.drift,
+        offset_a=faults.offset_a * scale,
+        hardware_drift=faults.hardware_drift,
+        hardware_offset_a=faults.hardware_offset_a * scale,
+        full_scale_a=scale,
+    ).transpose(1, 2, 0)
+    names, gain = evidence_names(NAMES), 1.0 + faults.drift.T
+    for name, measured, explained_by in zip(names, value, made, strict=True):
+        if name.startswith("gain read"):
+            assert np.isnan(measured).all()
+            continue
+        load_a = 2.0 * gain[0] if name == "junction constant" else 0.0
+        np.testing.assert_allclose(measured + load_a, explained_by, atol=1e-9)
+    np.testing.assert_allclose(value[names.index("slope motor")], gain[1] * (1.0 + faults.hardware_drift))
+    np.testing.assert_allclose(value[names.index("offset read motor")], faults.offset_a[:, 1] * scale)
+    np.testing.assert_allclose(sd[names.index("slope motor")], 0.002 * value[names.index("slope motor")])
+    np.testing.assert_allclose(sd[names.index("offset read battery")], 0.001 * scale)
 
 
 def test_gain_error_of_a_whole_or_more_has_no_parameters() -> None:
