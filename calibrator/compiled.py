@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, cast
+from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import llvmlite.binding
 import numba as _numba
@@ -72,18 +72,22 @@ class compiled(Generic[_Parameters, _Result]):  # noqa: N801 (a decorator)
         """Machine code for arguments of these types, from the cache if it is there."""
         if numba.config.DISABLE_JIT:  # to debug what is compiled
             return self._function
-        plan, folder = _Plan(self._function, types), _cache_folder()
+        folder = _cache_folder()
         if folder is None:
             if self.takes_long:
                 _say(f"in every run, as its cache cannot be written; {CACHE_VARIABLE} can name another folder")
-            return cast("Callable[_Parameters, _Result]", _without_cache(plan))
+            return _machine_code(self._function, types, None)
         with _alone(folder):
             os.utime(folder)
             if not any(folder.rglob(f"*.{self._function.__qualname__}-*.nbc")):
                 _forget_others(folder)
                 if self.takes_long:
                     _say("once")
-            return cast("Callable[_Parameters, _Result]", _from_cache(plan, folder))
+            try:
+                return _machine_code(self._function, types, folder)
+            except (OSError, EOFError, pickle.UnpicklingError):  # the machine went down as it was written, say
+                _clear(folder)
+                return _machine_code(self._function, types, None)
 
 
 class compiled_with_notice(compiled[_Parameters, _Result]):  # noqa: N801 (a decorator)
@@ -106,37 +110,17 @@ def _dispatcher(function: Callable[..., object], **options: Any) -> Any:
     return numba.njit(error_model="numpy", no_cfunc_wrapper=True, **options)(function)
 
 
-class _Plan(NamedTuple):
-    """What is to be compiled, for arguments of which types."""
-
-    function: Callable[..., object]
-    types: tuple[Any, ...]
-
-
-def _from_cache(plan: _Plan, folder: Path) -> Any:
-    """Machine code from the folder, or compiled and written there, or only compiled if that cannot be done."""
-    dispatcher = _cached_dispatcher(plan, folder)
+def _machine_code(
+    function: Callable[_Parameters, _Result], types: tuple[Any, ...], folder: Path | None
+) -> Callable[_Parameters, _Result]:
+    """A function as machine code: from the folder, or compiled and written there; None: only compiled."""
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder or "")
     try:
-        dispatcher.compile(plan.types)
-    except (OSError, EOFError, pickle.UnpicklingError):
-        if not dispatcher.signatures:  # what is there cannot be read: the machine went down as it was written, say
-            _clear(folder)
-            return _without_cache(plan)
-    return dispatcher
-
-
-def _without_cache(plan: _Plan) -> Any:
-    dispatcher = _dispatcher(plan.function)
-    dispatcher.compile(plan.types)
-    return dispatcher
-
-
-def _cached_dispatcher(plan: _Plan, folder: Path) -> Any:
-    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
-    try:
-        return _dispatcher(plan.function, cache=True)
+        dispatcher = _dispatcher(function, cache=folder is not None)
     finally:
         numba.config.CACHE_DIR = before
+    dispatcher.compile(types)
+    return cast("Callable[_Parameters, _Result]", dispatcher)
 
 
 @cache
