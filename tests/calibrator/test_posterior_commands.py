@@ -8,7 +8,7 @@ import pytest
 from calibrator.estimator.results import read_results, read_run
 from calibrator.fleet_truth import read_truth
 from ecu_node.database import read_database
-from ecu_node.layout import file_digest, read_layout
+from ecu_node.layout import read_layout
 from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
 from tests.calibrator.command_here import calibrator, made_once
 
@@ -94,39 +94,6 @@ def test_a_harm_limit_of_zero_corrects_nothing_and_every_fault_says_why(result: 
     unknown = [item for item in parameters if item.verdict == "cannot tell"]
     assert unknown
     assert all(item.explanations and item.deciding_evidence for item in unknown)
-
-
-@pytest.mark.long
-def test_trusted_vehicles_are_taken_for_faultless(fleet: Path, tmp_path: Path) -> None:
-    truth = read_truth(fleet / "truth.json").vehicles
-    sound = [name for name, vehicle in truth.items() if not any([*vehicle.drift.values(), *vehicle.offset_a.values()])]
-    assert len(sound) >= 3
-    trusted = ["--trusted", ",".join(sound[:2]), *(part for name in sound[2:] for part in ("--trusted", name))]
-    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *trusted)
-    assert run.returncode == 0, run.stderr
-    rows = [row for row in read_results(tmp_path / "result") if row["vehicle"] in sound]
-    assert len(rows) == 2 * len(sound)
-    assert all(row["drift"] == 0.0 and row["offset_a"] == 0.0 for row in rows)
-
-
-@pytest.mark.long
-def test_a_bench_reading_of_a_sensor_is_heeded_and_recorded(fleet: Path, tmp_path: Path) -> None:
-    vehicle, truth = next(
-        (name, vehicle)
-        for name, vehicle in read_truth(fleet / "truth.json").vehicles.items()
-        if any(vehicle.offset_a.values())
-    )
-    table = tmp_path / "bench.csv"
-    cells = "".join(f"{vehicle},{name},{truth.offset_a[name]},0.02\n" for name in ("battery", "motor"))
-    table.write_text(f"vehicle,branch,offset_a,offset_sd_a\n{cells}")
-    out = tmp_path / "result"
-    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)
-    assert run.returncode == 0, run.stderr
-    assert read_run(out).settings["readings"] == ["bench.csv", file_digest(table)]
-    after = {row["branch"]: row for row in read_results(out) if row["vehicle"] == vehicle}
-    for name in ("battery", "motor"):
-        assert after[name]["offset_a"] == pytest.approx(truth.offset_a[name], abs=0.1)
-        assert after[name]["offset_sd_a"] <= 0.03
 
 
 def test_a_slip_in_the_bench_readings_ends_the_run_before_any_drive_is_read(fleet: Path, tmp_path: Path) -> None:

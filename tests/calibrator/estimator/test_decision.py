@@ -45,7 +45,7 @@ def as_faults(values: Array) -> Faults:
     return Faults(hardware_drift=none[:, 0], hardware_offset_a=none, drift=values[:, :K], offset_a=values[:, K:])
 
 
-@pytest.mark.parametrize("sd", [1e-4, 0.001, 0.005, 0.01, 0.03])
+@pytest.mark.parametrize("sd", [1e-4, 0.005, 0.03])
 def test_confidence_is_the_probability_to_be_recovered(sd: float) -> None:
     found = points(TWO_EXPLANATIONS, sd=sd)
     estimate, confidence = best_estimate(found, LEAST)
@@ -99,17 +99,6 @@ def test_small_faults_are_counted_with_the_smallest_of_the_fleet() -> None:
     assert best_estimate(found, np.array([0.005, 0.05]))[1] == pytest.approx(0.5)
 
 
-def test_order_of_the_branches_and_the_sign_of_all_faults_do_not_matter() -> None:
-    found, order = points(TWO_EXPLANATIONS, sd=0.004), [1, 0, 3, 2]
-    estimate, confidence = best_estimate(found, LEAST)
-    swapped = best_estimate(found._replace(faults=found.faults[:, order]), LEAST)
-    np.testing.assert_allclose(swapped[0], estimate[order], atol=1e-12)
-    assert swapped[1] == pytest.approx(confidence)
-    mirrored = best_estimate(found._replace(faults=-found.faults), LEAST)
-    np.testing.assert_allclose(mirrored[0], -estimate, atol=1e-12)
-    assert mirrored[1] == pytest.approx(confidence)
-
-
 def test_harm_on_any_drive_counts_once_and_a_branch_without_a_correction_has_none() -> None:
     found, estimate = points(TWO_EXPLANATIONS, sd=0.05), np.array([0.12, 0.0, 0.0, 0.0])
     still = np.zeros((1, K)), np.full((1, K), 1e-4)
@@ -144,15 +133,6 @@ def test_fault_models_are_averaged_by_their_probabilities() -> None:
     mean = 0.7 * single[0].weight @ single[0].faults + 0.3 * single[1].weight @ single[1].faults
     np.testing.assert_allclose(both.weight @ both.faults, mean, atol=1e-12)
     assert np.bincount(both.model, np.bincount(both.explanation, both.weight)) == pytest.approx([0.7, 0.3], abs=1e-4)
-
-
-def test_what_the_sensors_share_is_part_of_every_fault() -> None:
-    shared = np.array([0.0, 0.02, 0.03, 0.0, 0.0])
-    sound = no_faults(1, K)
-    sound.drift[0, 0], sound.offset_a[0, 1] = np.expm1(0.03), 0.02
-    estimate, confidence = best_estimate(posterior_points([explained(sound, first_prior(K), shared=shared)])[0], LEAST)
-    np.testing.assert_allclose(estimate, [np.expm1(0.03), 0.0, 0.0, 0.02], atol=1e-9)
-    assert confidence > 0.9
 
 
 def group_prior() -> Prior:

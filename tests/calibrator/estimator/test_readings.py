@@ -1,13 +1,13 @@
 """Direct readings: every slip in a table is named, contradictions are named, and nothing is averaged over them."""
 
-import os
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
 from calibrator.estimator.evidence import EvidenceRows
 from calibrator.estimator.readings import (
@@ -21,7 +21,6 @@ from calibrator.estimator.readings import (
 )
 from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.layout import UnmeasuredLoad
-from tests.calibrator.estimator.simulated_drives import no_faults, summaries_of
 
 VEHICLES, BRANCHES, FULL_SCALE_A = ("V1", "V2"), ("battery", "motor"), 400.0
 HEADER = "vehicle,branch,drift,drift_sd,offset_a,offset_sd_a"
@@ -53,22 +52,6 @@ def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> Ev
     rows.relative[0, K + 1] = relative
     rows.constant[:, K] = np.array(constant_a) / FULL_SCALE_A
     return rows
-
-
-def vehicles_that_showed(offset_a: float, sd_a: float) -> list[VehicleSummary]:
-    """Two vehicles; the first battery sensor showed this offset with open contactors."""
-    delays = BranchDelays(branches=BRANCHES, delay_s=np.zeros(2), sd_s=np.zeros(2), known=np.ones(2, bool))
-    shown = {"V1": (offset_a, sd_a), "V2": (NAN, NAN)}
-    return [
-        VehicleSummary(
-            vehicle=name,
-            drives=("d",),
-            summary=summary,
-            delays=delays,
-            zero_current=ZeroCurrent(offset_a=np.array([shown[name][0], NAN]), sd_a=np.array([shown[name][1], NAN])),
-        )
-        for name, summary in zip(VEHICLES, summaries_of(no_faults(2, 2)), strict=True)
-    ]
 
 
 def test_table_is_read_in_any_order_and_empty_cells_are_not_read(tmp_path: Path) -> None:
@@ -105,14 +88,6 @@ def test_slip_is_named_with_its_line(tmp_path: Path, lines: list[str], message: 
         check(read(tmp_path, *lines))
 
 
-def test_table_that_is_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "bench.csv")
-    with pytest.raises(
-        FleetError, match=r"bench\.csv: cannot read the bench readings: it is a pipe; a file is expected"
-    ):
-        read_bench_table(tmp_path / "bench.csv", BRANCHES, full_scale_a=FULL_SCALE_A)
-
-
 @pytest.mark.parametrize("reading", [(0.05, 0.002, NAN, NAN), (NAN, NAN, 3.0, 0.2)])
 def test_trusted_vehicle_that_was_read_as_faulty_is_refused(reading: tuple[float, float, float, float]) -> None:
     bench = bench_of(*reading)
@@ -122,20 +97,29 @@ def test_trusted_vehicle_that_was_read_as_faulty_is_refused(reading: tuple[float
     check(bench_of(0.001, 0.002, 0.1, 0.2), "V1")
 
 
-def test_window_and_reading_that_agree_count_together() -> None:
-    bench = {**bench_of(NAN, NAN, 5.1, 0.1), **bench_of(0.02, 0.001, NAN, NAN, "V2", "motor")}
-    readings, notices = merge_readings(vehicles_that_showed(4.9, 0.1), bench, BRANCHES)
-    assert notices == []
+def test_window_and_reading_count_together_or_neither_does_where_they_contradict_each_other() -> None:
+    shown = {"V1": (4.9, 0.1), "V2": (5.0, 0.1), "V3": (NAN, NAN)}  # by the battery sensor with open contactors
+    vehicles = cast(
+        "list[VehicleSummary]",
+        [
+            SimpleNamespace(
+                vehicle=name,
+                zero_current=ZeroCurrent(offset_a=np.array([offset_a, NAN]), sd_a=np.array([sd_a, NAN])),
+            )
+            for name, (offset_a, sd_a) in shown.items()
+        ],
+    )
+    bench = {
+        **bench_of(NAN, NAN, 5.1, 0.1),
+        **bench_of(0.03, 0.001, -5.0, 0.1, "V2", "battery"),
+        **bench_of(0.02, 0.001, NAN, NAN, "V3", "motor"),
+        **bench_of(0.02, 0.001, NAN, NAN, "gone", "motor"),
+    }
+    readings, notices = merge_readings(vehicles, bench, BRANCHES)
     assert readings[:, 1, 0, 0] == pytest.approx([5.0, 0.1 / np.sqrt(2.0)])
-    assert readings[0, 0, 1, 1] == pytest.approx(0.02)
-
-
-def test_of_window_and_reading_that_contradict_each_other_neither_is_used() -> None:
-    bench = {**bench_of(0.03, 0.001, -5.0, 0.1), **bench_of(0.02, 0.001, NAN, NAN, "gone", "motor")}
-    readings, notices = merge_readings(vehicles_that_showed(5.0, 0.1), bench, BRANCHES)
-    assert np.isnan(readings[:, 1, 0, 0]).all()
-    assert readings[0, 0, 0, 0] == pytest.approx(0.03)
-    assert notices[0].startswith("vehicle V1: its battery sensor was read as -5.0 A on the bench, and showed +5.0 A")
+    assert np.isnan(readings[:, 1, 1, 0]).all()
+    assert (readings[0, 0, 1, 0], readings[0, 0, 2, 1]) == pytest.approx((0.03, 0.02))
+    assert notices[0].startswith("vehicle V2: its battery sensor was read as -5.0 A on the bench, and showed +5.0 A")
     assert notices[1] == "bench readings of vehicles that are left out are not used: gone"
 
 
