@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["calibrate", "identify", "params"]
 
-OF_POSTERIOR = ("harm_limit", "trusted", "readings", "load", "charge", "meter", "scheduler", "since")
+OF_POSTERIOR = ("harm_limit", "trusted", "readings", "load", "charge", "meter", "expected_faults", "scheduler", "since")
 OF_PUBLISHED = ("classifier", "truth", "sparsity", "magnitude", "symmetric", "seed")
 """What only one method heeds."""
 
@@ -91,6 +91,10 @@ def calibrate(
             metavar="BRANCH",
             help="Branch with another sensor in each folder of one car's recordings, such as a charger (posterior).",
         ),
+    ] = None,
+    expected_faults: Annotated[
+        float | None,
+        number_option("--expected-faults", 0, 1, "Share of vehicles with a sensor fault, if known (posterior)"),
     ] = None,
     classifier: Annotated[
         Classifier, typer.Option("--classifier", help="Tells hardware faults (published).")
@@ -146,6 +150,7 @@ def calibrate(
         load=None if load is None else _load(load),
         charge_ah=dict(_charge(item) for item in charge or ()),
         meter=meter,
+        expected_faults=expected_faults,
         classifier=classifier,
         truth=_truth_of(fleet, truth) if truth is not None else None,
         sparsity=sparsity,

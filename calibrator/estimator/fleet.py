@@ -274,7 +274,10 @@ class _Calibrator:
     def _settings(self, *, alone: bool) -> CalibrationSettings:
         """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
         given = self.get_params()
-        require(is_number(given["harm_limit"], 0, 1), "harm_limit", given["harm_limit"], "a number from 0 to 1")
+        for name in ("harm_limit", "expected_faults"):
+            value = given.get(name)
+            none = value is None and name == "expected_faults"
+            require(none or is_number(value, 0, 1), name, value, "a number from 0 to 1")
         for name in given.keys() & {"trusted", "hold_out"}:
             names = [given[name]] if isinstance(given[name], str) else () if given[name] is None else given[name]
             given[name] = frozenset(names_of(names, name, sets=True))
@@ -383,6 +386,8 @@ class FleetCalibrator(_Calibrator):
         Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
     hold_out : collection of str
         Vehicles to calibrate, but to learn nothing from for others.
+    expected_faults : float or None
+        Share of vehicles with a sensor fault, if it is known. [1]
     workers : int
         Number of processes; the result does not depend on it.
     scheduler : str or None
@@ -413,6 +418,7 @@ class FleetCalibrator(_Calibrator):
     trusted: Collection[str] = ()
     readings: str | Path | pd.DataFrame | None = None
     hold_out: Collection[str] = ()
+    expected_faults: float | None = None
     workers: int = 2
     scheduler: str | None = None
     verbose: bool = False

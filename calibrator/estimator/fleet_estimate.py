@@ -195,6 +195,7 @@ def learn_fleet(
     readings: Array | None = None,
     trusted: Mask | None = None,
     load: UnmeasuredLoad | None = None,
+    expected_faults: float | None = None,
     known: Prior | None = None,
 ) -> FleetReference:
     """Learn what vehicles without faults are like, and which faults there are.
@@ -214,6 +215,8 @@ def learn_fleet(
         the junction law are not trusted, those that differ from the others do not carry.
     load : UnmeasuredLoad or None
         Load that no branch measures, if it is known; None: estimated from the fleet.
+    expected_faults : float or None
+        Share of vehicles with a sensor fault, if it is known. [1]
     known : Prior or None
         Prior of the faults, if it is known.
 
@@ -251,6 +254,7 @@ def learn_fleet(
             fixed=_carried_centre(rows, carriers),
             load=None if load is None else load.mean_a / full_scale_a,
             known=known,
+            expected_faults=expected_faults,
         )
         return models, estimate_rows(rows, models, feed=feed, mean=mean, mean_square=square, usual=usual)
 

@@ -179,6 +179,7 @@ def learn_task(
             readings=readings[:, :, learning],
             trusted=trusted,
             load=settings.load or layout.unmeasured_load,
+            expected_faults=settings.expected_faults,
         )
         task = FleetTask(
             reference=reference,

@@ -108,6 +108,7 @@ def learn_fault_models(
     fixed: Array | None = None,
     load: float | None = None,
     known: Prior | None = None,
+    expected_faults: float | None = None,
 ) -> list[FaultModel]:
     """Learn the fault models that explain a fleet.
 
@@ -123,6 +124,8 @@ def learn_fault_models(
         Load that no branch measures, in fractions of full scale, if it is known. [1]
     known : Prior or None
         Prior of the faults, if it is known.
+    expected_faults : float or None
+        Share of vehicles with a sensor fault, if it is known. [1]
 
     Returns
     -------
@@ -136,7 +139,7 @@ def learn_fault_models(
 
     def learner_of(most: int) -> _Learner:
         some = order[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
-        return _Learner(rows.take(np.sort(some)), feed, fixed, known)
+        return _Learner(rows.take(np.sort(some)), feed, fixed, known, expected_faults)
 
     learner, starter = learner_of(MOST_LEARNT), learner_of(MOST_STARTED)
     climbed = [starter.climb(starter.start(centre), START_ROUNDS) for centre in learner.centres()]
@@ -149,10 +152,13 @@ def learn_fault_models(
 class _Learner:
     """Expectation maximisation on the evidence of one fleet."""
 
-    def __init__(self, rows: EvidenceRows, feed: int, fixed: Array, known: Prior | None) -> None:
+    def __init__(
+        self, rows: EvidenceRows, feed: int, fixed: Array, known: Prior | None, expected_faults: float | None
+    ) -> None:
         K = rows.branches
         self.rows, self.feed, self.fixed, self.known = rows, feed, fixed, known
         self.at, self.parameters = rows.places, ParameterPlaces(K)
+        self.expected_faults = expected_faults
         self.free = centre_rows(K) & np.isnan(fixed)
         least_sd = np.empty(5 * K)
         least_sd[self.at.relative], least_sd[self.at.constant] = LEAST_SPREAD
@@ -359,6 +365,10 @@ class _Learner:
         tally = np.zeros(prior.counts.shape)
         np.add.at(tally, (draws.fits.hardware, draws.fits.sensor), of_fit)
         counts = (tally + COUNT_VEHICLES * sparse_counts(tally)) / (N + COUNT_VEHICLES)
+        if self.expected_faults is not None:
+            sound, faulty = counts[:, :1], counts[:, 1:]
+            expected = self.expected_faults
+            counts = np.concatenate([(1.0 - expected) * sound / sound.sum(), expected * faulty / faulty.sum()], axis=1)
         loaded = draws.fits.support[:, :, load]
         share, centre, sd = prior.group_share.copy(), prior.group_centre.copy(), prior.group_sd.copy()
         for g in range(len(share)):

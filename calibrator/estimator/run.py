@@ -192,8 +192,9 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) 
     alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
     if not (alone or of_branches or len(fleet.vehicles) == 1):
         return None
-    if settings.hold_out:
-        raise ContradictionError("--hold-out is for a fleet that is compared with itself, not for single junctions")
+    fleets = {"--hold-out": settings.hold_out, "--expected-faults": settings.expected_faults is not None}
+    for option in (option for option, given in fleets.items() if given):
+        raise ContradictionError(f"{option} is for a fleet that is compared with itself, not for single junctions")
     from calibrator.estimator.junction import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
 
     return calibrate_junctions

@@ -49,6 +49,8 @@ class CalibrationSettings:
         Of single junctions: branch that has another sensor in each folder of recordings of one car.
     harm_limit : float
         Largest posterior probability of making a branch worse with which it is corrected. [1]
+    expected_faults : float or None
+        Share of the vehicles that have a sensor fault, if it is known; None: learnt from the fleet. [1]
     classifier : Classifier
         Of the published method.
     truth : FleetTruth or None
@@ -80,6 +82,7 @@ class CalibrationSettings:
     charge_ah: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     meter: str | None = None
     harm_limit: float = HARM_LIMIT
+    expected_faults: float | None = None
     classifier: Classifier = Classifier.TREE
     truth: FleetTruth | None = None
     sparsity: float = 80.0
@@ -104,6 +107,7 @@ class CalibrationSettings:
             "harm_limit": self.harm_limit,
             "trusted": sorted(self.trusted),
             "readings": None if self.readings is None else _named_digest(self.readings),
+            "expected_faults": self.expected_faults,
             "load": None if self.load is None else [self.load.mean_a, self.load.sd_a],
             "charge_ah": dict(self.charge_ah),
             "meter": self.meter,

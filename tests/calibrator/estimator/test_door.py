@@ -355,6 +355,7 @@ def test_wrong_places_and_parameters_are_refused(tmp_path: Path) -> None:
     fleet = Fleet.from_frames(frames(), JUNCTION)
     wrong: tuple[tuple[dict[str, Any], str], ...] = (
         ({"harm_limit": 2.0}, "harm_limit 2.0: expected a number from 0 to 1"),
+        ({"expected_faults": "half"}, "expected_faults 'half': expected a number from 0 to 1"),
         ({"workers": 0}, "workers 0: expected a whole number from 1 to 256"),
         ({"scheduler": 1}, "scheduler 1: expected the address of a Dask scheduler"),
         ({"readings": "nothere.csv"}, "readings 'nothere.csv': expected a file that exists"),

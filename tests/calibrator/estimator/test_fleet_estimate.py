@@ -209,8 +209,10 @@ def test_load_is_found_from_the_fleet_or_taken_as_declared() -> None:
     assert not estimate_vehicles(summaries, declared).corrected.any()
 
 
-def test_known_distribution_of_the_faults_is_used() -> None:
+def test_expected_share_and_known_distribution_of_the_faults_are_used() -> None:
     summaries, counts = drives("drift"), np.zeros((3, 5))
+    expected = learned(summaries, expected_faults=0.4)
+    assert expected.models[0].prior.counts[:, 1:].sum() == pytest.approx(0.4, abs=0.02)
     counts[0, :2] = 0.75, 0.25
     prior = known_prior(counts, (0.05, 0.25))
     assert learned(summaries, known=prior).models[0].prior is prior

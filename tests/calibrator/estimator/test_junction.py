@@ -350,6 +350,7 @@ def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:
         (["--charge", "battery"], "expected a branch with its charge"),
         (["--charge", "battery=3"], "give its standard deviation"),
         (["--trusted", "battery", "--hold-out", "car"], "--hold-out is for a fleet"),
+        (["--trusted", "battery", "--expected-faults", "0.2"], "--expected-faults is for a fleet"),
     ],
 )
 def test_wrong_option_is_one_line(table: Path, tmp_path: Path, options: list[str], match: str) -> None:
