@@ -10,12 +10,15 @@ Equation (25) is that of [1]_.
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults
 
-__all__ = ["TOLERANCE", "correction_error_rms", "f2_score", "harmed", "recovered"]
+__all__ = ["TOLERANCE", "UnseenDrive", "f2_score", "harmed", "recovered"]
 
 TOLERANCE = 0.10
 """Relative error below which a vehicle counts as recovered, section IV-D. [1]"""
@@ -65,31 +68,48 @@ def f2_score(predicted: Mask, actual: Mask) -> float:
     return float(hits / weighed) if weighed else 1.0
 
 
-def correction_error_rms(
-    *, true_drift: Array, true_offset_a: Array, drift: Array, offset_a: Array, mean_a: Array, mean_square_a2: Array
-) -> Array:
-    """RMSE of corrected against true currents, from the moments of the true currents alone.
+@dataclass(frozen=True)
+class UnseenDrive:
+    """Moments of the true currents i and of the sensors' errors e = i_m - i on a drive that no method has seen.
 
-    With alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat), corrected minus true current is
-    alpha i + beta; parameters d_hat = 0, o_hat = 0 give the error of the measured currents.
-
-    Parameters
+    Attributes
     ----------
-    true_drift, true_offset_a : ndarray of shape (..., K)
-        Sensor faults. [1], [A]
-    drift, offset_a : ndarray of shape (..., K)
-        Parameters the currents are corrected with. [1], [A]
-    mean_a, mean_square_a2 : ndarray of shape (..., K)
-        Moments of the true currents on a drive. [A], [A^2]
-
-    Returns
-    -------
-    ndarray of shape (..., K)
-        RMSE of each branch. [A]
+    mean_a, mean_square_a2 : ndarray of shape (N, K)
+        Of i. [A], [A^2]
+    error_mean_a, error_mean_square_a2, error_product_a2 : ndarray of shape (N, K)
+        E[e], E[e^2] and E[e i]. [A], [A^2], [A^2]
     """
-    alpha = (1.0 + true_drift) / (1.0 + drift) - 1.0
-    beta = (true_offset_a - offset_a) / (1.0 + drift)
-    return np.asarray(np.sqrt(np.maximum(alpha**2 * mean_square_a2 + 2.0 * alpha * beta * mean_a + beta**2, 0.0)))
+
+    mean_a: Array
+    mean_square_a2: Array
+    error_mean_a: Array
+    error_mean_square_a2: Array
+    error_product_a2: Array
+
+    @classmethod
+    def of_samples(cls, drives: Sequence[tuple[Array, Array]]) -> "UnseenDrive":
+        """Moments of the true and the measured currents, both of shape (T, K), of N vehicles. [A]"""
+        moments = [(i, i**2, i_m - i, (i_m - i) ** 2, (i_m - i) * i) for i, i_m in drives]
+        return cls(*np.array([[values.mean(axis=0) for values in own] for own in moments]).swapaxes(0, 1))
+
+    @classmethod
+    def of_linear_sensors(cls, mean_a: Array, mean_square_a2: Array, truth: Faults) -> "UnseenDrive":
+        """Moments of N vehicles with linear sensors (13), from those of their true currents, shape (K,) or (N, K)."""
+        d, o, i, i2 = truth.drift, truth.offset_a, mean_a, mean_square_a2
+        return cls(i, i2, d * i + o, d**2 * i2 + 2.0 * d * o * i + o**2, d * i2 + o * i)
+
+    def rms_a(self, drift: Array, offset_a: Array) -> Array:
+        """Root mean square error of the currents corrected with these parameters (25), shape (N, K). [A]
+
+        (i_m - o) / (1 + d) - i = (e - o - d i) / (1 + d); parameters of 0 give the error as measured.
+        """
+        square = (
+            self.error_mean_square_a2
+            + offset_a**2
+            + drift**2 * self.mean_square_a2
+            + 2.0 * (drift * offset_a * self.mean_a - offset_a * self.error_mean_a - drift * self.error_product_a2)
+        )
+        return np.asarray(np.sqrt(np.maximum(square, 0.0)) / np.abs(1.0 + drift))
 
 
 def harmed(estimate: Faults, truth: Faults, *, mean_a: Array, mean_square_a2: Array) -> Mask:
@@ -107,19 +127,8 @@ def harmed(estimate: Faults, truth: Faults, *, mean_a: Array, mean_square_a2: Ar
     ndarray of bool of shape (N,)
         True where the corrected current of some branch is strictly farther from the true one than the measured.
     """
-    zero = np.zeros_like(truth.drift)
-    measured, corrected = (
-        correction_error_rms(
-            true_drift=truth.drift,
-            true_offset_a=truth.offset_a,
-            drift=drift,
-            offset_a=offset,
-            mean_a=mean_a,
-            mean_square_a2=mean_square_a2,
-        )
-        for drift, offset in ((zero, zero), (estimate.drift, estimate.offset_a))
-    )
-    return np.asarray(np.any(corrected > measured, axis=-1))
+    unseen, zero = UnseenDrive.of_linear_sensors(mean_a, mean_square_a2, truth), np.zeros_like(truth.drift)
+    return np.asarray(np.any(unseen.rms_a(estimate.drift, estimate.offset_a) > unseen.rms_a(zero, zero), axis=-1))
 
 
 def _close(estimate: Array, truth: Array, smallest: float, tolerance: float) -> Mask:

@@ -29,6 +29,6 @@ class SensorOnly:
         return Estimate(faults=faults, hardware=sound > 0.0, corrected=changed, confidence=None, failed=0)
 
 
-experiment, methods = EXPERIMENTS["classifier"].with_vehicles(200), (PERFECT, POSTERIOR, SensorOnly())
+experiment, methods = EXPERIMENTS["classifier"].small(vehicles=200), (PERFECT, POSTERIOR, SensorOnly())
 result = run_experiment(experiment, fleet_for(experiment), methods=methods, repetitions=2)
 Console(width=100).print(result_table(result))

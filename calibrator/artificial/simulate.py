@@ -6,7 +6,7 @@ delay and noise, sampled by its own message at its own instants, quantised by th
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,17 +36,7 @@ from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch, Layout, split_signal
 
-__all__ = [
-    "FleetPlan",
-    "Vehicle",
-    "draw_vehicles",
-    "simulate_fleet",
-    "trip_of",
-    "vehicle_currents",
-    "vehicle_drive",
-    "vehicle_frames",
-    "write_vehicle",
-]
+__all__ = ["FleetPlan", "Vehicle", "draw_vehicles", "simulate_fleet", "trip_of", "vehicle_drive", "vehicle_frames"]
 
 WRITTEN_DOWN = ("seed", "sparsity", "magnitude", "balanced", "symmetric", "common_drive", "noise")
 """Fields of the plan that stand in the truth, too."""
@@ -141,7 +131,7 @@ def _sent_messages(
     Yields the message's name, its instants [s], and of each signal its name, that of the branch or input, its values in
     the unit of the DBC, and the factor from there to ampere into the junction.
     """
-    i, layout = vehicle_currents(vehicle, trip), database.layout
+    i, layout = _true_currents(vehicle, trip), database.layout
     messages: dict[str, list[tuple[str, str]]] = {}
     names = [(_current_signal(layout.find_branch(name)), name) for name in vehicle.branches]
     names += [(item.signal, item.name) for item in layout.input if item.name in trip.inputs]
@@ -163,41 +153,19 @@ def _sent_messages(
         yield message, time_s, sent
 
 
-def write_vehicle(
-    folder: Path,
-    database: VehicleDatabase,
-    vehicle: Vehicle,
-    *,
-    calibration: GroundTruth,
-    unseen: GroundTruth,
-    seed: Sequence[int],
+def _write_vehicle(
+    numbered: tuple[int, Vehicle], *, folder: Path, database: VehicleDatabase, trips: TripSource, seed: int
 ) -> VehicleTruth:
-    """Write the logs of one vehicle: ``logs/NAME/drive.log.gz`` and ``unseen/NAME/drive.log.gz``.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the fleet.
-    database : VehicleDatabase
-        DBC and layout.
-    vehicle : Vehicle
-        Who.
-    calibration, unseen : GroundTruth
-        Trip to learn from, and trip to test on.
-    seed : sequence of int
-        Seed of the frames' chance.
-
-    Returns
-    -------
-    VehicleTruth
-        What was put in, with the moments of the true currents on the unseen trip.
-    """
-    rng = random_stream(Purpose.FRAMES, *seed)
+    """Write ``logs/NAME/drive.log.gz`` and ``unseen/NAME/drive.log.gz`` of one vehicle, and return its truth."""
+    number, vehicle = numbered
+    rng = random_stream(Purpose.FRAMES, seed, number)
+    calibration = trip_of(trips, vehicle, number, "calibration", database.layout)
+    unseen = trip_of(trips, vehicle, number, "unseen", database.layout)
     for kind, trip in (("logs", calibration), ("unseen", unseen)):
         target = folder / kind / vehicle.name
         target.mkdir(parents=True, exist_ok=True)
         write_candump(target / LOG_NAME, vehicle_frames(rng, database, vehicle, trip))
-    i, faults = vehicle_currents(vehicle, unseen), vehicle.faults
+    i, faults = _true_currents(vehicle, unseen), vehicle.faults
     by_branch = {
         "hardware_offset_a": faults.hardware_offset_a,
         "drift": faults.drift,
@@ -213,7 +181,7 @@ def write_vehicle(
     )
 
 
-def vehicle_currents(vehicle: Vehicle, trip: GroundTruth) -> Array:
+def _true_currents(vehicle: Vehicle, trip: GroundTruth) -> Array:
     """True currents of the vehicle's branches, with what the unmeasured load draws from the first. [A]"""
     i = true_currents(trip.matrix_a(), vehicle.faults)
     i[:, 0] += vehicle.unmeasured_a
@@ -302,7 +270,7 @@ def simulate_fleet(
     branches = choose_branches(layout, trips.branches, plan.currents)
     vehicles = draw_vehicles(plan, layout, branches)
     with whole_folder(out) as folder:
-        write = partial(_write, folder=folder, database=database, trips=trips, seed=plan.seed)
+        write = partial(_write_vehicle, folder=folder, database=database, trips=trips, seed=plan.seed)
         written = run_many(write, enumerate(vehicles), Workers(processes=workers))
         told = shown(written, "simulate", len(vehicles), "vehicles")
         truths = {vehicle.name: truth for vehicle, truth in zip(vehicles, told, strict=True)}
@@ -337,20 +305,6 @@ def draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) ->
         )
         for number in range(plan.vehicles)
     ]
-
-
-def _write(
-    numbered: tuple[int, Vehicle], *, folder: Path, database: VehicleDatabase, trips: TripSource, seed: int
-) -> VehicleTruth:
-    number, vehicle = numbered
-    return write_vehicle(
-        folder,
-        database,
-        vehicle,
-        calibration=trip_of(trips, vehicle, number, "calibration", database.layout),
-        unseen=trip_of(trips, vehicle, number, "unseen", database.layout),
-        seed=(seed, number),
-    )
 
 
 def trip_of(trips: TripSource, vehicle: Vehicle, number: int, purpose: TripPurpose, layout: Layout) -> GroundTruth:

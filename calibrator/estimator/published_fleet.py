@@ -14,6 +14,7 @@ from itertools import compress
 
 import numpy as np
 
+from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import align
 from calibrator.errors import FleetError
@@ -21,9 +22,11 @@ from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.fleet_truth import faults_of
+from calibrator.options import Classifier
 from calibrator.processes.run_many import Workers
-from calibrator.published.classify import ExpectedFaults
-from calibrator.published.recovery import Recovery, calibrate_published
+from calibrator.published.classify import classify_by_expected_trees, classify_by_threshold, classify_by_truth
+from calibrator.published.evidence import evidence_of_models
+from calibrator.published.recovery import Recovery, recover_fleet
 from calibrator.published.state_space import VehicleModel, identify_vehicle
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.terminal.progress import progress_bar
@@ -88,24 +91,27 @@ def calibrate_fleet_published(
     vehicles = _without_misfits(vehicles, settings.hold_out, branches, left_out)
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
-    learners = list(compress(vehicles, learning))
-    # the vehicle whose held-out inputs are the unity drive has the longest
-    unity, truth = max(learners, key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in), settings.truth
+    learners, truth = list(compress(vehicles, learning)), settings.truth
     if truth is not None and tuple(truth.branches) != branches:
         raise FleetError(f"the truth is of branches {truth.branches}, the fleet has {branches}")
     with progress_bar("estimate the faults", None):
-        recovery = calibrate_published(
-            [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles],  # (2)
-            junction_a2=np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles]),
-            in_reference=np.array(learning),
-            simulation_error_a=_median_error_a(learners),
-            full_scale_a=layout.full_scale_a,
-            classifier=settings.classifier,
-            expected=ExpectedFaults(
-                **{name: getattr(settings, name) for name in ("sparsity", "magnitude", "symmetric", "seed")}
-            ),
-            truth=None if truth is None else faults_of(truth, names),
-        )
+        evidence, reference, unity = evidence_of_models(vehicles, learning)
+        if settings.classifier is Classifier.PERFECT:
+            assert truth is not None  # the command asks for it
+            classes = classify_by_truth(faults_of(truth, names))
+        elif settings.classifier is Classifier.THRESHOLD:
+            classes = classify_by_threshold(evidence.features, np.array(learning))
+        else:
+            classes = classify_by_expected_trees(
+                evidence.features,
+                reference,
+                _median_error_a(learners),
+                full_scale_a=layout.full_scale_a,
+                expected=FaultSettings(sparsity=settings.sparsity, magnitude=settings.magnitude, balanced=True),
+                seed=settings.seed,
+                reference_vehicles=None if settings.symmetric else len(learners),
+            )
+        recovery = recover_fleet(evidence, classes, full_scale_a=layout.full_scale_a)
     left_out |= {names[j]: reason for j, reason in recovery.failed.items()}
     parameters = [
         _parameters(vehicle, recovery, j, branches=branches, identity=identity, fleet_size=len(vehicles))

@@ -13,32 +13,29 @@ branch, (.)_r the others and M the covariance of the measured currents, g = M_rr
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, builtin_trip
+from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.random_fleet import FaultSettings
-from calibrator.artificial.trips import with_branches
 from calibrator.drive import Array
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, densest_clusters
-from calibrator.experiments.trial import CommonEvidence, Trial, UnseenDrive, drawn_distribution
+from calibrator.experiments.trial import CommonEvidence, Trial, drawn_distribution
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.published.state_space import choose_order, identify_model
 from calibrator.random_streams import Purpose, random_stream
+from calibrator.score import UnseenDrive
 
-__all__ = [
-    "CommonCase", "CommonDrive", "builtin_common_drive", "common_rows", "common_trial", "measured_moments",
-]  # fmt: skip
+__all__ = ["CommonCase", "CommonDrive", "builtin_common_drive", "common_rows", "common_trial", "measured_moments"]
 
 TRAIN_SHARE = 0.8
 """Share of the drive on which models are trained; the rest is the unity drive, section IV-C. [1]"""
 DURATION_S = 3600.0
 """An hour: 7,200 samples of unity drive at 10 Hz; the paper does not say. [s]"""
-BALANCE = "motor"
 FULL_SCALE_A = 400.0
 """Nominal maximum current of the built-in vehicle's junction, as in its layout. [A]"""
 GAIN_VARIANCE, CONSTANT_VARIANCE = 1e-10, 1e-12
@@ -80,10 +77,23 @@ class CommonDrive:
         if not worst <= 1e-6 * self.full_scale_a:
             raise DriveError(f"drive {self.name}: ideal currents must sum to zero; the worst sum is {worst:.3g} A")
 
-    @property
-    def branches(self) -> int:
-        """Number of branches K."""
-        return int(self.i_s.shape[1])
+    def with_branches(self, count: int) -> "CommonDrive":
+        """First K branches, of which the second one, the motor, takes the balance (19).
+
+        Raises
+        ------
+        FleetError
+            If there are not so many.
+        """
+        K = self.i_s.shape[1]
+        if not 2 <= count <= K:
+            raise FleetError(f"{count} branches: drive {self.name} has 2 to {K}")
+        if count == K:
+            return self
+        i_s, unseen = (currents[:, :count].copy() for currents in (self.i_s, self.unseen))
+        for currents in (i_s, unseen):
+            currents[:, 1] = -np.sum(np.delete(currents, 1, axis=1), axis=1)
+        return replace(self, i_s=i_s, unseen=unseen)
 
     @property
     def unity_start(self) -> int:
@@ -100,20 +110,17 @@ class CommonDrive:
         """What is needed to make the drive again."""
         return {
             "drive": self.name,
-            "branches": self.branches,
             "samples": len(self.i_s),
             "unity_samples": len(self.unity),
             "full_scale_a": self.full_scale_a,
         }
 
 
-def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float = DURATION_S) -> CommonDrive:
-    """Take the common drive from the built-in vehicle; it has the model inputs of ``dbc/hv_powertrain.toml``.
+def builtin_common_drive(*, seed: int = 0, duration_s: float = DURATION_S) -> CommonDrive:
+    """Take the common drive from the built-in vehicle, with all branches and the inputs of ``dbc/hv_powertrain.toml``.
 
     Parameters
     ----------
-    branches : int
-        Number of branches K, 2 to 5: battery and motor first; the motor takes the balance (19).
     seed : int
         Which trip.
     duration_s : float
@@ -122,22 +129,19 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
     Raises
     ------
     FleetError
-        If the built-in vehicle has not so many branches, or fastsim is not installed.
+        If fastsim is not installed.
     """
-    if not 2 <= branches <= len(BUILTIN_BRANCHES):
-        raise FleetError(f"{branches} branches: the built-in vehicle has 2 to {len(BUILTIN_BRANCHES)}")
     trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, seed), duration_s=duration_s, name=f"builtin-{seed}")
     unseen = builtin_trip(random_stream(Purpose.UNSEEN_TRIP, seed), duration_s=duration_s, name="unseen")
     x = trip.inputs
     power, demands = x["torque"] * x["speed"], [x[f"{name}_demand"] for name in ("heater", "aircon", "low_voltage")]
     inputs = [np.maximum(power, 0.0), np.minimum(power, 0.0), x["torque"] ** 2, *demands]
-    currents, other = (with_branches(t, BUILTIN_BRANCHES[:branches], BALANCE).matrix_a() for t in (trip, unseen))
     return CommonDrive(
         name=trip.name,
-        i_s=currents,
+        i_s=trip.matrix_a(),
         inputs=np.stack(inputs, axis=1) / x["voltage"][:, None],
         full_scale_a=FULL_SCALE_A,
-        unseen=other,
+        unseen=unseen.matrix_a(),
     )
 
 
@@ -147,6 +151,8 @@ class CommonCase(FaultSettings):
 
     Attributes
     ----------
+    branches : int
+        Number of branches K.
     vehicles : int
         Fleet size N, a multiple of 4 for a symmetric fleet.
     training_vehicles : int
@@ -157,6 +163,7 @@ class CommonCase(FaultSettings):
         Simulate by a state-space model of each vehicle (2), trained on 80 % of the drive, instead of artificially (23).
     """
 
+    branches: int = 2
     vehicles: int = 1000
     training_vehicles: int = 3000
     sparsity: float = 60.0
@@ -168,7 +175,8 @@ class CommonCase(FaultSettings):
 
 def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
     """Evidence of N vehicles on the unity drive; the same for the same seed."""
-    junction: dict[str, Any] = {"branches": drive.branches, "full_scale_a": drive.full_scale_a}
+    drive = drive.with_branches(case.branches)
+    junction: dict[str, Any] = {"branches": case.branches, "full_scale_a": drive.full_scale_a}
     truth = case.draw(random_stream(Purpose.FAULTS, seed), vehicles=case.vehicles, **junction)
     simulate = _simulation(drive, truth, case, Purpose.SIMULATION_ERROR, seed)
     if case.state_space:
@@ -191,10 +199,10 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         smallest_fault=case.magnitude[0],
         full_scale_a=drive.full_scale_a,
         truth=truth,
-        unseen=UnseenDrive.of_linear_sensors(drive.unseen, truth),
+        unseen=_unseen(drive.unseen, truth),
         record=record,
         collect=lambda: evidence,
-        drawn_from=drawn_distribution(case, drive.branches),
+        drawn_from=drawn_distribution(case, case.branches),
         training=training,
     )
 
@@ -231,6 +239,14 @@ def _measured(i_s: Array, truth: Faults) -> Iterator[Array]:
 def _junction_a2(drive: CommonDrive, truth: Faults) -> Array:
     """Mean square of the sum of each vehicle's measured currents (6), shape (N,). [A^2]"""
     return np.array([np.mean(measured.sum(axis=1) ** 2) for measured in _measured(drive.unity, truth)])
+
+
+def _unseen(ideal_a: Array, truth: Faults) -> UnseenDrive:
+    """Moments of N vehicles with linear sensors that all make one drive of ideal currents (T, K), (11)."""
+    gain, constant = 1.0 + truth.hardware_drift[:, None], truth.hardware_offset_a
+    mean_a, mean_square_a2 = ideal_a.mean(axis=0), np.mean(ideal_a**2, axis=0)
+    i2 = gain**2 * mean_square_a2 + 2.0 * gain * constant * mean_a + constant**2
+    return UnseenDrive.of_linear_sensors(gain * mean_a + constant, i2, truth)
 
 
 def measured_moments(i_s: Array, truth: Faults) -> tuple[Array, Array]:

@@ -22,36 +22,15 @@ from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, builtin_common_drive
 from calibrator.experiments.figures import TENTH_COLUMNS
-from calibrator.experiments.methods import (
-    BASELINES,
-    CEILING,
-    LEFT_IN,
-    PERFECT,
-    POSTERIOR,
-    THRESHOLD,
-    TREE,
-)
-from calibrator.experiments.recorded_trips import (
-    RecordedCase,
-    RecordedFleet,
-    builtin_fleet,
-    read_fleet,
-)
+from calibrator.experiments.methods import BASELINES, CEILING, LEFT_IN, PERFECT, POSTERIOR, THRESHOLD, TREE
+from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, builtin_fleet, read_fleet
 from calibrator.experiments.trial import ComparedMethod
 from calibrator.files.layout_files import vehicle_database
 
 __all__ = [
-    "CALIBRATION",
-    "COVERAGE",
-    "EXPERIMENTS",
-    "KEYS",
-    "REAL",
-    "Experiment",
-    "ExperimentResult",
-    "Setting",
-    "fleet_for",
+    "CALIBRATION", "COVERAGE", "EXPERIMENTS", "KEYS", "REAL", "Experiment", "ExperimentResult", "Setting", "fleet_for",
     "read_records",
-]
+]  # fmt: skip
 
 KEYS = ["series", "x", "method"]
 """Columns of a result that say what a row is of."""
@@ -101,8 +80,6 @@ class Experiment:
         Series and values of x to which ``--quick`` keeps; empty: all.
     drive_s : float
         Length of the common drive. [s]
-    branches : int
-        Number of branches K of the common drive, 2 to 5; on recorded trips the cases say it.
     paper : mapping
         Figures of the paper by (x, method) and name; the best by x stands in the tables.
     note : str
@@ -127,7 +104,6 @@ class Experiment:
     settings: tuple[Setting, ...]
     quick: Mapping[str, Sequence[float]] = field(default_factory=dict)
     drive_s: float = 3600.0
-    branches: int = 2
     paper: Mapping[tuple[float, str], Mapping[str, float]] = field(default_factory=dict)
     note: str = ""
     picture: Literal["lines", "dots", "map", "reliability"] = "lines"
@@ -140,25 +116,17 @@ class Experiment:
         """Whether it is on recorded trips."""
         return any(isinstance(setting.case, RecordedCase) for setting in self.settings)
 
-    def with_vehicles(self, vehicles: int, training_vehicles: int = 3000) -> "Experiment":
-        """The same with smaller fleets on the common drive, and a smaller one to train trees on."""
-        settings = tuple(
-            replace(
-                each,
-                case=replace(
-                    each.case, vehicles=min(each.case.vehicles, vehicles), training_vehicles=training_vehicles
-                ),
-            )
-            if isinstance(each.case, CommonCase)
-            else each
-            for each in self.settings
-        )
-        return replace(self, settings=settings)
-
-    def small(self) -> "Experiment":
-        """The same with small fleets and few settings: shows that it runs, not the figures."""
-        kept = tuple(s for s in self.settings if not self.quick or s.x in self.quick.get(s.series, ()))
-        return replace(self, settings=kept).with_vehicles(QUICK_VEHICLES, QUICK_TRAINING_VEHICLES)
+    def small(self, vehicles: int = QUICK_VEHICLES) -> "Experiment":
+        """The same with small fleets on the common drive, and few settings: shows that it runs, not the figures."""
+        kept = []
+        for each in self.settings:
+            case = each.case
+            if isinstance(case, CommonCase):
+                fewer = min(case.vehicles, vehicles)
+                case = replace(case, vehicles=fewer, training_vehicles=QUICK_TRAINING_VEHICLES)
+            if not self.quick or each.x in self.quick.get(each.series, ()):
+                kept.append(replace(each, case=case))
+        return replace(self, settings=tuple(kept))
 
 
 READINGS = (("", 60.0), ("3 of 6", 50.0))
@@ -404,7 +372,7 @@ def fleet_for(
     """
     if not experiment.recorded:
         duration_s = QUICK_DURATION_S if quick else experiment.drive_s
-        return builtin_common_drive(branches=experiment.branches, duration_s=duration_s)
+        return builtin_common_drive(duration_s=duration_s)
     if layout is None and not DEFAULT_LAYOUT.is_file():
         raise FleetError(
             f"{DEFAULT_LAYOUT}: not in this folder, which is no checkout of the source; experiments on recorded trips "

@@ -18,7 +18,7 @@ from calibrator.estimator.prior import Prior, known_prior
 from calibrator.experiments.baselines import BASELINES as SOLVERS
 from calibrator.experiments.trial import CommonEvidence, Estimate, FaultDistribution, Trial
 from calibrator.faults import Faults
-from calibrator.published.classify import Classification, FaultTrees, classify_by_threshold, classify_by_truth
+from calibrator.published.classify import Classification, classify_by_threshold, classify_by_trees, classify_by_truth
 from calibrator.published.recovery import recover_fleet
 
 __all__ = [
@@ -122,7 +122,7 @@ def _by_tree(trial: Trial) -> Classification:
     if trial.training is None:
         raise FleetError("published/tree: these trials have no artificial fleet that its trees could learn from")
     evidence, faults = trial.training()
-    return FaultTrees(evidence.features, faults).classify(trial.evidence.features)
+    return classify_by_trees(evidence.features, faults, trial.evidence.features)
 
 
 def _baseline(trial: Trial, *, solve: Callable[[Trial], Faults]) -> Estimate:
@@ -145,38 +145,33 @@ def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
     Raises
     ------
     FleetError
-        If it is no estimate, or one of its arrays has another shape or type, or values that are not finite.
+        If it is no estimate, or an array has another shape or type, or values that are not finite.
     """
     N, K = truth.drift.shape
 
     def wrong(what: str, given: object, expected: str) -> FleetError:
-        kind = "None" if given is None else f"an object of type {type(given).__name__}"
-        if isinstance(given, np.ndarray):
-            kind = f"an array of {given.dtype} of shape {given.shape}"
+        kind = f"{given.dtype} of shape {given.shape}" if isinstance(given, np.ndarray) else type(given).__name__
         return FleetError(
-            f"method '{method}': {what} {kind}, expected {expected}; see Estimate of {Estimate.__module__}"
+            f"method '{method}': {what} is {kind}, expected {expected}; see Estimate of {Trial.__module__}"
         )
 
     if not isinstance(estimate, Estimate):
-        raise wrong("estimate() returned", estimate, "an Estimate")
+        raise wrong("what estimate() returned", estimate, "an Estimate")
     if not isinstance(estimate.faults, Faults):
-        raise wrong("faults are", estimate.faults, "Faults of calibrator.faults")
+        raise wrong("faults", estimate.faults, "Faults of calibrator.faults")
     given = {f"faults.{name}": value for name, value in vars(estimate.faults).items()}
     given |= {name: getattr(estimate, name) for name in ("hardware", "corrected")}
     optional = {name: getattr(estimate, name) for name in ("confidence", "drift_sd", "offset_sd_a")}
     given |= {name: value for name, value in optional.items() if value is not None}
     for what, values in given.items():
         shape = (N,) if what in {"faults.hardware_drift", "hardware", "confidence"} else (N, K)
-        kinds, elements = ("b", "bool") if what in {"hardware", "corrected"} else ("fiu", "numbers")
-        if not (isinstance(values, np.ndarray) and values.shape == shape and values.dtype.kind in kinds):
-            axes = "vehicles and branches" if shape[1:] else "vehicles"
-            raise wrong(f"{what} is", values, f"an array of {elements} of shape {shape}: {axes}")
-        bad, expected = ~np.isfinite(values), "finite ones, 0 where no fault is found"
-        if what == "confidence":
-            bad |= (values < -ROUNDING) | (values > 1.0 + ROUNDING)
-            expected = "probabilities from 0 to 1"
-        if bad.any():
-            raise wrong(f"{what} has {np.sum(bad)} wrong values in", values, expected)
+        kinds, elements = ("b", "bool") if what in {"hardware", "corrected"} else ("fiu", "finite numbers")
+        fits = isinstance(values, np.ndarray) and values.shape == shape and values.dtype.kind in kinds
+        if not fits or not np.isfinite(values).all():
+            raise wrong(what, values, f"{elements} of shape {shape} (vehicles, branches), 0 where no fault is found")
+    confidence = estimate.confidence
+    if confidence is not None and (confidence.min() < -ROUNDING or confidence.max() > 1.0 + ROUNDING):
+        raise wrong("confidence", confidence, "probabilities from 0 to 1")
     if len(estimate.findings) not in {0, N}:
-        raise wrong(f"findings are of {len(estimate.findings)} vehicles in", estimate.findings, f"{N}, or none")
+        raise wrong(f"findings of {len(estimate.findings)} vehicles", estimate.findings, f"those of {N}, or none")
     return estimate

@@ -20,11 +20,12 @@ from calibrator.drives.align import Samples, align, choose_inputs, evaluate_form
 from calibrator.drives.delays import estimate_delays, without_delays
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
-from calibrator.experiments.trial import ComparedMethod, Trial, UnseenDrive, drawn_distribution
+from calibrator.experiments.trial import ComparedMethod, Trial, drawn_distribution
 from calibrator.faults import Faults, measured_currents, true_currents
-from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
+from calibrator.published.evidence import FleetEvidence, evidence_of_models
 from calibrator.published.state_space import identify_vehicle
 from calibrator.random_streams import Purpose, random_stream
+from calibrator.score import UnseenDrive
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise_samples
 from calibrator.terminal.progress import shown
@@ -248,18 +249,21 @@ class VehicleSamples:
         following : ndarray of shape (T, K) or None
             Ideal currents of the trip on which corrections are judged; None: its own trip is wanted. [A]
         """
-        faults, pairs = self.truth.take(vehicle), []
-        for i_s, unseen in ((own, False), (following, True)):
-            if i_s is not None:
-                i = true_currents(i_s, faults)
-                i[:, 0] += self.unmeasured_a[vehicle]
-                i = i if self.attack is None else self.attack.true_a(vehicle, i, unseen=unseen)
-                pairs.append((i, measured_currents(i, faults)))
-        i, i_m = pairs[-1]
-        if self.attack is None:
-            return i, i_m
-        peak_a = np.abs(pairs[0][1]).max(axis=0)
-        return i, self.attack.measured_a(vehicle, i_m, unseen=following is not None, peak_a=peak_a)
+        faults, attack = self.truth.take(vehicle), self.attack
+
+        def linear(i_s: Array, *, unseen: bool) -> tuple[Array, Array]:
+            i = true_currents(i_s, faults)
+            i[:, 0] += self.unmeasured_a[vehicle]
+            i = i if attack is None else attack.true_a(vehicle, i, unseen=unseen)
+            return i, measured_currents(i, faults)
+
+        i, i_m = linear(own, unseen=False)
+        peak_a = np.abs(i_m).max(axis=0)
+        if following is not None:
+            i, i_m = linear(following, unseen=True)
+        if attack is not None:
+            i_m = attack.measured_a(vehicle, i_m, unseen=following is not None, peak_a=peak_a)
+        return i, i_m
 
 
 def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial:
@@ -395,7 +399,4 @@ def _published_evidence(samples: Sequence[Samples], fleet: RecordedFleet) -> Fle
         )
         for j, drive in enumerate(samples)
     ]
-    unity = max(vehicles, key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in)
-    simulated = [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles]
-    junction_a2 = np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles])
-    return collect_evidence(simulated, fleet_mean(simulated), junction_a2)
+    return evidence_of_models(vehicles, [True] * len(vehicles))[0]

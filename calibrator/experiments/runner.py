@@ -7,7 +7,7 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,7 @@ import pandas as pd
 from calibrator.errors import FleetError
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, common_trial
 from calibrator.experiments.experiments import CALIBRATION, KEYS, Experiment, ExperimentResult, Setting
-from calibrator.experiments.figures import (
-    ALL,
-    calibration_errors,
-    figure_rows,
-    judge,
-    pool_figures,
-    pool_tenths,
-)
+from calibrator.experiments.figures import ALL, calibration_errors, figure_rows, judge, pool_figures, pool_tenths
 from calibrator.experiments.methods import POSTERIOR, require_estimate
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, recorded_trial
 from calibrator.experiments.trial import ComparedMethod
@@ -34,12 +27,6 @@ from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 
 __all__ = ["made_now", "pool_confidences", "run_experiment"]
-
-TRIALS: dict[tuple[type, type], Callable[..., Any]] = {
-    (CommonCase, CommonDrive): common_trial,
-    (RecordedCase, RecordedFleet): recorded_trial,
-}
-"""What makes a trial, by case and fleet."""
 
 
 def run_experiment(
@@ -83,11 +70,8 @@ def run_experiment(
     names = [method.name for method in usual]
     if twice := [name for name in names if names.count(name) > 1]:
         raise FleetError(f"{len(twice)} methods are called '{twice[0]}'; give each method a name of its own")
-    if isinstance(fleet, RecordedFleet):  # too few branches are said before anything is run
-        for count in {each.case.branches for each in experiment.settings if isinstance(each.case, RecordedCase)}:
-            fleet.with_branches(count)
-    elif fleet.branches != experiment.branches:
-        raise FleetError(f"{experiment.name}: expected a drive of {experiment.branches} branches, not {fleet.branches}")
+    for case in (setting.case for setting in experiment.settings):
+        fleet.with_branches(case.branches)  # too few are said before anything is run
     rows = [(setting, setting.methods or usual) for setting in experiment.settings]
     keys = [(setting.series, setting.x, method.name) for setting, own in rows for method in own]
     if not keys or len({*keys}) < len(keys):
@@ -113,10 +97,12 @@ def _run_trial(
     fleet: CommonDrive | RecordedFleet, task: tuple[CommonCase | RecordedCase, Sequence[ComparedMethod], int]
 ) -> list[dict[str, Any]]:
     case, methods, seed = task
-    make = TRIALS.get((type(case), type(fleet)))
-    if make is None:
+    if isinstance(case, RecordedCase) and isinstance(fleet, RecordedFleet):
+        trial = recorded_trial(fleet, case, seed)
+    elif isinstance(case, CommonCase) and isinstance(fleet, CommonDrive):
+        trial = common_trial(fleet, case, seed)
+    else:
         raise FleetError(f"{type(case).__name__} cannot be run on a {type(fleet).__name__}; see fleet_for()")
-    trial = make(fleet, case, seed)
     return [judge(require_estimate(method.name, method.estimate(trial), trial.truth), trial) for method in methods]
 
 

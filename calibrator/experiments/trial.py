@@ -16,17 +16,10 @@ from calibrator.drive import Array, Mask
 from calibrator.estimator.evidence import EvidenceRows
 from calibrator.faults import Faults
 from calibrator.published.evidence import FleetEvidence
+from calibrator.score import UnseenDrive
 from calibrator.summaries.moments import DriveSummary
 
-__all__ = [
-    "CommonEvidence",
-    "ComparedMethod",
-    "Estimate",
-    "FaultDistribution",
-    "Trial",
-    "UnseenDrive",
-    "drawn_distribution",
-]
+__all__ = ["CommonEvidence", "ComparedMethod", "Estimate", "FaultDistribution", "Trial", "drawn_distribution"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,54 +85,6 @@ class CommonEvidence:
     rows: EvidenceRows
     mean_a: Array
     covariance_a2: Array
-
-
-@dataclass(frozen=True)
-class UnseenDrive:
-    """Moments of the true currents i and of the sensors' errors e = i_m - i on a drive that no method has seen.
-
-    Attributes
-    ----------
-    mean_a, mean_square_a2 : ndarray of shape (N, K)
-        Of i. [A], [A^2]
-    error_mean_a, error_mean_square_a2, error_product_a2 : ndarray of shape (N, K)
-        E[e], E[e^2] and E[e i]. [A], [A^2], [A^2]
-    """
-
-    mean_a: Array
-    mean_square_a2: Array
-    error_mean_a: Array
-    error_mean_square_a2: Array
-    error_product_a2: Array
-
-    @classmethod
-    def of_samples(cls, drives: Sequence[tuple[Array, Array]]) -> "UnseenDrive":
-        """Moments of the true and the measured currents, both of shape (T, K), of N vehicles. [A]"""
-        moments = [(i, i**2, i_m - i, (i_m - i) ** 2, (i_m - i) * i) for i, i_m in drives]
-        return cls(*np.array([[values.mean(axis=0) for values in own] for own in moments]).swapaxes(0, 1))
-
-    @classmethod
-    def of_linear_sensors(cls, ideal_a: Array, truth: Faults) -> "UnseenDrive":
-        """Moments of N vehicles with linear sensors that all make one drive of ideal currents (T, K), (11) and (13)."""
-        gain, constant = 1.0 + truth.hardware_drift[:, None], truth.hardware_offset_a
-        mean_a, mean_square_a2 = ideal_a.mean(axis=0), np.mean(ideal_a**2, axis=0)
-        i = gain * mean_a + constant
-        i2 = gain**2 * mean_square_a2 + 2.0 * gain * constant * mean_a + constant**2
-        d, o = truth.drift, truth.offset_a
-        return cls(i, i2, d * i + o, d**2 * i2 + 2.0 * d * o * i + o**2, d * i2 + o * i)
-
-    def rms_a(self, drift: Array, offset_a: Array) -> Array:
-        """Root mean square error of the currents corrected with these parameters (25), shape (N, K). [A]
-
-        (i_m - o) / (1 + d) - i = (e - o - d i) / (1 + d); parameters of 0 give the error as measured.
-        """
-        square = (
-            self.error_mean_square_a2
-            + offset_a**2
-            + drift**2 * self.mean_square_a2
-            + 2.0 * (drift * offset_a * self.mean_a - offset_a * self.error_mean_a - drift * self.error_product_a2)
-        )
-        return np.asarray(np.sqrt(np.maximum(square, 0.0)) / np.abs(1.0 + drift))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,12 +16,11 @@ from sklearn.tree import DecisionTreeClassifier
 from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.published.evidence import FleetEvidence
 from calibrator.random_streams import Purpose, random_stream
 
 __all__ = [
-    "Classification", "ExpectedFaults", "FaultTrees", "classify_by_expected_tree", "classify_by_threshold",
-    "classify_by_truth", "decision_criterion", "expected_features",
+    "Classification", "classify_by_expected_trees", "classify_by_threshold", "classify_by_trees", "classify_by_truth",
+    "decision_criterion", "expected_features",
 ]  # fmt: skip
 
 TRAINING_VEHICLES = 3000
@@ -96,55 +95,25 @@ def classify_by_truth(faults: Faults) -> Classification:
     return Classification(hardware=faults.has_hardware_fault, sensor=faults.has_sensor_fault)
 
 
-class FaultTrees:
-    """Decision trees for hardware faults and for sensor faults.
+def classify_by_trees(learnt: Array, truth: Faults, features: Array) -> Classification:
+    """Classify vehicles by two decision trees, for hardware faults and for sensor faults.
 
     Parameters
     ----------
+    learnt : ndarray of shape (N', K + 1)
+        Features of an artificial fleet made like the fleet to be classified. [A^2]
+    truth : Faults
+        Of the artificial fleet.
     features : ndarray of shape (N, K + 1)
-        Of an artificial fleet made like the fleet to be classified. [A^2]
-    faults : Faults
-        The truth about it.
+        Of the fleet to be classified. [A^2]
     """
 
-    def __init__(self, features: Array, faults: Faults) -> None:
-        self._hardware = _fit_tree(features, faults.has_hardware_fault)
-        self._sensor = _fit_tree(features, faults.has_sensor_fault)
+    def found(faulty: Mask) -> Mask:
+        weight = {False: 1.0, True: RECALL_WEIGHT}
+        tree = DecisionTreeClassifier(max_depth=TREE_DEPTH, criterion="entropy", class_weight=weight, random_state=0)
+        return np.asarray(tree.fit(learnt, faulty).predict(features), bool)
 
-    def classify(self, features: Array) -> Classification:
-        """Classify vehicles by features of shape (N, K + 1). [A^2]"""
-        return Classification(
-            hardware=np.asarray(self._hardware.predict(features), bool),
-            sensor=np.asarray(self._sensor.predict(features), bool),
-        )
-
-
-def _fit_tree(features: Array, faulty: Mask) -> DecisionTreeClassifier:
-    weight = {False: 1.0, True: RECALL_WEIGHT}
-    tree = DecisionTreeClassifier(max_depth=TREE_DEPTH, criterion="entropy", class_weight=weight, random_state=0)
-    return tree.fit(features, faulty)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExpectedFaults:
-    """What the user expects the fleet's faults to be like; the trees are trained on it.
-
-    Attributes
-    ----------
-    sparsity : float
-        Sparsity level S. [%]
-    magnitude : tuple of float
-        Range of drifts [1] and of offsets in fractions of full scale.
-    symmetric : bool
-        Whether the mean of the fleet is the ideal vehicle (22).
-    seed : int
-        Seed of the training fleet.
-    """
-
-    sparsity: float
-    magnitude: tuple[float, float]
-    symmetric: bool
-    seed: int
+    return Classification(hardware=found(truth.has_hardware_fault), sensor=found(truth.has_sensor_fault))
 
 
 def expected_features(
@@ -186,37 +155,37 @@ def _mean_of_groups(values: Array, size: int) -> Array:
     return np.stack([values[group == number].mean(axis=0) for number in range(group[-1] + 1)])[group]
 
 
-def classify_by_expected_tree(
-    evidence: FleetEvidence,
+def classify_by_expected_trees(
+    features: Array,
     reference: Array,
     simulation_error_a: Array,
     *,
     full_scale_a: float,
-    expected: ExpectedFaults,
-    reference_vehicles: int,
+    expected: FaultSettings,
+    seed: int,
+    reference_vehicles: int | None,
 ) -> Classification:
     """Classify a real fleet by trees that learn from an artificial fleet with the faults that the user expects.
 
     Parameters
     ----------
-    evidence : FleetEvidence
-        Of N vehicles with K branches.
+    features : ndarray of shape (N, K + 1)
+        Of the real fleet. [A^2]
     reference : ndarray of shape (T, K)
         Fleet reference. [A]
     simulation_error_a : ndarray of shape (K,)
         Standard deviation of the simulation error. [A]
     full_scale_a : float
         Full scale of the junction. [A]
-    expected : ExpectedFaults
+    expected : FaultSettings
         What the fleet's faults are like.
-    reference_vehicles : int
-        How many vehicles the reference is the mean of.
+    seed : int
+        Seed of the artificial fleet.
+    reference_vehicles : int or None
+        How many vehicles the reference is the mean of; None: the fleet is symmetric, so its mean is the ideal vehicle.
     """
-    i_s = reference - reference.mean(axis=1, keepdims=True)
-    settings = FaultSettings(sparsity=expected.sparsity, magnitude=expected.magnitude, balanced=True)
-    rng = random_stream(Purpose.TRAINING_FAULTS, expected.seed)
-    faults = settings.draw(rng, vehicles=TRAINING_VEHICLES, branches=evidence.branches, full_scale_a=full_scale_a)
-    features = expected_features(
-        faults, i_s, simulation_error_a, reference_vehicles=None if expected.symmetric else reference_vehicles
-    )
-    return FaultTrees(features, faults).classify(evidence.features)
+    i_s, rng = reference - reference.mean(axis=1, keepdims=True), random_stream(Purpose.TRAINING_FAULTS, seed)
+    K = reference.shape[1]
+    faults = expected.draw(rng, vehicles=TRAINING_VEHICLES, branches=K, full_scale_a=full_scale_a)
+    learnt = expected_features(faults, i_s, simulation_error_a, reference_vehicles=reference_vehicles)
+    return classify_by_trees(learnt, faults, features)

@@ -14,29 +14,19 @@ the sum of the others and is not in the norm. Least squares on the support that 
 .. [2] H. Ohlsson, A. Y. Yang, R. Dong, S. S. Sastry, "Quadratic Basis Pursuit", arXiv:1301.7002 (2013).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import cvxpy
 import numpy as np
 
-from calibrator.drive import Array, Mask
+from calibrator.drive import Array
 from calibrator.faults import Faults
-from calibrator.options import Classifier
-from calibrator.published.classify import (
-    Classification,
-    ExpectedFaults,
-    classify_by_expected_tree,
-    classify_by_threshold,
-    classify_by_truth,
-)
-from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
+from calibrator.published.classify import Classification
+from calibrator.published.evidence import FleetEvidence
 
-__all__ = [
-    "BasisPursuit", "BasisPursuitError", "Recovery", "calibrate_published", "quadratic_forms", "recover_fleet",
-    "refit_support",
-]  # fmt: skip
+__all__ = ["BasisPursuit", "BasisPursuitError", "Recovery", "quadratic_forms", "recover_fleet", "refit_support"]
 
 cp: Any = cvxpy  # its type hints leave out the atoms
 
@@ -201,65 +191,6 @@ class Recovery:
     faults: Faults
     classification: Classification
     failed: Mapping[int, str]
-
-    def __len__(self) -> int:
-        return len(self.faults)
-
-
-def calibrate_published(
-    simulated: Sequence[Array],
-    *,
-    junction_a2: Array,
-    in_reference: Mask,
-    simulation_error_a: Array,
-    full_scale_a: float,
-    classifier: Classifier,
-    expected: ExpectedFaults,
-    truth: Faults | None,
-) -> Recovery:
-    """Estimate the faults of a fleet with the paper's method.
-
-    Parameters
-    ----------
-    simulated : sequence of N ndarrays of shape (T, K)
-        Currents of every vehicle on the unity drive (2). [A]
-    junction_a2 : ndarray of shape (N,)
-        Mean square of each vehicle's measured junction sum (6). [A^2]
-    in_reference : ndarray of bool of shape (N,)
-        Vehicles whose mean is the fleet reference (3).
-    simulation_error_a : ndarray of shape (K,)
-        Standard deviation of the simulation error of each branch. [A]
-    full_scale_a : float
-        Full scale of the junction. [A]
-    classifier : Classifier
-        How hardware faults are told.
-    expected : ExpectedFaults
-        For the tree.
-    truth : Faults or None
-        Of the same vehicles, for the perfect classifier.
-
-    Returns
-    -------
-    Recovery
-        Faults of every vehicle, in the order given.
-    """
-    reference = fleet_mean(currents for currents, used in zip(simulated, in_reference, strict=True) if used)
-    evidence = collect_evidence(simulated, reference, junction_a2)
-    if classifier is Classifier.PERFECT:
-        assert truth is not None
-        classification = classify_by_truth(truth)
-    elif classifier is Classifier.THRESHOLD:
-        classification = classify_by_threshold(evidence.features, in_reference)
-    else:
-        classification = classify_by_expected_tree(
-            evidence,
-            reference,
-            simulation_error_a,
-            full_scale_a=full_scale_a,
-            expected=expected,
-            reference_vehicles=int(in_reference.sum()),
-        )
-    return recover_fleet(evidence, classification, full_scale_a=full_scale_a)
 
 
 def recover_fleet(evidence: FleetEvidence, classification: Classification, *, full_scale_a: float) -> Recovery:

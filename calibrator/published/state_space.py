@@ -29,17 +29,9 @@ from calibrator.errors import DriveError
 from calibrator.terminal.text import counted
 
 __all__ = [
-    "StateSpaceModel",
-    "VehicleModel",
-    "bridged",
-    "choose_order",
-    "identify_model",
-    "identify_vehicle",
-    "pooled_poles",
-    "simulation_snr_db",
-    "snr_from_power",
-    "solve_scaled",
-]
+    "StateSpaceModel", "VehicleModel", "bridged", "choose_order", "identify_model", "identify_vehicle", "pooled_poles",
+    "simulation_snr_db", "snr_from_power", "solve_scaled",
+]  # fmt: skip
 
 TRAIN_SHARE = 0.8
 """Share of each drive that a model is identified on, section IV-C of [1]_. [1]"""

@@ -1,3 +1,6 @@
+"""Trips of the ideal vehicle: built in, recorded, or joined of pieces."""
+
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -5,12 +8,16 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.trips import (
     BuiltinTrips,
     GroundTruth,
     RecordedTrips,
     TripSource,
     choose_trips,
+    cut_and_rejoin,
+    ground_truth_from_drive,
+    with_branches,
 )
 from calibrator.drive import Channel, Drive
 from calibrator.drives.store import write_drive
@@ -18,49 +25,73 @@ from calibrator.errors import FleetError
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-
-def recorded(name: str, level: float) -> GroundTruth:
-    speed = np.where(np.arange(600) % 60 < 10, 0.0, 30.0)
-    battery = np.full(600, level)
-    return GroundTruth(
-        name=name, period_s=0.1, currents_a={"battery": battery, "motor": -battery}, inputs={"speed": speed}
-    )
+NOT_MODELLED = {"contactor_state", "junction_box_temperature"}
+"""Inputs that the built-in vehicle does not have; its logs hold "not available" for them."""
 
 
-TRIPS = [recorded(f"trip{k}", float(k)) for k in range(4)]
+def recorded(level: float, rise: float = 0.0) -> GroundTruth:
+    """A minute at 10 Hz that starts and ends at a standstill."""
+    speed = np.where((np.arange(600) + 5) % 60 < 10, 0.0, 30.0)
+    battery, auxiliary = level + rise * np.arange(600.0), np.full(600, -2.0)
+    currents = {"battery": battery, "motor": -battery - auxiliary, "auxiliary": auxiliary}
+    return GroundTruth(name=f"trip{level:g}", period_s=0.1, currents_a=currents, inputs={"speed": speed})
 
 
 def levels(trip: GroundTruth) -> set[float]:
     return set(trip.currents_a["battery"].tolist())
 
 
-def test_each_vehicle_has_a_recorded_trip_of_its_own_while_they_last() -> None:
-    trips = RecordedTrips(seed=0, recorded=TRIPS, vehicles=4, unseen_s=20.0)
-    assert [levels(trips.trip(k, "calibration")) for k in range(4)] == [{0.0}, {1.0}, {2.0}, {3.0}]
+def test_balancing_branch_is_minus_the_sum_of_the_others() -> None:
+    two = with_branches(recorded(10.0), ("battery", "motor"), "motor")
+    np.testing.assert_array_equal(two.currents_a["motor"], -recorded(10.0).currents_a["battery"])
 
 
-def test_unseen_trip_holds_nothing_of_the_vehicles_own() -> None:
-    trips = RecordedTrips(seed=0, recorded=TRIPS, vehicles=4, unseen_s=30.0)
+def test_rejoined_trip_is_made_of_pieces_between_standstills() -> None:
+    joined = cut_and_rejoin(np.random.default_rng(0), [recorded(0.0, rise=1.0)], duration_s=50.0, name="new")
+    assert len(joined) >= 500
+    jumps = np.flatnonzero(np.abs(np.diff(joined.currents_a["battery"])) > 1.0)
+    assert jumps.size > 0
+    assert np.all(joined.inputs["speed"][jumps] == 0.0)
+    np.testing.assert_allclose(joined.matrix_a().sum(axis=1), 0.0, atol=1e-12)
+
+
+def test_recorded_drive_becomes_a_trip_over_the_span_of_all_channels() -> None:
+    def channel(start: float, good: np.ndarray) -> Channel:
+        time_s = start + np.arange(100) * 0.1
+        return Channel(time_s=time_s, value=np.where(good, 2.0 * time_s, 1e9), good=good)
+
+    some, none = np.arange(100) != 50, np.zeros(100, bool)
+    branches = {"battery": channel(0.0, some)}
+    drive = Drive(vehicle="V", name="d", branches=branches, inputs={"speed": channel(0.5, some)})
+    made = ground_truth_from_drive(drive, 0.1)
+    assert made is not None
+    np.testing.assert_allclose(made.currents_a["battery"], 2.0 * (0.5 + made.time_s))
+    assert len(made) == pytest.approx(94, abs=1)
+    without_good = Drive(vehicle="V", name="d", branches=branches, inputs={"speed": channel(0.5, none)})
+    assert ground_truth_from_drive(without_good, 0.1) is None
+
+
+def test_recordings_serve_as_own_trips_while_they_last_and_never_for_both_purposes() -> None:
+    trips = [recorded(float(k)) for k in range(4)]
+    enough = RecordedTrips(seed=0, recorded=trips, vehicles=4, unseen_s=30.0)
     for k in range(4):
-        unseen = trips.trip(k, "unseen")
+        assert levels(enough.trip(k, "calibration")) == {float(k)}
+        unseen = enough.trip(k, "unseen")
         assert len(unseen) == 300
         assert float(k) not in levels(unseen)
-
-
-def test_larger_fleets_learn_from_some_recordings_and_are_tested_on_the_others() -> None:
-    trips = RecordedTrips(seed=0, recorded=TRIPS, vehicles=9, unseen_s=30.0)
+    few = RecordedTrips(seed=0, recorded=trips, vehicles=9, unseen_s=30.0)
     for k in range(9):
-        assert levels(trips.trip(k, "calibration")) <= {0.0, 1.0}
-        assert levels(trips.trip(k, "unseen")) <= {2.0, 3.0}
+        assert levels(few.trip(k, "calibration")) <= {0.0, 1.0}
+        assert levels(few.trip(k, "unseen")) <= {2.0, 3.0}
+    single = RecordedTrips(seed=0, recorded=[recorded(0.0, rise=1.0)], vehicles=3, unseen_s=10.0)
+    assert levels(single.trip(0, "calibration")).isdisjoint(levels(single.trip(0, "unseen")))
 
 
-def test_single_recording_is_cut_in_time() -> None:
-    ramp = np.arange(600.0)
-    inputs = recorded("only", 0.0).inputs
-    only = GroundTruth(name="only", period_s=0.1, currents_a={"battery": ramp, "motor": -ramp}, inputs=inputs)
-    for vehicles in (1, 3):
-        trips = RecordedTrips(seed=0, recorded=[only], vehicles=vehicles, unseen_s=10.0)
-        assert levels(trips.trip(0, "calibration")).isdisjoint(levels(trips.trip(0, "unseen")))
+def test_builtin_trip_obeys_the_junction_law_with_branches_and_inputs_of_the_layout(database: VehicleDatabase) -> None:
+    trip = builtin_trip(np.random.default_rng(7), duration_s=300.0, name="trip")
+    np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
+    assert set(trip.currents_a) == set(database.layout.branch_names)
+    assert set(trip.inputs) == {item.name for item in database.layout.input} - NOT_MODELLED
 
 
 def test_common_trips_are_the_same_for_all_and_differ_by_purpose() -> None:
@@ -71,22 +102,26 @@ def test_common_trips_are_the_same_for_all_and_differ_by_purpose() -> None:
     assert len(unseen) != len(first) or not np.array_equal(unseen.inputs["speed"], first.inputs["speed"])
 
 
-def channel(good: bool) -> Channel:
-    return Channel(time_s=np.arange(100) * 0.1, value=np.ones(100), good=np.full(100, good))
+def test_without_fastsim_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fastsim", None)  # makes its import fail
+    with pytest.raises(FleetError, match=r"need fastsim; .*: pip install 'hv-current-correction\[demo\]'$"):
+        builtin_trip(np.random.default_rng(0), duration_s=60.0, name="trip")
+
+
+def chosen(drives: str, layout: Layout) -> TripSource:
+    return choose_trips(drives, layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
 
 
 def test_drives_without_good_samples_are_left_out_by_name(database: VehicleDatabase, tmp_path: Path) -> None:
     for name, good in (("fine", True), ("stuck", False)):
-        branches = {"battery": channel(True), "motor": channel(good)}
+        branches = {
+            branch: Channel(time_s=np.arange(100) * 0.1, value=np.ones(100), good=np.full(100, usable))
+            for branch, usable in (("battery", True), ("motor", good))
+        }
         write_drive(tmp_path, Drive(vehicle=name, name="d", branches=branches, inputs={}), database.layout)
-    trips = choose_trips(str(tmp_path), database.layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
+    trips = chosen(str(tmp_path), database.layout)
     assert trips.branches == ("battery", "motor")
-    assert "stuck/d" in trips.notices[0]
-    assert "fine/d" not in trips.notices[0]
-
-
-def builtin(layout: Layout) -> TripSource:
-    return choose_trips("builtin", layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
+    assert trips.notices[0].endswith("left out: stuck/d")
 
 
 def renamed(layout: Layout, *, branches: bool = False, inputs: Sequence[str] = ()) -> Layout:
@@ -98,11 +133,8 @@ def renamed(layout: Layout, *, branches: bool = False, inputs: Sequence[str] = (
     return msgspec.structs.replace(layout, branch=branch, derived=derived)
 
 
-def test_layout_with_other_branches_is_told_those_of_the_builtin_vehicle(database: VehicleDatabase) -> None:
+def test_names_of_a_layout_that_the_builtin_vehicle_lacks_are_said(database: VehicleDatabase) -> None:
     with pytest.raises(FleetError, match=r"two or more branches named battery, motor, .* or give --drives a store"):
-        builtin(renamed(database.layout, branches=True))
-
-
-def test_inputs_that_the_builtin_vehicle_has_not_are_named(database: VehicleDatabase) -> None:
-    (notice,) = builtin(renamed(database.layout, inputs=["heater_demand"])).notices
+        chosen("builtin", renamed(database.layout, branches=True))
+    (notice,) = chosen("builtin", renamed(database.layout, inputs=["heater_demand"])).notices
     assert notice == "model inputs that the built-in vehicle has not: heater_current"

@@ -4,7 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,7 +25,7 @@ from calibrator.experiments.experiments import (
     read_records,
 )
 from calibrator.experiments.figures import ALL
-from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR
+from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR, MethodRow
 from calibrator.experiments.pages import headline, result_markdown, result_table, write_page
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
 from calibrator.experiments.runner import pool_confidences, run_experiment
@@ -58,7 +58,7 @@ def printed(result: ExperimentResult, width: int = 200) -> str:
     return capture.get()
 
 
-def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path) -> None:
+def test_new_experiment_is_one_row_and_says_before_it_runs_what_it_lacks(fleet: RecordedFleet, tmp_path: Path) -> None:
     row = Experiment(
         name="loads",
         title="Loads without a sensor",
@@ -74,18 +74,10 @@ def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path) -> None
     page = (tmp_path / "results" / "loads.md").read_text()
     assert "| load [A] | posterior |" in page
     assert re.search(r"\| 5 \| [01]\.\d{3} \([01]\.\d{3} to [01]\.\d{3}\)", page), "each rate with its interval"
-    assert (tmp_path / "results" / "loads.png").read_bytes().startswith(b"\x89PNG")
     assert "(results/loads.md)" in (tmp_path / "results.md").read_text()
-
-
-def test_more_branches_than_the_trips_have_are_refused_before_anything_is_run(fleet: RecordedFleet) -> None:
-    def estimate(_: object) -> NoReturn:
-        pytest.fail("a trial was run")
-
-    settings = tuple(Setting(x=K, case=RecordedCase(branches=K)) for K in (2, 9))
-    row = Experiment(name="many", title="Many branches", x_label="K", methods=(), settings=settings)
-    with pytest.raises(FleetError, match="9"):
-        run_experiment(row, fleet, methods=[replace(POSTERIOR, estimate=estimate)], repetitions=1)
+    many = replace(row, settings=(*row.settings, Setting(x=9.0, case=RecordedCase(branches=9))))
+    with pytest.raises(FleetError, match="9 currents asked for"):
+        run_experiment(many, fleet, methods=[MethodRow("none", lambda _: pytest.fail("a trial was run"))])
 
 
 @pytest.mark.parametrize(
@@ -93,7 +85,7 @@ def test_more_branches_than_the_trips_have_are_refused_before_anything_is_run(fl
 )
 def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
     row = EXPERIMENTS[name].small()
-    result = run_experiment(row, fleet if row.recorded else smooth_drive(row.branches, samples=2000), repetitions=1)
+    result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")
     write_page(tmp_path / "results", result)
     found = dict.fromkeys(zip(result.figures["series"], result.figures["x"], result.figures["method"], strict=True))
@@ -105,7 +97,7 @@ def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet,
     page = (tmp_path / "results" / f"{name}.md").read_text()
     assert f"`calibrator experiment {name} --out FOLDER`" in page
     assert ("minus the sum of the others" in page) == row.recorded
-    assert (tmp_path / "results" / f"{name}.png").is_file()
+    assert (tmp_path / "results" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     for line in printed(result, width=80).splitlines():
         assert len(line) <= 80
         assert "…" not in line
@@ -127,28 +119,19 @@ def test_figures_depend_on_the_seed_and_not_on_the_number_of_processes(snr: Expe
     assert not other.figures["value"].equals(again.figures["value"])
 
 
-def test_table_puts_paper_published_method_and_default_side_by_side(snr: ExperimentResult) -> None:
+def test_tables_put_paper_published_method_and_default_side_by_side_and_explain_what_is_there(
+    snr: ExperimentResult,
+) -> None:
     table = headline(snr)
     assert list(table.columns[:5]) == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
     assert table[["SNR [dB]", "paper"]].to_numpy().tolist() == [["10", "-"], ["20", "0.91"]]
     rate = snr.value("recovery_rate", x=20.0, method=POSTERIOR.name)
     assert re.fullmatch(rf"{rate:.3f} \(\d\.\d{{3}} to \d\.\d{{3}}\)", table[POSTERIOR.name].iloc[1])
-    assert f" / {0.91:.2f} |" in result_markdown(snr)
-
-
-def test_only_columns_that_are_there_are_explained(snr: ExperimentResult) -> None:
     only_published = only(snr, "method", PERFECT.name)
     for text in (result_markdown(only_published), printed(only_published)):
+        assert " / 0.91" in text
         assert "harmed: share of the corrected vehicles" in text
         assert not any(absent in text for absent in ("confidence", "calibration error", "delays", "failed:"))
-    assert "0.91" in printed(snr), "the paper stands beside"
-
-
-def test_common_drive_has_the_branches_of_the_row() -> None:
-    drive = fleet_for(replace(EXPERIMENTS["snr"], branches=4), quick=True)
-    assert drive.record["branches"] == 4
-    with pytest.raises(FleetError, match="9 branches: the built-in vehicle has 2 to 5"):
-        fleet_for(replace(EXPERIMENTS["snr"], branches=9), quick=True)
 
 
 def test_damaged_record_is_named(tmp_path: Path) -> None:
@@ -180,17 +163,31 @@ def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkey
     assert fleet_for(EXPERIMENTS["real"], quick=True, layout=LAYOUT).record["trips"] == 8
 
 
-def test_wrong_fleet_and_what_makes_no_table_are_refused(fleet: RecordedFleet) -> None:
-    with pytest.raises(FleetError, match="CommonCase cannot be run on a RecordedFleet"):
-        run_experiment(EXPERIMENTS["snr"].small(), fleet, repetitions=1)
-    with pytest.raises(FleetError, match="at least 1 repetition, not 0"):
-        run_experiment(EXPERIMENTS["snr"], smooth_drive(), repetitions=0)
-    with pytest.raises(FleetError, match=r"^snr: expected a drive of 4 branches, not 2$"):
-        run_experiment(replace(EXPERIMENTS["snr"], branches=4), smooth_drive())
-    twice = (Setting(x=1.0, case=CommonCase()), Setting(x=1.0, case=CommonCase()))
-    for change in ({"settings": ()}, {"methods": ()}, {"settings": twice}):
-        with pytest.raises(FleetError, match=r"^snr: expected a method, and settings that differ in x or series$"):
-            run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive())
+TWICE = (Setting(x=1.0, case=CommonCase()),) * 2
+NO_TABLE = "^snr: expected a method, and settings that differ in x or series$"
+
+
+@pytest.mark.parametrize(
+    ("change", "repetitions", "message"),
+    [
+        ({"settings": (Setting(x=1.0, case=RecordedCase()),)}, 1, "RecordedCase cannot be run on a CommonDrive"),
+        ({}, 0, "at least 1 repetition, not 0"),
+        ({"settings": (Setting(x=1.0, case=CommonCase(branches=4)),)}, 1, "4 branches: drive smooth has 2 to 2"),
+        ({"settings": ()}, 1, NO_TABLE),
+        ({"settings": TWICE}, 1, NO_TABLE),
+        ({"methods": ()}, 1, NO_TABLE),
+        ({"methods": (PERFECT, POSTERIOR, PERFECT)}, 1, "^2 methods are called 'published/perfect'; give each method"),
+    ],
+)
+def test_what_makes_no_table_is_refused(change: dict[str, Any], repetitions: int, message: str) -> None:
+    with pytest.raises(FleetError, match=message):
+        run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive(), repetitions=repetitions)
+
+
+def test_small_experiment_keeps_few_settings_and_small_fleets_that_are_as_large_as_the_table_says() -> None:
+    small = EXPERIMENTS["asymmetry"].small()
+    assert [(each.series, each.x) for each in small.settings] == [("0", 20.0), ("0.4", 20.0)]
+    assert {each.case.vehicles for each in small.settings} == {20}
 
 
 def test_command_runs_records_and_pools(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Figures of merit against what they are by definition."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,8 +9,9 @@ from scipy.stats import binomtest, chisquare
 
 from calibrator.drive import Array, Mask
 from calibrator.experiments.figures import Values, calibration_errors, figure_rows, judge, tenths_of
-from calibrator.experiments.trial import Estimate, Trial, UnseenDrive
-from calibrator.faults import Faults, measured_currents, true_currents
+from calibrator.experiments.trial import Estimate, Trial
+from calibrator.faults import Faults
+from calibrator.score import UnseenDrive
 
 N = 1000
 SWINGING_A = np.array([[11.0, -11.0], [-9.0, 9.0]])
@@ -26,34 +27,35 @@ def confident(confidence: Array, recovered: Array | Mask) -> Values:
     """Values of a method that says its confidence, and recovers some vehicles."""
     within = recovered.astype(bool)
     zero = np.zeros((len(within), 2))
-    truth = Faults(hardware_drift=zero[:, 0], hardware_offset_a=zero, drift=zero, offset_a=zero)
-    found = replace(truth, drift=zero + np.where(within, 0.0, 1.0)[:, None])
-    trial = replace(two_vehicles(drift=0.1, harm_second=0.0)[1], truth=truth, unseen=unseen_of(truth))
-    estimate = Estimate(faults=found, hardware=within, corrected=zero > 0.0, confidence=confidence, failed=0)
-    return judge(estimate, trial)
+    estimate, trial = one_of(drift=np.where(within, 0.0, 1.0)[:, None] + zero, truth=zero)
+    return judge(replace(estimate, confidence=confidence), trial)
 
 
 def unseen_of(truth: Faults) -> UnseenDrive:
-    return UnseenDrive.of_linear_sensors(SWINGING_A, truth)
+    return UnseenDrive.of_linear_sensors(SWINGING_A.mean(axis=0), np.mean(SWINGING_A**2, axis=0), truth)
+
+
+def one_of(*, drift: Array, truth: Array) -> tuple[Estimate, Trial]:
+    """An estimate of drifts alone, shape (N, K), all of which are corrected, and its trial."""
+    zero = np.zeros(truth.shape)
+    faults = Faults(hardware_drift=zero[:, 0], hardware_offset_a=zero, drift=truth, offset_a=zero)
+    trial = Trial(
+        smallest_fault=0.05,
+        full_scale_a=400.0,
+        truth=faults,
+        unseen=unseen_of(faults),
+        record=lambda: pytest.fail("not needed"),
+        collect=lambda: pytest.fail("not needed"),
+    )
+    sound = np.zeros(len(truth), bool)
+    found = replace(faults, drift=drift)
+    return Estimate(faults=found, hardware=sound, corrected=drift != 0.0, confidence=None, failed=0), trial
 
 
 def two_vehicles(*, drift: float, harm_second: float) -> tuple[Estimate, Trial]:
     """Two vehicles with a drift of 0.1 in their first branch, and an estimate."""
-    zero, real = np.zeros((2, 2)), np.array([[0.1, 0.0], [0.1, 0.0]])
-    truth = Faults(hardware_drift=np.zeros(2), hardware_offset_a=zero, drift=real, offset_a=zero)
-    found = replace(truth, drift=np.array([[drift, 0.0], [drift, harm_second]]))
-    trial = Trial(
-        smallest_fault=0.05,
-        full_scale_a=400.0,
-        truth=truth,
-        unseen=unseen_of(truth),
-        record=lambda: pytest.fail("not needed"),
-        collect=lambda: pytest.fail("not needed"),
-    )
-    estimate = Estimate(
-        faults=found, hardware=np.zeros(2, bool), corrected=found.drift != 0.0, confidence=np.ones(2), failed=0
-    )
-    return estimate, trial
+    found = np.array([[drift, 0.0], [drift, harm_second]])
+    return one_of(drift=found, truth=np.array([[0.1, 0.0], [0.1, 0.0]]))
 
 
 def test_calibration_error_of_an_honest_confidence_is_that_of_chance_and_of_boasting_its_excess() -> None:
@@ -97,29 +99,9 @@ def test_branch_that_passes_through_can_do_no_harm() -> None:
     estimate, trial = two_vehicles(drift=0.1, harm_second=0.2)
     only_first = replace(estimate, corrected=estimate.corrected & np.array([True, False]))
     assert figures_of(judge(only_first, trial))["harmed"].value == 0.0
-    nothing = replace(estimate, corrected=np.zeros((2, 2), bool))
-    figures = figures_of(judge(nothing, trial))
-    assert figures["deployed"].value == 0.0
-    assert "harmed" not in figures
-
-
-def test_unseen_moments_are_those_of_the_samples() -> None:
-    rng = np.random.default_rng(0)
-    i_s = rng.normal(size=(N, 2)) * 50.0 + 10.0
-    truth = Faults(
-        hardware_drift=np.array([0.2]),
-        hardware_offset_a=np.array([[10.0, -10.0]]),
-        drift=np.array([[0.1, -0.2]]),
-        offset_a=np.array([[5.0, -3.0]]),
-    )
-    i = true_currents(i_s, truth.take(0))
-    i_m = measured_currents(i, truth.take(0))
-    unseen, sampled = UnseenDrive.of_linear_sensors(i_s, truth), UnseenDrive.of_samples([(i, i_m)])
-    for field in fields(UnseenDrive):
-        np.testing.assert_allclose(getattr(unseen, field.name), getattr(sampled, field.name))
-    drift, offset_a = np.array([[0.15, -0.1]]), np.array([[2.0, 1.0]])
-    error_a = (i_m - offset_a[0]) / (1.0 + drift[0]) - i
-    np.testing.assert_allclose(unseen.rms_a(drift, offset_a)[0], np.sqrt(np.mean(error_a**2, axis=0)))
+    nothing = figures_of(judge(replace(estimate, corrected=np.zeros((2, 2), bool)), trial))
+    assert nothing["deployed"].value == 0.0
+    assert "harmed" not in nothing
 
 
 def test_shares_have_an_exact_interval() -> None:
@@ -131,30 +113,18 @@ def test_shares_have_an_exact_interval() -> None:
 
 
 def test_standard_deviations_that_are_right_have_normal_scores() -> None:
-    rng, vehicles = np.random.default_rng(0), 4000
-    zero, sd = np.zeros((vehicles, 2)), rng.uniform(0.01, 0.03, (vehicles, 2))
-    truth = Faults(hardware_drift=zero[:, 0], hardware_offset_a=zero, drift=0.2 + zero, offset_a=zero)
-    found = replace(truth, drift=truth.drift + sd * rng.standard_normal(sd.shape))
-    estimate = Estimate(
-        faults=found,
-        hardware=zero[:, 0] > 0.0,
-        corrected=np.ones((vehicles, 2), bool),
-        confidence=None,
-        failed=0,
-        drift_sd=sd,
-        offset_sd_a=sd,
-    )
-    trial = replace(two_vehicles(drift=0.1, harm_second=0.0)[1], truth=truth, unseen=unseen_of(truth))
+    rng, true = np.random.default_rng(0), np.full((4000, 2), 0.2)
+    sd = rng.uniform(0.01, 0.03, true.shape)
+    estimate, trial = one_of(drift=true + sd * rng.standard_normal(sd.shape), truth=true)
+    estimate = replace(estimate, drift_sd=sd, offset_sd_a=sd)
     values = judge(estimate, trial)
-    figures = figures_of(values)
+    figures, counts = figures_of(values), tenths_of(values)["pit"]
     assert figures["gain_within_1"].value == pytest.approx(0.683, abs=0.02)
-    assert figures["gain_beyond_3"].of == 2 * vehicles
+    assert figures["gain_beyond_3"].of == sum(counts) == true.size
     assert "offset_within_1" not in figures  # no offset was found, so none is deployed
-    counts = tenths_of(values)["pit"]
-    assert sum(counts) == 2 * vehicles
     assert chisquare(counts).pvalue > 0.01
     own = replace(estimate, pit=lambda truth: (np.full(truth.drift.shape, 0.55), np.zeros(truth.drift.shape)))
-    assert tenths_of(judge(own, trial))["pit"][5] == 2 * vehicles
+    assert tenths_of(judge(own, trial))["pit"][5] == true.size
 
 
 def test_causes_that_findings_name_are_counted_where_there_is_an_attack() -> None:

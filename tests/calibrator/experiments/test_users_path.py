@@ -36,10 +36,10 @@ def test_trips_that_differ_have_what_all_of_them_have_and_without_model_inputs_a
         read_fleet(write_store(tmp_path / "none", trips, lacking=[*trips[0].inputs]), database)
 
 
-def calibrated(store: Path, out: Path, *more: str) -> pd.DataFrame:
+def calibrated(store: Path, out: Path) -> pd.DataFrame:
     """Result of the commands that users run, by vehicle and branch."""
     layout = ("--layout", str(LAYOUT), "--workers", "1")
-    drawn = ("--vehicles", str(VEHICLES), "--drives", str(store), "--unseen-minutes", "0.1", *more)
+    drawn = ("--vehicles", str(VEHICLES), "--drives", str(store), "--unseen-minutes", "0.1", "--balanced")
     for command in (
         ("simulate", *layout, *drawn, "--out", str(out / "fleet")),
         ("calibrate", str(out / "fleet"), *layout, "--out", str(out / "result")),
@@ -50,16 +50,11 @@ def calibrated(store: Path, out: Path, *more: str) -> pd.DataFrame:
     return rows[rows["branch"].notna()].pivot_table(index="vehicle", columns="branch", aggfunc="first", sort=True)
 
 
-@pytest.mark.parametrize(
-    "balanced", [True, pytest.param(False, marks=pytest.mark.long)], ids=["balanced", "any vehicle"]
-)
-def test_recovery_and_deployment_are_those_of_the_commands(store: Path, tmp_path: Path, *, balanced: bool) -> None:
-    fleet = read_fleet(store, read_database(read_layout(LAYOUT)))
-    case = RecordedCase(balanced=balanced)
+def test_recovery_and_deployment_are_those_of_the_commands(store: Path, tmp_path: Path) -> None:
+    fleet, case = read_fleet(store, read_database(read_layout(LAYOUT))), RecordedCase()
     trial = recorded_trial(fleet, case, 0)
     estimate = POSTERIOR.estimate(trial)
-    options = ("--sparsity", f"{case.sparsity:g}", "--seed", "0", *(("--balanced",) if balanced else ()))
-    table = calibrated(store, tmp_path, *options)
+    table = calibrated(store, tmp_path)
     branches = list(fleet.with_branches(2)[0].currents_a)
 
     def column(name: str) -> np.ndarray:
