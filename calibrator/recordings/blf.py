@@ -11,6 +11,7 @@ any error: the structure is checked throughout, and damage is refused with its p
 import struct
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -33,9 +34,9 @@ from calibrator.recordings.frame_arrays import (
     Frames,
     concatenate_frames,
 )
-from calibrator.recordings.log_files import UNREADABLE
+from calibrator.recordings.log_files import UNREADABLE, open_log
 
-__all__ = ["read_blf"]
+__all__ = ["blf_frames", "read_blf"]
 
 BATCH_BYTES = 1 << 21
 """Content of containers that is taken apart at a time. [byte]"""
@@ -70,7 +71,13 @@ class _DamageError(Exception):
         super().__init__(f"at byte {byte} {text}")
 
 
-def read_blf(file: BinaryIO, name: str) -> Frames:
+def read_blf(path: Path) -> Frames:
+    """Read all frames of a BLF file, gzipped or not; see :func:`blf_frames`."""
+    with open_log(path) as file:
+        return blf_frames(file, str(path))
+
+
+def blf_frames(file: BinaryIO, name: str) -> Frames:
     """Read all frames of a BLF file.
 
     Parameters

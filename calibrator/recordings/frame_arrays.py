@@ -52,6 +52,8 @@ class Frames:
         Names of the buses that the frames came from.
     error_frames, remote_frames, damaged : int
         What the log has besides: error frames, remote frames, and lines or frames that could not be read.
+    first_damaged : int
+        Line of a text that is the first damaged one, from 1; 0 if there is none or the log has no lines.
     """
 
     time_ns: NDArray[np.int64]
@@ -63,6 +65,7 @@ class Frames:
     error_frames: int = 0
     remote_frames: int = 0
     damaged: int = 0
+    first_damaged: int = 0
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -117,6 +120,7 @@ def concatenate_frames(parts: Sequence[Frames]) -> Frames:
         error_frames=sum(part.error_frames for part in parts),
         remote_frames=sum(part.remote_frames for part in parts),
         damaged=sum(part.damaged for part in parts),
+        first_damaged=next((part.first_damaged for part in parts if part.first_damaged), 0),
     )
 
 

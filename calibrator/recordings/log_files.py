@@ -23,7 +23,6 @@ from isal import igzip, isal_zlib
 from calibrator.errors import LogError, naming
 
 __all__ = [
-    "MAX_DAMAGED_SHARE",
     "PRINTED_CANDUMP",
     "TABLE_SUFFIXES",
     "UNREADABLE",
@@ -48,9 +47,6 @@ _NO_ARCHIVE = (*UNREADABLE, zipfile.BadZipFile, UnicodeError, RuntimeError, KeyE
 """What opening and unpacking an archive may raise; RuntimeError where it is encrypted."""
 _BINARY = (".mf4", ".parquet", ".feather", ".arrow")
 """Formats whose readers need a file that is not packed."""
-MAX_DAMAGED_SHARE = 0.05
-"""Of the lines of a text log. Recordings of a real car through a serial adapter had up to 3 % broken lines and decoded
-well. [1]"""
 PRINTED_CANDUMP = re.compile(
     rb"^[ \t]*(?:\((?P<time>[-\d:. ]+)\)[ \t]+)?(?P<channel>[\w.-]+)[ \t]+(?:[RT]X [-B] [-E][ \t]+)?"
     rb"(?P<id>[\dA-F]{8}|[\dA-F]{3})[ \t]+\[(?P<length>\d+)\](?:[ \t]+(?P<remote>remote request)|[ \t]+(?P<data>"

@@ -1,23 +1,32 @@
-"""Lines of candump and of ASC files (Vector's text logs) turned into frame arrays by compiled code.
+"""Text logs: candump, ASC (Vector), TRC (PEAK), CSV of SavvyCAN and of python-can.
 
     (1740960798.000833) can0 2E5#000007320000DD00           candump -L: classic, 11 bits
     (1740960798.000833) can0 000002E5##1000007320000DD00    CAN FD, 29 bits; one digit of flags after ##
     (1740960798.000833) can0 123#R8                         remote frame
 
-    (1740960798.000833)  can0  2E5   [8]  00 00 07 32      printed with -ta, -tA, -tz, -td: turned into the form above
-
        0.011478 1  1F334455x       Rx   d 8 50 04 0C A9 D4 03 88 01  Length = 0 BitCount = 0          ASC
 
-A line of candump of none of these forms is damaged and counted. python-can takes about thirty times as long for an ASC
-file, and reads what is left: files with CAN FD, decimal numbers, or anything that looks like a frame and is not quite
-one.
+Lines of these two forms are read by compiled code, ASC some thirty times as fast as by python-can. What candump prints
+without ``-L``, and the rows of SavvyCAN, are turned into lines of ``candump -L`` first. python-can reads what is left:
+TRC, its own CSV, and ASC with CAN FD or decimal numbers.
 """
 
+import csv
+import io
 import re
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime
+from logging import WARNING, LogRecord, getLogger
+from logging.handlers import BufferingHandler
 from math import isfinite, nan
 from pathlib import Path
+from typing import TextIO
 
+import can
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,82 +45,112 @@ from calibrator.recordings.frame_arrays import (
     FrameColumns,
     Frames,
     concatenate_frames,
+    frames_of,
 )
 from calibrator.recordings.log_files import (
-    MAX_DAMAGED_SHARE,
     PRINTED_CANDUMP,
     UNREADABLE,
     is_candump,
     open_log,
+    read_undamaged,
     reason_of,
+    suffix_of,
     text_blocks,
     text_head,
 )
 
-__all__ = ["parse_candump", "read_candump", "read_plain_asc"]
+__all__ = ["parse_candump", "read_asc", "read_candump", "read_csv", "read_trc"]
 
 _DECIMAL = re.compile(r"^base\s+dec", re.MULTILINE | re.IGNORECASE)
+_RELATIVE = re.compile(r"^base\s+\w+\s+timestamps\s+relative", re.MULTILINE | re.IGNORECASE)
 _MOST_DISORDER = 0.1
 """Share of lines whose time is not after the one before: in a log nearly none, of distances about half. [1]"""
 _SINCE_1970_S = 1e8
 """Later than any time since a start. [s]"""
+_NO_TEXT = frozenset(range(32)) - frozenset(b"\t\n\v\f\r\x1a")
+"""Control characters; the last one kept ends text files of old systems."""
+_LOOKED_AT = 4096
+"""Bytes: of random ones, a tenth are control characters."""
+_AT_A_TIME = 10_000
+"""Messages of python-can that are kept at a time: they take more memory than arrays."""
 _ERROR_BIT = 1 << 29
 _MOST_CHANNELS = 256
 """Different names in one block of text; no machine has more buses."""
 _NANOSECOND_DIGITS = 9
-_UNUSUAL = 255
-"""Of a line of an ASC file that python-can is to judge."""
 _NOT_HEX = 255
 HEX = np.array([int(c, 16) if c in "0123456789ABCDEFabcdef" else _NOT_HEX for c in map(chr, range(256))], np.uint8)
 """Value of each character as a hexadecimal digit."""
 _Text = NDArray[np.uint8]
+_Parse = Callable[[bytes], tuple[Frames, NDArray[np.uint8]]]
+"""Of some lines their frames, and what each line is."""
+
+
+class _CanFdError(Exception):
+    """An ASC file has frames of CAN FD."""
 
 
 def read_candump(path: Path) -> Frames:
-    """Read a text of candump; single broken lines are left out and counted.
+    """Read what ``candump -L`` wrote, or candump printed."""
+    if is_candump(text_head(path)[0], printed=True):
+        return _read_lines(path, lambda text: parse_candump(_as_logged(text, path)), at_once=True)
+    return _read_lines(path, parse_candump)
 
-    Parameters
-    ----------
-    path : Path
-        The file, gzipped or not.
 
-    Returns
-    -------
-    Frames
-        In the order of the lines.
+def read_csv(path: Path) -> Frames:
+    """Read a CSV of SavvyCAN and other programs of GVRET, or of python-can; or a text of candump."""
+    head = text_head(path)[0]
+    if is_candump(head):
+        return read_candump(path)
+    header = head.partition("\n")[0]
+    if "arbitration_id" in header:
+        return _read_by_python_can(path, _csv_messages)
+    columns = [name.strip() for name in header.split(",")]
+    for name in ("Time Stamp", "ID", "Extended", "Bus", "LEN", "D1"):
+        if name not in columns:
+            raise LogError(f"{path}: a CSV of frames without the column {name!r}; save it with SavvyCAN again")
+    return _read_lines(path, lambda text: parse_candump(_gvret_as_logged(text, columns)))
 
-    Raises
-    ------
-    LogError
-        If the file is cut, more than :data:`.MAX_DAMAGED_SHARE` of its lines are damaged, or they have no times.
-    """
-    parts: list[Frames] = []
-    first_damaged, lines, above = 0, 0, 0
+
+def read_asc(path: Path) -> Frames:
+    """Read an ASC file."""
+    head = text_head(path)[0]
+    if _RELATIVE.search(head):
+        raise LogError(f"{path}: the time stamps are relative to the line before; save it with absolute ones")
     try:
-        printed = is_candump(text_head(path)[0], printed=True)
+        frames = None if _DECIMAL.search(head) else _read_lines(path, _parse_plain_asc)
+    except _CanFdError:
+        frames = None
+    return frames if frames is not None and len(frames) else _read_by_python_can(path, can.ASCReader)
+
+
+def read_trc(path: Path) -> Frames:
+    """Read a TRC file of any version."""
+    return _read_by_python_can(path, can.TRCReader)
+
+
+def _read_lines(path: Path, parse: _Parse, *, at_once: bool = False) -> Frames:
+    """Frames of a text, gzipped or not, some lines at a time or all at once; LogError if the file is cut."""
+    parts, first_damaged, above = list[Frames](), 0, 0
+    try:
         with open_log(path) as file:
-            for text in [_log_lines(file.read(), str(path))] if printed else text_blocks(file):
-                frames, kind = parse_candump(text)
+            for text in [file.read()] if at_once else text_blocks(file):
+                frames, kind = parse(text)
                 if frames.damaged and not first_damaged:
                     first_damaged = above + int(np.argmax(kind == DAMAGED)) + 1
                 parts.append(frames)
-                lines += int(np.count_nonzero(kind))
                 above += len(kind)
     except UNREADABLE as error:
         raise LogError(
             f"{path}: truncated or damaged {f'after line {above}' if above else 'in its first line'}: "
             f"{reason_of(error)}; {sum(map(len, parts))} frames before it are readable; copy the file again"
         ) from None
-    frames = concatenate_frames(parts)
-    if frames.damaged > MAX_DAMAGED_SHARE * lines:
-        raise LogError(
-            f"{path}: line {first_damaged} is damaged, and {frames.damaged} of {lines} lines are; "
-            f"expected '(seconds) channel identifier#data' as 'candump -L' writes it; {len(frames)} frames are readable"
-        )
-    return frames
+    return replace(concatenate_frames(parts), first_damaged=first_damaged)
 
 
-def _log_lines(text: bytes, where: str) -> bytes:
+# ---- other forms as lines of candump -L
+
+
+def _as_logged(text: bytes, path: Path) -> bytes:
     """Turn what candump prints into as many lines of ``candump -L``; other lines stay as they are.
 
     Times are absolute (``-ta``, ``-tA``), since the start (``-tz``) or since the line before (``-td``), which hardly
@@ -119,7 +158,7 @@ def _log_lines(text: bytes, where: str) -> bytes:
     """
     times = [match["time"] for match in PRINTED_CANDUMP.finditer(text)]
     if None in times:
-        raise LogError(f"{where}: printed by candump without times; record it with 'candump -L' or 'candump -ta'")
+        raise LogError(f"{path}: printed by candump without times; record it with 'candump -L' or 'candump -ta'")
     seconds = np.array([_seconds(time.decode()) for time in times])
     known = seconds[np.isfinite(seconds)]
     if np.mean(np.diff(known, prepend=-1.0) <= 0.0) > _MOST_DISORDER and np.all(known < _SINCE_1970_S):
@@ -144,6 +183,97 @@ def _seconds(time: str) -> float:
         return nan
 
 
+def _gvret_as_logged(text: bytes, columns: Sequence[str]) -> bytes:
+    """Turn rows of GVRET into as many lines of ``candump -L``: microseconds, and hexadecimal identifier and bytes."""
+    lines = list[str]()
+    for row in csv.reader(text.decode("latin-1").splitlines(), quoting=csv.QUOTE_NONE, skipinitialspace=True):
+        if not row or [cell.strip() for cell in row] == columns:
+            lines.append("")
+            continue
+        cells = dict(zip(columns, row, strict=False))
+        try:
+            time_us, identifier, extended = int(cells["Time Stamp"]), int(cells["ID"], 16), cells["Extended"].lower()
+            data = bytes(int(cells[f"D{k}"], 16) for k in range(1, int(cells["LEN"]) + 1))
+            if any(row[len(columns) :]) or not 0 <= identifier <= LARGEST_IDENTIFIER:
+                raise ValueError
+            name = f"{identifier:08X}" if extended == "true" else f"{identifier:03X}"
+            fd = "##0" if len(data) > CLASSIC_BYTES else "#"
+            lines.append(f"({time_us // 10**6}.{time_us % 10**6:06d}) {cells['Bus']} {name}{fd}{data.hex()}")
+        except (ValueError, KeyError):
+            lines.append("a damaged row")
+    return "\n".join(lines).encode("latin-1")
+
+
+# ---- by python-can
+
+
+def _csv_messages(text: TextIO) -> Iterator[can.Message]:
+    """Messages of a file that does not say which are CAN FD."""
+    for message in can.CSVReader(text):
+        message.is_fd = message.dlc > CLASSIC_BYTES
+        yield message
+
+
+def _read_by_python_can(path: Path, reader: Callable[[TextIO], Iterable[can.Message]]) -> Frames:
+    """Take every message of a text; what python-can raises on damage becomes a LogError with the place.
+
+    Binary data under the name of a text are refused, as python-can skips whatever it does not know.
+    """
+    with open_log(path) as file:
+        if _NO_TEXT.intersection(read_undamaged(file, _LOOKED_AT)[0]):
+            raise LogError(
+                f"{path}: not a {suffix_of(path)} log but binary data; give the file the suffix of its format"
+            )
+    parts, messages = list[Frames](), list[can.Message]()
+    with open_log(path) as file, _quiet() as complaints:
+        text = _CountedLines(file, encoding="latin-1")
+        try:
+            for message in reader(text):
+                messages.append(message)
+                if len(messages) == _AT_A_TIME:
+                    parts.append(frames_of(messages))
+                    messages.clear()
+        except Exception as error:  # noqa: BLE001 (python-can lets through whatever its parsing meets)
+            before = sum(map(len, parts)) + len(frames_of(messages))
+            raise LogError(
+                f"{path}: damaged {'after' if isinstance(error, UNREADABLE) else 'at'} line {text.count} "
+                f"({reason_of(error)}); {before} frames before it are readable; copy the file again, or cut it there"
+            ) from None
+    frames = concatenate_frames([*parts, frames_of(messages)])
+    return replace(frames, damaged=frames.damaged + len(complaints))
+
+
+class _CountedLines(io.TextIOWrapper):
+    """A text file that knows how many of its lines were read."""
+
+    count = 0
+
+    def __next__(self) -> str:  # type: ignore[override]  # as TextIOBase has it
+        line = super().__next__()
+        self.count += 1
+        return line
+
+
+@contextmanager
+def _quiet() -> Iterator[list[LogRecord]]:
+    """Collect what python-can logs, an entry per damaged line, and keep its warnings from the terminal."""
+    logger, handler = getLogger("can"), BufferingHandler(sys.maxsize)
+    handler.setLevel(WARNING)
+    before = logger.propagate
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield handler.buffer
+    finally:
+        logger.propagate = before
+        logger.removeHandler(handler)
+
+
+# ---- by compiled code
+
+
 def parse_candump(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
     """Parse lines of ``candump -L`` that end in LF or CRLF: frames in their order, and what each line is."""
     text = text if text.endswith(b"\n") else text + b"\n"
@@ -154,25 +284,13 @@ def parse_candump(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
     return columns.frames([text[start:end].decode("latin-1") for start, end in names[:found].tolist()]), columns.kind
 
 
-def read_plain_asc(path: Path) -> Frames | None:
-    """Read an ASC file, gzipped or not; None if it is damaged or has lines for python-can."""
-    parts: list[Frames] = []
-    try:
-        if _DECIMAL.search(text_head(path)[0]):
-            return None
-        with open_log(path) as file:
-            for text in text_blocks(file):
-                columns = FrameColumns.of(_lines(text), fd=False)
-                if not _parse_asc(np.frombuffer(text, np.uint8), HEX, columns):
-                    return None
-                parts.append(columns.frames())
-    except UNREADABLE:
-        return None
-    return concatenate_frames(parts)
-
-
-def _lines(text: bytes) -> int:
-    return text.count(b"\n") + (not text.endswith(b"\n"))
+def _parse_plain_asc(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
+    """Parse lines of an ASC file with hexadecimal numbers: frames in their order, and what each line is."""
+    if b"CANFD" in text:
+        raise _CanFdError
+    columns = FrameColumns.of(text.count(b"\n") + (not text.endswith(b"\n")), fd=False)
+    _parse_asc(np.frombuffer(text, np.uint8), HEX, columns)
+    return columns.frames(), columns.kind
 
 
 @compiled
@@ -258,25 +376,15 @@ def _parse_candump(  # noqa: PLR0912, PLR0915 (a line is judged from left to rig
 
 
 @compiled
-def _parse_asc(text: _Text, digits: _Text, columns: FrameColumns) -> bool:
-    """Parse line by line; whether all of them are usual."""
+def _parse_asc(text: _Text, digits: _Text, columns: FrameColumns) -> None:
+    """Parse line by line."""
     row, start = 0, 0
     while start < len(text):
-        stop, end = _line_end(text, start)
-        columns.kind[row] = _asc_line(text[:stop], start, digits, row, columns)
-        if columns.kind[row] == _UNUSUAL:
-            return False
+        end = start
+        while end < len(text) and text[end] != ord("\n"):
+            end += 1
+        columns.kind[row] = _asc_line(text[:end], start, digits, row, columns)
         row, start = row + 1, end + 1
-    return True
-
-
-@inner
-def _line_end(text: _Text, end: int) -> tuple[int, int]:
-    """Where a line ends without and with CR."""
-    start = end
-    while end < len(text) and text[end] != ord("\n"):
-        end += 1
-    return (end - 1 if end > start and text[end - 1] == ord("\r") else end), end
 
 
 @inner
@@ -291,7 +399,7 @@ def _is_same(text: _Text, first: int, last: int, first_too: int, last_too: int) 
 
 
 @inner
-def _asc_line(  # noqa: PLR0911, PLR0912 (as above)
+def _asc_line(  # noqa: PLR0911 (as above)
     text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns
 ) -> int:
     """Parse what starts here and ends with the text into a row; what it is."""
@@ -300,10 +408,8 @@ def _asc_line(  # noqa: PLR0911, PLR0912 (as above)
     if fraction < 0 or at != end:
         return NOTHING  # a line of the header, or a comment
     if time_ns < 0:
-        return _UNUSUAL
+        return DAMAGED
     at, end = _word(text, end)
-    if end - at == 5 and text[at] == ord("C") and text[at + 4] == ord("D"):
-        return _UNUSUAL  # CANFD
     channel = 0
     for k in range(at, end):
         if not ord("0") <= text[k] <= ord("9"):
@@ -319,20 +425,18 @@ def _asc_line(  # noqa: PLR0911, PLR0912 (as above)
     identifier = _hexadecimal(text, identifier_at, identifier_end - extended, digits)
     at, end = _word(text, end)
     if not 0 <= identifier <= LARGEST_IDENTIFIER or end - at != 1 or channel > 255:
-        return _UNUSUAL
+        return DAMAGED
     if text[at] == ord("r"):
         return REMOTE
     at, end = _word(text, end)
     length = _hexadecimal(text, at, end, digits)
     if not 0 <= length <= CLASSIC_BYTES:
-        return _UNUSUAL
+        return DAMAGED
     for k in range(length):
         at, end = _word(text, end)
-        if at == len(text):
-            return DAMAGED
         value = _hexadecimal(text, at, end, digits)
         if not 0 <= value <= 0xFF:
-            return _UNUSUAL
+            return DAMAGED
         columns.data[row, k] = value
     columns.time_ns[row], columns.channel[row], columns.length[row] = time_ns, channel, length
     columns.key[row] = identifier | EXTENDED_BIT if extended else identifier

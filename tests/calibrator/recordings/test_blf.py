@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from calibrator.errors import LogError
 from calibrator.recordings import blf
-from calibrator.recordings.blf import read_blf
+from calibrator.recordings.blf import blf_frames
 from calibrator.recordings.frame_arrays import Frames, frames_of
 
 START = 1_700_000_000.0
@@ -61,7 +61,7 @@ def by_python_can(content: bytes) -> Frames:
 
 
 def assert_the_same(content: bytes) -> Frames:
-    ours, theirs = read_blf(io.BytesIO(content), "x.blf"), by_python_can(content)
+    ours, theirs = blf_frames(io.BytesIO(content), "x.blf"), by_python_can(content)
     width = theirs.data.shape[1]
     np.testing.assert_array_equal(ours.key, theirs.key)
     np.testing.assert_array_equal(ours.length, theirs.length)
@@ -127,14 +127,14 @@ def test_the_newer_fd_object_is_read_with_what_it_leaves_out_as_zeros(length: in
 def test_a_header_of_unknown_version_is_counted_as_damaged() -> None:
     good = an_object(CLASSIC, classic(0x10, b"x"))
     strange = good[:6] + struct.pack("<H", 7) + good[8:]
-    frames = read_blf(io.BytesIO(of_objects(good, strange)), "x.blf")
+    frames = blf_frames(io.BytesIO(of_objects(good, strange)), "x.blf")
     assert (len(frames), frames.damaged) == (1, 1)
 
 
 def test_an_impossible_time_stamp_is_counted_as_damaged() -> None:
     good = an_object(CLASSIC, classic(0x10, b"x"))
     late = an_object(CLASSIC, classic(0x11, b"x"), time=2**64 - 1)
-    frames = read_blf(io.BytesIO(of_objects(late, good)), "x.blf")
+    frames = blf_frames(io.BytesIO(of_objects(late, good)), "x.blf")
     assert (frames.key.tolist(), frames.damaged) == ([0x10], 1)
 
 
@@ -150,7 +150,7 @@ def test_an_impossible_time_stamp_is_counted_as_damaged() -> None:
 )
 def test_damage_is_refused_with_its_place(content: bytes, message: str) -> None:
     with pytest.raises(LogError, match=rf"x\.blf: truncated or damaged BLF: at byte \d+ .*{message}.* before it"):
-        read_blf(io.BytesIO(content), "x.blf")
+        blf_frames(io.BytesIO(content), "x.blf")
 
 
 @pytest.mark.parametrize("batch_bytes", [1, 100, 1 << 21])
@@ -167,4 +167,4 @@ def test_a_damaged_container_among_others_is_named_with_the_frames_before_it(wro
     sound = an_object(CLASSIC, classic(0x123, b"\1"))
     before = of_objects(sound, sound) + a_container(sound)
     with pytest.raises(LogError, match=f"at byte {len(before)} .*; 3 frames before it are readable"):
-        read_blf(io.BytesIO(before + a_container(wrong) + a_container(sound)), "x.blf")
+        blf_frames(io.BytesIO(before + a_container(wrong) + a_container(sound)), "x.blf")

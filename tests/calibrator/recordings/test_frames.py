@@ -196,20 +196,23 @@ def test_a_blf_with_an_object_of_no_size_ends_in_an_error_not_in_a_loop(tmp_path
         read_frames(path)
 
 
-def test_a_damaged_asc_line_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "line", ["0.05 1  12Z  Rx   d 2 01 02", "0.05 1  123  Rx   d 8 01 02", "9" * 12 + ".0 1 1 Rx d 0"]
+)
+def test_a_damaged_asc_line_is_left_out_and_counted(tmp_path: Path, line: str) -> None:
+    path = write_log(tmp_path / "drive.asc", some_messages(20))
+    path.write_text(f"{path.read_text()}{line}\n")
+    frames = read_frames(path)
+    assert (len(frames), frames.damaged, frames.first_damaged) == (20, 1, len(path.read_text().splitlines()))
+
+
+def test_a_damaged_asc_line_among_those_of_can_fd_is_named(tmp_path: Path) -> None:
     path = write_log(tmp_path / "drive.asc", some_messages(20))
     lines = path.read_text().splitlines()
-    lines[10] = "0.050000 1  12Z  Rx   d 2 01 02"
+    lines[10:11] = ["0.05 CANFD 1 Rx 123 1 0 9 12 " + "00 " * 12, "0.050000 1  12Z  Rx   d 2 01 02"]
     path.write_text("\n".join(lines))
-    with pytest.raises(LogError, match=r"drive\.asc: damaged at line 11 .*\d+ frames before it are readable"):
+    with pytest.raises(LogError, match=r"drive\.asc: damaged at line 12 .*\d+ frames before it are readable"):
         read_frames(path)
-
-
-def test_a_frame_shorter_than_it_says_is_damaged(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "drive.asc", some_messages(20))
-    path.write_text(path.read_text() + "0.500000 1  123  Rx   d 8 01 02\n")
-    frames = read_frames(path)
-    assert (len(frames), frames.damaged) == (20, 1)
 
 
 def test_an_asc_with_relative_time_stamps_is_refused(tmp_path: Path) -> None:

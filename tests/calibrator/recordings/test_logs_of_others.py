@@ -434,7 +434,7 @@ def nameless_archive(path: Path) -> None:
     [
         ("x.log", lines("  can0  {id}   [8]  {data}"), "without times; record it with 'candump -L' or 'candump -ta'"),
         ("x.csv", with_head(GVRET.replace("LEN", "L"), "{us},{id8},true,Rx,0,8,{cells}"), "without the column 'LEN'"),
-        ("x.csv", with_head(GVRET, "{us},{id8},true,Rx,0,8,ZZ"), "line 2 is damaged, and 80 of 80 are"),
+        ("x.csv", with_head(GVRET, "{us},{id8},true,Rx,0,8,ZZ"), "line 2 is damaged, and 80 of 80 lines are"),
         ("x.zip", lambda path: path.write_bytes(b"PK nothing"), "x.zip: not a readable archive: File is not a zip"),
         ("x.zip", nameless_archive, "x.zip: no logs in it; expected .log, .asc"),
         ("x.zip", lambda path: zipfile.ZipFile(path, "w").close(), "x.zip: no logs in it; expected .log, .asc"),
