@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +13,7 @@ from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import LogError
 from calibrator.kirchhoff.junction import RecordedJunction, look_at_junction
 from calibrator.kirchhoff.sums import with_voltages
-from calibrator.recordings.frame_arrays import repaired_time
-from calibrator.recordings.frames import read_frames
-from calibrator.recordings.readers import (
-    FrameSource,
-    RecordingReport,
-    SignalSource,
-    TableSource,
-    drive_from_frames,
-    drive_from_table,
-)
-from calibrator.recordings.tables import is_table, read_table
+from calibrator.recordings.readers import RecordingReport, SignalSource, open_recording
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import Branch, Input, Layout
 from ecu_node.summary import TIME_RESOLUTION_S
@@ -126,22 +115,14 @@ def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
 
 
 def _read(path: Path, database: VehicleDatabase) -> ExaminedLog:
-    names = {"vehicle": database.layout.name, "name": path.name.partition(".")[0]}
-    if is_table(path):
-        table = read_table(path)
-        source: SignalSource = TableSource(table, database)
-        time_s, make = table.time_s, partial(drive_from_table, table, database, **names)
-    else:
-        frames = read_frames(path)
-        source, time_s = FrameSource(frames, database, str(path)), repaired_time(frames.time_ns).time_s
-        make = partial(drive_from_frames, frames, database, **names, where=str(path))
+    source = open_recording(path, database)
     drive: Drive | LogError
     try:
-        recording = make()
+        recording = source.recording(database.layout.name, path.name.partition(".")[0])
         drive, report = recording.drive, recording.report
     except LogError as error:
         drive, report = error, source.report(())
-    return ExaminedLog(name=str(path), source=source, report=report, drive=drive, duration_s=float(time_s[-1]))
+    return ExaminedLog(name=str(path), source=source, report=report, drive=drive, duration_s=float(source.time_s[-1]))
 
 
 def _channel(

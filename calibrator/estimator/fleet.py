@@ -45,7 +45,7 @@ from calibrator.files.folders import whole_folder
 from calibrator.files.layout_files import vehicle_database
 from calibrator.files.storage import open_storage
 from calibrator.processes.run_many import Workers
-from calibrator.recordings.readers import read_drive
+from calibrator.recordings.readers import read_recording
 from calibrator.terminal.progress import no_progress
 from calibrator.terminal.text import told_once
 from ecu_node.database import VehicleDatabase
@@ -596,5 +596,5 @@ def read_log(path: str | Path, layout: str | Path) -> RecordedLog:
     """
     log = path_of(path, "path", "the path of a log")
     database = vehicle_database(path_of(layout, "layout"))
-    drive = read_drive(log, database, vehicle=log.absolute().parent.name, name=log.name.partition(".")[0])
-    return RecordedLog(drive=drive, layout=database.layout)
+    found = read_recording(log, database, vehicle=log.absolute().parent.name, name=log.name.partition(".")[0])
+    return RecordedLog(drive=found.drive, layout=database.layout)

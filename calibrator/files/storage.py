@@ -183,6 +183,12 @@ class Storage:
         except Exception as error:  # noqa: BLE001
             raise self._failed(name, "write", error) from None
 
+    def require_writable(self) -> None:
+        """Raise StorageError, before any work is done, if no file can be written: one is, and removed."""
+        self.write(".trial", b"")
+        with suppress(StorageError):  # some may write and not remove
+            self.remove(".trial")
+
     def remove(self, name: str) -> None:
         """Remove a file, if it is there."""
         filesystem, root = self._filesystem()

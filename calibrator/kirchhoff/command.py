@@ -81,7 +81,7 @@ def kirchhoff(
         from calibrator.recordings.frames import is_log
         from calibrator.recordings.live import record_bus
         from calibrator.recordings.log_files import files_in
-        from calibrator.recordings.readers import drive_from_frames, read_recording
+        from calibrator.recordings.readers import FrameSource, open_recording
         from calibrator.recordings.tables import is_table, layout_from_branches, read_table
         from ecu_node.parameters import check_fit, read_parameters
 
@@ -104,17 +104,12 @@ def kirchhoff(
     if (found := None if parameters is None else read_parameters(parameters)) is not None:
         check_fit(found, database, None)
     vehicle, where = database.layout.name, f"{interface}:{channel}" if log is None else log.name
-    recording = (
-        drive_from_frames(
-            record_bus(str(interface), channel, duration or USUAL_S),
-            database,
-            vehicle=vehicle,
-            name="live",
-            where=where,
-        )
+    source = (
+        FrameSource(record_bus(str(interface), channel, duration or USUAL_S), database, where)
         if log is None
-        else read_recording(log, database, vehicle=vehicle, name=where.partition(".")[0])
+        else open_recording(log, database)
     )
+    recording = source.recording(vehicle, "live" if log is None else where.partition(".")[0])
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:
         draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {where}")

@@ -34,9 +34,7 @@ __all__ = [
     "RecordingReport",
     "SignalSource",
     "TableSource",
-    "drive_from_frames",
-    "drive_from_table",
-    "read_drive",
+    "open_recording",
     "read_recording",
 ]
 
@@ -126,11 +124,6 @@ class Recording:
     report: RecordingReport
 
 
-def read_drive(path: Path, database: VehicleDatabase, *, vehicle: str, name: str) -> Drive:
-    """Read a log as a drive; see :func:`read_recording`, which also tells what was left out."""
-    return read_recording(path, database, vehicle=vehicle, name=name).drive
-
-
 def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name: str) -> Recording:
     """Read a log or a table as a drive with its account.
 
@@ -155,37 +148,14 @@ def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name:
     DatabaseError
         If a signal of the layout cannot be decoded.
     """
+    return open_recording(path, database).recording(vehicle, name)
+
+
+def open_recording(path: Path, database: VehicleDatabase) -> "SignalSource":
+    """Read a log or a table; LogError as :func:`read_recording`."""
     if is_table(path):
-        return drive_from_table(read_table(path), database, vehicle=vehicle, name=name)
-    return drive_from_frames(read_frames(path), database, vehicle=vehicle, name=name, where=str(path))
-
-
-def drive_from_frames(frames: Frames, database: VehicleDatabase, *, vehicle: str, name: str, where: str) -> Recording:
-    """Decode frames as a drive; as :func:`read_recording`, with `where` to name the source in messages."""
-    return _recording(FrameSource(frames, database, where), vehicle, name)
-
-
-def drive_from_table(table: Table, database: VehicleDatabase, *, vehicle: str, name: str) -> Recording:
-    """Take the columns of a table as a drive; as :func:`read_recording`."""
-    return _recording(TableSource(table, database), vehicle, name)
-
-
-def _recording(source: "SignalSource", vehicle: str, name: str) -> Recording:
-    layout = source.database.layout
-    branches = {branch.name: source.branch(branch, branch.source) for branch in layout.branch}
-    if not any(channel.time_s.size for channel in branches.values()):
-        what = f"{source.where}: no branch of {layout.path} in it; {source.found_and_expected()}"
-        raise LogError(what, "check that layout and log belong to the same vehicle and bus")
-    inputs = {item.name: source.samples(item.signal)[0] for item in layout.input}
-    corrected = {branch.name: source.branch(branch, branch.corrected) for branch in layout.branch if branch.corrected}
-    drive = Drive(
-        vehicle=vehicle,
-        name=name,
-        branches={key: channel for key, channel in branches.items() if channel.time_s.size},
-        inputs={key: channel for key, channel in inputs.items() if channel.good.any()},
-    )
-    corrected = {key: channel for key, channel in corrected.items() if channel.time_s.size}
-    return Recording(drive=drive, corrected=corrected, report=source.report(tuple((branches | inputs).items())))
+        return TableSource(read_table(path), database)
+    return FrameSource(read_frames(path), database, str(path))
 
 
 class SignalSource(ABC):
@@ -197,11 +167,14 @@ class SignalSource(ABC):
         DBC and layout.
     where : str
         The file, for messages.
+    time_s : ndarray of shape (n,)
+        Time of all frames or rows since the first one, not decreasing. [s]
     """
 
-    def __init__(self, database: VehicleDatabase, where: str) -> None:
+    def __init__(self, database: VehicleDatabase, where: str, time_s: Array) -> None:
         self.database = database
         self.where = where
+        self.time_s = time_s
 
     @abstractmethod
     def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:
@@ -221,6 +194,24 @@ class SignalSource(ABC):
     @abstractmethod
     def report(self, channels: Collection[tuple[str, Channel]]) -> RecordingReport:
         """The account of the recording."""
+
+    def recording(self, vehicle: str, name: str) -> Recording:
+        """The drive of this vehicle and name, with its account; LogError if none of the branches is in it."""
+        layout = self.database.layout
+        branches = {branch.name: self.branch(branch, branch.source) for branch in layout.branch}
+        if not any(channel.time_s.size for channel in branches.values()):
+            what = f"{self.where}: no branch of {layout.path} in it; {self.found_and_expected()}"
+            raise LogError(what, "check that layout and log belong to the same vehicle and bus")
+        inputs = {item.name: self.samples(item.signal)[0] for item in layout.input}
+        corrected = {branch.name: self.branch(branch, branch.corrected) for branch in layout.branch if branch.corrected}
+        drive = Drive(
+            vehicle=vehicle,
+            name=name,
+            branches={key: channel for key, channel in branches.items() if channel.time_s.size},
+            inputs={key: channel for key, channel in inputs.items() if channel.good.any()},
+        )
+        corrected = {key: channel for key, channel in corrected.items() if channel.time_s.size}
+        return Recording(drive=drive, corrected=corrected, report=self.report(tuple((branches | inputs).items())))
 
     def branch(self, branch: Branch, signal_name: str) -> Channel:
         """One branch, measured or corrected, as a current positive into the junction.
@@ -279,8 +270,8 @@ class FrameSource(SignalSource):
     """
 
     def __init__(self, frames: Frames, database: VehicleDatabase, where: str) -> None:
-        super().__init__(database, where)
         self.time = repaired_time(frames.time_ns)
+        super().__init__(database, where, self.time.time_s)
         self.frames = frames.take(self.time.order) if self.time.disordered or self.time.clock_steps else frames
         self._messages: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8], Array, Mask]] = {}
         self.ignored: Counter[str] = Counter()
@@ -341,7 +332,7 @@ class FrameSource(SignalSource):
             index = index[self._is_of_bus(name, self.frames.channel[index])]
             data, length = self.frames.data.take(index, axis=0), self.frames.length.take(index)
             unspoilt = message_is_sound(self.database, message, data, length)
-            self._messages[name] = (data, length, self.time.time_s.take(index), unspoilt)
+            self._messages[name] = (data, length, self.time_s.take(index), unspoilt)
         return self._messages[name]
 
     def _is_of_bus(self, name: str, channel: NDArray[np.uint32]) -> Mask:
@@ -371,7 +362,7 @@ class TableSource(SignalSource):
     """Columns of a table; with a DBC they may be called ``Message.Signal`` or ``Signal``."""
 
     def __init__(self, table: Table, database: VehicleDatabase) -> None:
-        super().__init__(database, str(table.path))
+        super().__init__(database, str(table.path), table.time_s)
         self.table = table
         layout = database.layout
         names = {name for item in layout.branch for name in (item.signal, item.power, item.voltage) if name is not None}

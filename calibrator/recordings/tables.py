@@ -75,6 +75,8 @@ _LONG_STEPS = ((5000.0, "us"), (5.0, "ms"))
 Steps below 100 are milliseconds only where the table is then not shorter than :data:`_SHORTEST_S`.
 """
 _SHORTEST_S = 60.0
+ON_OFF = "on/off"
+"""Unit of a column of true and false, so that none is taken for a current."""
 HEADROOM = 2.0
 """A recorded drive hardly ever has the nominal maximum in it. [1]"""
 ROUND = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
@@ -314,6 +316,7 @@ def likely_full_scale_a(peak_a: float) -> float:
 
 def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -> Table:
     units = {name: unit for name in frame if (unit := usual_unit(units.get(name, "")) or _name_and_unit(name)[1])}
+    units |= {name: ON_OFF for name in frame if pd.api.types.is_bool_dtype(frame[name])}
     names, time_s, about = _time(path, frame, units)
     known = np.isfinite(time_s)
     known &= np.abs(time_s - np.median(time_s[known])) < 1e-9 * LATEST_TIME_STAMP_NS

@@ -31,7 +31,7 @@ from calibrator.files.storage import Entry, Storage, is_url, local_copy, open_st
 from calibrator.processes.run_many import Failed, Workers, try_many, try_many_shown
 from calibrator.recordings.frames import LOG_SUFFIXES, is_log
 from calibrator.recordings.log_files import files_in
-from calibrator.recordings.readers import read_drive
+from calibrator.recordings.readers import read_recording
 from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import few, few_reasons
 from ecu_node.database import VehicleDatabase
@@ -284,7 +284,7 @@ def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
     with local_copy(entry.place) as path:
         if is_drive_file(path):
             return read_drive_file(path, database.layout)
-        return read_drive(path, database, vehicle=entry.vehicle, name=entry.name)
+        return read_recording(path, database, vehicle=entry.vehicle, name=entry.name).drive
 
 
 def read_vehicles(

@@ -99,20 +99,8 @@ def test_table_is_looked_at(place: Path) -> None:
     assert "battery" in run(place, "kirchhoff", drive)
 
 
-def test_table_is_compared_before_and_after(place: Path, result: Path) -> None:
-    drive, params = place / "logs" / "V1" / "drive.csv", result / "params" / "V1.json"
-    figures = json.loads(run(place, "kirchhoff", drive, "--parameters", params, "--json"))
-    assert figures["after"]["sum"]["rmse_a"] < 0.3 * figures["before"]["sum"]["rmse_a"]
-
-
 def test_filter_bank_is_chosen_for_tables(place: Path) -> None:
     assert "vehicles: 8" in run(place, "identify", place / "logs", "--workers", "1")
-
-
-def test_report_of_tables(result: Path, tmp_path: Path) -> None:
-    done = calibrator("report", result, "--out", tmp_path / "report.html")
-    assert done.returncode == 0, done.stderr
-    assert "V4" in (tmp_path / "report.html").read_text()
 
 
 def solar_plant(folder: Path) -> Path:

@@ -2,10 +2,9 @@ from collections.abc import Sequence
 from math import isfinite, nan
 from typing import Any, Literal
 
-import cantools
 import numpy as np
 import pytest
-from cantools.database.can import Database, Message, Signal
+from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from e2e.p01 import e2e_p01_check, e2e_p01_protect
 from hypothesis import given
@@ -16,26 +15,6 @@ from calibrator.recordings.decode import decode_signal, p01_is_sound
 from ecu_node.database import means_not_available
 from ecu_node.errors import DatabaseError
 
-MULTIPLEXED = """VERSION ""
-BU_: A
-BO_ 100 Mux: 8 A
- SG_ Page M : 0|4@1+ (1,0) [0|0] "" A
- SG_ Always : 4|4@1+ (1,0) [0|0] "" A
- SG_ First m0 : 8|16@1+ (0.1,0) [0|0] "A" A
- SG_ Second m1 : 8|16@1- (0.5,-3) [0|0] "A" A
-"""
-NESTED = """VERSION ""
-BU_: A
-BO_ 100 Mux: 8 A
- SG_ Top M : 0|4@1+ (1,0) [0|0] "" A
- SG_ Sub m1M : 4|4@1+ (1,0) [0|0] "" A
- SG_ Page m0 : 8|16@1+ (0.1,0) [0|0] "A" A
- SG_ SubPage m2 : 8|16@1- (0.5,-3) [0|0] "A" A
-SG_MUL_VAL_ 100 Sub Top 1-1, 3-4;
-SG_MUL_VAL_ 100 Page Top 0-0;
-SG_MUL_VAL_ 100 SubPage Sub 2-3;
-"""
-
 
 def payloads(rows: list[bytes], width: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     data = np.frombuffer(b"".join(row.ljust(width, b"\0") for row in rows), np.uint8).reshape(-1, width)
@@ -43,29 +22,16 @@ def payloads(rows: list[bytes], width: int) -> tuple[NDArray[np.uint8], NDArray[
 
 
 def one_signal(
-    start: int,
     length: int,
     *,
-    byte_order: Literal["little_endian", "big_endian"] = "little_endian",
     signed: bool = False,
-    is_float: bool = False,
     scale: float = 1,
-    offset: float = 0,
     size: int = 8,
     choices: dict[int, str] | None = None,
     limits: tuple[float | None, float | None] = (None, None),
 ) -> tuple[Message, Signal]:
-    conversion = BaseConversion.factory(scale=scale, offset=offset, choices=choices, is_float=is_float)  # type: ignore[arg-type]
-    signal = Signal(
-        "S",
-        start,
-        length,
-        byte_order=byte_order,
-        is_signed=signed,
-        conversion=conversion,
-        minimum=limits[0],
-        maximum=limits[1],
-    )
+    conversion = BaseConversion.factory(scale=scale, offset=0, choices=choices, is_float=False)  # type: ignore[arg-type]
+    signal = Signal("S", 0, length, is_signed=signed, conversion=conversion, minimum=limits[0], maximum=limits[1])
     return Message(1, "M", size, [signal]), signal
 
 
@@ -174,24 +140,20 @@ def test_a_frame_of_any_length_is_good_where_cantools_finds_the_signal(
 
 @pytest.mark.parametrize("code", [-32768, 0x8000])
 def test_the_code_for_not_available_is_not_good_however_the_dbc_writes_it(code: int) -> None:
-    message, signal = one_signal(0, 16, signed=True, scale=0.02, choices={code: "SNA", 1: "Standby"})
+    message, signal = one_signal(16, signed=True, scale=0.02, choices={code: "SNA", 1: "Standby"})
     decoded = decode_signal(message, signal, *payloads([b"\x00\x80", b"\x01\x00", b"\xff\xff"], 8))
     assert decoded.good.tolist() == [False, True, True]
     np.testing.assert_allclose(decoded.value[1:], [0.02, -0.02])
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["SNA", "sna", "Signal not available", "Signal_Not_Available", "SignalNotAvailable", "Invalid", "INVALID_VALUE",
-     "Error", "ErrorIndicator", "Not Defined", "N/A", "Init", "unavailable"],
-)  # fmt: skip
-def test_this_name_means_not_available(name: str) -> None:
-    assert means_not_available(name)
+NO_VALUE = ["SNA", "sna", "Signal not available", "Signal_Not_Available", "SignalNotAvailable", "Invalid",
+            "INVALID_VALUE", "Error", "ErrorIndicator", "Not Defined", "N/A", "Init", "unavailable"]  # fmt: skip
+VALUES = ["No error", "Initialised", "Open", "Closed", "Erroneous gear", "Snail mode", "Valid"]
 
 
-@pytest.mark.parametrize("name", ["No error", "Initialised", "Open", "Closed", "Erroneous gear", "Snail mode", "Valid"])
-def test_this_name_is_a_value(name: str) -> None:
-    assert not means_not_available(name)
+@pytest.mark.parametrize(("name", "expected"), [*((name, True) for name in NO_VALUE), *((n, False) for n in VALUES)])
+def test_names_of_the_dbc_tell_which_codes_are_no_value(name: str, expected: bool) -> None:
+    assert means_not_available(name) == expected
 
 
 @pytest.mark.parametrize(
@@ -206,23 +168,13 @@ def test_this_name_is_a_value(name: str) -> None:
     ],
 )
 def test_a_value_outside_the_range_of_the_dbc_is_not_good(limits: tuple[float, float], good: list[bool]) -> None:
-    message, signal = one_signal(0, 8, scale=0.1, limits=limits)
+    message, signal = one_signal(8, scale=0.1, limits=limits)
     decoded = decode_signal(message, signal, *payloads([b"\0", b"\x0a", b"\x0b"], 8))
     assert decoded.good.tolist() == good
 
 
-def test_extended_multiplexing_of_a_dbc_is_pages_within_pages() -> None:
-    database = cantools.database.load_string(NESTED)
-    assert isinstance(database, Database)
-    message = database.get_message_by_name("Mux")
-    rows = [bytes([page, 7, 0, 0, 0, 0, 0, 0]) for page in (0x00, 0x21, 0x31, 0x33, 0x41, 0x22)]
-    decoded = decode_signal(message, message.get_signal_by_name("SubPage"), *payloads(rows, 8))
-    assert decoded.good.tolist() == decoded.present.tolist() == [False, True, True, True, False, False]
-    np.testing.assert_allclose(decoded.value[decoded.good], 0.5)
-
-
 def test_a_number_of_more_than_64_bits_is_refused() -> None:
-    message, signal = one_signal(0, 65, size=64)
+    message, signal = one_signal(65, size=64)
     with pytest.raises(DatabaseError, match="signal S is a number of 65 bits"):
         decode_signal(message, signal, *payloads([bytes(64)], 64))
 

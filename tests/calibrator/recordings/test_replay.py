@@ -2,7 +2,6 @@
 
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -10,7 +9,6 @@ import pytest
 from can.interfaces.virtual import VirtualBus
 
 from calibrator.cli import app
-from calibrator.recordings.frames import read_frames
 from calibrator.recordings.live import play_frames
 from calibrator.terminal.command_line import run_app
 from ecu_node.errors import BusError
@@ -29,20 +27,10 @@ FRAMES = [
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    return written(tmp_path / "drive.log")
-
-
-def written(path: Path) -> Path:
-    with can.Logger(path) as logger:
+    with can.Logger(tmp_path / "drive.log") as logger:
         for frame in FRAMES:
             logger(frame)
-    return path
-
-
-@pytest.fixture
-def listener(request: pytest.FixtureRequest) -> Iterator[can.BusABC]:
-    with VirtualBus(request.node.name) as bus:
-        yield bus
+    return tmp_path / "drive.log"
 
 
 def heard(bus: can.BusABC) -> list[tuple[int, bool, bytes]]:
@@ -71,17 +59,11 @@ def test_frames_never_come_before_their_instant(speed: float) -> None:
             assert instant - begin >= (frame.timestamp - FRAMES[0].timestamp) / speed
 
 
-def test_a_log_that_goes_back_in_time_is_not_waited_for(listener: can.BusABC, request: pytest.FixtureRequest) -> None:
+def test_error_frames_are_left_out_and_a_log_that_goes_back_in_time_is_not_waited_for() -> None:
     frames = [can.Message(timestamp=stamp, arbitration_id=1) for stamp in (1e6, 1.0, 2.0)]
-    with VirtualBus(request.node.name) as bus:
-        assert play_frames(frames, bus) == 3
-
-
-def test_error_frames_are_left_out(listener: can.BusABC, request: pytest.FixtureRequest) -> None:
-    frames = [can.Message(is_error_frame=True), can.Message(arbitration_id=1)]
-    with VirtualBus(request.node.name) as bus:
-        assert play_frames(frames, bus, speed=0.0) == 1
-    assert len(heard(listener)) == 1
+    with VirtualBus("one") as bus, VirtualBus("one") as listener:
+        assert play_frames([can.Message(is_error_frame=True), *frames], bus) == 3
+        assert len(heard(listener)) == 3
 
 
 def test_a_bus_that_takes_nothing_ends_the_replay(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,13 +117,6 @@ def test_ctrl_c_ends_the_line_of_progress_first_and_says_how_much_was_sent(
     *_, progress, last = capsys.readouterr().err.splitlines()
     assert progress.startswith(f"replay: 3 of {len(FRAMES)} frames, ")
     assert last == f"calibrator replay: 3 of {len(FRAMES)} frames were sent"
-
-
-def test_long_payloads_are_played_as_can_fd(tmp_path: Path) -> None:
-    path = tmp_path / "fd.log"
-    path.write_text("(1.000000) can0 123##1" + "AB" * 12 + "\n(1.100000) can0 123#AB\n")
-    frames = list(read_frames(path).messages())
-    assert [(frame.is_fd, bytes(frame.data)) for frame in frames] == [(True, b"\xab" * 12), (False, b"\xab")]
 
 
 @pytest.mark.parametrize("speed", ["-1", "nan", "inf", "fast"])

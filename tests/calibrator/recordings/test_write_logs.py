@@ -50,17 +50,14 @@ def test_frames_with_a_counter_of_several_bytes_are_written_and_read() -> None:
     assert np.flatnonzero(~sound).tolist() == [1, 2, 3]
 
 
-def test_missing_values_become_the_code_for_not_available(database: VehicleDatabase) -> None:
-    series = encode_message(database, "HV_Motor", np.zeros(1), {"MotorCurrent": np.array([np.nan])})
+@pytest.mark.parametrize(("value", "expected"), [(np.nan, "SNA"), (1e6, 650.0), (-1e6, -650.0)])
+def test_missing_values_become_the_code_for_not_available_and_others_saturate(
+    database: VehicleDatabase, value: float, expected: object
+) -> None:
+    series = encode_message(database, "HV_Motor", np.zeros(1), {"MotorCurrent": np.array([value])})
     decoded = database.message("HV_Motor").decode_simple(series.data[0].tobytes())
-    assert decoded["MotorCurrent"] == "SNA"
+    assert decoded["MotorCurrent"] == (pytest.approx(expected) if isinstance(expected, float) else expected)
     assert decoded["MotorTorque"] == "SNA"
-
-
-def test_values_beyond_the_range_saturate(database: VehicleDatabase) -> None:
-    series = encode_message(database, "HV_Motor", np.zeros(2), {"MotorCurrent": np.array([1e6, -1e6])})
-    decoded = [database.message("HV_Motor").decode_simple(row.tobytes())["MotorCurrent"] for row in series.data]
-    assert decoded == pytest.approx([650.0, -650.0])
 
 
 def test_float_signal_is_not_written_as_whole_number() -> None:

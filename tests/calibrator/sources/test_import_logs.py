@@ -4,6 +4,7 @@ import os
 import re
 from pathlib import Path
 
+import fsspec
 import pytest
 
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
@@ -13,8 +14,8 @@ from calibrator.processes.run_many import Workers
 from calibrator.sources.import_logs import ImportReport, import_logs
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-
-LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+from tests.calibrator.command_here import calibrator
+from tests.calibrator.conftest import LAYOUT
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +85,18 @@ def test_the_store_knows_which_artificial_fleet_its_drives_are_of(
 ) -> None:
     imported([fleet / "logs" / "V001" / "drive.log.gz"], tmp_path, database)
     assert read_fleet_ids(tmp_path) == read_fleet_ids(fleet / "logs") != frozenset()
+
+
+def test_import_into_a_bucket_that_nobody_may_write_ends_before_it_reads(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(*_: object, **__: object) -> None:
+        raise PermissionError("Access Denied")
+
+    monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "pipe_file", denied)
+    monkeypatch.setattr("calibrator.sources.import_logs.import_logs", denied)
+    done = calibrator("import", fleet / "logs", "--layout", LAYOUT, "--out", "memory://bucket/store")
+    assert "memory://bucket/store/.trial: cannot write it: Access Denied; check the credentials" in done.stderr
 
 
 def write_endless_log(path: Path) -> None:
