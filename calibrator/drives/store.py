@@ -187,14 +187,12 @@ def read_drive_file(path: Path, layout: Layout) -> Drive:
         about = _about(table.schema)
         _check_identity(about, str(path), layout)
         channels: dict[str, dict[str, Channel]] = {"branch": {}, "input": {}}
-        for row in range(table.num_rows):
-            time_s, value, good = (_values(table, column, row) for column in ("time_s", "value", "good"))
-            if not len(time_s) == len(value) == len(good):
+        for row in table.to_pandas(use_threads=False).itertuples():
+            if not len(row.time_s) == len(row.value) == len(row.good):
                 raise ValueError("a channel has columns of different lengths")
-            channel = Channel(
-                time_s=time_s.astype(np.float64), value=value.astype(np.float64), good=good.astype(np.bool_)
+            channels[row.kind][row.name] = Channel(
+                time_s=row.time_s.astype(np.float64), value=row.value.astype(np.float64), good=row.good.astype(np.bool_)
             )
-            channels[table.column("kind")[row].as_py()][table.column("name")[row].as_py()] = channel
         vehicle, name = str(about["vehicle"]), str(about["drive"])
     return Drive(vehicle=vehicle, name=name, branches=channels["branch"], inputs=channels["input"])
 
@@ -246,13 +244,6 @@ def _check_identity(about: Mapping[str, object], place: str, layout: Layout) -> 
         )
     if about.get("dbc_sha256") != layout.dbc_digest:
         raise DriveError(f"{place}: made with another DBC than {layout.dbc_path}; import the logs again with this DBC")
-
-
-def _values(table: pa.Table, column: str, row: int) -> "np.ndarray[tuple[int], np.dtype[np.generic]]":
-    values: np.ndarray[tuple[int], np.dtype[np.generic]] = table.column(column)[row].values.to_numpy(
-        zero_copy_only=False
-    )
-    return values
 
 
 def read_onboard_record(path: Path, database: VehicleDatabase) -> SummaryFile:

@@ -94,6 +94,7 @@ class Frames:
 
 
 _COLUMNS = ("time_ns", "key", "channel", "length", "data")
+_COUNTS = ("error_frames", "remote_frames", "damaged")
 
 
 def concatenate_frames(parts: Sequence[Frames]) -> Frames:
@@ -103,25 +104,18 @@ def concatenate_frames(parts: Sequence[Frames]) -> Frames:
         return parts[0]
     channels = tuple(dict.fromkeys(name for part in parts for name in part.channels))
     width = max(part.data.shape[1] for part in parts)
-    return Frames(
-        time_ns=np.concatenate([part.time_ns for part in parts]),
-        key=np.concatenate([part.key for part in parts]),
-        channel=np.concatenate(
-            [np.array([channels.index(name) for name in part.channels], np.uint32)[part.channel] for part in parts]
-        ),
-        length=np.concatenate([part.length for part in parts]),
-        data=np.concatenate(
-            [
-                part.data if (lacking := width - part.data.shape[1]) == 0 else np.pad(part.data, ((0, 0), (0, lacking)))
-                for part in parts
-            ]
-        ),
-        channels=channels,
-        error_frames=sum(part.error_frames for part in parts),
-        remote_frames=sum(part.remote_frames for part in parts),
-        damaged=sum(part.damaged for part in parts),
-        first_damaged=next((part.first_damaged for part in parts if part.first_damaged), 0),
-    )
+    alike = [
+        replace(
+            part,
+            channel=np.array([channels.index(name) for name in part.channels], np.uint32)[part.channel],
+            data=np.pad(part.data, ((0, 0), (0, width - part.data.shape[1]))),
+        )
+        for part in parts
+    ]
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in alike]) for name in _COLUMNS}
+    counts = {name: sum(getattr(part, name) for part in parts) for name in _COUNTS}
+    first_damaged = next((part.first_damaged for part in parts if part.first_damaged), 0)
+    return Frames(**columns, **counts, channels=channels, first_damaged=first_damaged)
 
 
 class FrameColumns(NamedTuple):

@@ -2,6 +2,7 @@
 
 import errno
 import os
+from contextlib import nullcontext
 from pathlib import Path
 
 import fsspec
@@ -34,30 +35,20 @@ def test_unknown_kind_of_storage_is_refused() -> None:
 def test_a_file_that_vanishes_while_its_folder_is_listed_hides_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "gone").touch()
     (tmp_path / "there").touch()
-    status = os.DirEntry.stat
 
     class Vanishing:
-        """What os.scandir yields, of files that another process removes."""
+        """What os.scandir yields, of a file that another process removes."""
 
-        def __init__(self, entry: os.DirEntry[str]) -> None:
-            self.name, self.is_dir, self.is_file, self._entry = entry.name, entry.is_dir, entry.is_file, entry
+        name = "gone"
+        is_dir, is_file = staticmethod(lambda: False), staticmethod(lambda: True)
 
-        def stat(self) -> os.stat_result:
-            (tmp_path / "gone").unlink(missing_ok=True)
-            return status(self._entry)
+        def stat(self) -> None:
+            raise FileNotFoundError
 
-    class Listing:
-        def __enter__(self) -> list[Vanishing]:
-            with scandir(tmp_path) as entries:
-                return [Vanishing(entry) for entry in entries]
-
-        def __exit__(self, *_: object) -> None:
-            pass
-
-    scandir = os.scandir
-    monkeypatch.setattr("calibrator.files.storage.os.scandir", lambda _: Listing())
+    with os.scandir(tmp_path) as entries:
+        listed = [Vanishing(), *entries]
+    monkeypatch.setattr("calibrator.files.storage.os.scandir", lambda _: nullcontext(listed))
     assert open_storage(tmp_path).names() == ["there"]
 
 
