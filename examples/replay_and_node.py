@@ -14,7 +14,7 @@ import pandas as pd
 from typer.testing import CliRunner
 
 from calibrator.cli import app
-from calibrator.recordings.frames import read_frames
+from calibrator.recordings.log_formats import read_frames
 from ecu_node.bus.wiring import choose_parameters, wire
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout

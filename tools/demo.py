@@ -25,8 +25,8 @@ from matplotlib.figure import Figure
 from calibrator.errors import FleetError
 from calibrator.estimator.vehicle_report import explained
 from calibrator.fleet_truth import FleetTruth, read_truth
-from calibrator.recordings.frames import read_frames
 from calibrator.recordings.live import play_frames
+from calibrator.recordings.log_formats import read_frames
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import progress_bar
 from ecu_node.bus.node import Node

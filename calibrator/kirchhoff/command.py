@@ -78,9 +78,9 @@ def kirchhoff(
         from calibrator.kirchhoff.junction import look_at_junction
         from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
         from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_text, save_table
-        from calibrator.recordings.frames import is_log
         from calibrator.recordings.live import record_bus
         from calibrator.recordings.log_files import files_in
+        from calibrator.recordings.log_formats import is_log
         from calibrator.recordings.readers import FrameSource, open_recording
         from calibrator.recordings.tables import is_table, layout_from_branches, read_table
         from ecu_node.parameters import check_fit, read_parameters

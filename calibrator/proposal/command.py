@@ -56,7 +56,7 @@ def propose(
     with importing():
         from calibrator.proposal.dialogue import ask, candidate_lines
         from calibrator.proposal.proposal import layout_text, look_at, parsed_branches
-        from calibrator.recordings.frames import is_log
+        from calibrator.recordings.log_formats import is_log
         from calibrator.recordings.tables import is_table
 
     if more:

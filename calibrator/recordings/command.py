@@ -39,8 +39,8 @@ def replay(
     The log is read whole before the first frame is sent. Error and remote frames are left out.
     """
     with importing():
-        from calibrator.recordings.frames import LOG_SUFFIXES, read_frames
         from calibrator.recordings.live import play_frames
+        from calibrator.recordings.log_formats import LOG_SUFFIXES, read_frames
         from ecu_node.bus.adapters import connect
 
     logging.getLogger("can").addHandler(logging.NullHandler())

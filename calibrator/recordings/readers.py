@@ -20,7 +20,7 @@ from calibrator.drives.align import at_instants, evaluate_formula
 from calibrator.errors import LogError
 from calibrator.recordings.decode import decode_signal, message_is_sound, signal_range
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S, EXTENDED_BIT, Frames, frame_key, repaired_time
-from calibrator.recordings.frames import read_frames
+from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.tables import Table, is_table, read_table
 from calibrator.terminal.text import Notice
 from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, usual_unit
@@ -130,7 +130,7 @@ def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name:
     Parameters
     ----------
     path : Path
-        Log of any format of :mod:`calibrator.recordings.frames`, or table of :mod:`calibrator.recordings.tables`.
+        Log of any format of :mod:`calibrator.recordings.log_formats`, or table of :mod:`calibrator.recordings.tables`.
     database : VehicleDatabase
         DBC and layout.
     vehicle, name : str

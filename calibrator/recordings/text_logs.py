@@ -11,7 +11,6 @@ without ``-L``, and the rows of SavvyCAN, are turned into lines of ``candump -L`
 TRC, its own CSV, and ASC with CAN FD or decimal numbers.
 """
 
-import csv
 import io
 import re
 import sys
@@ -186,8 +185,9 @@ def _seconds(time: str) -> float:
 def _gvret_as_logged(text: bytes, columns: Sequence[str]) -> bytes:
     """Turn rows of GVRET into as many lines of ``candump -L``: microseconds, and hexadecimal identifier and bytes."""
     lines = list[str]()
-    for row in csv.reader(text.decode("latin-1").splitlines(), quoting=csv.QUOTE_NONE, skipinitialspace=True):
-        if not row or [cell.strip() for cell in row] == columns:
+    for line in text.splitlines():
+        row = [cell.strip() for cell in line.decode("latin-1").split(",")]
+        if not line.strip() or row == columns:
             lines.append("")
             continue
         cells = dict(zip(columns, row, strict=False))

@@ -29,8 +29,8 @@ from calibrator.drives.store import (
 from calibrator.errors import DriveError, FleetError, LogError
 from calibrator.files.storage import Entry, Storage, is_url, local_copy, open_storage, walk
 from calibrator.processes.run_many import Failed, Workers, try_many, try_many_shown
-from calibrator.recordings.frames import LOG_SUFFIXES, is_log
 from calibrator.recordings.log_files import files_in
+from calibrator.recordings.log_formats import LOG_SUFFIXES, is_log
 from calibrator.recordings.readers import read_recording
 from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import few, few_reasons

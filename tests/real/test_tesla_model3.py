@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cantools.database.can import Database
 
-from calibrator.recordings.frames import read_frames
+from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.readers import read_recording
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout

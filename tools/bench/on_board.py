@@ -7,7 +7,7 @@ from pathlib import Path
 from bench.row import LAYOUT, Row
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
-from calibrator.recordings.frames import read_frames
+from calibrator.recordings.log_formats import read_frames
 from calibrator.sources.fleet_source import find_fleet, probe_equipment
 from calibrator.summaries.summarise_fleet import read_vehicle_summary
 from ecu_node.bus.on_board_summary import OnBoardSummary

@@ -25,7 +25,7 @@ from bench.published import Publisher
 from bench.row import LAYOUT
 from calibrator.fleet_truth import VehicleTruth, read_truth
 from calibrator.processes.run_many import Workers, run_many
-from calibrator.recordings.frames import read_frames
+from calibrator.recordings.log_formats import read_frames
 from calibrator.terminal.progress import shown
 from ecu_node.bus.wiring import Mode, branch_signals, key_of, wire
 from ecu_node.core.signals import Codes, FrameKey

@@ -74,13 +74,6 @@ def test_the_band_of_a_straight_line_is_zero_even_after_hours() -> None:
     np.testing.assert_allclose(slope, 0.0, atol=1e-6)
 
 
-def test_bands_add_up_as_the_currents_do() -> None:
-    (time_s, one), (_, two) = uneven(4), uneven(5)
-    instants_s = np.linspace(3.0, 17.0, 50)
-    bands = [curve_of(time_s, value).band(instants_s, BAND)[0] for value in (one, two, one - 2.0 * two)]
-    np.testing.assert_allclose(bands[2], bands[0] - 2.0 * bands[1], atol=1e-9)
-
-
 def test_of_several_samples_at_one_instant_the_last_counts() -> None:
     time_s, value = np.array([0.0, 1.0, 1.0, 2.0]), np.array([0.0, 9.0, 1.0, 2.0])
     curve = curve_of(time_s, value)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.recordings.frames import read_frames
+from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.write_logs import write_drive_log
 from calibrator.summaries.store import existing_store
 from calibrator.summaries.vehicle_summary import VehicleSummary

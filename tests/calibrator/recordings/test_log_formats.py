@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S, DAMAGED, Frames, repaired_time
-from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_files import _READ_BYTES, BLOCK_BYTES
+from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.text_logs import parse_candump
 
 
