@@ -1,6 +1,7 @@
 """``python -m ecu_node`` and the console command."""
 
 import sys
+from contextlib import suppress
 
 __all__ = ["main"]
 
@@ -10,7 +11,9 @@ def main() -> int:
     try:
         from ecu_node.cli import main as run  # noqa: PLC0415
     except KeyboardInterrupt:
-        print("ecu-node: interrupted", file=sys.stderr)
+        if sys.stderr is not None:  # closed by who started the program
+            with suppress(OSError):
+                print("ecu-node: interrupted", file=sys.stderr, flush=True)
         return 130
     return run()
 

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 
 from ecu_node import __version__
 from ecu_node.errors import LayoutError
-from ecu_node.program import CommandParser, load_python_can, run_program, say_error, write_output, write_result
+from ecu_node.program import CommandParser, load_python_can, run_program, write_output, write_result
 from ecu_node.update.command import add_update_commands
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "--params": {"type": Path, "required": True, "metavar": "FILE", "help": "parameter file of this vehicle"},
 }
 """Of all commands; what a command says otherwise stands with it."""
-_BUS = ("--interface", "--channel", "--fd", "--bitrate", "--data-bitrate", "--listen-only")
+_BUS = "--interface --channel --fd --bitrate --data-bitrate --listen-only"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -154,9 +154,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error; may stand anywhere")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
-    def command(name: str, work: Callable[[argparse.Namespace], Any], options: Sequence[str], **words: Any) -> Any:
+    def command(name: str, work: Callable[[argparse.Namespace], Any], options: str, **words: Any) -> Any:
         added = commands.add_parser(name, **words)
-        for option in options:
+        for option in options.split():
             added.add_argument(option, **_OPTIONS[option])
         added.set_defaults(command=work, error=added.error, vehicle=os.environ.get(_VEHICLE_VARIABLE) or None)
         return added
@@ -164,18 +164,7 @@ def _parser() -> argparse.ArgumentParser:
     run = command(
         "run",
         _run,
-        (
-            "--unsigned",
-            "--layout",
-            "--vehicle",
-            *_BUS,
-            "--gateway",
-            "--shadow",
-            "--dry-run",
-            "--telemetry",
-            "--summary",
-            "--realtime",
-        ),
+        f"--unsigned --layout --vehicle {_BUS} --gateway --shadow --dry-run --telemetry --summary --realtime",
         help="correct until SIGTERM or SIGINT",
         description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
         "own on the same bus, or, with --gateway, in place on another bus. With parameters that do not fit it passes "
@@ -190,7 +179,7 @@ def _parser() -> argparse.ArgumentParser:
     command(
         "monitor",
         _monitor,
-        ("--layout", *_BUS, "--once", "--json"),
+        f"--layout {_BUS} --once --json",
         help="show the branches, their sum and the node, live",
         description="Listens to a bus, and never sends: measured and corrected currents, frame rates, faults, the "
         "Kirchhoff sum, and what the node says of itself. A table in a terminal, else a block of text per second; "
@@ -202,7 +191,7 @@ def _parser() -> argparse.ArgumentParser:
     command(
         "faults",
         _faults,
-        ("--json", "--state"),
+        "--json --state",
         help="why the node fell back: first, last, how often, with which currents",
         description="Prints the fault memory of a state folder, the last fault first. What is active keeps a node from "
         "correcting, also after a restart.",
@@ -210,7 +199,7 @@ def _parser() -> argparse.ArgumentParser:
     command(
         "clear",
         _clear,
-        ("--state",),
+        "--state",
         help="forget the faults, and correct again",
         description="Empties the fault memory of a state folder. A node that runs corrects again within a second; find "
         "out first what was wrong.",
@@ -218,7 +207,7 @@ def _parser() -> argparse.ArgumentParser:
     command(
         "check",
         _check,
-        ("--params", "--layout", "--vehicle", "--gateway", "--json"),
+        "--params --layout --vehicle --gateway --json",
         help="would these parameters be applied?",
         description="Checks parameters against layout, DBC and vehicle, and shows the integer plan of each branch, "
         "with --gateway as a gateway would apply it; no bus is opened. What it accepts, 'ecu-node run' accepts.",
@@ -228,7 +217,7 @@ def _parser() -> argparse.ArgumentParser:
     template = command(
         "template",
         _template,
-        ("--layout",),
+        "--layout",
         help="print a parameter file to be filled in by hand",
         description="Prints a parameter file that fits the layout and corrects nothing yet. Where the fault of a "
         "sensor was measured, write it there: drift [1], offset_a [A, positive into the junction], and "
@@ -237,7 +226,7 @@ def _parser() -> argparse.ArgumentParser:
         "the node would wait for their frames. All else can stay as it is.",
     )
     template.add_argument("--vehicle", required=True, type=_VEHICLE, metavar="ID", help="identity of the vehicle")
-    command("schema", _schema, (), help="print the JSON Schema of the parameter file")
+    command("schema", _schema, "", help="print the JSON Schema of the parameter file")
     return parser
 
 
@@ -246,31 +235,23 @@ def _parser() -> argparse.ArgumentParser:
 
 def _bus_settings(options: argparse.Namespace) -> dict[str, Any]:
     """Settings of the bus, as :func:`ecu_node.bus.adapters.bus_config` takes them."""
-    names = ("interface", "channel", "fd", "bitrate", "data_bitrate", "listen_only")
+    names = [option.removeprefix("--").replace("-", "_") for option in _BUS.split()]
     return {name: getattr(options, name) for name in names}
 
 
 def _run(options: argparse.Namespace) -> int:
     from ecu_node.bus.run import run_node  # noqa: PLC0415
 
-    for is_wrong, text in (
-        (
-            options.gateway == options.channel,
-            f"--gateway {options.gateway} is the bus of the sensors itself; two buses are expected",
-        ),
-        (
-            options.gateway is not None and options.listen_only,
-            "--listen-only sends nothing, and a gateway must pass frames on; leave one of them out",
-        ),
-        (options.state is not None and options.unsigned, "--state holds signed parameters; leave --unsigned out"),
-        (
-            options.params is not None and not options.unsigned,
-            "--params names a file that nobody signed: give --state with signed parameters, or --unsigned as well",
-        ),
-    ):
-        if is_wrong:
-            say_error(f"ecu-node: {text}")
-            return 2
+    if options.gateway == options.channel:
+        options.error(f"--gateway {options.gateway} is the bus of the sensors itself; two buses are expected")
+    if options.gateway is not None and options.listen_only:
+        options.error("--listen-only sends nothing, and a gateway must pass frames on; leave one of them out")
+    if options.state is not None and options.unsigned:
+        options.error("--state holds signed parameters; leave --unsigned out")
+    if options.params is not None and not options.unsigned:
+        options.error(
+            "--params names a file that nobody signed: give --state with signed parameters, or --unsigned too"
+        )
     return run_node(options, _bus_settings(options))
 
 

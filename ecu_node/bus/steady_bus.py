@@ -259,7 +259,7 @@ class _FrameByFrame:
         except (ValueError, TypeError, struct.error) as error:  # of python-can's serial driver, on a disturbed line
             raise can.CanOperationError(f"the adapter sends what is no frame: {error}") from None
         now_s = time.monotonic()
-        self.asked_s = now_s if timeout_s > 0.0 else asked_s
+        self.asked_s = min(now_s, asked_s + timeout_s)  # a pause of the process after the wait heard nothing
         if message is not None:
             self.read_s = now_s
             if not self._has_time_of_day:
@@ -365,8 +365,9 @@ class SocketCanLink:
     def _fill(self, timeout_s: float) -> bool:
         """Take all frames that wait; whether there were any."""
         if timeout_s > 0.0:
+            waiting_s = time.monotonic()
             is_asked = bool(self._waiting.poll(1e3 * timeout_s))
-            self.asked_s = time.monotonic()
+            self.asked_s = min(time.monotonic(), waiting_s + timeout_s)  # a pause after the wait heard nothing
         else:
             is_asked, self._had_no_more = not self._had_no_more, False
             if is_asked:

@@ -50,13 +50,3 @@ def test_a_fault_of_the_node_names_its_place_and_ends_with_70(
     assert line.startswith("ecu-node: internal error: ZeroDivisionError: nobody thought of that (cli.py, line ")
     assert main(["schema", "--debug"]) == INTERNAL_ERROR
     assert "in broken" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("arguments", [["--debug", "check"], ["check", "--debug"]])
-def test_the_node_takes_debug_before_and_after_the_command(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*arguments, "--params", "p.json", "--layout", "none.toml"]) == FAILED
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "Traceback (most recent call last):"
-    assert lines[-1].startswith("ecu-node: none.toml: cannot read the layout")

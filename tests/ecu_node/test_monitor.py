@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import cycle
 from typing import Any
 
@@ -116,7 +115,9 @@ def test_sum_needs_a_fresh_value_of_every_branch_seen_and_its_answer(bus: Bus) -
     assert bus.sums(0.002) == (None, None)
     bus.pair("Battery", 0.01, 100.0, 90.0)
     bus.pair("Motor", 0.01, 80.0)
-    assert bus.monitor.look(0.02)["sums"] == {"measured_a": pytest.approx(20.0), "corrected_a": None}
+    measured_a, corrected_a = bus.sums(0.02)
+    assert measured_a == pytest.approx(20.0)
+    assert corrected_a is None
     assert [each["name"] for each in bus.monitor.look(0.02)["branches"] if each["is_seen"]] == ["battery", "motor"]
     bus.pair("Battery", 0.3, 100.0, 90.0)
     assert bus.sums(0.31) == (None, None)
@@ -170,20 +171,6 @@ def test_what_else_a_reader_should_know_is_said(make_database: MakeDatabase) -> 
     assert closed[0].startswith("can0: this computer's interface failed or is down; trying to open it again")
 
 
-@contextmanager
-def battery_on_bus(database: VehicleDatabase) -> Iterator[can.BusABC]:
-    """A battery that sends; the bus to listen on whether anybody else does."""
-    counters = cycle(range(15))
-
-    def count_on(message: can.Message) -> None:
-        message.data = bytearray(protected(database, "HV_Battery", next(counters), BatteryCurrent=100.0))
-
-    with can.Bus(interface="virtual", channel=CHANNEL) as bus:
-        frame = can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8))
-        bus.send_periodic(frame, 0.01, modifier_callback=count_on)
-        yield bus
-
-
 @pytest.fixture
 def handlers() -> Iterator[None]:
     """Leave signal handlers as they were."""
@@ -195,29 +182,33 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("handlers")
-def test_once_prints_what_was_seen_and_sends_nothing(
+def test_once_prints_what_was_seen_sends_nothing_and_ends_in_1_without_any_branch(
     database: VehicleDatabase, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with battery_on_bus(database) as bus:
+    counters = cycle(range(15))
+
+    def count_on(message: can.Message) -> None:
+        message.data = bytearray(protected(database, "HV_Battery", next(counters), BatteryCurrent=100.0))
+
+    with can.Bus(interface="virtual", channel=CHANNEL) as bus:
+        frame = can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8))
+        bus.send_periodic(frame, 0.01, modifier_callback=count_on)
         assert main([*MONITOR, "--listen-only", "--once", "0.5"]) == 0
-        assert bus.recv(0.0) is None
         lines = capsys.readouterr().out.splitlines()
         assert main([*MONITOR, "--once", "0.3", "--json"]) == 0
+        document = json.loads(capsys.readouterr().out)
+        bus.stop_all_periodic_tasks()
+        assert bus.recv(0.0) is None
+        assert main([*MONITOR, "--once", "0.1"]) == 1
     assert lines[0] == f"virtual {CHANNEL}: no node on this bus"
     assert next(line.split() for line in lines if line.startswith("battery"))[1] == "+100.00"
     assert lines[-1] == "no corrected messages on this bus: the currents are shown as they are on it"
-    document = json.loads(capsys.readouterr().out)
     assert document["branches"][0]["measured_a"] == pytest.approx(100.0)
     assert document["is_bus_open"] is True
-
-
-@pytest.mark.usefixtures("handlers")
-def test_bus_without_any_branch_ends_in_1(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*MONITOR, "--once", "0.1"]) == 1
-    captured = capsys.readouterr()
+    said = capsys.readouterr()
     line = f"ecu-node: virtual {CHANNEL}: no branch of {LAYOUT} was seen; see that the bus is the right one\n"
-    assert captured.err == line
-    assert captured.out.splitlines()[-1].startswith("no frame of any branch")
+    assert said.err == line
+    assert said.out.splitlines()[-1].startswith("no frame of any branch")
 
 
 def test_in_a_terminal_a_table_is_drawn_and_ctrl_c_ends_it_with_0() -> None:

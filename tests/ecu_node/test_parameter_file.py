@@ -36,14 +36,16 @@ class Running:
 
 
 def test_a_changed_file_is_put_in_force_within_a_second(path: Path, database: VehicleDatabase) -> None:
-    running = Running(path, database)
+    """Also one of the same size and time."""
+    running, before = Running(path, database), path.stat()
     assert (running.drift, running.file.look(running.corrector, 5.0)) == (0.25, False)
-    write_parameters(parameters_for(database, battery=(0.125, 5.0)), path)
+    path.write_bytes(path.read_bytes().replace(b"0.25", b"0.15"))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert path.stat().st_size == before.st_size
     assert not running.file.look(running.corrector, 5.5), "it looks once a second"
     assert running.file.look(running.corrector, 6.0)
-    assert running.drift == 0.125
+    assert (running.drift, running.corrector.counters.reloads) == (0.15, 1)
     assert running.said == ["parameter set 300 of vehicle v1 is in force"]
-    assert running.corrector.counters.reloads == 1
 
 
 @pytest.mark.parametrize("cut", [0, 1, 300])
@@ -76,11 +78,22 @@ def test_a_file_that_is_gone_or_of_another_vehicle_changes_nothing(path: Path, d
     assert running.said[1].endswith("no such parameter file; name one that is there")
 
 
-def test_a_file_that_comes_later_is_put_in_force(path: Path, database: VehicleDatabase) -> None:
+@pytest.mark.parametrize(
+    ("old", "new", "reason", "words"),
+    [
+        (b"{", b"", Reason.MALFORMED_PARAMETERS, "not a parameter file"),
+        (b'"v1"', b'"v2"', Reason.WRONG_VEHICLE, "parameters are for vehicle 'v2', this is 'v1'"),
+    ],
+)
+def test_a_file_that_comes_later_is_put_in_force(
+    path: Path, database: VehicleDatabase, old: bytes, new: bytes, reason: Reason, words: str
+) -> None:
+    """What stood there at the start is not used, and why is published."""
     content = path.read_bytes()
-    path.unlink()
+    path.write_bytes(content.replace(old, new, 1))
     running = Running(path, database)
-    assert running.corrector.reason is Reason.NO_PARAMETERS
+    assert (running.drift, running.corrector.reason) == (0.0, reason)
+    assert (running.file.why_not or "").startswith(f"{path}: {words}")
     path.write_bytes(content)
     assert running.file.look(running.corrector, 2.0)
     assert (running.corrector.reason, running.drift) == (Reason.NONE, 0.25)
@@ -98,23 +111,3 @@ def test_after_a_change_all_is_as_after_a_start(make_database: MakeDatabase, pat
     for live, new in zip(running.corrector.branches, fresh.branches, strict=True):
         assert (live.plan, live.fault) == (new.plan, new.fault)
         assert live.deadline_s == new.deadline_s
-
-
-def test_a_new_file_of_the_same_size_and_time_is_noticed(path: Path, database: VehicleDatabase) -> None:
-    running = Running(path, database)
-    found = path.stat()
-    write_parameters(parameters_for(database, battery=(0.75, 5.0)), path)
-    path.write_bytes(path.read_bytes().replace(b"0.75", b"0.15"))
-    os.utime(path, ns=(found.st_atime_ns, found.st_mtime_ns))
-    assert path.stat().st_size == found.st_size
-    assert running.file.look(running.corrector, 2.0)
-    assert running.drift == 0.15
-
-
-def test_at_start_parameters_of_another_vehicle_are_not_used_and_the_reason_is_published(
-    path: Path, database: VehicleDatabase
-) -> None:
-    path.write_bytes(path.read_bytes().replace(b'"v1"', b'"v2"'))
-    running = Running(path, database)
-    assert (running.drift, running.corrector.reason) == (0.0, Reason.WRONG_VEHICLE)
-    assert running.file.why_not == f"{path}: parameters are for vehicle 'v2', this is 'v1'"

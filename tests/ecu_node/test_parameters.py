@@ -4,14 +4,14 @@ import codecs
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -83,53 +83,34 @@ def test_what_the_schema_refuses_is_not_written(
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("p.json", "older")]
 
 
-def _paths(value: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
-    below = value.items() if isinstance(value, dict) else ()
+def _paths(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    below: Iterable[tuple[Any, Any]] = (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    )
     return [path, *(deeper for key, item in below for deeper in _paths(item, (*path, key)))]
 
 
-FINDING = {"branch": "battery", "cause": "inverted", "probability": 0.99, "text": "battery: its sign is turned."}
 values = st.one_of(
     st.none(), st.booleans(), st.integers(-3, 300), st.floats(-2, 2).filter(lambda x: x != int(x)), st.text(max_size=3),
-    st.just([]), st.just({}), st.just({"a": 1}), st.just("a" * 64), st.just("a" * 65), st.just("a" * 66),
+    st.sampled_from([[], {}, {"a": 1}, *("a" * length for length in (64, 65, 500, 501))]),
 )  # fmt: skip
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_schema_and_reader_agree_wherever_any_value_is_put_or_a_key_left_out(
     database: VehicleDatabase, data: st.DataObject
 ) -> None:
-    document = {**as_document(parameters_for(database, battery=(0.1, -2.5))), "extra": 1}
-    *outer, last = data.draw(st.sampled_from(_paths(document)[1:]))
-    document.pop("extra", None)
+    finding = {"branch": "battery", "cause": "inverted", "probability": 0.99, "text": "battery: its sign is turned."}
+    document = as_document(parameters_for(database, battery=(0.1, -2.5))) | {"findings": [finding]}
+    *outer, last = data.draw(st.sampled_from([*_paths(document)[1:], ("extra",)]))
     place = document
     for key in outer:
         place = place[key]
-    if data.draw(st.booleans()):
+    if last == "extra" or data.draw(st.booleans()):
         place[last] = data.draw(values)
     else:
-        place.pop(last, None)
-    assert is_readable(document) == VALIDATOR.is_valid(document)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"vehicle": "x" * 64},
-        {"branches": {f"b{k}": {"drift": 0, "offset_a": 0, "apply": True} for k in range(17)}},
-        {"branches": {"battery": {"drift": 0, "offset_a": 0, "apply": True, "sensor_model": None}}},
-        {"branches": {"battery": {"drift": 0, "offset_a": 0, "apply": True, "sensor_model": {"kind": "temperature"}}}},
-        {"findings": [FINDING]},
-        {"findings": [{**FINDING, "branch": None}]},
-        {"findings": [{**FINDING, "cause": ""}]},
-        {"findings": [{**FINDING, "text": "x" * 501}]},
-        {"findings": [{**FINDING, "probability": 1.1}]},
-        {"findings": 65 * [FINDING]},
-    ],
-    ids=range(10),
-)
-def test_schema_and_reader_agree(database: VehicleDatabase, change: dict[str, Any]) -> None:
-    document = as_document(parameters_for(database, battery=(0.1, -2.5))) | change
+        del place[last]
     assert is_readable(document) == VALIDATOR.is_valid(document)
 
 
@@ -139,17 +120,14 @@ def test_schema_and_reader_agree(database: VehicleDatabase, change: dict[str, An
         (b"", "it is empty"),
         (b"{", "JSON is malformed|Input data was truncated"),
         (b"[]", "Expected object, got array"),
-        (b"null", "Expected object, got null"),
         (b"\xff\xfe{}", "JSON is malformed"),
         (b'{"vehicle": "\xff"}', "it is no text in UTF-8"),
-        (b"[" * 100_000, "it is nested too deeply"),
         (b'{"branches": ' + b'{"a":' * 100_000, "it is nested too deeply"),
         (b'{"vehicle": v1}', r"JSON is malformed: .*\(byte 12\)"),
-        (b"not json at all\nsecond line", "JSON is malformed"),
         (b'{"payload":"","payloadType":"x","signatures":[]}\n', r"signed by version 1\.0; name the parameter file"),
         (b" " * (MAX_FILE_BYTES + 1), f"it is larger than {MAX_FILE_BYTES} bytes"),
     ],
-    ids=range(12),
+    ids=range(9),
 )
 def test_what_is_no_parameter_file_is_one_line(tmp_path: Path, content: bytes, words: str) -> None:
     (tmp_path / "p.json").write_bytes(content)
@@ -186,27 +164,6 @@ def test_parameters_that_do_not_belong_here_are_unfit(
     assert caught.value.reason is reason
     for own in ("v1", None):
         check_fit(parameters_for(database, battery=(0.4, -150.0)), database, own)
-
-
-@pytest.mark.parametrize("expected_a", [150.5, -150.5])
-def test_an_expected_sum_beyond_the_limit_of_offsets_does_not_fit(database: VehicleDatabase, expected_a: float) -> None:
-    residual = JunctionResidual(measured_a=1.0, corrected_a=0.1, expected_a=expected_a)
-    words = rf"^an expected Kirchhoff sum of \{expected_a:+g} A is beyond the layout's limit of offsets, 150 A$"
-    with pytest.raises(UnfitError, match=words) as caught:
-        check_fit(replace(parameters_for(database, battery=(0.1, 1.0)), junction_residual=residual), database, "v1")
-    assert caught.value.reason is Reason.IMPLAUSIBLE_PARAMETERS
-
-
-@pytest.mark.parametrize("apply", [True, False])
-@pytest.mark.parametrize("delay_s", [5.5, -5.5])
-def test_a_delay_that_no_vehicle_has_does_not_fit(database: VehicleDatabase, delay_s: float, apply: bool) -> None:
-    parameters = parameters_for(database, battery=(0.1, 1.0))
-    with_delay = [replace(SOUND, apply=apply, delay_s=delay) for delay in (None, delay_s / 1.1, delay_s)]
-    for branch in with_delay[:2]:
-        check_fit(replace(parameters, branches={"battery": branch}), database, "v1")
-    with pytest.raises(UnfitError, match=rf"^branch battery: delay \{delay_s:+g} s is beyond 5 s$") as caught:
-        check_fit(replace(parameters, branches={"battery": with_delay[2]}), database, "v1")
-    assert caught.value.reason is Reason.IMPLAUSIBLE_PARAMETERS
 
 
 def test_sums_about_the_expected_one_are_those_of_the_samples() -> None:
@@ -251,7 +208,6 @@ def test_a_file_of_version_1_0_is_read_unless_it_has_a_sensor_model(database: Ve
         (("verdict",), "fine", "verdict: .*'cannot tell' or .*, found \"fine\""),
         (("provenance", "drives"), [1], "provenance, drives, entry number 1: Expected str, got int, found 1"),
         (("vehicle",), "", 'vehicle: Expected str of length >= 1, found ""'),
-        (("vehicle",), 65 * "v", "vehicle: Expected str of length <= 64, found"),
         (("branches",), {}, "branches: Expected object of length >= 1, found {}"),
         (("dbc", "sha256"), "abc", 'dbc, sha256: expected SHA-256: 64 digits 0-9 and a-f, found "abc"'),
     ],
@@ -272,6 +228,41 @@ def test_a_wrong_field_is_named_with_its_place_and_value(
     assert "`" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            {"expected_a": 150.5},
+            r"an expected Kirchhoff sum of \+150\.5 A is beyond .* limit of offsets, 150 A$",
+        ),
+        (
+            {"expected_a": -150.5},
+            r"an expected Kirchhoff sum of -150\.5 A is beyond",
+        ),
+        ({"delay_s": 5.5, "apply": False}, r"branch battery: delay \+5\.5 s is beyond 5 s"),
+        ({"delay_s": -5.5}, r"branch battery: delay -5\.5 s is beyond 5 s"),
+        ({"drift": -0.5}, r"branch battery: drift -0\.5 is beyond the layout's limit of 0\.4"),
+        ({"offset_a": 151.0}, r"branch battery: offset \+151 A is beyond the layout's limit of 150 A"),
+        ({"drift": 0.4, "offset_a": -150.0, "delay_s": 5.0}, None),
+        ({"drift": -0.5, "offset_a": 151.0, "apply": False}, None),
+        ({"expected_a": -150.0, "delay_s": None}, None),
+    ],
+)
+def test_parameters_beyond_the_limits_of_the_layout_do_not_fit_unless_they_are_not_applied(
+    database: VehicleDatabase, change: dict[str, Any], words: str | None
+) -> None:
+    expected = {key: value for key, value in change.items() if key == "expected_a"}
+    residual = JunctionResidual(measured_a=1.0, corrected_a=0.1, **expected)
+    branches = {"battery": replace(SOUND, **{key: change[key] for key in change.keys() - expected})}
+    parameters = replace(parameters_for(database, battery=(0, 0)), branches=branches, junction_residual=residual)
+    if words is None:
+        check_fit(parameters, database, "v1")
+        return
+    with pytest.raises(UnfitError, match=f"^{words}") as caught:
+        check_fit(parameters, database, "v1")
+    assert caught.value.reason is Reason.IMPLAUSIBLE_PARAMETERS
+
+
 @pytest.mark.parametrize("verdict", ["cannot tell", "not enough data"])
 def test_what_was_not_decided_is_not_applied(database: VehicleDatabase, verdict: Verdict) -> None:
     parameters = replace(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)), verdict=verdict)
@@ -290,14 +281,12 @@ def test_what_was_not_decided_is_not_applied(database: VehicleDatabase, verdict:
         (b'"number":300', b'"number":299,"number":300', "'number' stands there twice in one place"),
         (b'"number":300', b'"number":299,"numbe\\u0072":300', "'number' stands there twice in one place"),
         (b'"battery":{', b'"battery":{"drift":0.5,', "'drift' stands there twice in one place"),
-        (b'"battery":{', b'"battery":{"drift":"x"},"battery":{', "'battery' stands there twice in one place"),
         (b'"number":300', b'"number":9007199254740992', "number: "),
         *(
             (b"-2.5", number, "not a parameter file")
             for number in (b"NaN", b"Infinity", b"-Infinity", b"1e999", b"9" * 400)
         ),
         (b'"number":300', b'"number":' + b"[" * 100_000 + b"]" * 100_000, "it is nested too deeply"),
-        (b'"v1"', b'"' + b"v" * 300 + b'"', "vehicle: Expected str of length <= 64, found"),
         (b'"v1"', b'"' + b"v" * 300 + b'"', "... (300 characters)"),
     ],
 )
@@ -313,16 +302,6 @@ def test_mistakes_of_a_file_that_was_written_by_hand_are_told(
     assert str(caught.value).startswith(f"{tmp_path}/p.json: not a parameter file: ")
     assert str(caught.value).endswith("; correct it, or write it anew with 'calibrator calibrate'")
     assert str(caught.value).isprintable()
-
-
-def test_limits_are_those_of_what_is_applied(database: VehicleDatabase) -> None:
-    passed = {"battery": replace(SOUND, drift=-0.5, apply=False), "motor": replace(SOUND, offset_a=151.0, apply=False)}
-    parameters = replace(parameters_for(database, battery=(0.1, 1.0)), branches=passed)
-    check_fit(parameters, database, "v1")
-    for name, words in (("battery", r"drift -0\.5 is beyond .* 0\.4"), ("motor", r"offset \+151 A is beyond .* 150 A")):
-        with pytest.raises(UnfitError, match=f"^branch {name}: {words}") as caught:
-            check_fit(replace(parameters, branches={name: replace(passed[name], apply=True)}), database, "v1")
-        assert caught.value.reason is Reason.IMPLAUSIBLE_PARAMETERS
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """What the service manager is told, over a real socket; the log's rate limit; signals."""
 
 import os
-import signal
 import socket
 import sys
 import time
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.service import Log, ServiceManager, stopped_by
+from ecu_node.bus.service import Log, ServiceManager
 
 WATCHDOG_S = 4.0
 
@@ -115,15 +114,3 @@ def test_a_log_that_is_gone_does_not_end_the_node(monkeypatch: pytest.MonkeyPatc
         Log().say("nobody reads this")
         monkeypatch.undo()
         os.dup2(os.open(os.devnull, os.O_WRONLY), gone.fileno())  # what is left in its buffer can be closed
-
-
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
-def test_signals_that_ask_to_stop(how: signal.Signals) -> None:
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.getsignal(number) for number in numbers]
-    stop = stopped_by(*numbers)
-    assert not stop()
-    os.kill(os.getpid(), how)
-    assert stop()
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)

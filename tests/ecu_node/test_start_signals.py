@@ -19,8 +19,9 @@ def hook(event, arguments):
     if event == {event!r} and str(arguments[0]) == {what!r}:
         signal.raise_signal({number})
 sys.addaudithook(hook)
-from ecu_node.cli import main
-sys.exit(main({arguments!r}))
+from ecu_node.__main__ import main
+sys.argv[1:] = {arguments!r}
+sys.exit(main())
 """
 MOMENTS = [("import", "can"), ("open", str(LAYOUT))]
 
@@ -33,7 +34,7 @@ def files(tmp_path: Path) -> list[str]:
     return ["--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT)]
 
 
-@pytest.mark.parametrize(("event", "what"), MOMENTS)
+@pytest.mark.parametrize(("event", "what"), [("import", "ecu_node.cli"), *MOMENTS])
 def test_ctrl_c_at_start_is_one_line_and_130(tmp_path: Path, event: str, what: str) -> None:
     command = program(event, what, signal.SIGINT, ["check", *files(tmp_path)])
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -1,89 +1,72 @@
 """Lines in the log: each fall-back, each sleep, and their ends, once each."""
 
-from collections.abc import Sequence
-
 import pytest
 
 from ecu_node.bus.run import StateChanges
-from ecu_node.bus.wiring import InForce, Mode, key_of, put_in_force, wire
+from ecu_node.bus.wiring import InForce, Mode, put_in_force
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
-from tests.ecu_node.vehicles import Frame, answers, parameters_for, protected
+from tests.ecu_node.vehicles import answers, battery, corrector_for, parameters_for
 
-STEP_S = 0.02
-BOTH = ("Battery", "Motor")
-AGAIN = ["no branch sends", "branches send again"]
-FALLS_BACK = "passing measured values through until the bus has slept: "
+FALLS_BACK = "passing measured values through until"
 
 
-class Drive:
-    """Frames of battery and motor, and a look after each round; the battery's offset is corrected by 5 A."""
+class Node:
+    """A node whose battery may send; what it says of its state."""
 
-    def __init__(self, database: VehicleDatabase) -> None:
-        self.database = database
-        fit = InForce(parameters=parameters_for(database, battery=(0.0, 5.0), motor=(0.0, 0.0)))
-        self.corrector = wire(database, fit, 0.0)
-        self.changes = StateChanges(self.corrector)
-        self.now_s, self.round = 0.0, 0
+    def __init__(self, database: VehicleDatabase, *, has_memory: bool = True) -> None:
+        self.database, self.now_s = database, 0.0
+        self.corrector = corrector_for(database, battery=(0.0, 5.0))
+        self.changes = StateChanges(self.corrector, has_memory=has_memory)
 
-    def go_on(self, duration_s: float, names: Sequence[str], error_a: float = 5.0, swing_a: float = 0.0) -> list[str]:
-        """What is said meanwhile, with 20 A from battery to motor; the battery's may swing alone."""
-        said = []
-        for _ in range(round(duration_s / STEP_S)):
-            self.now_s += STEP_S
-            self.round += 1
-            for name in names:
-                more_a = error_a + swing_a * (self.round % 2) if name == "Battery" else 0.0
-                data = protected(self.database, f"HV_{name}", self.round % 15, **{f"{name}Current": 20.0 + more_a})
-                answers(self.corrector, Frame(key_of(self.database.message(f"HV_{name}")), data), self.now_s)
-            self.corrector.look(self.now_s)
-            said.append(self.changes.news())
-        return [text for text in said if text is not None]
+    def drive(self) -> str | None:
+        answers(self.corrector, battery(self.database, round(self.now_s) % 15), self.now_s)
+        return self.later(0.02)
 
-    def load(self, in_force: InForce) -> list[str | None]:
+    def later(self, seconds: float) -> str | None:
+        self.now_s += seconds
+        self.corrector.look(self.now_s)
+        news = self.changes.news()
+        assert self.changes.news() is None, "once each"
+        return news
+
+    def latch(self, reason: Reason, *branches: str) -> str | None:
+        self.corrector.latch(reason, branches)
+        return self.changes.news()
+
+    def load(self, in_force: InForce) -> str | None:
         put_in_force(self.corrector, self.database, in_force, self.now_s, mode=Mode.OVERLAY)
-        return [self.changes.news(), self.changes.news()]
+        return self.changes.news()
 
 
-@pytest.fixture
-def drive(database: VehicleDatabase) -> Drive:
-    return Drive(database)
-
-
-def test_every_silence_and_its_end_is_said_the_first_one_too(drive: Drive) -> None:
-    assert drive.go_on(1.0, BOTH) == []
-    assert [line for _ in range(3) for line in drive.go_on(1.0, ()) + drive.go_on(1.0, BOTH)] == 3 * AGAIN
-
-
+@pytest.mark.parametrize("before", [Reason.NONE, Reason.BRANCH_STALE])
 @pytest.mark.parametrize("revoked", [False, True])
-def test_a_silence_after_a_fall_back_is_said_in_the_same_way_also_without_parameters(
-    drive: Drive, revoked: bool
-) -> None:
-    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [
-        f"{FALLS_BACK}{Reason.BRANCH_STALE.words} (motor)"
-    ]
+def test_every_silence_and_its_end_is_said(database: VehicleDatabase, before: Reason, revoked: bool) -> None:
+    """After a fall-back, or without parameters, in the same way."""
+    node = Node(database)
+    assert node.drive() is None
+    node.latch(before, "motor")
     if revoked:
-        assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None], "it does not correct again"
-    assert drive.go_on(7.0, ()) + drive.go_on(1.0, BOTH) == AGAIN
+        assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None, "it does not correct again"
+    for _ in range(2):
+        assert [node.later(1.0), node.later(6.0), node.drive()] == ["no branch sends", None, "branches send again"]
 
 
-def test_a_correction_that_makes_it_worse_and_a_stuck_branch_are_said_and_that_it_corrects_again(drive: Drive) -> None:
-    worse = "the corrected Kirchhoff sum is worse than the measured one"
-    assert drive.go_on(12.0, BOTH, error_a=0.0) == [
-        f"passing measured values through until other parameters or 'ecu-node clear': {worse}"
-    ]
-    parameters = parameters_for(drive.database, battery=(0.0, 5.0), motor=(0.0, 0.0))
-    assert drive.load(InForce(parameters=parameters)) == ["correcting again", None]
-    assert drive.go_on(12.0, BOTH, swing_a=40.0) == [f"{FALLS_BACK}{Reason.BRANCH_STUCK.words} (motor)"]
+def test_a_fall_back_says_why_until_when_and_that_it_corrects_again(database: VehicleDatabase) -> None:
+    node = Node(database)
+    stuck = node.latch(Reason.BRANCH_STUCK, "motor", "dcdc")
+    assert stuck == f"{FALLS_BACK} the bus has slept: {Reason.BRANCH_STUCK.words} (motor, dcdc)"
+    wrong = node.latch(Reason.SUM_IMPLAUSIBLE, "motor", "dcdc")
+    until = f"{FALLS_BACK} other parameters or 'ecu-node clear'"
+    assert wrong == f"{until}: {Reason.SUM_IMPLAUSIBLE.words} (motor or dcdc)"
+    assert node.latch(Reason.CORRECTION_WORSE) == f"{until}: {Reason.CORRECTION_WORSE.words}"
+    fit = InForce(parameters=parameters_for(database, battery=(0.0, 5.0)))
+    assert node.load(fit) == "correcting again"
+    alone = Node(database, has_memory=False)
+    assert f"{FALLS_BACK} other parameters or a restart: " in (alone.latch(Reason.CORRECTION_WORSE) or "")
 
 
-def test_a_node_without_a_fault_memory_says_that_a_restart_releases(drive: Drive) -> None:
-    drive.changes = StateChanges(drive.corrector, has_memory=False)
-    (line,) = drive.go_on(12.0, BOTH, error_a=0.0)
-    assert "until other parameters or a restart: " in line
-
-
-def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(drive: Drive) -> None:
-    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ()) == AGAIN[:1]
-    assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None]
-    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ()) == AGAIN[::-1]
+def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(database: VehicleDatabase) -> None:
+    node = Node(database)
+    assert [node.drive(), node.later(1.0)] == [None, "no branch sends"]
+    assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None

@@ -57,16 +57,6 @@ def test_the_sum_is_judged_about_the_load_that_the_layout_declares(
     assert corrector.state() == state
 
 
-@pytest.mark.parametrize("vehicle", ["", " ", "v" * 65, "a\nb", "\udcff"])
-def test_a_vehicle_that_no_parameter_file_can_name_is_wrong_use(
-    vehicle: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["template", "--layout", str(LAYOUT), "--vehicle", vehicle])
-    assert caught.value.code == 2
-    assert "--vehicle: the identity of the vehicle is expected" in capsys.readouterr().err
-
-
 def test_template_of_a_load_beyond_the_limits_is_refused(
     make_database: MakeDatabase, capsys: pytest.CaptureFixture[str]
 ) -> None:

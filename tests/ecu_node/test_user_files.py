@@ -2,13 +2,12 @@
 
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from ecu_node.cli import main
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
 
 
@@ -39,14 +38,14 @@ KINDS = [(pipe, "it is a pipe; a file is expected"), (endless, "it is a device; 
     ],
 )
 def test_a_layout_dbc_or_parameter_file_that_is_no_file_is_one_line(
-    tmp_path: Path, make: Callable[[Path], None], words: str, role: str, said: str
+    tmp_path: Path, make: Callable[[Path], None], words: str, role: str, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make(tmp_path / role)
     (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
     layout = {"small.dbc": tmp_path / "small.toml", "other.toml": tmp_path / role}.get(role, LAYOUT)
-    command = [sys.executable, "-m", "ecu_node", "check", "--params", str(tmp_path / "p.json"), "--layout", str(layout)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    found, silent = (done.stdout, done.stderr) if role == "p.json" else (done.stderr, done.stdout)
+    code = main(["check", "--params", str(tmp_path / "p.json"), "--layout", str(layout)])
+    out, err = capsys.readouterr()
+    found, silent = (out, err) if role == "p.json" else (err, out)
     assert re.match(said + words, found)
-    assert (done.returncode, silent) == (1, "")
+    assert (code, silent) == (1, "")
     assert role == "p.json" or found.count("\n") == 1

@@ -8,8 +8,10 @@ from typing import Any, NamedTuple, cast
 import msgspec
 from e2e.p01 import e2e_p01_protect
 
+from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import FrameKey
+from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import (
     BranchParameters,
@@ -20,6 +22,10 @@ from ecu_node.parameters import (
     VehicleParameters,
 )
 
+BATTERY, MOTOR = FrameKey(0x110, False), FrameKey(0x120, False)
+"""Of the project's own layout."""
+PAIR, HEATER, NET = FrameKey(256, False), FrameKey(512, True), FrameKey(258, False)
+"""Of the small vehicle."""
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 MakeDatabase = Callable[..., VehicleDatabase]
 """Makes a database from the texts of layout and DBC; without them, those of the small vehicle."""
@@ -129,3 +135,22 @@ def passed_on(corrector: Corrector, frame: Frame, now_s: float) -> bytes | None:
         return frame.data
     data = source.forward(bytearray(frame.data), now_s)
     return None if data is None else bytes(data)
+
+
+def battery(database: VehicleDatabase, counter: int, current: float = 100.0, **more: float) -> Frame:
+    """A frame of the battery of the project's own layout. [A]"""
+    return Frame(BATTERY, protected(database, "HV_Battery", counter, BatteryCurrent=current, **more))
+
+
+def damaged(frame: Frame) -> Frame:
+    """The same with a wrong CRC."""
+    return Frame(frame.key, bytes([frame.data[0] ^ 1]) + frame.data[1:])
+
+
+def corrector_for(
+    database: VehicleDatabase, mode: Mode = Mode.OVERLAY, start_s: float = 0.0, /, **faults: tuple[float, float]
+) -> Corrector:
+    """The node's core with drift and offset [A] per branch in force; without any there are no parameters."""
+    parameters = parameters_for(database, **faults) if faults else None
+    in_force = InForce(parameters=parameters, reason=Reason.NONE if faults else Reason.NO_PARAMETERS)
+    return wire(database, in_force, start_s, mode=mode)
