@@ -77,6 +77,7 @@ def test_line_has_currents_by_vss_name_sums_state_and_counters(make_outlet: Any,
     outlet = make_outlet(tmp_path / "node.jsonl")
     outlet.telemetry.latency.add(100e-6)
     outlet.second()
+    outlet.telemetry.look(outlet.now_s + 0.5)  # a line per second
     (line,) = lines_of(tmp_path / "node.jsonl", 1)
     assert line["branches"] == {
         VSS: {"measured_a": 80.0, "corrected_a": 60.0, "quality": "CORRECTED"},
