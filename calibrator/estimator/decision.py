@@ -25,11 +25,11 @@ from calibrator.score import TOLERANCE
 from ecu_node.parameters import Explanation, SensorFinding
 
 __all__ = [
-    "Estimate",
     "Explained",
     "FleetEstimate",
     "Points",
     "RowsEstimate",
+    "SensorEstimate",
     "best_estimate",
     "decided",
     "estimate_rows",
@@ -221,7 +221,7 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Estimate:
+class SensorEstimate:
     """What is found of N vehicles with K branches, branches in their own order.
 
     Attributes
@@ -279,7 +279,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RowsEstimate(Estimate):
+class RowsEstimate(SensorEstimate):
     """The same of evidence rows, before anything is decided.
 
     Attributes
@@ -301,7 +301,7 @@ class RowsEstimate(Estimate):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FleetEstimate(Estimate):
+class FleetEstimate(SensorEstimate):
     """The same of whole vehicles, with what is decided and said.
 
     Attributes

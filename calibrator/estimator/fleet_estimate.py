@@ -14,7 +14,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.checks import UsualMisfits, find_misfits, learn_usual_misfits
-from calibrator.estimator.decision import Estimate, FleetEstimate, RowsEstimate, decided, estimate_rows
+from calibrator.estimator.decision import FleetEstimate, RowsEstimate, SensorEstimate, decided, estimate_rows
 from calibrator.estimator.evidence import (
     EvidenceRows,
     FleetMoments,
@@ -417,7 +417,7 @@ def estimate_vehicles(
         1.0 - max((each.probability for each in mine if each.cause not in LINEAR_CAUSES), default=0.0) for mine in unfit
     ]
     spread = reference.models[0].spread
-    estimate = {each.name: getattr(found, each.name) for each in fields(Estimate)}
+    estimate = {each.name: getattr(found, each.name) for each in fields(SensorEstimate)}
     return FleetEstimate(
         **{**estimate, "confidence": found.confidence * linear},
         corrected=corrected,

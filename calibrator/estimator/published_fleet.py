@@ -25,9 +25,8 @@ from calibrator.fleet_truth import faults_of
 from calibrator.options import Classifier
 from calibrator.processes.run_many import Workers
 from calibrator.published.classify import classify_by_expected_trees, classify_by_threshold, classify_by_truth
-from calibrator.published.evidence import evidence_of_models
 from calibrator.published.recovery import Recovery, recover_fleet
-from calibrator.published.state_space import VehicleModel, identify_vehicle
+from calibrator.published.state_space import VehicleModel, evidence_of_models, identify_vehicle
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.terminal.progress import progress_bar
 from ecu_node.database import VehicleDatabase

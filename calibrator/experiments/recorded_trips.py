@@ -22,8 +22,8 @@ from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
 from calibrator.experiments.trial import ComparedMethod, Trial, drawn_distribution
 from calibrator.faults import Faults, measured_currents, true_currents
-from calibrator.published.evidence import FleetEvidence, evidence_of_models
-from calibrator.published.state_space import identify_vehicle
+from calibrator.published.evidence import FleetEvidence
+from calibrator.published.state_space import evidence_of_models, identify_vehicle
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.score import UnseenDrive
 from calibrator.summaries.moments import DriveSummary

@@ -6,18 +6,16 @@ those of [1]_.
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import compress
 
 import numpy as np
 
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Index
-from calibrator.published.state_space import VehicleModel
 
-__all__ = ["FleetEvidence", "collect_evidence", "evidence_of_models", "fleet_mean"]
+__all__ = ["FleetEvidence", "collect_evidence", "fleet_mean"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,34 +117,6 @@ def collect_evidence(simulated: Iterable[Array], reference: Array, junction_a2: 
         deviation_a2=deviation,
         junction_a2=junction_a2,
     )
-
-
-def evidence_of_models(
-    vehicles: Sequence[VehicleModel], in_reference: Sequence[bool]
-) -> tuple[FleetEvidence, Array, VehicleModel]:
-    """Simulate all vehicles on the longest held-out drive, the unity drive (2), and compare them with their mean.
-
-    Parameters
-    ----------
-    vehicles : sequence of N VehicleModel
-        With K branches.
-    in_reference : sequence of N bool
-        Vehicles whose mean is the fleet reference (3), and whose held-out drives may be the unity drive.
-
-    Returns
-    -------
-    evidence : FleetEvidence
-        Of all vehicles.
-    reference : ndarray of shape (T, K)
-        Fleet reference. [A]
-    unity : VehicleModel
-        Whose held-out drive is the unity drive.
-    """
-    unity = max(compress(vehicles, in_reference), key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in)
-    simulated = [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles]
-    reference = fleet_mean(compress(simulated, in_reference))
-    junction_a2 = np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles])
-    return collect_evidence(simulated, reference, junction_a2), reference, unity
 
 
 def _compare(currents: Array, reference: Array, centred: Array, power: Array) -> Array:

@@ -15,6 +15,7 @@ the simulation error (output error), so noise on the currents leaves no bias in 
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -26,10 +27,11 @@ from scipy.signal import lfilter
 from calibrator.drive import Array, Complex, Mask
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
+from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.terminal.text import counted
 
 __all__ = [
-    "StateSpaceModel", "VehicleModel", "bridged", "choose_order", "identify_model", "identify_vehicle", "pooled_poles",
+    "StateSpaceModel", "VehicleModel", "bridged", "choose_order", "evidence_of_models", "identify_model", "identify_vehicle", "pooled_poles",
     "simulation_snr_db", "snr_from_power", "solve_scaled",
 ]  # fmt: skip
 
@@ -425,3 +427,31 @@ def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpace
         ) from None
     columns = np.eye(len(excited))[excited]
     return replace(model, B=model.B @ columns, D=model.D @ columns)
+
+
+def evidence_of_models(
+    vehicles: Sequence[VehicleModel], in_reference: Sequence[bool]
+) -> tuple[FleetEvidence, Array, VehicleModel]:
+    """Simulate all vehicles on the longest held-out drive, the unity drive (2), and compare them with their mean.
+
+    Parameters
+    ----------
+    vehicles : sequence of N VehicleModel
+        With K branches.
+    in_reference : sequence of N bool
+        Vehicles whose mean is the fleet reference (3), and whose held-out drives may be the unity drive.
+
+    Returns
+    -------
+    evidence : FleetEvidence
+        Of all vehicles.
+    reference : ndarray of shape (T, K)
+        Fleet reference. [A]
+    unity : VehicleModel
+        Whose held-out drive is the unity drive.
+    """
+    unity = max(compress(vehicles, in_reference), key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in)
+    simulated = [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles]
+    reference = fleet_mean(compress(simulated, in_reference))
+    junction_a2 = np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles])
+    return collect_evidence(simulated, reference, junction_a2), reference, unity

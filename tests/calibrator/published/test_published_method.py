@@ -19,9 +19,9 @@ from calibrator.published.classify import (
     decision_criterion,
     expected_features,
 )
-from calibrator.published.evidence import FleetEvidence, collect_evidence, evidence_of_models, fleet_mean
+from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.published.recovery import recover_fleet
-from calibrator.published.state_space import StateSpaceModel, VehicleModel
+from calibrator.published.state_space import StateSpaceModel, VehicleModel, evidence_of_models
 from calibrator.score import f2_score, recovered
 from tests.calibrator.command_here import calibrator
 from tests.calibrator.estimator.simulated_rows import random_faults
