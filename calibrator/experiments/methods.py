@@ -78,7 +78,7 @@ def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float)
     return _estimated(found, found.faulty & found.identifiable & (found.harm_probability < HARM_LIMIT), models[0].prior)
 
 
-def _estimated(found: decision.Estimate, corrected: Mask, prior: Prior) -> Estimate:
+def _estimated(found: decision.SensorEstimate, corrected: Mask, prior: Prior) -> Estimate:
     return Estimate(
         faults=Faults(
             hardware_drift=found.hardware_drift,
