@@ -31,8 +31,8 @@ from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet
 from calibrator.terminal.text import counted
 
 __all__ = [
-    "StateSpaceModel", "VehicleModel", "bridged", "choose_order", "evidence_of_models", "identify_model", "identify_vehicle", "pooled_poles",
-    "simulation_snr_db", "snr_from_power", "solve_scaled",
+    "StateSpaceModel", "VehicleModel", "bridged", "choose_order", "evidence_of_models", "identify_model",
+    "identify_vehicle", "pooled_poles", "simulation_snr_db", "snr_from_power", "solve_scaled",
 ]  # fmt: skip
 
 TRAIN_SHARE = 0.8
