@@ -51,7 +51,7 @@ def _posterior(trial: Trial, *, known: bool = False) -> Estimate:
     prior = None
     if known:
         if trial.drawn_from is None:
-            raise FleetError("posterior/law known: nobody can say what the faults of these trials were drawn from")
+            raise FleetError("posterior/prior known: nobody can say what the faults of these trials were drawn from")
         prior = known_prior(trial.drawn_from.counts, trial.drawn_from.gain)
     if isinstance(trial.recorded, CommonEvidence):
         return _of_rows(trial.recorded, prior, trial.full_scale_a)
@@ -134,7 +134,7 @@ THRESHOLD = MethodRow("published/threshold", partial(_published, classify=_by_th
 TREE = MethodRow("published/tree", partial(_published, classify=_by_tree))
 PERFECT = MethodRow("published/perfect", partial(_published, classify=_by_truth))
 POSTERIOR = MethodRow("posterior", _posterior)
-CEILING = MethodRow("posterior/law known", partial(_posterior, known=True))
+CEILING = MethodRow("posterior/prior known", partial(_posterior, known=True))
 LEFT_IN = MethodRow("posterior, delays left in", _posterior)
 BASELINES = tuple(MethodRow(name, partial(_baseline, solve=solve)) for name, solve in SOLVERS.items())
 
