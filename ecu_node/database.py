@@ -102,7 +102,7 @@ class VehicleDatabase:
         )
 
     def current_step_a(self, branch: str) -> float:
-        """Step of the signal of a branch [A]; 0 where its current is computed of several, or any number."""
+        """Resolution of a branch's signal [A]; 0 if its current is computed from others, or the signal is a float."""
         name = self.layout.find_branch(branch).signal
         if name is None:
             return 0.0

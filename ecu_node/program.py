@@ -177,7 +177,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence[str]) -> int:
-    """Run a program; whatever ends it is one line on standard error.
+    """Run a program; any error is one line on standard error, but a closed output pipe, which is silent.
 
     Parameters
     ----------

@@ -680,7 +680,7 @@ class EvidenceRows:
         return EvidenceRows(**{name: values[index] for name, values in vars(self).items()})
 
     def intercept_covariance(self) -> Array:
-        """Covariance of b + a mean(f), which does not depend on errors of the slopes a, shape (N, K, K)."""
+        """Covariance of the intercepts at the mean current, where errors of slopes have no effect, shape (N, K, K)."""
         b = self.places.intercepts
         return _shifted(self.covariance, -_pivot(self.means, self.values), first=b.start)[:, b, b]
 

@@ -112,7 +112,7 @@ class FleetReference:
 
     @property
     def ordered(self) -> list[str]:
-        """Names of the branches in the order worked with."""
+        """Names of the branches in :attr:`order`, the one that varies most first."""
         return [self.branches[k] for k in self.order]
 
     @property
@@ -122,7 +122,7 @@ class FleetReference:
 
     @property
     def expected_a(self) -> float:
-        """Mean junction sum that right sensors show: the load that none of them sees. [A]"""
+        """Mean junction sum of faultless sensors: the unmeasured load, positive into the junction. [A]"""
         spread, K = self.models[0].spread, len(self.branches)
         return float((spread.mean[RowPlaces(K).junction] - spread.shared[:K].sum()) * self.full_scale_a)
 

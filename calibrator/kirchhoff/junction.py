@@ -57,7 +57,7 @@ class RecordedJunction:
     Attributes
     ----------
     database : VehicleDatabase
-        With the voltages, see :func:`.with_voltages`, and at the pace of the drives.
+        With the voltages as inputs, see :func:`.with_voltages`; its period is at least that of the recordings.
     branches : tuple of str
         The K branches.
     drives : tuple of Drive
@@ -146,7 +146,7 @@ class RecordedJunction:
 
     @cached_property
     def stands_still(self) -> bool:
-        """Whether no current moves by more than its sensor can show; a speed that moves says otherwise."""
+        """Whether no current varies by more than its sensor resolves; False if a speed moves, or of too little."""
         if self.speed or not len(self.moves_a):
             return False
         least_a = min(STILL_A, STILL_SHARE * self.database.layout.full_scale_a)

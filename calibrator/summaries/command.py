@@ -69,7 +69,7 @@ def info(store: StoreArgument, json: JsonOption = False) -> None:
 
 @store_app.command(epilog=example("calibrator store check summaries"))
 def check(store: StoreArgument, json: JsonOption = False) -> None:
-    """Read all of a store; exit code 1 if something in it is damaged, or counts twice."""
+    """Read a whole store; exit code 1 if something is damaged or left over, or two vehicles share a recording."""
     with importing():
         from calibrator.summaries.store import look_at_store
 

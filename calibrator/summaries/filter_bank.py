@@ -141,7 +141,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
     def described(self) -> str:
-        """Poles in words: time constants of low-passes, and frequencies of resonances with theirs."""
+        """Poles in words: the time constant of each low-pass, frequency and time constant of each resonance."""
         words = [_described(pole, self.period_s) for pole in self.complex_poles]
         return ", ".join(words) or "the plain inputs"
 

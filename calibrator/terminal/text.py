@@ -100,12 +100,12 @@ def few(names: Sequence[str]) -> str:
 
 
 def few_reasons(reasons: Mapping[str, str], *, count: int | None = None) -> str:
-    """Why vehicles cannot be used, to be added to a message.
+    """Format the reasons why vehicles cannot be used, to append to a message.
 
     Parameters
     ----------
     reasons : mapping of str to str
-        Why, by vehicle; of many perhaps the first ones.
+        Reason of each vehicle; of many it may hold only the first ones.
     count : int or None
         How many vehicles there are in all; None: those that are given.
 

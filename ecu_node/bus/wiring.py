@@ -88,7 +88,7 @@ def rewritten(database: VehicleDatabase) -> dict[FrameKey, Message]:
 
 
 def transmitted(database: VehicleDatabase, mode: Mode) -> dict[FrameKey, Message]:
-    """Messages that the node sends in its own name, by identifier."""
+    """Messages of which the node is the sender, by identifier; not those that a gateway rewrites."""
     return _by_key(database, (item.name for item in _written(database, mode) if item.own))
 
 

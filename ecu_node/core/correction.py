@@ -112,11 +112,11 @@ class IntegerPlan:
         return self.voltage_gain != 0
 
     def apply(self, code: int, voltage_code: int = 0) -> int:
-        """Correct one code; the result saturates at the ends and never wraps."""
+        """Correct one code; the result is clipped to the codes of the signal (lowest, highest), never wrapped."""
         return min(max(self.unbounded(code, voltage_code), self.lowest), self.highest)
 
     def unbounded(self, code: int, voltage_code: int = 0) -> int:
-        """The same, though it may lie beyond the ends."""
+        """The same without clipping."""
         return (code * self.gain + voltage_code * self.voltage_gain + self.bias + (1 << (self.shift - 1))) >> self.shift
 
 

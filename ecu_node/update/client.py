@@ -100,7 +100,7 @@ class _Offer(msgspec.Struct, frozen=True):
 
 
 def target_path(vehicle: str) -> str:
-    """Path of a vehicle's parameter file in the repository, such as ``V001.json``; it never leads anywhere else."""
+    """Path of a vehicle's parameter file in the repository, such as ``V001.json``; never outside it."""
     return f"{quote(vehicle, safe='', errors='surrogateescape')}.json"
 
 

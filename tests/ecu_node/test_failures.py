@@ -27,7 +27,7 @@ def test_each_error_is_one_line(error: Exception, code: int, text: str, capsys: 
     assert line.startswith(text)
 
 
-def test_parameters_that_are_unfit_are_so_for_another_process_too() -> None:
+def test_trust_error_keeps_its_reason_when_pickled() -> None:
     found = pickle.loads(pickle.dumps(TrustError(Reason.REVOKED, "number 5 was revoked")))
     assert (type(found), found.reason, str(found)) == (TrustError, Reason.REVOKED, "number 5 was revoked")
 

@@ -127,7 +127,7 @@ def test_steps_of_loads_are_no_fault(junction: Junction) -> None:
     assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
-def test_without_what_the_calibrator_saw_gross_faults_show_all_the_same(tmp_path: Path) -> None:
+def test_gross_fault_is_detected_without_residual_standard_deviations(tmp_path: Path) -> None:
     """The sum that the calibrator saw is none."""
     junction = Junction(three_branches(tmp_path), sd_a=None, sd_per_a=None, corrected_a=60.0)
     junction.wrong = {"heater": lambda shown_a: shown_a + 60.0}

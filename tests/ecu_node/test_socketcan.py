@@ -69,7 +69,7 @@ def test_all_kinds_of_frames_are_read_as_they_were_written(ends: Ends) -> None:
         assert [fields(message) for message in received(link, 20)] == [fields(frame) for frame in frames]
 
 
-def test_all_kinds_of_frames_are_written_as_python_can_reads_them(ends: Ends) -> None:
+def test_written_frames_match_python_can_for_every_kind(ends: Ends) -> None:
     link, far = ends
     rng = random.Random(1)
     for _ in range(50):

@@ -209,7 +209,7 @@ def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: 
     assert "internal error in Telemetry, which is off now; please report it: ZeroDivisionError" in said
 
 
-def test_real_time_says_what_was_not_allowed_and_goes_on() -> None:
+def test_missing_real_time_permissions_are_reported_not_fatal() -> None:
     code = (
         "import os; from ecu_node.bus.service import be_real_time; "
         "os.geteuid() or os.setuid(65534); print(be_real_time()); print(len(os.sched_getaffinity(0)))"

@@ -31,7 +31,7 @@ def test_only_what_the_node_needs_is_installed(node: CleanVenv) -> None:
     assert node.run("python", "-m", "pip", "check", folder=node.folder).returncode == 0
 
 
-def test_parameters_are_checked(node: CleanVenv, car: Path) -> None:
+def test_node_only_install_checks_a_parameter_file(node: CleanVenv, car: Path) -> None:
     arguments = ("--params", "V001.json", *LAYOUT, "--vehicle", VEHICLE, "--json")
     done = node.run("ecu-node", "check", *arguments, folder=car)
     assert (done.returncode, done.stderr) == (0, "")

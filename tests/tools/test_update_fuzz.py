@@ -19,7 +19,7 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Vehicle:
     return Vehicle(tmp_path_factory.mktemp("fuzz"))
 
 
-def test_changed_bundles_come_as_far_as_every_check(vehicle: Vehicle) -> None:
+def test_fuzzed_bundles_reach_every_check(vehicle: Vehicle) -> None:
     rng, said = Random(3), []
     for _ in range(300):
         content = vehicle.changed(rng)

@@ -132,9 +132,7 @@ def test_key_that_cannot_be_had_is_one_line(repo: Repo) -> None:
         failed(repo, words, "publish", repo.path, "--key", key)
 
 
-def test_encrypted_key_signs_with_its_passphrase_alone(
-    repo: Repo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_encrypted_key_needs_its_own_passphrase(repo: Repo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(PASSPHRASE_VARIABLE, "short")
     failed(repo, "at least 12 characters", "key", "dora", "--out", tmp_path, code=2)
     monkeypatch.setenv(PASSPHRASE_VARIABLE, "a long passphrase")

@@ -212,7 +212,7 @@ def test_a_fault_of_the_program_leaves_the_rules_as_a_kill_does() -> None:
 
 
 @pytest.mark.parametrize("gap_ms", [300, 1], ids=["each 300 ms", "1000 per s"])
-def test_foreign_frames_of_a_branch_hold_nothing_up_and_the_status_says_so(
+def test_foreign_branch_frames_are_dropped_and_reported(
     params: Path, drive: Path, start_node: StartNode, recording: Recording, other_recording: Recording, gap_ms: int
 ) -> None:
     command = ["cangen", OTHER_CHANNEL, "-I", f"{BATTERY:X}", "-D", FOREIGN, "-L", "8", "-g", str(gap_ms)]

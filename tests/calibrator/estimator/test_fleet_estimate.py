@@ -91,9 +91,7 @@ def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_said(truth
 
 
 @pytest.mark.parametrize(("vehicles", "branch", "gain"), [(5, 0, 0.1), (8, 1, -0.09), (8, 0, 0.03), (12, 1, 0.02)])
-def test_gain_error_that_all_sensors_of_a_branch_share_is_said_and_not_corrected_in_either(
-    vehicles: int, branch: int, gain: float
-) -> None:
+def test_gain_error_shared_by_a_branch_is_reported_but_not_corrected(vehicles: int, branch: int, gain: float) -> None:
     batch = no_faults(vehicles, K)
     batch.drift[:, branch] = gain
     summaries = summaries_of(batch, Conditions(samples=900), seed=vehicles)

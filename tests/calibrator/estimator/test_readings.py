@@ -97,7 +97,7 @@ def test_trusted_vehicle_that_was_read_as_faulty_is_refused(reading: tuple[float
     check(bench_of(0.001, 0.002, 0.1, 0.2), "V1")
 
 
-def test_window_and_reading_count_together_or_neither_does_where_they_contradict_each_other() -> None:
+def test_zero_current_and_bench_readings_combine_or_both_drop_out_if_contradictory() -> None:
     shown = {"V1": (4.9, 0.1), "V2": (5.0, 0.1), "V3": (NAN, NAN)}  # by the battery sensor with open contactors
     vehicles = cast(
         "list[VehicleSummary]",

@@ -31,7 +31,7 @@ SANITIZED = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
 @needs("gcc")
-def test_frames_and_all_codes_of_a_vehicle_with_everything_are_the_same(tmp_path: Path) -> None:
+def test_c_core_matches_the_node_for_all_codes_and_frames(tmp_path: Path) -> None:
     checked = vehicle()
     program = build(checked, tmp_path)
     assert check_frames(checked, program, Random(2026), 100_000) > 30_000

@@ -86,7 +86,7 @@ def test_dcm_is_read_back(checked: Checked, tmp_path: Path, caplog: pytest.LogCa
     assert passed_over == ["TEXTSTRING", "LANGNAME", "FUNKTION", "TEXT", "END"] * (len(passed_over) // 5)
 
 
-def test_cdfx_is_read_back_in_the_order_of_the_dtd(checked: Checked) -> None:
+def test_cdfx_follows_the_order_of_the_dtd_and_keeps_its_values(checked: Checked) -> None:
     document = ET.fromstring(cdfx_document(checked))
     for element in document.iter():
         tags, order = [child.tag for child in element], ORDER.get(element.tag, [])

@@ -139,7 +139,7 @@ def test_sum_of_a_gain_error_is_told_from_a_constant_and_a_delay(tmp_path: Path)
     assert len(digits or "") == len(sd_ms.lstrip("0123456789")), "as many digits as the deviation has"
 
 
-def test_empty_cell_widens_the_band_there_alone(tmp_path: Path) -> None:
+def test_missing_value_widens_the_expected_deviation_at_that_row_only(tmp_path: Path) -> None:
     battery = MOTOR_A + 0.05 * np.random.default_rng(5).normal(size=1200)
     battery[600] = np.nan
     assert run(*table(tmp_path, battery=battery, motor=-MOTOR_A), "--table", tmp_path / "out.csv").returncode == 0

@@ -126,9 +126,7 @@ def test_every_page_within_pages_decodes_as_cantools_decodes_it(message: Message
 
 
 @given(signals(), st.lists(st.binary(max_size=64), min_size=1, max_size=8))
-def test_a_frame_of_any_length_is_good_where_cantools_finds_the_signal(
-    pair: tuple[Message, Signal], rows: list[bytes]
-) -> None:
+def test_frames_of_any_length_decode_as_in_cantools(pair: tuple[Message, Signal], rows: list[bytes]) -> None:
     message, signal = pair
     decoded = decode_signal(message, signal, *payloads(rows, 64))
     for k, row in enumerate(rows):

@@ -368,7 +368,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("name", DAMAGED)
-def test_damaged_log_is_one_line_or_counted(tmp_path: Path, layout: Path, name: str, damage: str) -> None:
+def test_damaged_log_gives_one_error_line_or_is_counted(tmp_path: Path, layout: Path, name: str, damage: str) -> None:
     log = tmp_path / name
     LOGS[DAMAGED[name]][1](log)
     log.write_bytes(DAMAGES[damage](log.read_bytes()))
