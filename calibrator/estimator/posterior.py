@@ -76,7 +76,7 @@ MOST_PARAMETERS = 6
 MOST_TURN = 3.0
 """Largest logarithm by which a measured ratio can be off. [1]"""
 LOWEST, HIGHEST, STEP = -2.5, 1.2, 0.5
-"""Range of a parameter, and the longest step of one iteration: gains from 0.08 to 3.3. [1]"""
+"""Range of the logarithm of a gain, and the longest step of one iteration: gains from 0.08 to 3.3. [1]"""
 MOST_STEPS, LAST_STEP = 7, 1e-7
 """Gauss-Newton steps, and the size of a step that is the last one: far below what any row shows. [1]"""
 DIFFERENCE = 1e-6
@@ -377,9 +377,12 @@ def _refine(evidence: Evidence, j: int, chosen: Integers, theta: Array, root: Ar
         step = np.linalg.solve(H, g)
         if np.abs(step).max() < LAST_STEP:
             break
-        theta[chosen] = np.minimum(
-            np.maximum(theta[chosen] + np.minimum(np.maximum(step, -STEP), STEP), LOWEST), HIGHEST
-        )
+        for a in range(len(chosen)):
+            p = chosen[a]
+            if p <= len(theta) // 3:  # a gain; constants are linear beside them
+                theta[p] = min(max(theta[p] + min(max(step[a], -STEP), STEP), LOWEST), HIGHEST)
+            else:
+                theta[p] += step[a]
     L = np.linalg.cholesky(H)
     inverse = np.linalg.inv(L)  # its transpose is a root of the covariance
     value = -0.5 * chi2

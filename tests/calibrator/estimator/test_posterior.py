@@ -111,6 +111,16 @@ def test_what_all_sensors_share_leaves_nothing_either(K: int, of_sensor: bool) -
     np.testing.assert_allclose(left[rows.known], 0.0, atol=1e-12)
 
 
+def test_large_offset_behind_a_small_gain_is_fitted() -> None:
+    """An offset of 60 % of full scale is one of 150 % in true currents, where the gain is 0.4."""
+    truth = no_faults(1, 3)
+    truth.drift[0, 0], truth.offset_a[0, 0] = -0.6, 0.6
+    fits = fitted(plain_evidence(rows_of(truth, noise=0.0)))
+    place = supports(fits, 0).index((1, 6))
+    assert fits.theta[0, place, 6] == pytest.approx(1.5, rel=1e-3)
+    assert fits.chi2[0, place] < 1.0
+
+
 def test_rows_that_nothing_explains_and_rows_that_say_nothing_are_fitted_without_failing() -> None:
     rows = rows_of(random_faults(10, vehicles=3, branches=2))
     rows.relative[0, :2], rows.constant[1, :2] = 3.0, -40.0
