@@ -169,11 +169,8 @@ class CommandParser(argparse.ArgumentParser):
         say_error(f"{self.prog}: {message}; see '{self.prog} --help'")
         self.exit(2)
 
-    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
-        if file is not None and file is sys.stdout:
-            write_output(message.removesuffix("\n"))
-        else:
-            super()._print_message(message, file)
+    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:  # noqa: ARG002  # standard output
+        write_output(message.removesuffix("\n"))
 
 
 def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence[str]) -> int:

@@ -9,6 +9,7 @@ import pty
 import re
 import select
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -24,7 +25,7 @@ import cantools
 import pytest
 from can.typechecking import BitTimingFdDict
 
-from ecu_node.bus.adapters import bus_config, connect
+from ecu_node.bus.adapters import bus_config, carries_fd, connect
 from ecu_node.cli import main
 from ecu_node.errors import BusError
 from ecu_node.parameters import write_parameters
@@ -125,6 +126,13 @@ def test_bit_timing_of_can_conf_reaches_the_driver(timing: dict[str, int], fd: b
     assert dict(found) == timing
 
 
+@pytest.mark.parametrize(
+    ("interface", "channel", "fd"), [("socketcan", "lo", True), ("socketcan", "none", False), ("virtual", "lo", False)]
+)
+def test_whether_an_interface_carries_can_fd_is_known_from_its_mtu(interface: str, channel: str, fd: bool) -> None:
+    assert carries_fd(interface, channel) == fd
+
+
 # ---- a dry run
 
 
@@ -144,6 +152,16 @@ def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
     assert captured.err == ""
     assert main([*node, *adapter, "--dry-run"]) == 1
     assert "no bitrate" in capsys.readouterr().err
+
+
+def test_dry_run_prints_a_bit_timing_once(
+    node: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
+    assert main([*node, "--interface", "pcan", "--channel", "PCAN_USBBUS1", "--dry-run"]) == 0
+    (opened, *_) = capsys.readouterr().out.splitlines()
+    assert opened.startswith("would open pcan PCAN_USBBUS1: timing BR: 250_000 bit/s, SP: 87.50%, BRP: 2, ")
+    assert "f_clock" not in opened
 
 
 def test_dry_run_of_a_gateway_prints_both_ways(node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -259,6 +277,23 @@ def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected_unless_it_only_li
     assert {text[:5] for text in answers} <= {b"t2008"}
     assert all(answer(bytes.fromhex(text[5:].decode())) == RIGHT for text in answers)
     assert any("listen-only: nothing is sent, and no frame acknowledged" in text for text in log) == bool(options)
+
+
+def test_node_tells_which_branch_it_does_not_publish_and_that_no_branch_sends(
+    node: list[str], line: SerialLine, make_database: MakeDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In its log, and the second one also to the service manager."""
+    write_parameters(parameters_for(make_database(), battery=(0.1, 1.0), heater=(0.1, 0.0)), tmp_path / "v1.json")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(60.0)
+        with running(*node, "--interface", "slcan", "--channel", line.path, "--bitrate", "250000") as log:
+            line.put(b"t1008" + MEASURED.hex().upper().encode() + b"\r")
+            while manager.recv(4096) != b"STATUS=no branch sends":
+                pass
+    assert any("branch heater is not published: the parameters apply a fault to it" in text for text in log)
+    assert "ecu-node: no branch sends\n" in log
 
 
 def test_serial_line_is_answered_corrected_also_after_a_disturbance(node: list[str], line: SerialLine) -> None:

@@ -13,6 +13,8 @@ from ecu_node.bus.faults import FaultMemory
 from ecu_node.cli import main
 from ecu_node.core.status import Reason
 from tests.ecu_node.junctions import Junction, driving, three_branches
+from tests.ecu_node.test_adapters import running
+from tests.ecu_node.vehicles import LAYOUT
 
 
 class AtOnce(Executor):
@@ -176,3 +178,11 @@ def test_a_folder_that_is_not_there_is_one_line(
 ) -> None:
     assert main([command, "--state", str(tmp_path / "none")]) == 1
     assert "no such state folder" in capsys.readouterr().err
+
+
+def test_a_node_without_the_state_of_a_vehicle_says_so_and_passes_values_through(tmp_path: Path) -> None:
+    bus = ["--interface", "virtual", "--channel", "state"]
+    with running("run", "--state", str(tmp_path), "--layout", str(LAYOUT), *bus) as log:
+        assert log[-1].endswith("running on virtual state, correcting nothing\n")
+    why = f"{tmp_path}: no state of a vehicle there; make one with 'ecu-node provision'"
+    assert f"ecu-node: passing measured values through: {why}\n" in log

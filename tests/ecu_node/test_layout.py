@@ -68,6 +68,7 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ('"Pair.Motor"', '"Pair.Battery"', "branches battery and motor: both read Pair.Battery"),
         ('"PairOut.Motor"', '"PairOut.Battery"', "PairOut.Battery is written twice"),
         ('"PairOut.Motor"', '"Pair.Motor"', "Pair.Motor is both read and written"),
+        ("sign = ", "balance = true, sign = ", "more than one branch has 'balance = true'"),
         (
             "full_scale_a",
             'input = [{ name = "x", signal = "PairOut.Quality" }]\nfull_scale_a',
@@ -110,3 +111,25 @@ def test_a_dbc_that_lacks_what_the_layout_names_is_refused(make_database: MakeDa
     with pytest.raises(DatabaseError, match=words) as caught:
         make_database(SMALL_LAYOUT, dbc)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore:cantools.database.diagnostics")
+def test_a_diagnostics_database_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
+    (tmp_path / "ecu.cdd").write_text("<CANDELA><ECUDOC><ECU><VAR/></ECU></ECUDOC></CANDELA>")
+    with pytest.raises(DatabaseError, match=r"ecu.cdd: a diagnostics database; a CAN database \(DBC\) is needed"):
+        make_database(SMALL_LAYOUT.replace("small.dbc", "ecu.cdd"))
+
+
+@pytest.mark.parametrize("mark", [1 << 31, 0])
+@pytest.mark.parametrize("more", ["", 'VAL_ 258 Gone 1 "On";\n'])
+def test_29_bit_identifiers_that_are_not_marked_and_names_for_values_of_no_signal_are_put_right(
+    make_database: MakeDatabase, mark: int, more: str
+) -> None:
+    """As they stand in many public DBCs."""
+    number = mark | 0x18FF0200
+    texts = f'CM_ SG_ {number} Power "Taken up";\nVAL_ {number} Power 65535 "SNA";\n'
+    database = make_database(dbc=SMALL_DBC.replace("BO_ 2147484160", f"BO_ {number}") + texts + more)
+    heater, pair = database.message("Heater"), database.message("Pair")
+    power, battery = heater.get_signal_by_name("Power"), pair.get_signal_by_name("Battery")
+    assert (heater.frame_id, heater.is_extended_frame) == (0x18FF0200, True)
+    assert (power.comment, power.choices, battery.choices) == ("Taken up", {65535: "SNA"}, {-32768: "SNA"})

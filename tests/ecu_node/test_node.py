@@ -308,6 +308,32 @@ def test_a_bus_that_can_be_opened_but_is_down_is_not_said_to_be_open(channel: st
     assert [line.partition(": ")[2].partition(":")[0] for line in said] == ["the bus failed", "the bus is open again"]
 
 
+def test_a_bus_off_that_is_told_as_the_bus_opens_again_is_counted(peer: can.BusABC, channel: str) -> None:
+    gone = failing(f"{channel} before", receiving=can.CanOperationError("Network is down", errno.ENETDOWN))
+    opened, counters = iter([gone, VirtualBus(channel)]), Counters()
+    peer.send(can.Message(arbitration_id=0x40, is_error_frame=True))
+    with closing(SteadyBus(lambda: next(opened), counters)) as bus:
+        wait_until(lambda: bus.receive(0.01) is None and counters.reopened == 1)
+    assert (counters.bus_errors, counters.bus_off) == (1, 1)
+
+
+class ClassicBus(VirtualBus):
+    """A bus that takes no frame of CAN FD."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if msg.is_fd:
+            raise can.CanOperationError("Invalid argument", errno.EINVAL)
+        super().send(msg, timeout)
+
+
+def test_a_frame_that_the_bus_never_takes_holds_up_none_behind_it(peer: can.BusABC, channel: str) -> None:
+    with closing(SteadyBus(lambda: ClassicBus(channel), Counters())) as bus:
+        for identifier, is_fd in ((1, False), (2, True), (3, False)):
+            bus.send(can.Message(arbitration_id=identifier, is_fd=is_fd))
+        assert bus.flush() == (2, 1)
+    assert [receive(peer, identifier, 1)[0].arbitration_id for identifier in (1, 3)] == [1, 3]
+
+
 def test_a_bus_of_which_only_sending_tells_that_it_is_gone_is_opened_again(
     database: VehicleDatabase, peer: can.BusABC, channel: str
 ) -> None:

@@ -31,6 +31,7 @@ from ecu_node.parameters import (
     read_parameters,
     write_parameters,
 )
+from tests.disk import full_disk
 from tests.ecu_node.vehicles import as_document, parameters_for
 
 SCHEMA_FILE = Path(ecu_node.__file__).parent / "parameters.schema.json"
@@ -317,3 +318,13 @@ def test_what_is_in_the_way_of_reading_is_told(tmp_path: Path, name: str, words:
     with pytest.raises(UnfitError, match=words) as caught:
         read_parameters(tmp_path / name)
     assert caught.value.reason is reason
+
+
+def test_a_full_disk_leaves_the_parameter_file_as_it_was(database: VehicleDatabase, tmp_path: Path) -> None:
+    path = tmp_path / "v1.json"
+    write_parameters(parameters_for(database, battery=(0.25, 5.0)), path)
+    before = path.read_bytes()
+    with full_disk(100), pytest.raises(OSError, match="File too large"):
+        write_parameters(parameters_for(database, battery=(0.5, 5.0)), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

@@ -118,6 +118,12 @@ def test_frames_are_dated_by_the_kernel_and_none_with_the_time_of_another(ends: 
     assert undated.timestamp == 0.0
 
 
+def test_a_closed_bus_has_dropped_nothing(ends: Ends) -> None:
+    link, _ = ends
+    link.close()
+    assert link.newly_dropped() == 0
+
+
 def test_a_bus_that_takes_no_more_says_how_many_it_took(ends: Ends) -> None:
     link, far = ends
     frames = [can.Message(arbitration_id=number) for number in range(1000)]

@@ -42,13 +42,14 @@ class Outlet:
         self.telemetry = Telemetry(
             target, self.corrector, layout=database.layout, latency=Latency(), buses=[self.bus], say=self.said.append
         )
+        self.now_s = time.monotonic() - 1.0
 
     def wait_for_loss(self, count: int) -> None:
         wait_until(lambda: self.corrector.counters.telemetry_lost >= count)
 
     def second(self) -> None:
         """A frame of the pair, of 80 A from battery to motor, and what is done once per second."""
-        self.now_s = getattr(self, "now_s", time.monotonic()) + 1.0
+        self.now_s += 1.0
         data = bytes((*(800).to_bytes(2, "big"), *(-1600).to_bytes(2, "big", signed=True), 0, 0, 0, 0))
         answers(self.corrector, Frame(FrameKey(256, False), data), self.now_s)
         self.corrector.look(self.now_s)
@@ -211,8 +212,8 @@ def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: 
 
 def test_missing_real_time_permissions_are_reported_not_fatal() -> None:
     code = (
-        "import os; from ecu_node.bus.service import be_real_time; "
-        "os.geteuid() or os.setuid(65534); print(be_real_time()); print(len(os.sched_getaffinity(0)))"
+        "import os; from ecu_node.bus.service import be_real_time; user = os.geteuid(); user or os.seteuid(65534); "
+        "print(be_real_time()); print(len(os.sched_getaffinity(0))); os.seteuid(user)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     line, processors = done.stdout.splitlines()

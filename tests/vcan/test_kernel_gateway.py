@@ -17,6 +17,7 @@ import pytest
 from ecu_node.bus.kernel_routes import KernelRoutes
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import BusError
 from tests.vcan.conftest import StartNode
 from tests.vcan.processes import (
     CHANNEL,
@@ -209,6 +210,14 @@ def test_a_fault_of_the_program_leaves_the_rules_as_a_kill_does() -> None:
         routes.set()
         raise ZeroDivisionError
     assert len(rules()) == 2 * (11 + 1)
+
+
+def test_rules_for_an_interface_that_has_just_gone_are_refused_in_one_line() -> None:
+    ip_link("add", "vcan9", "type", "vcan")
+    with KernelRoutes((CHANNEL, "vcan9"), {(BATTERY, False)}, fd=False, say=print) as routes:
+        ip_link("delete", "vcan9")
+        with pytest.raises(BusError, match=r"^vcan0 and vcan9: the kernel refuses a rule of can-gw: no interface"):
+            routes.set()
 
 
 @pytest.mark.parametrize("gap_ms", [300, 1], ids=["each 300 ms", "1000 per s"])

@@ -8,7 +8,7 @@ import pytest
 from calibrator.drives.align import evaluate_formula
 from calibrator.files.layout_files import chosen_layout
 from ecu_node.errors import LayoutError
-from ecu_node.formulas import parse_formula
+from ecu_node.formulas import formula_value, parse_formula
 from tests.ecu_node.vehicles import SMALL_LAYOUT
 
 VALUES = {"a": np.array([1.0, -2.0, 4.0]), "b": np.array([2.0, 0.0, -1.0])}
@@ -37,6 +37,7 @@ def test_undefined_formula_gives_a_non_finite_value_without_warning(formula: str
     result = evaluate_formula(formula, VALUES)
     assert np.isfinite(result[0]) == (formula != "1e200 * 1e200 * b")
     assert not np.isfinite(result[1])
+    assert np.isnan(formula_value(parse_formula(formula), {name: float(value[1]) for name, value in VALUES.items()}))
 
 
 @pytest.mark.parametrize(
