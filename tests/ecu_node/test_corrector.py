@@ -291,6 +291,14 @@ def test_a_value_that_an_input_cannot_have_is_refused(make_database: MakeDatabas
         whole_vehicle(make_database, WATCHED, (rf"{name} = \[.*\]", f"{name} = [2, {value}]"))
 
 
+def test_any_value_of_a_floating_point_input_can_be_waited_for(make_database: MakeDatabase) -> None:
+    waiting = 'input = [{ name = "net", signal = "Net.Voltage" }]\ncontactor = { input = "net", open = [0.123] }\n'
+    dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01,0) [0|650]", "0|32@1- (1,0) [0|650]")
+    assert (
+        make_database(f"{SMALL_LAYOUT}{waiting}", f"{dbc}SIG_VALTYPE_ 258 Voltage : 1;\n").layout.contactor is not None
+    )
+
+
 LOADED = JunctionResidual(measured_a=0.0, corrected_a=3.0, measured_mean_a=0.0, corrected_mean_a=-3.0, expected_a=-3.0)
 """Battery and motor sum to 0 A; with a load of 3 A that no branch measures right sensors would not."""
 
@@ -363,6 +371,27 @@ def test_branches_that_lag_are_looked_at_in_the_same_instant(database: VehicleDa
     assert worst < 0.03
 
 
+def test_no_sum_is_interpolated_across_a_frame_without_value(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
+    no_value_a = -655.36
+    for k, current_a in enumerate((80.0, no_value_a, 80.0)):
+        answers(corrector, battery(database, k, current_a), 0.03 * k)
+    answers(corrector, motor(database, 0), 0.02)
+    assert sums_at(corrector, 0.07) == (None, None)
+    answers(corrector, motor(database, 1), 0.06)
+    assert sums_at(corrector, 0.07) == pytest.approx((-20.0, -20.0))
+
+
+def test_first_value_whose_time_is_before_that_of_a_frame_without_value_is_used(database: VehicleDatabase) -> None:
+    """As after the clock was set: the first frame counts as of when it was read, the next one as of when it came."""
+    corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
+    answers(corrector, battery(database, 0, -655.36), 0.02)
+    answers(corrector, battery(database, 1, 80.0), 0.01)
+    answers(corrector, motor(database, 0), 0.01)
+    assert sums_at(corrector, 0.02) == pytest.approx((-20.0, -20.0))
+    assert corrector.watch.verdict is None
+
+
 @pytest.mark.parametrize(("signal", "codes"), [("State", State), ("Reason", Reason)])
 def test_the_dbc_names_the_codes_of_the_status(
     database: VehicleDatabase, signal: str, codes: type[State] | type[Reason]
@@ -386,6 +415,15 @@ def test_a_power_counts_in_the_sum_as_power_over_voltage(make_database: MakeData
     assert corrector.branches[2].currents_at(0.7) is None, "a voltage 0.7 s old is not divided by"
     answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": 0.5})), 0.7)
     assert corrector.branches[2].currents_at(0.7) is None, "nor one near zero"
+
+
+@pytest.mark.parametrize(("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")])
+def test_unit_per_bit_counts_once_beside_the_scale(make_database: MakeDatabase, scale: str, unit: str) -> None:
+    dbc = SMALL_DBC.replace('(1,0) [0|60000] "W"', f'({scale},0) [0|60000] "{unit}"')
+    corrector = corrector_for(make_database(SMALL_LAYOUT, dbc), heater=(0.0, 0.0))
+    answers(corrector, Frame(HEATER, (80).to_bytes(4, "little")), 0.0)
+    answers(corrector, Frame(NET, (40_000).to_bytes(2, "little")), 0.0)
+    assert corrector.branches[2].currents_at(0.0) == pytest.approx((-10.0, -10.0))
 
 
 def test_a_power_is_divided_by_the_voltage_of_its_own_instant(make_database: MakeDatabase) -> None:

@@ -35,10 +35,10 @@ class Drive:
         self.summary = OnBoardSummary(folder, "V1", database, delays={}, say=self.said.append)
         self.stamp_s = 1000.0
 
-    def go_on(self, duration_s: float, *, battery_only: bool = False) -> None:
+    def go_on(self, duration_s: float, *, battery_only: bool = False, open_s: float = OPEN_S) -> None:
         """Frames at 10 Hz; the contactors are open in the first seconds."""
         for step in range(round(10.0 * duration_s)):
-            flows = step >= 10.0 * OPEN_S
+            flows = step >= 10.0 * open_s
             motor_a, heater_a = flows * (50.0 + 30.0 * math.sin(0.37 * step)), flows * HEATER_W / NET_V
             battery, motor = round((motor_a + heater_a + OFFSET_A) / 0.1), round(-motor_a / 0.05)
             pair = battery.to_bytes(2, "big", signed=True) + motor.to_bytes(2, "big", signed=True) + bytes(4)
@@ -98,6 +98,22 @@ def test_one_branch_alone_makes_no_record(drive: Drive) -> None:
     drive.go_on(400.0, battery_only=True)
     drive.summary.close()
     assert drive.records() == []
+
+
+@pytest.mark.parametrize(("flows_s", "records"), [(2.0, 0), (5.5, 0), (6.5, 1)])
+def test_drive_counts_from_a_fifth_of_a_block_on(drive: Drive, flows_s: float, records: int) -> None:
+    drive.go_on(flows_s, open_s=0.0)
+    drive.summary.close()
+    assert len(drive.records()) == records
+
+
+def test_noise_is_zero_where_no_four_samples_follow_each_other(drive: Drive) -> None:
+    for _ in range(60):
+        drive.go_on(0.3, open_s=0.0)
+        drive.stamp_s += 0.7
+    drive.summary.close()
+    (record,) = drive.records()
+    assert [*unpacked(record.noise_a2)] == [0.0, 0.0, 0.0]
 
 
 def test_full_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,10 +76,11 @@ def peer(channel: str) -> Iterator[can.BusABC]:
         yield bus
 
 
+@pytest.mark.parametrize("filters", [True, False])
 def test_frames_are_corrected_on_the_bus_and_others_left_alone(
-    database: VehicleDatabase, peer: can.BusABC, channel: str
+    database: VehicleDatabase, peer: can.BusABC, channel: str, *, filters: bool
 ) -> None:
-    with node_on(database, channel) as corrector:
+    with node_on(database, channel, None if filters else lambda: VirtualBus(channel)) as corrector:
         for k in range(100):
             data = protected(database, "HV_Battery", k % 15, BatteryCurrent=float(k))
             peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))

@@ -1,5 +1,6 @@
 """A sensor that breaks after the calibration: the node no longer says that its values are corrected."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,16 @@ def test_a_sensor_that_stays_where_it_is_while_the_others_move_is_stuck(junction
     junction.run(10.0, accelerating)
     assert junction.corrector.latched is Reason.BRANCH_STUCK
     assert junction.corrector.latched_branches == ("battery",)
+
+
+def test_a_steady_load_beside_a_gain_error_that_is_corrected_is_not_stuck(junction: Junction) -> None:
+    def swinging(time_s: float) -> dict[str, float]:
+        motor_a = 350.0 * math.sin(0.7 * time_s)
+        return {"battery": motor_a + 20.0, "motor": motor_a, "heater": 20.0}
+
+    junction.wrong = {"heater": lambda _: 19.1}
+    junction.run(40.0, swinging)
+    assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
 def test_narrow_signals_say_invalid_and_worse(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """``calibrator repository``: keys, thresholds, signers one after the other, and mistakes in one line."""
 
+import os
 import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
@@ -147,6 +148,25 @@ def test_encrypted_key_needs_its_own_passphrase(repo: Repo, monkeypatch: pytest.
     monkeypatch.delenv(PASSPHRASE_VARIABLE)
     failed(repo, "give its passphrase in", "publish", repo.path, "--key", private)
     failed(repo, "give either a passphrase", "key", "e", "--out", tmp_path, code=2)
+
+
+def test_passphrase_is_asked_for_at_a_terminal(repo: Repo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with monkeypatch.context() as patch:
+        patch.setenv(PASSPHRASE_VARIABLE, "a long passphrase")
+        repo.done("key", "dora", "--out", tmp_path)
+    terminal, program_end = os.openpty()
+    command = [sys.executable, "-m", "calibrator", "repository", "publish", repo.path, "--key", tmp_path / "dora.key"]
+    with subprocess.Popen(
+        list(map(str, command)), stdin=program_end, stderr=subprocess.PIPE, start_new_session=True
+    ) as program:
+        assert program.stderr is not None
+        prompt = f"passphrase of {tmp_path / 'dora.key'}: ".encode()
+        shown = program.stderr.read(len(prompt))
+        os.write(terminal, b"a long passphrase\n")
+        assert shown == prompt
+        assert b"belongs to no role here" in program.stderr.read()
+    os.close(terminal)
+    os.close(program_end)
 
 
 @pytest.mark.parametrize("kind", ["key", "pub"])

@@ -129,6 +129,9 @@ def test_what_has_no_parameters_of_this_vehicle_is_refused(repo: Repo, new: Path
     repo.refused(new, words, repo.bundle("v2"))
     repo.provision(tmp_path / "v9", "v9")
     repo.refused(tmp_path / "v9", "part of snapshot")
+    repo.forge(repo.bin, lambda targets: targets.targets.clear(), "t1", "t2")
+    repo.relist(repo.bin, "snapshot", "timestamp")
+    repo.refused(new, "the repository has no parameters for vehicle 'v1'")
 
 
 def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, new: Path) -> None:
@@ -206,11 +209,14 @@ def server(repo: Repo) -> Any:
         thread.join()
 
 
-def test_web_server(repo: Repo, new: Path, server: Any) -> None:
+def test_web_server(repo: Repo, new: Path, server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     url, handler = server
     handler.is_endless = True
     repo.refused(new, "exceeding the maximum allowed length", url)
     handler.is_endless = False
+    with monkeypatch.context() as patch:
+        patch.setattr("ecu_node.update.sources._LONGEST_DOWNLOAD_S", 0.0)
+        repo.refused(new, "took longer than 0 s; check address and connection", url)
     assert repo.updated(new, url).startswith("on trial: ")
     shutil.rmtree(repo.metadata)
     repo.refused(new, "status 404; is it complete", url)

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from securesystemslib.dsse import Envelope
 from securesystemslib.exceptions import FormatError
 from securesystemslib.formats import encode_canonical
-from tuf.api.metadata import Metadata, Targets
+from tuf.api.metadata import Metadata, TargetFile
 
 from ecu_node.core.status import TrustError
 from ecu_node.database import VehicleDatabase
@@ -200,6 +200,8 @@ def test_set_expires_for_good_and_a_clock_behind_is_not_believed(
     with pytest.raises(TrustError, match="expired at"):
         update(state, str(repo.path), database, now + timedelta(days=40))  # the timestamp has expired by then
     found = held_set(state)
+    end_expired(state, tried, tried.expires)
+    assert numbers(state)[:2] == [300, None], "another set is in force"
     end_expired(state, found, found.expires)
     assert numbers(state)[:2] == [None, None]
     assert read_state(state).ended == "expired"
@@ -246,13 +248,27 @@ def test_vehicle_is_provisioned_once_with_a_root_that_is_signed(repo: Repo, stat
     assert not place.exists()
 
 
-def test_expiry_without_time_zone_is_refused(repo: Repo, new: Path) -> None:
-    def set_expiry(targets: Targets) -> None:
-        targets.targets["v1.json"].custom["expires"] = "2100-01-01T00:00:00"
-
-    repo.forge(repo.bin, set_expiry, "t1", "t2")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda file: file.custom.update(expires="2100-01-01T00:00:00"),
+            "custom fields of v1.json: Expected `datetime` with a timezone component",
+        ),
+        (lambda file: file.custom.update(layout=DIGEST), "layout and DBC are not those of the signed description"),
+        (lambda file: setattr(file, "length", 1_000_001), "v1.json is no parameter file"),
+        (lambda file: file.hashes.update(sha512=DIGEST), "v1.json is no parameter file"),
+    ],
+)
+def test_signed_description_of_what_is_no_parameter_file_is_refused(
+    change: Callable[[TargetFile], object], words: str, repo: Repo, new: Path
+) -> None:
+    repo.forge(repo.bin, lambda targets: change(targets.targets["v1.json"]), "t1", "t2")
     repo.relist(repo.bin, "snapshot", "timestamp")
-    repo.refused(new, "custom fields of v1.json: Expected `datetime` with a timezone component")
+    code, out, err = repo.update(new)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert words in err
+    assert numbers(new)[:2] == [None, None]
 
 
 @pytest.mark.parametrize("damage", [without, cut, zeros, a_folder, a_pipe, huge])
@@ -297,6 +313,24 @@ def test_names_break_no_line(repo: Repo, state: Path) -> None:
         assert err[:-1].isprintable()
 
 
+def test_folder_that_cannot_be_a_state_is_one_line(repo: Repo, state: Path) -> None:
+    code, out, err = repo.node("inspect", "--state", state / "state.json")
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "cannot read the state: Not a directory" in err
+    a_pipe(state / "lock")
+    code, out, err = repo.update(state)
+    assert (code, out, err) == (1, "", f"ecu-node: {state}: cannot be used as state: it is no file; remove it\n")
+
+
+def test_updates_without_their_packages_are_one_line(state: Path) -> None:
+    code = "import sys; sys.modules['tuf'] = None; from ecu_node.__main__ import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "update", "none", "--state", state, "--layout", LAYOUT]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("ecu-node: updates need the package tuf")
+    assert done.stderr.endswith(": pip install 'hv-current-correction[update]'\n")
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
 def test_root_leaves_files_to_the_owner_of_the_folder_and_follows_no_link(repo: Repo, new: Path) -> None:
     os.chown(new, 65534, 65534)
@@ -307,6 +341,12 @@ def test_root_leaves_files_to_the_owner_of_the_folder_and_follows_no_link(repo: 
     with pytest.raises(UserError, match="cannot be written"):
         add_decision(new, "x", "y", datetime.now(UTC))
     assert not (repo.folder / "victim").exists()
+    (new / "decisions.log").unlink()
+    (repo.folder / "of root").touch()
+    (new / "decisions.log").hardlink_to(repo.folder / "of root")
+    with pytest.raises(UserError, match="it is another name of somebody else's file; remove it"):
+        add_decision(new, "x", "y", datetime.now(UTC))
+    assert (repo.folder / "of root").stat().st_uid == 0
 
 
 def test_full_log_of_decisions_is_kept_until_the_next_is_full(state: Path) -> None:

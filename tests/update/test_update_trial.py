@@ -150,6 +150,12 @@ def test_set_that_leaves_an_error_fails(vehicle: Path, database: VehicleDatabase
     assert "at most 2 A were to be left" in told
 
 
+def test_set_that_changes_nothing_passes(vehicle: Path, database: VehicleDatabase) -> None:
+    drive = tried(vehicle, right(database, 0.0, 0.0), database, drift=0.0, offset_a=0.0)
+    (told,) = (line for line in drive.said if PASSED in line)
+    assert "no change that counts" in told
+
+
 def test_set_without_a_predicted_change_may_leave_anything(vehicle: Path, database: VehicleDatabase) -> None:
     """As one that was written by hand: what is taken away is measured all the same."""
     unknown = JunctionResidual(measured_a=4.0, corrected_a=0.5)
