@@ -103,7 +103,6 @@ def test_power_cut_at_any_moment_leaves_the_state_of_before_or_of_after(
 ERRORS = {"openat": "ENOSPC", "write": "ENOSPC", "fsync": "EIO", "rename": "EIO", "unlink": "EIO", "fchown": "EPERM"}
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("command", ["update"], indirect=True)
 def test_full_or_broken_disk_is_one_line_and_keeps_the_state_or_says_so(
     command: Callable[[Path], list[str]], state: Path, tmp_path: Path
