@@ -112,7 +112,7 @@ class FleetReference:
 
     @property
     def ordered(self) -> list[str]:
-        """Names of the branches in :attr:`order`, the one that varies most first."""
+        """Names of the branches in the order of ``order``: the one that varies most first."""
         return [self.branches[k] for k in self.order]
 
     @property
