@@ -395,19 +395,18 @@ class _Run:
 
 def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:
     """Refuse an earlier result that a run cannot go on from."""
-    run = read_run(folder)
+    run, layout = read_run(folder), database.layout
+    for what, was, now in (
+        ("method", run.method, Method.POSTERIOR.value),
+        ("list of branches", ", ".join(run.branches), ", ".join(store.branches)),
+        (f"version of {layout.path}", run.layout_sha256[:8], layout.digest[:8]),
+        ("version of the DBC", run.dbc_sha256[:8], database.digest[:8]),
+        ("number of buckets", run.buckets, store.buckets),
+    ):
+        if was != now:
+            raise FleetError(f"{folder}: its {what} is {was}, that of this run {now}; calibrate without --since")
     if not (folder / PARTS).is_dir():
         raise FleetError(
             f"{folder / PARTS}: no such folder; expected the parameters of the earlier result: give the whole folder "
             f"that 'calibrator calibrate' wrote, or calibrate without --since"
         )
-    layout = database.layout
-    for what, was, now in (
-        ("the method", run.method, Method.POSTERIOR.value),
-        ("branches", ", ".join(run.branches), ", ".join(store.branches)),
-        (f"another version of {layout.path}:", run.layout_sha256[:8], layout.digest[:8]),
-        ("another version of the DBC:", run.dbc_sha256[:8], database.digest[:8]),
-        ("a number of buckets of", run.buckets, store.buckets),
-    ):
-        if was != now:
-            raise FleetError(f"{folder}: a result with {what} {was}, and now it is {now}; calibrate without --since")

@@ -314,11 +314,11 @@ def test_vehicle_of_the_earlier_result_that_is_in_the_store_no_more_is_named(
         (
             "method",
             "published",
-            "a result with the method published, and now it is posterior; calibrate without --since",
+            "its method is published, that of this run posterior; calibrate without --since",
         ),
-        ("branches", ["battery"], "a result with branches battery, and now it is battery, motor"),
-        ("layout_sha256", "0", "a result with another version of "),
-        ("buckets", 32, "a result with a number of buckets of 32, and now it is 16"),
+        ("branches", ["battery"], "its list of branches is battery, that of this run battery, motor"),
+        ("layout_sha256", "0", "its version of "),
+        ("buckets", 32, "its number of buckets is 32, that of this run 16"),
     ],
 )
 def test_since_a_result_of_something_else_is_refused(
