@@ -122,7 +122,7 @@ class FleetReference:
 
     @property
     def expected_a(self) -> float:
-        """Mean junction sum of faultless sensors, positive into the junction: the unmeasured load that flows out. [A]"""
+        """Mean junction sum of faultless sensors, positive into the junction: the unmeasured load that leaves. [A]"""
         spread, K = self.models[0].spread, len(self.branches)
         return float((spread.mean[RowPlaces(K).junction] - spread.shared[:K].sum()) * self.full_scale_a)
 
