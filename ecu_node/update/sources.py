@@ -8,8 +8,10 @@ bounded here, and again, file by file, by TUF's client.
 import errno
 import lzma
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path, PurePosixPath
+from typing import cast
 from urllib.parse import quote
 
 import msgspec
@@ -125,7 +127,9 @@ class _WebFetcher(Urllib3Fetcher):
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         end_s = time.monotonic() + _LONGEST_DOWNLOAD_S
-        for chunk in super()._fetch(f"{self._base}/{quote(url)}"):  # names of files have a % themselves, as V%201.json
-            if time.monotonic() > end_s:
-                raise SlowRetrievalError(f"{url} took longer than {_LONGEST_DOWNLOAD_S:g} s")
-            yield chunk
+        chunks = super()._fetch(f"{self._base}/{quote(url)}")  # names of files have a % themselves, as V%201.json
+        with closing(cast("Generator[bytes]", chunks)):  # gives the connection back
+            for chunk in chunks:
+                if time.monotonic() > end_s:
+                    raise SlowRetrievalError(f"{url} took longer than {_LONGEST_DOWNLOAD_S:g} s")
+                yield chunk
