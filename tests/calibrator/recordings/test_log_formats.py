@@ -147,7 +147,7 @@ def test_line_without_data_frame_is_left_out_and_counted(
 ) -> None:
     path = write_log(tmp_path / f"drive{suffix}", some_messages(20))
     path.write_text(f"{path.read_text()}{line}\n")
-    with caplog.at_level(logging.DEBUG):
+    with caplog.at_level(logging.DEBUG, logger="can"):
         frames = read_frames(path)
     assert (len(frames), frames.error_frames, frames.remote_frames, frames.damaged) == (20, *counts)
     if suffix != ".trc" and frames.damaged:
