@@ -12,10 +12,10 @@ from calibrator.processes.interrupts import ending_at_sigterm, importing, interr
 from ecu_node.errors import UserError
 from ecu_node.program import INTERRUPTED, drop_output, flush_output, load_python_can, say_error
 
-__all__ = ["main"]
+__all__ = ["calibrator_program"]
 
 
-def main() -> None:
+def calibrator_program() -> None:
     """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 70 internal, 130 interrupted, 143 SIGTERM."""
     ending_at_sigterm()
     try:
@@ -39,7 +39,7 @@ def _run() -> int:
     try:
         with importing():
             load_python_can()
-            run: Callable[[], int] = import_module("calibrator.cli").main
+            run: Callable[[], int] = import_module("calibrator.cli").run_calibrator
     except ModuleNotFoundError as error:
         say_error(f"calibrator: {error.name} is not installed; pip install 'hv-current-correction[calibrator]'")
         return 1
@@ -47,4 +47,4 @@ def _run() -> int:
 
 
 if __name__ == "__main__":
-    main()
+    calibrator_program()

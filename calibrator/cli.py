@@ -23,7 +23,7 @@ from calibrator.summaries.command import store_app, summarise
 from calibrator.terminal.command_line import command_app, example, run_app
 from ecu_node import __version__
 
-__all__ = ["app", "main"]
+__all__ = ["app", "run_calibrator"]
 
 COMMANDS: dict[str, dict[str, tuple[Callable[..., None] | typer.Typer, list[str]]]] = {
     "Commands to look at a recording": {
@@ -86,7 +86,7 @@ for name, (command, lines) in chain.from_iterable(commands.items() for commands 
         app.command(name, epilog=epilog)(command)
 
 
-def main() -> int:
+def run_calibrator() -> int:
     """Run the command line and return its exit code, see :data:`calibrator.terminal.command_line.EXIT_CODES`."""
     return run_app(app, "calibrator", sys.argv[1:])
 

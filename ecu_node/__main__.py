@@ -3,20 +3,20 @@
 import sys
 from contextlib import suppress
 
-__all__ = ["main"]
+__all__ = ["ecu_node_program"]
 
 
-def main() -> int:
+def ecu_node_program() -> int:
     """Run the command line; Ctrl-C while it is imported ends it in one line, too."""
     try:
-        from ecu_node.cli import main as run  # noqa: PLC0415
+        from ecu_node.cli import run_ecu_node  # noqa: PLC0415
     except KeyboardInterrupt:
         if sys.stderr is not None:  # closed by who started the program
             with suppress(OSError):
                 print("ecu-node: interrupted", file=sys.stderr, flush=True)
         return 130
-    return run()
+    return run_ecu_node()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ecu_node_program())

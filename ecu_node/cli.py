@@ -31,7 +31,7 @@ _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
 _AT_WORK = "done (also when ended by a signal at work)"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run_ecu_node(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Parameters

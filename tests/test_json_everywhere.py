@@ -69,7 +69,7 @@ def test_a_life_of_signed_parameters_in_json(
 
     def done(program: str, *arguments: object) -> dict[str, Any]:
         words = [*map(str, arguments), "--json"]
-        code = node_cli.main(words) if program == "ecu-node" else run_app(app, program, words)
+        code = node_cli.run_ecu_node(words) if program == "ecu-node" else run_app(app, program, words)
         printed = capsys.readouterr()
         assert (code, printed.err) == (0, "")
         found: dict[str, Any] = json.loads(printed.out)

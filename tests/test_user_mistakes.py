@@ -170,7 +170,7 @@ def run(command: str) -> int:
     if words[0] == "calibrator":
         return run_app(app, "calibrator", words[1:])
     try:
-        return node_cli.main(words[1:])
+        return node_cli.run_ecu_node(words[1:])
     except SystemExit as end:
         return int(end.code or 0)
 

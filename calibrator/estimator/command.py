@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibrator.estimator.settings import Classifier, Method
 from calibrator.files.folders import require_possible_file, require_possible_folder
 from calibrator.files.layout_files import vehicle_database
-from calibrator.options import Classifier, Method
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import (
     TIME_LIMIT_S,

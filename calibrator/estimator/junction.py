@@ -32,6 +32,7 @@ from calibrator.estimator.checks import CAUSES, UsualMisfits, find_misfits
 from calibrator.estimator.decision import FleetEstimate, Points, decided, harm_probability, recovery_probability
 from calibrator.estimator.evidence import junction_regression, stack_summaries
 from calibrator.estimator.fleet_estimate import SUSPECTED
+from calibrator.estimator.parameter_files import RunIdentity
 from calibrator.estimator.readings import (
     CONTRADICTION,
     TRUSTED_DRIFT_SD,
@@ -45,7 +46,6 @@ from calibrator.estimator.readings import (
 from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
 from calibrator.estimator.vehicle_report import parameters_of, sensor_texts
-from calibrator.files.parameter_files import RunIdentity
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.summaries.moments import BLOCK_S, DriveSummary

@@ -18,11 +18,10 @@ from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import align
 from calibrator.errors import FleetError
+from calibrator.estimator.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.estimator.results import encode_chunk
-from calibrator.estimator.settings import CalibrationSettings, require_learning
-from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
+from calibrator.estimator.settings import CalibrationSettings, Classifier, require_learning
 from calibrator.fleet_truth import faults_of
-from calibrator.options import Classifier
 from calibrator.processes.run_many import Workers
 from calibrator.published.classify import classify_by_expected_trees, classify_by_threshold, classify_by_truth
 from calibrator.published.recovery import Recovery, recover_fleet

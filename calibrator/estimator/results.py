@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.files.parameter_files import held_back_lines
+from calibrator.estimator.parameter_files import held_back_lines
 from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 from ecu_node.documents import write_atomically

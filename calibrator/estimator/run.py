@@ -21,6 +21,7 @@ from calibrator.drive import Equipment, FleetSource
 from calibrator.drives.store import DRIVES_FOLDER
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
+from calibrator.estimator.parameter_files import RunIdentity, time_of_run
 from calibrator.estimator.readings import BenchTable, check_bench_table, read_bench_table
 from calibrator.estimator.results import (
     MOST_NAMED,
@@ -36,11 +37,9 @@ from calibrator.estimator.results import (
     write_parameter_files,
     write_run,
 )
-from calibrator.estimator.settings import CalibrationSettings, require_learning
+from calibrator.estimator.settings import CalibrationSettings, Method, require_learning
 from calibrator.files.folders import require_new_folder, whole_folder
-from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import Storage, open_storage
-from calibrator.options import Method
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.sources.fleet_source import LOGS_FOLDER, find_fleet, probe_equipment
 from calibrator.summaries.identity import StoreIdentity, read_identity
@@ -50,7 +49,6 @@ from calibrator.summaries.summarise_fleet import add_drives
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.terminal.progress import numbered_passes, progress_bar
 from calibrator.terminal.text import few, few_reasons
-from calibrator.time_of_run import time_of_run
 from ecu_node.database import VehicleDatabase
 from ecu_node.documents import write_atomically
 from ecu_node.layout import Layout

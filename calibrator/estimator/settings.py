@@ -2,23 +2,38 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from calibrator.errors import ContradictionError, FleetError
 from calibrator.fleet_truth import FleetTruth
-from calibrator.options import Classifier, Method
 from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few, few_reasons
 from ecu_node.documents import text_digest
 from ecu_node.layout import UnmeasuredLoad, file_digest
 
-__all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "require_learning"]
+__all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "Classifier", "Method", "require_learning"]
 
 FEWEST_VEHICLES = 5
 """Of a fleet that is compared with itself: in a smaller one it is not clear who differs from whom."""
 HARM_LIMIT = 0.001
 """Default probability of making a branch worse up to which it is corrected. [1]"""
+
+
+class Method(StrEnum):
+    """How sensor faults are estimated."""
+
+    POSTERIOR = "posterior"
+    PUBLISHED = "published"
+
+
+class Classifier(StrEnum):
+    """How the published method tells vehicles with hardware faults, section III-B of the paper."""
+
+    THRESHOLD = "threshold"
+    TREE = "tree"
+    PERFECT = "perfect"
 
 
 @dataclass(frozen=True, kw_only=True)

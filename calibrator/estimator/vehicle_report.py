@@ -8,7 +8,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.drives.delays import BranchDelays
 from calibrator.estimator.fleet_estimate import CONFIDENT, SUSPECTED, FleetEstimate
-from calibrator.files.parameter_files import REASONS, RunIdentity, by_branch, held_back_lines, junction_residual
+from calibrator.estimator.parameter_files import REASONS, RunIdentity, by_branch, held_back_lines, junction_residual
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, HeldBack, VehicleParameters, Verdict
 

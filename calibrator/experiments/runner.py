@@ -15,6 +15,7 @@ from typing import Any
 import pandas as pd
 
 from calibrator.errors import FleetError
+from calibrator.estimator.parameter_files import time_of_run
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, common_trial
 from calibrator.experiments.experiments import CALIBRATION, KEYS, Experiment, ExperimentResult, Setting
 from calibrator.experiments.figures import ALL, calibration_errors, figure_rows, judge, pool_figures, pool_tenths
@@ -23,7 +24,6 @@ from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, r
 from calibrator.experiments.trial import ComparedMethod
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.progress import shown
-from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 
 __all__ = ["made_now", "pool_confidences", "run_experiment"]

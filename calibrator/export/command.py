@@ -1,6 +1,7 @@
 """``calibrator export``: from parameter files to one file of another format, written whole or not at all."""
 
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,6 @@ from calibrator.export.core import (
 )
 from calibrator.export.tool_formats import a2l_text, cdfx_document, csv_text, dcm_text
 from calibrator.files.folders import require_possible_file, write_files
-from calibrator.options import ExportFormat
 from calibrator.terminal.options import JsonOption, LayoutOption
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps
@@ -28,6 +28,18 @@ from ecu_node.errors import printable
 from ecu_node.program import say_error, write_output
 
 __all__ = ["export"]
+
+
+class ExportFormat(StrEnum):
+    """Formats that parameters are taken to."""
+
+    C = "c"
+    HEX = "hex"
+    A2L = "a2l"
+    DCM = "dcm"
+    CDFX = "cdfx"
+    CSV = "csv"
+
 
 _S_RECORDS = (".s19", ".s28", ".s37", ".srec", ".mot")
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from calibrator.cli import main
+from calibrator.cli import run_calibrator
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 settings.register_profile("calibrator", deadline=None)  # the first call of some functions compiles them
@@ -22,4 +22,4 @@ def short_folder() -> Iterator[Path]:
 def run_command(arguments: list[str]) -> int:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["calibrator", *arguments])
-        return main()
+        return run_calibrator()

@@ -28,9 +28,9 @@ def test_ctrl_c_during_start_up_ends_it_in_one_line() -> None:
         "            try: os.kill(os.getpid(), signal.SIGINT)\n"
         "            except BaseException: pass\n"
         "sys.meta_path.insert(0, Finder())\n"
-        "from calibrator.__main__ import main\n"
+        "from calibrator.__main__ import calibrator_program\n"
         "sys.argv = ['calibrator', '--version']\n"
-        "main()\n"
+        "calibrator_program()\n"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert (run.returncode, run.stdout, run.stderr) == (INTERRUPTED, "", f"{interrupted_message([])}\n")

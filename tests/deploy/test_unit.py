@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -68,5 +68,5 @@ def test_the_command_of_the_unit_is_one_that_the_node_takes(capsys: pytest.Captu
         command = [word.replace(f"${{{key}}}", value) for word in command]
     command = [part for word in command for part in values.get(word.removeprefix("$"), word).split()]
     assert command[:3] == ["run", "--channel", "can0"]
-    assert main(command) == 1
+    assert run_ecu_node(command) == 1
     assert capsys.readouterr().err.startswith("ecu-node: /etc/ecu-node/my_car.toml: cannot read the layout: ")

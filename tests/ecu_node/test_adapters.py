@@ -26,7 +26,7 @@ import pytest
 from can.typechecking import BitTimingFdDict
 
 from ecu_node.bus.adapters import bus_config, carries_fd, connect
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 from ecu_node.errors import BusError
 from ecu_node.parameters import write_parameters
 from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
@@ -140,17 +140,17 @@ def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
     node: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     adapter = ["--interface", "pcan", "--channel", "PCAN_USBBUS1"]  # its library is not here: opening it would fail
-    assert main([*node, *adapter, "--bitrate", "250000", "--dry-run"]) == 0
+    assert run_ecu_node([*node, *adapter, "--bitrate", "250000", "--dry-run"]) == 0
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [
         "would open pcan PCAN_USBBUS1: bitrate 250000",
         "  reads Pair (0x100), Heater (0x200), Net (0x102)",
         "  sends PairOut (0x200)",
     ]
-    assert main([*node, *adapter, "--bitrate", "250000", "--dry-run", "--params", "none.json"]) == 0
+    assert run_ecu_node([*node, *adapter, "--bitrate", "250000", "--dry-run", "--params", "none.json"]) == 0
     assert capsys.readouterr().out.splitlines()[-1].startswith("would correct nothing: none.json: no such parameter")
     assert captured.err == ""
-    assert main([*node, *adapter, "--dry-run"]) == 1
+    assert run_ecu_node([*node, *adapter, "--dry-run"]) == 1
     assert "no bitrate" in capsys.readouterr().err
 
 
@@ -158,14 +158,14 @@ def test_dry_run_prints_a_bit_timing_once(
     node: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
-    assert main([*node, "--interface", "pcan", "--channel", "PCAN_USBBUS1", "--dry-run"]) == 0
+    assert run_ecu_node([*node, "--interface", "pcan", "--channel", "PCAN_USBBUS1", "--dry-run"]) == 0
     (opened, *_) = capsys.readouterr().out.splitlines()
     assert opened.startswith("would open pcan PCAN_USBBUS1: timing BR: 250_000 bit/s, SP: 87.50%, BRP: 2, ")
     assert "f_clock" not in opened
 
 
 def test_dry_run_of_a_gateway_prints_both_ways(node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*node, "--interface", "virtual", "--channel", "a", "--gateway", "b", "--dry-run"]) == 0
+    assert run_ecu_node([*node, "--interface", "virtual", "--channel", "a", "--gateway", "b", "--dry-run"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "would open virtual a: no settings",
         "  reads all frames; corrects Pair (0x100), Heater (0x200)",
@@ -192,7 +192,7 @@ def test_listen_only_says_whether_the_adapter_acknowledges(
     interface: str, words: str, node: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
-    assert main([*node, "--interface", interface, "--channel", "c0", *rate, "--listen-only", "--dry-run"]) == 0
+    assert run_ecu_node([*node, "--interface", interface, "--channel", "c0", *rate, "--listen-only", "--dry-run"]) == 0
     *_, sends, last = capsys.readouterr().out.splitlines()
     assert sends == "  sends nothing"
     assert re.search(words, last)

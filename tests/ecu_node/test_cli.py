@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
@@ -28,7 +28,7 @@ def check(params: Path, *more: str) -> list[str]:
 
 
 def test_fit_parameters_are_shown_with_their_integer_plan(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(check(params, "--vehicle", "v1", "--json")) == 0
+    assert run_ecu_node(check(params, "--vehicle", "v1", "--json")) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["fit"], report["reason"], report["vehicle"], report["parameter_set"]) == (True, "NONE", "v1", 300)
     battery, motor = report["branches"]["battery"], report["branches"]["motor"]
@@ -38,7 +38,7 @@ def test_fit_parameters_are_shown_with_their_integer_plan(params: Path, capsys: 
     assert battery["plan"]["bias"] / 2 ** battery["plan"]["shift"] == pytest.approx(-5.0 / 1.25 / 0.02)
     assert motor["plan"]["gain"] == 2 ** motor["plan"]["shift"]
     assert not report["branches"]["dcdc"]["applied"]
-    assert main(check(params)) == 0
+    assert run_ecu_node(check(params)) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "vehicle v1, parameter set 300: fit"
     assert re.fullmatch(r"battery +\+25\.0000% +\+5\.000 A  corrected", lines[2])
@@ -74,7 +74,7 @@ def test_fit_parameters_are_shown_with_their_integer_plan(params: Path, capsys: 
 )
 def test_wrong_use_is_one_line_and_2(arguments: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
-        main(arguments.split(" "))
+        run_ecu_node(arguments.split(" "))
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("ecu-node")
     assert words in line
@@ -88,11 +88,11 @@ def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gate
     database = make_database(bare)
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
     options = ["check", "--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
-    assert main(options) == 1
+    assert run_ecu_node(options) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "page 'Layout'" in line
     assert line.endswith("--gateway CHANNEL")
-    assert main([*options, "--gateway", "can1", "--json"]) == 0
+    assert run_ecu_node([*options, "--gateway", "can1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
 
 
@@ -102,7 +102,7 @@ def test_fault_that_is_not_applied_is_said(
     parameters = msgspec.structs.replace(parameters_for(database, battery=(0.25, 5.0)), vehicle="v\x1b[2J")
     held = msgspec.structs.replace(parameters.branches["battery"], apply=False)
     write_parameters(msgspec.structs.replace(parameters, branches={"battery": held}), tmp_path / "v1.json")
-    assert main(check(tmp_path / "v1.json")) == 0
+    assert run_ecu_node(check(tmp_path / "v1.json")) == 0
     text = capsys.readouterr().out
     assert '+5.000 A  passed through, "apply" is false' in text
     assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
@@ -114,19 +114,19 @@ def test_can_fd_that_run_would_need_is_said(
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
     files = ["--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
-    assert main(["check", *files]) == 0
+    assert run_ecu_node(["check", *files]) == 0
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
 
 
 def test_unfit_parameters_end_in_1_and_say_why_also_for_a_vehicle_of_the_environment(
     params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert main(check(params, "--vehicle", "v2", "--json")) == 1
+    assert run_ecu_node(check(params, "--vehicle", "v2", "--json")) == 1
     report = json.loads(capsys.readouterr().out)
     assert (report["fit"], report["reason"]) == (False, "WRONG_VEHICLE")
     assert report["message"] == f"{params}: parameters are for vehicle 'v1', this is 'v2'"
     monkeypatch.setenv("ECU_NODE_VEHICLE", "v2")
-    assert main(check(params)) == 1
+    assert run_ecu_node(check(params)) == 1
     assert capsys.readouterr().out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
 
 
@@ -143,8 +143,8 @@ def test_a_reader_that_leaves_early_gets_no_traceback(params: Path, command: str
 
 def test_the_node_brings_no_numpy_with_it(params: Path) -> None:
     code = (
-        "import sys; from ecu_node.cli import main; "
-        f"assert 'can' not in sys.modules; main({check(params)!r}); import can; "
+        "import sys; from ecu_node.cli import run_ecu_node; "
+        f"assert 'can' not in sys.modules; run_ecu_node({check(params)!r}); import can; "
         "assert not {'numpy', 'pandas', 'asammdf'} & set(sys.modules), 'heavy'"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

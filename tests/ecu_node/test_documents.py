@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Reason, State
 
 ROOT = Path(__file__).parents[2]
@@ -56,8 +56,8 @@ def test_the_lines_for_corrected_currents_in_the_layout_document_are_all_that_an
     (tmp_path / "my_car.toml").write_text(f"{layout.replace(sign, sign + branch)}\n{status}")
     (tmp_path / "my_car.dbc").write_text(f"{MEASURED.format(senders=' CorrectionNode')}\n{dbc}")
     files = ["--layout", str(tmp_path / "my_car.toml"), "--vehicle", "V1"]
-    assert main(["template", *files]) == 0
+    assert run_ecu_node(["template", *files]) == 0
     (tmp_path / "V1.json").write_text(capsys.readouterr().out)
-    assert main(["check", "--params", str(tmp_path / "V1.json"), *files, "--json"]) == 0
+    assert run_ecu_node(["check", "--params", str(tmp_path / "V1.json"), *files, "--json"]) == 0
     targets = {name: item["target"] for name, item in json.loads(capsys.readouterr().out)["branches"].items()}
     assert targets == {"battery": "BMS_1_Corrected.PackCurrentCorrected", "motor": None}

@@ -5,7 +5,7 @@ import pickle
 import pytest
 
 from ecu_node import cli
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Reason, TrustError
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.program import FAILED, INTERNAL_ERROR, end_of, split_debug
@@ -45,8 +45,8 @@ def test_a_fault_of_the_node_names_its_place_and_ends_with_70(
         raise ZeroDivisionError("nobody thought of that")
 
     monkeypatch.setattr(cli, "load_python_can", broken)
-    assert main(["schema"]) == INTERNAL_ERROR
+    assert run_ecu_node(["schema"]) == INTERNAL_ERROR
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("ecu-node: internal error: ZeroDivisionError: nobody thought of that (cli.py, line ")
-    assert main(["schema", "--debug"]) == INTERNAL_ERROR
+    assert run_ecu_node(["schema", "--debug"]) == INTERNAL_ERROR
     assert "in broken" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from ecu_node.bus.faults import FaultMemory
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Reason
 from tests.ecu_node.junctions import Junction, driving, three_branches
 from tests.ecu_node.test_adapters import running
@@ -58,12 +58,12 @@ class Vehicle:
         return self.corrector.latched
 
     def clear(self) -> None:
-        assert main(["clear", "--state", str(self.state)]) == 0
+        assert run_ecu_node(["clear", "--state", str(self.state)]) == 0
         self.later(2.0)
 
     def faults(self) -> Any:
         with redirect_stdout(StringIO()) as said:
-            assert main(["faults", "--state", str(self.state), "--json"]) == 0
+            assert run_ecu_node(["faults", "--state", str(self.state), "--json"]) == 0
         return json.loads(said.getvalue())
 
 
@@ -82,7 +82,7 @@ def test_a_fault_is_kept_with_its_currents(vehicle: Vehicle, capsys: pytest.Capt
     assert (fault["reason"], fault["branches"], fault["count"]) == ("SUM_IMPLAUSIBLE", ["battery"], 1)
     assert fault["active"]
     assert sum(fault["corrected_a"].values()) == pytest.approx(100.0, abs=10.0)
-    assert main(["faults", "--state", str(vehicle.state)]) == 0
+    assert run_ecu_node(["faults", "--state", str(vehicle.state)]) == 0
     assert "SUM_IMPLAUSIBLE (battery), active: 1 times" in capsys.readouterr().out
 
 
@@ -168,7 +168,7 @@ def test_a_damaged_memory_is_one_line(
         vehicle.file.write_text(content.replace(old, new, 1))
     vehicle.start()
     assert why in vehicle.said[-1]
-    assert main(["faults", "--state", str(vehicle.state)]) == 1
+    assert run_ecu_node(["faults", "--state", str(vehicle.state)]) == 1
     assert "'ecu-node clear' begins a new one" in capsys.readouterr().err
 
 
@@ -176,7 +176,7 @@ def test_a_damaged_memory_is_one_line(
 def test_a_folder_that_is_not_there_is_one_line(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([command, "--state", str(tmp_path / "none")]) == 1
+    assert run_ecu_node([command, "--state", str(tmp_path / "none")]) == 1
     assert "no such state folder" in capsys.readouterr().err
 
 

@@ -14,7 +14,7 @@ import can
 import pytest
 
 from ecu_node.bus.wiring import key_of
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.monitor import BusMonitor, View, view_lines
@@ -193,13 +193,13 @@ def test_once_prints_what_was_seen_sends_nothing_and_ends_in_1_without_any_branc
     with can.Bus(interface="virtual", channel=CHANNEL) as bus:
         frame = can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8))
         bus.send_periodic(frame, 0.01, modifier_callback=count_on)
-        assert main([*MONITOR, "--listen-only", "--once", "0.5"]) == 0
+        assert run_ecu_node([*MONITOR, "--listen-only", "--once", "0.5"]) == 0
         lines = capsys.readouterr().out.splitlines()
-        assert main([*MONITOR, "--once", "0.3", "--json"]) == 0
+        assert run_ecu_node([*MONITOR, "--once", "0.3", "--json"]) == 0
         document = json.loads(capsys.readouterr().out)
         bus.stop_all_periodic_tasks()
         assert bus.recv(0.0) is None
-        assert main([*MONITOR, "--once", "0.1"]) == 1
+        assert run_ecu_node([*MONITOR, "--once", "0.1"]) == 1
     assert lines[0] == f"virtual {CHANNEL}: no node on this bus"
     assert next(line.split() for line in lines if line.startswith("battery"))[1] == "+100.00"
     assert lines[-1] == "no corrected messages on this bus: the currents are shown as they are on it"

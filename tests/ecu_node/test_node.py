@@ -354,8 +354,9 @@ def test_nothing_leaks(database: VehicleDatabase, peer: can.BusABC, channel: str
                 for k in range(105):
                     peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data[k % 15]))
                 receive(peer, 0x510, 105)
+            gc.collect()
             objects.append(len(gc.get_objects()))
-    assert abs(objects[2] - objects[1]) < 500
+    assert objects[2] - objects[1] < 500
 
 
 def test_the_kernel_is_asked_for_branches_voltages_and_own_frames_only(make_database: MakeDatabase) -> None:

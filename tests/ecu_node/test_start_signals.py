@@ -19,9 +19,9 @@ def hook(event, arguments):
     if event == {event!r} and str(arguments[0]) == {what!r}:
         signal.raise_signal({number})
 sys.addaudithook(hook)
-from ecu_node.__main__ import main
+from ecu_node.__main__ import ecu_node_program
 sys.argv[1:] = {arguments!r}
-sys.exit(main())
+sys.exit(ecu_node_program())
 """
 MOMENTS = [("import", "can"), ("open", str(LAYOUT))]
 

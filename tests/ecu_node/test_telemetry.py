@@ -196,7 +196,7 @@ def test_latency_is_counted_by_bits_of_microseconds(monkeypatch: pytest.MonkeyPa
 
 def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: Path) -> None:
     broken = "from ecu_node.bus.telemetry import Telemetry; Telemetry._record = lambda *_: 1 / 0"
-    code = f"import sys; from ecu_node.cli import main; {broken}; sys.exit(main(sys.argv[1:]))"
+    code = f"import sys; from ecu_node.cli import run_ecu_node; {broken}; sys.exit(run_ecu_node(sys.argv[1:]))"
     options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]
     bus = ["--interface", "virtual", "--channel", "records", "--telemetry", str(tmp_path / "node.jsonl")]
     command = [sys.executable, "-c", code, "run", *options, *bus]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ecu_node.bus.wiring import InForce, key_of, wire
-from ecu_node.cli import main, template_text
+from ecu_node.cli import run_ecu_node, template_text
 from ecu_node.core.status import Reason, State
 from ecu_node.parameters import check_fit, decode_parameters
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, MakeDatabase, answers
@@ -22,9 +22,9 @@ def check(params: Path) -> list[str]:
 def test_the_template_of_a_layout_fits_it_at_once_and_corrects_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["template", "--layout", str(LAYOUT), "--vehicle", "my car"]) == 0
+    assert run_ecu_node(["template", "--layout", str(LAYOUT), "--vehicle", "my car"]) == 0
     (tmp_path / "V.json").write_text(capsys.readouterr().out)
-    assert main(check(tmp_path / "V.json")) == 0
+    assert run_ecu_node(check(tmp_path / "V.json")) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["vehicle"], report["warnings"]) == ("my car", [])
     assert [branch["applied"] for branch in report["branches"].values()] == [False] * len(report["branches"])
@@ -61,5 +61,5 @@ def test_template_of_a_load_beyond_the_limits_is_refused(
     make_database: MakeDatabase, capsys: pytest.CaptureFixture[str]
 ) -> None:
     database = make_database(f"{SMALL_LAYOUT}\nunmeasured_load = {{ mean_a = 200.0, sd_a = 1.0 }}\n")
-    assert main(["template", "--layout", str(database.layout.path), "--vehicle", "v1"]) == 1
+    assert run_ecu_node(["template", "--layout", str(database.layout.path), "--vehicle", "v1"]) == 1
     assert "[unmeasured_load] mean_a = 200 is beyond the layout's limit of 160 A" in capsys.readouterr().err

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
 
 
@@ -43,7 +43,7 @@ def test_a_layout_dbc_or_parameter_file_that_is_no_file_is_one_line(
     make(tmp_path / role)
     (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
     layout = {"small.dbc": tmp_path / "small.toml", "other.toml": tmp_path / role}.get(role, LAYOUT)
-    code = main(["check", "--params", str(tmp_path / "p.json"), "--layout", str(layout)])
+    code = run_ecu_node(["check", "--params", str(tmp_path / "p.json"), "--layout", str(layout)])
     out, err = capsys.readouterr()
     found, silent = (out, err) if role == "p.json" else (err, out)
     assert re.match(said + words, found)

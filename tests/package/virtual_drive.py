@@ -11,7 +11,7 @@ import time
 
 import can
 
-from ecu_node.cli import main
+from ecu_node.cli import run_ecu_node
 
 CORRECTED_BATTERY = 0x510
 """HV_BatteryCorrected of hv_powertrain.dbc."""
@@ -38,4 +38,4 @@ def play(log: str) -> None:
 
 if __name__ == "__main__":
     threading.Thread(target=play, args=(sys.argv[1],)).start()
-    sys.exit(main(["run", *sys.argv[2:]]))
+    sys.exit(run_ecu_node(["run", *sys.argv[2:]]))

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from calibrator.cli import main as calibrator_main
-from ecu_node.cli import main as node_main
+from calibrator.cli import run_calibrator as calibrator_main
+from ecu_node.cli import run_ecu_node as node_main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE

@@ -323,7 +323,7 @@ def test_folder_that_cannot_be_a_state_is_one_line(repo: Repo, state: Path) -> N
 
 
 def test_updates_without_their_packages_are_one_line(state: Path) -> None:
-    code = "import sys; sys.modules['tuf'] = None; from ecu_node.__main__ import main; sys.exit(main())"
+    code = "import sys; sys.modules['tuf'] = None; from ecu_node.__main__ import ecu_node_program as run; exit(run())"
     command = [sys.executable, "-c", code, "update", "none", "--state", state, "--layout", LAYOUT]
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)

@@ -28,7 +28,7 @@ def main() -> None:
     ready.bind(address)
     os.environ["NOTIFY_SOCKET"] = "@" + address[1:]
     threading.Thread(target=_watch, args=(job, ready, seen), daemon=True).start()
-    from ecu_node.cli import main as ecu_node  # noqa: PLC0415  # its start is measured
+    from ecu_node.cli import run_ecu_node as ecu_node  # noqa: PLC0415  # its start is measured
 
     seen["code"] = ecu_node(job["arguments"])
     print(json.dumps(seen))

@@ -21,7 +21,10 @@ from ecu_node import cli as node_cli
 
 __all__ = ["PROGRAMS", "command_help", "setup"]
 
-PROGRAMS: dict[str, Callable[[], int]] = {"calibrator": calibrator_cli.main, "ecu-node": node_cli.main}
+PROGRAMS: dict[str, Callable[[], int]] = {
+    "calibrator": calibrator_cli.run_calibrator,
+    "ecu-node": node_cli.run_ecu_node,
+}
 """What runs each program with the arguments of the process."""
 _WIDTH = "80"
 """Of the terminal for which the help is written. [characters]"""

@@ -15,8 +15,8 @@ from calibrator.drives.align import Samples
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.fleet_identification import choose_filter_bank, held_out_snr_db
+from calibrator.estimator.parameter_files import current_moments, junction_residual
 from calibrator.estimator.published_fleet import read_vehicle_model
-from calibrator.files.parameter_files import current_moments, junction_residual
 from calibrator.published.state_space import VehicleModel
 from calibrator.summaries.filter_bank import FilterBank, low_passes, read_bank
 from calibrator.summaries.summariser import summarise_samples

@@ -1,13 +1,16 @@
 """What every parameter file of one run has in common."""
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.options import Method
+from calibrator.errors import FleetError
+from calibrator.estimator.settings import Method
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import FileReference, HeldBack, JunctionResidual, Provenance, VehicleParameters
@@ -19,6 +22,7 @@ __all__ = [
     "current_moments",
     "held_back_lines",
     "junction_residual",
+    "time_of_run",
 ]
 
 REASONS: dict[HeldBack, str] = {
@@ -84,6 +88,21 @@ class RunIdentity:
             drives=list(drives),
             duration_s=round(duration_s, 3),
         )
+
+
+def time_of_run() -> str:
+    """The time now, ISO 8601; that of SOURCE_DATE_EPOCH, if it is set, makes results alike to the bit.
+
+    Raises
+    ------
+    FleetError
+        If SOURCE_DATE_EPOCH is no number of seconds.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    if epoch is not None and not epoch.isdecimal():
+        raise FleetError(f"SOURCE_DATE_EPOCH is {epoch!r}; expected seconds since 1970, or leave it unset")
+    now = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
+    return now.isoformat(timespec="seconds")
 
 
 def by_branch(branches: Sequence[str], values: Array) -> dict[str, float]:
