@@ -58,7 +58,6 @@ COUNT_EVERY_S = 1.0
 MEMORY_SHARE, LEAST_MEMORY_BYTES = 0.8, 1 << 30
 """Of the machine's memory for all processes that read; each may use this much at least. [1], [byte]"""
 PRELOADED = [
-    "cantools",
     "numba",
     "numpy",
     "pandas",
@@ -68,7 +67,8 @@ PRELOADED = [
     "threadpoolctl",
     "typer",
 ]
-"""Slow to import, so imported once, for all processes. Not this package: the fork server may find another copy."""
+"""Slow to import, so imported once, for all processes. Not this package: the fork server may find another copy.
+Not cantools: with it, python-can would import asammdf, see :func:`.load_python_can`."""
 LARGEST_GREETING = 1 << 20
 """With which a scheduler begins, at most. [byte]"""
 MEGABYTE = 1_000_000
