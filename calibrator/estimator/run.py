@@ -42,7 +42,7 @@ from calibrator.files.folders import require_new_folder, whole_folder
 from calibrator.files.storage import Storage, open_storage
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.sources.fleet_source import LOGS_FOLDER, find_fleet, probe_equipment
-from calibrator.summaries.identity import StoreIdentity, read_identity
+from calibrator.summaries.identity import FEWEST_BUCKETS, StoreIdentity, read_identity
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore, open_store
 from calibrator.summaries.summarise_fleet import add_drives
@@ -61,6 +61,8 @@ centre is known to a fortieth of what faultless vehicles differ by, so more woul
 so many blocks take about half a GiB, and are 200 vehicles with two hours of driving or more. [1]"""
 MOST_REASONS = 20
 """Reasons of vehicles left out that are kept for messages."""
+WORTH_PROCESSES = 200
+"""Vehicles from which on processes of their own, which take 4 s to start, are faster than this one alone."""
 Calibrate: TypeAlias = Callable[..., tuple[Equipment, bytes, dict[str, object], Sequence[str]]]
 """Calibrates a fleet in one piece: branches, part of the result, details and notices of the run."""
 
@@ -303,6 +305,10 @@ class _Run:
     settings: CalibrationSettings
     workers: Workers
 
+    def workers_if(self, many: bool) -> Workers:
+        """Where to compute what belongs to many vehicles or to few; a cluster was asked for in any case."""
+        return self.workers if many or self.workers.scheduler else Workers()
+
     def bench_table(self, store: SummaryStore) -> BenchTable:
         """Bench readings, if there are any."""
         given, scale_a = self.settings.readings, self.identity.database.layout.full_scale_a
@@ -320,7 +326,8 @@ class _Run:
             _require_previous(since, self.identity.database, store.identity)
         versions, settings, bench = store.versions(), self.settings, self.bench_table(store)
         checked = {vehicle for vehicle, _ in bench}
-        census = take_census(store, self.workers, settings.hold_out | settings.trusted | checked)
+        is_large = len(store.buckets()) > FEWEST_BUCKETS
+        census = take_census(store, self.workers_if(is_large), settings.hold_out | settings.trusted | checked)
         _require_named(settings, census.named, census.reasons, f"fleet {self.identity.fleet}")
         self.check(bench, census.named, census.reasons)
         with progress_bar("learn the fleet", None), threadpool_limits(1):  # one: the reference is the same anywhere
@@ -332,11 +339,12 @@ class _Run:
                 identity=self.identity,
                 fleet_size=census.size,
             )
+        where = self.workers_if(is_large or census.size >= WORTH_PROCESSES)
         calibrate, seen = partial(calibrate_bucket, store=store, task=task, previous=previous), 0
         earlier = () if previous is None else parts_of(previous)  # also of those who are there no more
         buckets = sorted({*census.usable, *earlier})
         with progress_bar("calibrate", census.size, "vehicles") as progress:
-            for bucket, part in zip(buckets, run_many(calibrate, buckets, self.workers), strict=True):
+            for bucket, part in zip(buckets, run_many(calibrate, buckets, where), strict=True):
                 write_atomically(part_file(self.result, bucket), part)
                 seen += census.usable.get(bucket, 0)
                 progress(seen)

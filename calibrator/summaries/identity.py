@@ -12,7 +12,15 @@ from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.moments import BLOCK_S
 from ecu_node.database import VehicleDatabase
 
-__all__ = ["SCHEMA_VERSION", "StoreIdentity", "bucket_of", "read_identity", "store_identity", "write_identity"]
+__all__ = [
+    "FEWEST_BUCKETS",
+    "SCHEMA_VERSION",
+    "StoreIdentity",
+    "bucket_of",
+    "read_identity",
+    "store_identity",
+    "write_identity",
+]
 
 SCHEMA_VERSION = 4
 FILE = "summaries.json"

@@ -18,8 +18,8 @@ DELAY_TOLERANCE_S = 0.005
 
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = ("--vehicles", 20, "--currents", 2, "--sparsity", 80, "--delay", 150, "--unmeasured", 3, 1)
-    length = ("--minutes", 5, "--unseen-minutes", 0.1, "--seed", 5)
+    options = ("--vehicles", 12, "--currents", 2, "--sparsity", 80, "--delay", 150, "--unmeasured", 3, 1)
+    length = ("--minutes", 3, "--unseen-minutes", 0.1, "--seed", 5)
     return made_once(tmp_path_factory, "asymmetric_fleet", "simulate", *options, *length)
 
 

@@ -181,35 +181,46 @@ def drives(place: str) -> dict[str, bytes]:
     }
 
 
-def test_logs_and_stores_in_object_storage_give_the_same_from_cluster_workers(
-    tmp_path: Path, database: VehicleDatabase, s3: dict[str, str]
-) -> None:
-    simulate_fleet(PLAN, BuiltinTrips(seed=0, duration_s=130.0, unseen_s=10.0), database, tmp_path / "fleet", workers=1)
-    logs = tmp_path / "fleet" / "logs"
-    for folder, files in walk(open_storage(logs), []):
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase, s3: dict[str, str]) -> Path:
+    """Logs of a fleet, which lie at s3://fleet/logs as well."""
+    out = tmp_path_factory.mktemp("fleet")
+    simulate_fleet(PLAN, BuiltinTrips(seed=0, duration_s=130.0, unseen_s=10.0), database, out, workers=1)
+    for folder, files in walk(open_storage(out / "logs"), []):
         for file in files:
-            Storage(url=f"s3://fleet/{folder.url.removeprefix(f'{logs.parent}/')}").write(
-                file.name, folder.read(file.name)
-            )
+            there = Storage(url=f"s3://fleet/{folder.url.removeprefix(f'{out}/')}")
+            there.write(file.name, folder.read(file.name))
+    return out / "logs"
+
+
+def test_drives_in_object_storage_are_those_in_a_folder(logs: Path, tmp_path: Path) -> None:
+    for source, out in ((logs, tmp_path / "here"), ("s3://fleet/logs", "s3://fleet/here")):
+        command("import", source, "--layout", LAYOUT, "--out", out)
+    assert drives("s3://fleet/here/drives") == drives(str(tmp_path / "here" / "drives"))
+
+
+@pytest.mark.long
+def test_logs_and_stores_in_object_storage_give_the_same_from_cluster_workers(
+    logs: Path, tmp_path: Path, s3: dict[str, str]
+) -> None:
     layout = ("--layout", LAYOUT)
+    for processes in (1, 2):
+        command("summarise", logs, *layout, "--out", tmp_path / f"s{processes}", "--workers", processes)
+    command("calibrate", tmp_path / "s1", *layout, "--out", tmp_path / "here")
     with DaskCluster(tmp_path, s3) as cluster:
         there = ("--scheduler", cluster.address)
-        command("import", logs, *layout, "--out", tmp_path / "drives", "--workers", 2)
-        command("import", "s3://fleet/logs", *layout, "--out", "s3://fleet/drives", *there)
-        assert drives("s3://fleet/drives/drives") == drives(str(tmp_path / "drives" / "drives"))
-        command("summarise", logs, *layout, "--out", tmp_path / "one", "--workers", 1)
-        command("summarise", logs, *layout, "--out", tmp_path / "two", "--workers", 2)
+        command("import", "s3://fleet/logs", *layout, "--out", "s3://fleet/there", *there)
+        command("import", logs, *layout, "--out", tmp_path / "drives")
+        assert drives("s3://fleet/there/drives") == drives(str(tmp_path / "drives" / "drives"))
         command("summarise", logs, *layout, "--out", tmp_path / "dask", *there)
         reading = ("summarise", "s3://fleet/logs", *layout, "--out", "s3://fleet/s", "--json")
         report = json.loads(command(*reading, *there).stdout)
         assert (report["vehicles"], report["drives"], report["left_out"]) == (6, 6, {})
-        again = json.loads(command(*reading).stdout)
-        assert again["drives"] == 0
-        expected = summaries(str(tmp_path / "one"))
-        for place in (str(tmp_path / "two"), str(tmp_path / "dask"), "s3://fleet/s"):
+        assert json.loads(command(*reading).stdout)["drives"] == 0  # they are known
+        expected = summaries(str(tmp_path / "s1"))
+        for place in (str(tmp_path / "s2"), str(tmp_path / "dask"), "s3://fleet/s"):
             assert summaries(place) == expected
-        command("calibrate", tmp_path / "one", *layout, "--out", tmp_path / "here", "--workers", 1)
         command("calibrate", "s3://fleet/s", *layout, "--out", tmp_path / "there", *there)
-        for path in sorted((tmp_path / "here" / "params").iterdir()):
-            assert (tmp_path / "there" / "params" / path.name).read_bytes() == path.read_bytes()
+    for path in sorted((tmp_path / "here" / "params").iterdir()):
+        assert (tmp_path / "there" / "params" / path.name).read_bytes() == path.read_bytes()
     assert "6 vehicles" in command("store", "info", "s3://fleet/s").stdout
