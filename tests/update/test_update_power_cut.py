@@ -74,7 +74,9 @@ def cuts(folder: Path, files: list[Path], place: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize(
-    "command", ["update", pytest.param("revoke", marks=pytest.mark.long), "conclude"], indirect=True
+    "command",
+    ["conclude", *(pytest.param(name, marks=pytest.mark.long) for name in ("update", "revoke"))],
+    indirect=True,
 )
 def test_power_cut_at_any_moment_leaves_the_state_of_before_or_of_after(
     command: Callable[[Path], list[str]], state: Path, tmp_path: Path
