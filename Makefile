@@ -38,7 +38,8 @@ demo: setup              ## a fleet, its calibration, and the Kirchhoff sum befo
 
 # tests write many files and sync each, which costs nothing in memory: where there are 4 GB of it
 IN_MEMORY := $(shell [ "$$(df --output=avail /dev/shm | tail -n 1)" -gt 4000000 ] 2>/dev/null && echo TMPDIR=/dev/shm)
-TEST := $(IN_MEMORY) $(BIN)/python -m pytest --numprocesses auto --dist worksteal
+# one thread each: those of BLAS in two workers only wait for one another
+TEST := $(IN_MEMORY) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 VCAN := HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan
 
 test: setup              ## all tests but the long ones; those of SocketCAN on a kernel that has it
