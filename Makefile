@@ -8,6 +8,8 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 SEED ?= 1100
 PYTHONS ?=
 PIP_QUIET := --quiet --disable-pip-version-check --no-deps
+# of BLAS, whose threads in processes that share the cores only wait for one another
+export OMP_NUM_THREADS = 1
 unexport PYTHONDONTWRITEBYTECODE # where it is set, each of some thousand processes compiles anew what it imports
 
 .DEFAULT_GOAL := help
@@ -38,8 +40,7 @@ demo: setup              ## a fleet, its calibration, and the Kirchhoff sum befo
 
 # tests write many files and sync each, which costs nothing in memory: where there are 4 GB of it
 IN_MEMORY := $(shell [ "$$(df --output=avail /dev/shm | tail -n 1)" -gt 4000000 ] 2>/dev/null && echo TMPDIR=/dev/shm)
-# one thread each: those of BLAS in two workers only wait for one another
-TEST := $(IN_MEMORY) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal
+TEST := $(IN_MEMORY) $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 VCAN := HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan
 
 test: setup              ## all tests but the long ones; those of SocketCAN on a kernel that has it
@@ -71,17 +72,17 @@ coverage: setup          ## all tests but the long ones, and which lines they re
 	$(BIN)/coverage report --include='calibrator/*' --fail-under=95
 
 bench: setup             ## how long each step takes, beside its peers; also build/bench.json (long)
-	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench
+	PYTHONPATH=tools $(BIN)/python -m bench
 
 bench-quick: setup       ## the same at small sizes, within five minutes
-	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench --quick
+	PYTHONPATH=tools $(BIN)/python -m bench --quick
 
 experiments: setup       ## docs/results anew, ten repetitions from SEED on; TRIPS=folder of the recorded BMW i3 trips (hours)
 	$(BIN)/python tools/import_bmw_i3.py $(TRIPS) --layout dbc/hv_powertrain.toml --out build/i3
 	$(BIN)/calibrator experiment all --seed $(SEED) --drives build/i3 --layout dbc/hv_powertrain.toml --out docs/results
 
 soak: setup              ## the node at the full load of a CAN FD bus, 10^7 frames; its watch on 24 h of real drives (hours)
-	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench node --out build/soak.json
+	PYTHONPATH=tools $(BIN)/python -m bench node --out build/soak.json
 	HV_WATCH_HOURS=24 $(BIN)/python -m pytest -n 2 tests/real/test_watch_on_real_drives.py
 
 fuzz: setup              ## 10^7 random frames through node and C core, 10^6 changed bundles (hours)
@@ -111,7 +112,7 @@ docs: setup              ## the documentation, in build/docs; its examples are r
 	! grep -rnoE --include='*.html' --include='*.css' '$(LOADED)' build/docs # from another server
 
 notebook: setup          ## run the notebook of the examples, and keep its outputs in it
-	OMP_NUM_THREADS=1 $(BIN)/jupyter execute --inplace --timeout 1800 examples/fleet_to_node.ipynb
+	$(BIN)/jupyter execute --inplace --timeout 1800 examples/fleet_to_node.ipynb
 
 dist: setup              ## wheel and source distribution, in dist/, checked
 	rm -rf dist
