@@ -326,6 +326,13 @@ def _rough_weights(evidence: Evidence, j: int, log_prior: Array, log_load: float
     K, log_wide = evidence.values.shape[1] // 5, log(WIDE_SD)
     P, feeding_offset = 3 * K + 1, 2 * K + evidence.feed
     best, scores, codes = -np.inf, [0.0 for _ in range(0)], [0 for _ in range(0)]
+    ahead = log_prior.copy()  # best prior of the same numbers of faults or more: few may be rarer than many
+    for h in range(K, -1, -1):
+        for s in range(2 * K, -1, -1):
+            if h < K:
+                ahead[h, s] = max(ahead[h, s], ahead[h + 1, s])
+            if s < 2 * K:
+                ahead[h, s] = max(ahead[h, s], ahead[h, s + 1])
     of_gains, of_relative, _ = _normal_equations(
         evidence, j, np.zeros(P), np.arange(K + 1), evidence.precision_relative[j]
     )
@@ -361,7 +368,7 @@ def _rough_weights(evidence: Evidence, j: int, log_prior: Array, log_load: float
                 scores.append(value + log_prior[h, s] + log_load * loads)
                 codes.append(code | (1 << p))
                 best = max(best, scores[-1])
-                if scores[-1] + possible - gain > best - MARGIN - 3.0:
+                if value + ahead[h, s] + log_load * loads + possible - gain > best - MARGIN - 3.0:
                     rest, right = _without(H, g, i)
                     stack.append((p + 1, size + 1, h, s, loads, codes[-1], value, possible - gain, rest, right))
     return np.array(scores), np.array(codes)

@@ -227,6 +227,15 @@ def test_weights_are_those_of_integration_on_a_grid() -> None:
                 np.testing.assert_allclose(found[on][1], mean, atol=0.004)
 
 
+def test_explanation_of_many_faults_is_found_though_no_vehicle_has_fewer() -> None:
+    """A hardware offset looks like one of two sensors; that alone, two of the four faults, would be too few."""
+    truth = no_faults(1, 3)
+    truth.hardware_offset_a[0], truth.drift[0, 1], truth.offset_a[0] = [0.16, 0.0, -0.16], 0.24, [-0.12, 0.0, 0.24]
+    prior = paper_prior(3, 4)
+    draws = drawn(rows_of(truth), prior)
+    assert of_supports(draws, weigh(draws, prior)[0], 0)[2, 4, 6, 8][0] > 0.5
+
+
 @pytest.mark.parametrize("kind", [GAIN, OFFSET])
 @pytest.mark.parametrize("every", [1, 4])
 def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None:
