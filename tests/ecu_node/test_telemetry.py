@@ -212,7 +212,9 @@ def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: 
 
 def test_missing_real_time_permissions_are_reported_not_fatal() -> None:
     code = (
-        "import os; from ecu_node.bus.service import be_real_time; user = os.geteuid(); user or os.seteuid(65534); "
+        "import os; from contextlib import suppress; from ecu_node.bus.service import be_real_time\n"
+        "user = os.geteuid()\n"
+        "with suppress(OSError): user or os.seteuid(65534)  # the root of a namespace may do nothing outside of it\n"
         "print(be_real_time()); print(len(os.sched_getaffinity(0))); os.seteuid(user)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
