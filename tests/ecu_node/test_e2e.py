@@ -145,12 +145,12 @@ def test_first_frame_is_that_of_the_examples_of_autosar(
     assert payload.hex() == expected
 
 
+@pytest.mark.parametrize(("profile", "identity"), [("P04", 0x12345678), ("P05", 0x5678), ("P07", 0x12345678)])
 def test_data_identifier_is_the_identifier_of_the_message_where_none_is_given(
-    protect: Callable[..., Protection],
+    protect: Callable[..., Protection], profile: str, identity: int
 ) -> None:
     long = ROOM.replace("BO_ 700", f"BO_ {0x80000000 | 0x12345678}")
-    (frame,) = stream(protect(autosar("P07", "offset = 3"), room=long), 1)
-    assert bytes.fromhex("12345678") in frame
+    assert protect(autosar(profile, "offset = 3"), room=long).identity == identity
 
 
 def crc8(data: bytes, polynomial: int) -> int:
@@ -214,6 +214,18 @@ def test_more_corrupt_frames_than_allowed_make_a_message_invalid_until_enough_ar
         receiver.check(damaged(frame) if number in {12, 13, 14} else frame)
         invalid += [number] * (receiver.state is E2EState.INVALID)
     assert invalid == [14, 15, 16, 17], "the third error of six; four frames without one make it valid again"
+
+
+def test_lost_frames_are_no_errors_and_a_few_errors_at_first_say_nothing(
+    kind: str, protect: Callable[..., Protection]
+) -> None:
+    windows = "init = { window = 4, min_ok = 3, max_error = 1 }\nvalid = { window = 4, min_ok = 4, max_error = 0 }"
+    protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
+    receiver, found = Receiver(protection), []
+    for number, frame in enumerate(stream(protection, 20)[::2]):
+        receiver.check(damaged(frame) if number == 1 else frame)
+        found.append(receiver.state)
+    assert found == [E2EState.INIT] * 3 + [E2EState.VALID, E2EState.INVALID] + [E2EState.VALID] * 5
 
 
 def test_after_a_silence_a_single_frame_with_any_counter_is_not_enough(protection: Protection) -> None:
