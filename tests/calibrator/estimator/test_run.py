@@ -130,6 +130,13 @@ def test_result_is_the_same_for_any_number_of_workers(
     assert contents(tmp_path / "two") == contents(result)
 
 
+def test_few_vehicles_are_calibrated_by_this_process_alone(
+    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_many, "_outcomes", None)  # which starts processes
+    assert calibrate(store.url, tmp_path / "out", "--workers", 2).returncode == 0
+
+
 # What is refused
 
 
