@@ -8,7 +8,7 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 SEED ?= 1100
 PYTHONS ?=
 PIP_QUIET := --quiet --disable-pip-version-check --no-deps
-# of BLAS, whose threads in processes that share the cores only wait for one another
+# processes share the cores: threads of BLAS in each would only wait for those of the others
 export OMP_NUM_THREADS = 1
 unexport PYTHONDONTWRITEBYTECODE # where it is set, each of some thousand processes compiles anew what it imports
 

@@ -209,7 +209,9 @@ def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> F
         log_evidence=np.full((N, MOST_FITTED), -np.inf),
         chi2=np.zeros((N, MOST_FITTED)),
     )
-    _fit_all(evidence, log_prior, log_load, fits)
+    backwards = np.maximum.accumulate(np.maximum.accumulate(log_prior[::-1, ::-1], axis=0), axis=1)
+    best_ahead = np.ascontiguousarray(backwards[::-1, ::-1])  # of as many faults or more: few may be rarer than many
+    _fit_all(evidence, log_prior, best_ahead, log_load, fits)
     at, on = ParameterPlaces(K), fits.support
     fits.hardware[:] = on[:, :, at.eta] + on[:, :, at.hardware_offsets].sum(axis=2)
     fits.sensor[:] = on[:, :, at.gains].sum(axis=2) + on[:, :, at.offsets].sum(axis=2)
@@ -265,9 +267,9 @@ def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
 
 
 @compiled_with_notice
-def _fit_all(evidence: Evidence, log_prior: Array, log_load: float, fits: Fits) -> None:
+def _fit_all(evidence: Evidence, log_prior: Array, best_ahead: Array, log_load: float, fits: Fits) -> None:
     for j in range(len(evidence.values)):
-        scores, codes = _rough_weights(evidence, j, log_prior, log_load)
+        scores, codes = _rough_weights(evidence, j, log_prior, best_ahead, log_load)
         kept = np.flatnonzero(scores > scores.max() - MARGIN)
         kept = kept[np.argsort(-scores[kept])][: fits.theta.shape[1]]
         fits.number[j] = len(kept)
@@ -316,23 +318,18 @@ def _without(H: Array, g: Array, i: int) -> tuple[Array, Array]:
 
 
 @inner
-def _rough_weights(evidence: Evidence, j: int, log_prior: Array, log_load: float) -> tuple[Array, Integers]:
+def _rough_weights(
+    evidence: Evidence, j: int, log_prior: Array, best_ahead: Array, log_load: float
+) -> tuple[Array, Integers]:
     """Rough log weights of the supports that may matter, and the supports as bits.
 
     For each set of gains, which the relative rows tell, the constants are linear: one after the other is eliminated
     from the normal equations, depth first. A branch of the search ends where even all constants together could not
-    make it matter.
+    make it matter, with the best prior that as many faults or more can have.
     """
     K, log_wide = evidence.values.shape[1] // 5, log(WIDE_SD)
     P, feeding_offset = 3 * K + 1, 2 * K + evidence.feed
     best, scores, codes = -np.inf, [0.0 for _ in range(0)], [0 for _ in range(0)]
-    ahead = log_prior.copy()  # best prior of the same numbers of faults or more: few may be rarer than many
-    for h in range(K, -1, -1):
-        for s in range(2 * K, -1, -1):
-            if h < K:
-                ahead[h, s] = max(ahead[h, s], ahead[h + 1, s])
-            if s < 2 * K:
-                ahead[h, s] = max(ahead[h, s], ahead[h, s + 1])
     of_gains, of_relative, _ = _normal_equations(
         evidence, j, np.zeros(P), np.arange(K + 1), evidence.precision_relative[j]
     )
@@ -368,7 +365,7 @@ def _rough_weights(evidence: Evidence, j: int, log_prior: Array, log_load: float
                 scores.append(value + log_prior[h, s] + log_load * loads)
                 codes.append(code | (1 << p))
                 best = max(best, scores[-1])
-                if value + ahead[h, s] + log_load * loads + possible - gain > best - MARGIN - 3.0:
+                if value + best_ahead[h, s] + log_load * loads + possible - gain > best - MARGIN - 3.0:
                     rest, right = _without(H, g, i)
                     stack.append((p + 1, size + 1, h, s, loads, codes[-1], value, possible - gain, rest, right))
     return np.array(scores), np.array(codes)

@@ -150,7 +150,10 @@ def test_data_identifier_is_the_identifier_of_the_message_where_none_is_given(
     protect: Callable[..., Protection], profile: str, identity: int
 ) -> None:
     long = ROOM.replace("BO_ 700", f"BO_ {0x80000000 | 0x12345678}")
-    assert protect(autosar(profile, "offset = 3"), room=long).identity == identity
+    protection = protect(autosar(profile, "offset = 3"), room=long)
+    assert protection.identity == identity
+    (frame,) = stream(protection, 1)
+    assert (identity.to_bytes(4, "big") in frame) is (profile != "P05")  # which sends none
 
 
 def crc8(data: bytes, polynomial: int) -> int:
