@@ -8,6 +8,7 @@ from typing import Any
 from weakref import WeakSet
 
 import pytest
+from hypothesis import settings
 
 from ecu_node.program import load_python_can
 
@@ -23,6 +24,9 @@ SHARED_DATA = ROOT.parent / "shared" / "data"
 WHEN_ASKED = [ROOT / "tests" / name for name in ("package", "vcan")]
 """Folders whose tests run only where they are named: they need a built wheel, or a kernel with SocketCAN."""
 NOTHING_MAY_BE_SKIPPED = os.environ.get("HV_REQUIRE_ALL") == "1"
+
+settings.register_profile("patient", deadline=None)  # a busy machine, or a first call that compiles, proves nothing
+settings.load_profile("patient")
 
 _open_buses: WeakSet[can.BusABC] = WeakSet()
 _bus_init, _bus_shutdown = can.BusABC.__init__, can.BusABC.shutdown

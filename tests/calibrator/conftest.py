@@ -3,13 +3,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
 
 from calibrator.cli import run_calibrator
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
-settings.register_profile("calibrator", deadline=None)  # the first call of some functions compiles them
-settings.load_profile("calibrator")
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from cantools.database.can import Signal
 from cantools.database.conversion import BaseConversion
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ecu_node.core.correction import LARGEST_ERROR, IntegerPlan, SensorFault, Signals, correction_plan
@@ -87,7 +87,6 @@ def test_every_code_of_16_bits_is_rounded_half_up_and_clamped(
     assert got == [min(max(code, low), high) for code in wanted]
 
 
-@settings(deadline=None)
 @given(
     length=st.integers(2, 64),
     signed=st.booleans(),
@@ -113,7 +112,6 @@ def test_passing_through_changes_no_code() -> None:
     assert [plan.apply(code) for code in whole_range(source)] == list(whole_range(source))
 
 
-@settings(deadline=None)
 @given(
     code=st.integers(-30000, 30000),
     volts=st.integers(0, 50000),
