@@ -69,114 +69,6 @@ class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A table of the file."""
 
 
-_DataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]
-_LongDataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
-_Offset = Annotated[int, msgspec.Meta(ge=0, le=60)]
-
-
-class E2EWindow(_Table, frozen=True, kw_only=True):
-    """When a message is VALID, by the last frames of it."""
-
-    window: Annotated[int, msgspec.Meta(ge=1, le=64)]
-    """Frames that are looked at."""
-    min_ok: Annotated[int, msgspec.Meta(ge=0, le=64)]
-    """Fewest of them that must be intact and new."""
-    max_error: Annotated[int, msgspec.Meta(ge=0, le=64)]
-    """Most of them that may be corrupt."""
-
-
-class _Protected(_Table, frozen=True, kw_only=True):
-    messages: Annotated[list[Name], msgspec.Meta(min_length=1)]
-    init: E2EWindow = E2EWindow(window=1, min_ok=1, max_error=0)
-    """To become VALID at the start."""
-    valid: E2EWindow = E2EWindow(window=10, min_ok=1, max_error=3)
-    """To stay VALID."""
-    invalid: E2EWindow = E2EWindow(window=10, min_ok=3, max_error=1)
-    """To become VALID again, also after a silence."""
-    max_delta_counter: Annotated[int, msgspec.Meta(ge=1, le=255)] = 3
-    """Largest step of the counter between two frames that is used: one more than the frames that may be lost."""
-
-    @property
-    def profile(self) -> str:
-        """Which one it is, as the file says."""
-        return str(self.__struct_config__.tag)
-
-
-class _WithHeader(_Protected, frozen=True, kw_only=True):
-    data_id: dict[str, _DataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
-    offset: _Offset = 0
-    """First byte of the header."""
-
-
-class ProfileP01(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P01"):
-    """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
-
-    data_id_mode: Literal["both", "alternating", "low", "nibble"] = "both"
-    """Which bytes of the data identifier the CRC covers: profile 1A, 1B, the low one only, 1C."""
-
-
-class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P02"):
-    """AUTOSAR E2E profile 2: CRC-8 and a counter of 4 bits that selects one of 16 data identifiers."""
-
-    data_id_list: dict[
-        str, Annotated[list[Annotated[int, msgspec.Meta(ge=0, le=255)]], msgspec.Meta(min_length=16, max_length=16)]
-    ]
-    """Data identifiers per message."""
-
-
-class ProfileP04(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P04"):
-    """AUTOSAR E2E profile 4: length, a counter of 16 bits, the data identifier and CRC-32."""
-
-    data_id: dict[str, _LongDataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
-
-
-class ProfileP05(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P05"):
-    """AUTOSAR E2E profile 5: CRC-16 and a counter of 8 bits."""
-
-
-class ProfileP06(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P06"):
-    """AUTOSAR E2E profile 6: CRC-16, length and a counter of 8 bits."""
-
-
-class ProfileP07(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P07"):
-    """AUTOSAR E2E profile 7: CRC-64, length, a counter of 32 bits and the data identifier."""
-
-    data_id: dict[str, _LongDataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
-
-
-class ProfileP11(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P11"):
-    """AUTOSAR E2E profile 11: CRC-8 and a counter of 4 bits, as profile 1 on the bus."""
-
-    data_id_mode: Literal["both", "nibble"] = "both"
-    """Which bits of the data identifier the CRC covers: both bytes (11A), or 12 bits, of which 4 are sent (11C)."""
-
-
-class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="counter CRC8"):
-    """A counter and a CRC-8 as signals of the DBC; the CRC covers all bytes but its own."""
-
-    counter: Name
-    crc: Name
-    algorithm: str = "sae_j1850"
-    """As fastcrc names it."""
-    counter_modulus: Annotated[int, msgspec.Meta(ge=2, le=65536)] | None = None
-    """Number of codes of the counter, which runs from 0; all that fit the signal where not given."""
-    data_id: dict[str, _DataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
-    data_id_bytes: Literal[0, 1, 2] = 0
-    """How many of its bytes the CRC covers too, the low one first."""
-    data_id_at: Literal["before", "after"] = "before"
-    """Whether they come before or after the payload."""
-
-
-AutosarProfile = ProfileP01 | ProfileP02 | ProfileP04 | ProfileP05 | ProfileP06 | ProfileP07 | ProfileP11
-"""A profile of AUTOSAR for some messages."""
-EndToEnd = AutosarProfile | CounterCrc8
-"""How some messages are protected."""
-
-
 _MAX_LAYOUT_BYTES = 1_000_000
 """A layout has some kilobytes; a larger file is not one."""
 
@@ -330,6 +222,114 @@ class Activation(_Table, frozen=True, kw_only=True):
     """Largest difference from the drift that is in force. [1]"""
     step_offset_a: _Positive | None = None
     """Largest difference from the offset that is in force [A]; 20 % of full scale where not given."""
+
+
+_DataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]
+_LongDataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
+_Offset = Annotated[int, msgspec.Meta(ge=0, le=60)]
+
+
+class E2EWindow(_Table, frozen=True, kw_only=True):
+    """When a message is VALID, by the last frames of it."""
+
+    window: Annotated[int, msgspec.Meta(ge=1, le=64)]
+    """Frames that are looked at."""
+    min_ok: Annotated[int, msgspec.Meta(ge=0, le=64)]
+    """Fewest of them that must be intact and new."""
+    max_error: Annotated[int, msgspec.Meta(ge=0, le=64)]
+    """Most of them that may be corrupt."""
+
+
+class _Protected(_Table, frozen=True, kw_only=True):
+    messages: Annotated[list[Name], msgspec.Meta(min_length=1)]
+    init: E2EWindow = E2EWindow(window=1, min_ok=1, max_error=0)
+    """To become VALID at the start."""
+    valid: E2EWindow = E2EWindow(window=10, min_ok=1, max_error=3)
+    """To stay VALID."""
+    invalid: E2EWindow = E2EWindow(window=10, min_ok=3, max_error=1)
+    """To become VALID again, also after a silence."""
+    max_delta_counter: Annotated[int, msgspec.Meta(ge=1, le=255)] = 3
+    """Largest step of the counter between two frames that is used: one more than the frames that may be lost."""
+
+    @property
+    def profile(self) -> str:
+        """Which one it is, as the file says."""
+        return str(self.__struct_config__.tag)
+
+
+class _WithHeader(_Protected, frozen=True, kw_only=True):
+    data_id: dict[str, _DataId] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+    offset: _Offset = 0
+    """First byte of the header."""
+
+
+class ProfileP01(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P01"):
+    """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
+
+    data_id_mode: Literal["both", "alternating", "low", "nibble"] = "both"
+    """Which bytes of the data identifier the CRC covers: profile 1A, 1B, the low one only, 1C."""
+
+
+class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P02"):
+    """AUTOSAR E2E profile 2: CRC-8 and a counter of 4 bits that selects one of 16 data identifiers."""
+
+    data_id_list: dict[
+        str, Annotated[list[Annotated[int, msgspec.Meta(ge=0, le=255)]], msgspec.Meta(min_length=16, max_length=16)]
+    ]
+    """Data identifiers per message."""
+
+
+class ProfileP04(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P04"):
+    """AUTOSAR E2E profile 4: length, a counter of 16 bits, the data identifier and CRC-32."""
+
+    data_id: dict[str, _LongDataId] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+
+
+class ProfileP05(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P05"):
+    """AUTOSAR E2E profile 5: CRC-16 and a counter of 8 bits."""
+
+
+class ProfileP06(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P06"):
+    """AUTOSAR E2E profile 6: CRC-16, length and a counter of 8 bits."""
+
+
+class ProfileP07(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P07"):
+    """AUTOSAR E2E profile 7: CRC-64, length, a counter of 32 bits and the data identifier."""
+
+    data_id: dict[str, _LongDataId] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+
+
+class ProfileP11(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P11"):
+    """AUTOSAR E2E profile 11: CRC-8 and a counter of 4 bits, as profile 1 on the bus."""
+
+    data_id_mode: Literal["both", "nibble"] = "both"
+    """Which bits of the data identifier the CRC covers: both bytes (11A), or 12 bits, of which 4 are sent (11C)."""
+
+
+class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="counter CRC8"):
+    """A counter and a CRC-8 as signals of the DBC; the CRC covers all bytes but its own."""
+
+    counter: Name
+    crc: Name
+    algorithm: str = "sae_j1850"
+    """As fastcrc names it."""
+    counter_modulus: Annotated[int, msgspec.Meta(ge=2, le=65536)] | None = None
+    """Number of codes of the counter, which runs from 0; all that fit the signal where not given."""
+    data_id: dict[str, _DataId] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+    data_id_bytes: Literal[0, 1, 2] = 0
+    """How many of its bytes the CRC covers too, the low one first."""
+    data_id_at: Literal["before", "after"] = "before"
+    """Whether they come before or after the payload."""
+
+
+AutosarProfile = ProfileP01 | ProfileP02 | ProfileP04 | ProfileP05 | ProfileP06 | ProfileP07 | ProfileP11
+"""A profile of AUTOSAR for some messages."""
+EndToEnd = AutosarProfile | CounterCrc8
+"""How some messages are protected."""
 
 
 class LayoutKeys(_Table, frozen=True, kw_only=True):
