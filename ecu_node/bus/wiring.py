@@ -21,7 +21,7 @@ from ecu_node.bus.adapters import Settings, connect, filters_of
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault, Signals, correction_plan
 from ecu_node.core.corrector import Corrector, OwnMessage, Source, StatusFields
 from ecu_node.core.e2e import protection_of
-from ecu_node.core.junction import BranchCorrection, HeardSignal, JunctionWatch, LiveBranch, Written
+from ecu_node.core.junction import HeardSignal, JunctionWatch, LiveBranch, Written
 from ecu_node.core.signals import (
     AMPERE,
     VOLT,
@@ -282,21 +282,16 @@ def put_in_force(
     """
     parameters = in_force.parameters
     found = parameters.branches if parameters is not None else {}
-    corrections = []  # all of them before the first is taken: either all or none
-    for branch in database.layout.branch:
+    for branch, live in zip(database.layout.branch, corrector.branches, strict=True):
         fault, said = in_force.fault(branch.name), found.get(branch.name)
         is_in_place = mode is Mode.GATEWAY or branch.corrected is None
-        corrections.append(
-            BranchCorrection(
-                fault=fault,
-                correcting=branch_plan(database, branch, fault, mode),
-                passing=AS_IT_IS if is_in_place else branch_plan(database, branch, NO_FAULT, mode),
-                delay_s=(said and said.delay_s) or 0.0,
-                expected_since_s=now_s if said is not None else None,
-            )
+        live.take(
+            fault,
+            correcting=branch_plan(database, branch, fault, mode),
+            passing=AS_IT_IS if is_in_place else branch_plan(database, branch, NO_FAULT, mode),
+            delay_s=(said and said.delay_s) or 0.0,
+            expected_since_s=now_s if said is not None else None,
         )
-    for live, correction in zip(corrector.branches, corrections, strict=True):
-        live.take(correction)
     number = parameters.number % PARAMETER_SETS if parameters is not None else 0
     expected = parameters.junction_residual if parameters is not None else None
     corrector.begin(reason=in_force.reason, parameter_set=number, expected=expected)

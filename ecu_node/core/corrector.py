@@ -380,7 +380,7 @@ class Corrector:
             What they say of the junction's sum.
         """
         self.reason, self.parameter_set = reason, parameter_set
-        self.watch.restart(*(() if expected is None else (expected,)))
+        self.watch.restart(expected)
         self.latch(Reason.NONE)
 
     def look(self, now_s: float) -> None:

@@ -107,20 +107,6 @@ class Written(NamedTuple):
             self.quality.put(payload, min(quality, self.quality.highest))
 
 
-class BranchCorrection(NamedTuple):
-    """What parameters say of one branch."""
-
-    fault: SensorFault
-    correcting: IntegerPlan
-    """The same in integers."""
-    passing: IntegerPlan
-    """What is written where nothing is corrected."""
-    delay_s: float
-    """How much later than the junction it is seen. [s]"""
-    expected_since_s: float | None
-    """Since when its frames are waited for; None: not before the first one (a vehicle may lack the branch). [s]"""
-
-
 class LiveBranch(HeardSignal):
     """One branch: state of its sensor, and what is made of it.
 
@@ -164,13 +150,33 @@ class LiveBranch(HeardSignal):
         self._is_named = False
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
 
-    def take(self, correction: BranchCorrection) -> None:
-        """Take another correction; it is used once :meth:`activate` says so."""
-        self.fault, self.delay_s = correction.fault, correction.delay_s
-        self._passing, self._correcting = correction.passing, correction.correcting
-        self._is_named = correction.expected_since_s is not None
-        if correction.expected_since_s is not None:
-            self._waited_s = max(self._waited_s, correction.expected_since_s)
+    def take(
+        self,
+        fault: SensorFault,
+        *,
+        correcting: IntegerPlan,
+        passing: IntegerPlan,
+        delay_s: float,
+        expected_since_s: float | None,
+    ) -> None:
+        """Take what other parameters say of it; that is used once :meth:`activate` says so.
+
+        Parameters
+        ----------
+        fault : SensorFault
+            Of its sensor.
+        correcting, passing : IntegerPlan
+            What is written of it corrected, and where nothing is corrected.
+        delay_s : float
+            How much later than the junction it is seen. [s]
+        expected_since_s : float or None
+            Since when its frames are waited for; None: not before the first one (a vehicle may lack the branch). [s]
+        """
+        self.fault, self.delay_s = fault, delay_s
+        self._passing, self._correcting = passing, correcting
+        self._is_named = expected_since_s is not None
+        if expected_since_s is not None:
+            self._waited_s = max(self._waited_s, expected_since_s)
 
     def activate(self, *, active: bool, doubted: bool) -> None:
         """Correct, or pass through; a sensor that is in doubt is never said to be right."""
@@ -408,7 +414,6 @@ _NEARLY_AS_GOOD = 1.25
 """Branches that leave so many times what the best one leaves of the sum explain it as well."""
 _ROUNDING = 1e-9
 """Share of the squares of the sums that rounding may leave where a branch explains all of it. [1]"""
-_NOTHING_EXPECTED = JunctionResidual(measured_a=0.0, corrected_a=0.0)
 
 
 class JunctionSums(NamedTuple):
@@ -508,13 +513,14 @@ class JunctionWatch:
         """Whether the state is missing that says when sums can be judged."""
         return self._whole is not None and self._whole[0].code_at(now_s) is None
 
-    def restart(self, expected: JunctionResidual = _NOTHING_EXPECTED) -> None:
+    def restart(self, expected: JunctionResidual | None = None) -> None:
         """Forget what was seen, and judge by what the parameter file says of the sum of right sensors from now on.
 
         What the calibrator itself expects the corrected sum to be worse, as where one of two offsets that cancel is
         corrected, is added to the margin, up to ten times that. Where the file says no standard deviations, shares of
         full scale (or what the calibrator saw, if more) and of the throughput are taken: then only gross faults show.
         """
+        expected = expected or JunctionResidual(measured_a=0.0, corrected_a=0.0)
         measured_a, corrected_a = expected.about_expected()
         margins = min(max((corrected_a - measured_a) / self._margin_a, 0.0), _MOST_MARGINS)
         self._expected_a, self._allowed_a = expected.expected_a, self._margin_a * (1.0 + margins)
