@@ -111,8 +111,8 @@ class ParameterStore:
         The time of day.
     vehicle : str or None
         Identity of the vehicle, where it is known besides; the state of another one is not used.
-    background : Executor or None
-        Writes decisions, as a slow disk may take seconds, and the bus must not wait; None: written at once.
+    background : Executor
+        Writes decisions, as a slow disk may take seconds, and the bus must not wait.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class ParameterStore:
         say: Callable[[str], None],
         now: Callable[[], datetime],
         vehicle: str | None = None,
-        background: Executor | None = None,
+        background: Executor,
     ) -> None:
         self._folder, self._database, self._mode, self._say, self._now = folder, database, mode, say, now
         self._vehicle, self._background = vehicle, background
@@ -255,14 +255,7 @@ class ParameterStore:
         """Write a decision in the background, unless one is being written or could not be a moment ago."""
         if self._writing is not None or now_s < self._retry_due_s:
             return
-        if self._background is not None:
-            self._writing = self._background.submit(work)
-        else:
-            self._writing = Future()
-            try:
-                self._writing.set_result(work())
-            except UserError as error:
-                self._writing.set_exception(error)
+        self._writing = self._background.submit(work)
         self._finish_writing(now_s)
 
     def _finish_writing(self, now_s: float) -> None:

@@ -1,7 +1,6 @@
 """The fault memory: what was latched is kept, told, and cleared."""
 
 import json
-from concurrent.futures import Executor, Future
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -14,16 +13,7 @@ from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Reason
 from tests.ecu_node.junctions import Junction, driving, three_branches
 from tests.ecu_node.test_adapters import running
-from tests.ecu_node.vehicles import LAYOUT
-
-
-class AtOnce(Executor):
-    """Does in the foreground what is to be done in the background."""
-
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        done: Future[Any] = Future()
-        done.set_result(fn(*args, **kwargs))
-        return done
+from tests.ecu_node.vehicles import LAYOUT, AtOnce
 
 
 class Vehicle:

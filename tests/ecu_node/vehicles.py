@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -13,6 +14,7 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
 from ecu_node.parameters import (
     BranchParameters,
     FileReference,
@@ -111,6 +113,18 @@ def protected(database: VehicleDatabase, message: str, counter: int, **values: f
 def decoded(database: VehicleDatabase, message: str, data: bytes) -> dict[str, Any]:
     """The signals of a frame by cantools; named codes as numbers."""
     return cast("dict[str, Any]", database.message(message).decode(data, decode_choices=False))
+
+
+class AtOnce(Executor):
+    """Does in the foreground what is to be done in the background."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        try:
+            done.set_result(fn(*args, **kwargs))
+        except UserError as error:
+            done.set_exception(error)
+        return done
 
 
 class Frame(NamedTuple):

@@ -19,16 +19,18 @@ from ecu_node.parameters import VehicleParameters
 from ecu_node.update.state import VehicleState, locked, read_state, write_state
 from ecu_node.update.store import ParameterStore
 from ecu_node.update.trial import ParameterTrial, TrialResult
+from tests.ecu_node.vehicles import AtOnce
 from tests.update.damage import a_folder, cut, without
 from tests.update.held import NOW, put_on_trial
 
 DRIFT, OTHER_DRIFT = 0.05, 0.06
+AT_ONCE = AtOnce()
 
 
 class Running:
     """A corrector with the store of its parameters, in time that is counted."""
 
-    def __init__(self, state: Path, database: VehicleDatabase, *, background: Executor | None = None) -> None:
+    def __init__(self, state: Path, database: VehicleDatabase, *, background: Executor = AT_ONCE) -> None:
         self.said: list[str] = []
         self.now = NOW
         self.store = ParameterStore(
@@ -104,7 +106,9 @@ def test_node_that_starts_with_a_damaged_state_passes_through_until_it_is_mended
 
 
 def test_state_of_another_vehicle_is_not_used(correcting: Path, database: VehicleDatabase) -> None:
-    store = ParameterStore(correcting, database, mode=Mode.OVERLAY, say=print, now=lambda: NOW, vehicle="v2")
+    store = ParameterStore(
+        correcting, database, mode=Mode.OVERLAY, say=print, now=lambda: NOW, vehicle="v2", background=AT_ONCE
+    )
     assert store.in_force.reason is Reason.WRONG_VEHICLE
     assert store.why_not is not None
 

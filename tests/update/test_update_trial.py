@@ -18,12 +18,28 @@ from ecu_node.layout import read_layout
 from ecu_node.parameters import JunctionResidual, VehicleParameters
 from ecu_node.update.state import read_state, write_state
 from ecu_node.update.store import ParameterStore
-from tests.ecu_node.vehicles import Frame, answers, parameters_for, protected
+from tests.ecu_node.vehicles import LAYOUT, AtOnce, Frame, answers, parameters_for, protected
 from tests.update.held import NOW, put_on_trial
 
 PERIOD_S = 0.1
 DRIFT, OFFSET_A = 0.05, 2.0
 """Of the battery's sensor in this vehicle."""
+
+
+TRIAL_S = 30.0
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> VehicleDatabase:
+    """The project's own layout and DBC, with a short trial."""
+    return own_vehicle(tmp_path_factory.mktemp("vehicle"))
+
+
+def own_vehicle(folder: Path, more: str = "") -> VehicleDatabase:
+    shutil.copy(LAYOUT.with_suffix(".dbc"), folder)
+    path = folder / LAYOUT.name
+    path.write_text(f"{LAYOUT.read_text()}\n[activation]\ntrial_s = {TRIAL_S}\n{more}")
+    return read_database(read_layout(path))
 
 
 class Drive:
@@ -32,7 +48,9 @@ class Drive:
     def __init__(self, state: Path, database: VehicleDatabase) -> None:
         self.database, self.said = database, list[str]()
         self.time = NOW
-        self.store = ParameterStore(state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.time)
+        self.store = ParameterStore(
+            state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.time, background=AtOnce()
+        )
         self.corrector = wire(database, self.store.in_force, 0.0)
         self._steps: Iterator[int] = count()
 
@@ -83,16 +101,16 @@ def tried(vehicle: Path, parameters: VehicleParameters, database: VehicleDatabas
     """A drive that is longer than a trial takes."""
     put_on_trial(vehicle, parameters)
     drive = Drive(vehicle, database)
-    drive.go_on(330.0, **conditions)  # type: ignore[arg-type]
+    drive.go_on(1.1 * TRIAL_S, **conditions)  # type: ignore[arg-type]
     return drive
 
 
 def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, database: VehicleDatabase) -> None:
     put_on_trial(vehicle, right(database))
     drive = Drive(vehicle, database)
-    drive.go_on(290.0)
+    drive.go_on(0.9 * TRIAL_S)
     assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
-    drive.go_on(30.0)
+    drive.go_on(0.2 * TRIAL_S)
     assert drive.told == (State.CORRECTING, Reason.NONE)
     assert read_state(vehicle).in_force is not None
     assert drive.has_said(PASSED)
@@ -116,10 +134,10 @@ def test_wrong_set_never_comes_in_force(
 def test_set_before_stays_in_force_during_a_trial(vehicle: Path, database: VehicleDatabase) -> None:
     drive = tried(vehicle, right(database), database)
     put_on_trial(vehicle, right(database, -DRIFT, 0.0))
-    drive.go_on(100.0)
+    drive.go_on(0.5 * TRIAL_S)
     assert drive.told == (State.CORRECTING, Reason.NONE)
     assert drive.corrector.branches[0].fault.drift == DRIFT
-    drive.go_on(250.0)
+    drive.go_on(0.6 * TRIAL_S)
     assert drive.told == (State.CORRECTING, Reason.NONE)
     assert drive.has_said(FAILED)
 
@@ -163,18 +181,13 @@ def test_set_without_a_predicted_change_may_leave_anything(vehicle: Path, databa
     assert tried(vehicle, parameters, database, load_a=-0.5).has_said(PASSED)
 
 
-def test_trial_waits_while_a_current_is_not_measured_and_while_none_flows(
-    vehicle: Path, database: VehicleDatabase, tmp_path: Path
-) -> None:
+def test_trial_waits_while_a_current_is_not_measured_and_while_none_flows(vehicle: Path, tmp_path: Path) -> None:
     """As while the vehicle charges, where the layout says so."""
-    shutil.copy(database.layout.dbc_path, tmp_path)
-    text = database.layout.path.read_text() + '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
-    (tmp_path / "watched.toml").write_text(text)
-    own = read_database(read_layout(tmp_path / "watched.toml"))
+    own = own_vehicle(tmp_path, '[watch]\ninput = "contactor_state"\nvalid = [2]\n')
     drive = tried(vehicle, right(own), own, contactor=1)
-    drive.go_on(330.0, contactor=2, moving=False)
+    drive.go_on(1.1 * TRIAL_S, contactor=2, moving=False)
     assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
-    drive.go_on(330.0, contactor=2)
+    drive.go_on(1.1 * TRIAL_S, contactor=2)
     assert drive.told == (State.CORRECTING, Reason.NONE)
 
 

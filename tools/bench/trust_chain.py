@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -141,7 +142,14 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
     except UserError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return outcome | {"refused": True}
-    store = ParameterStore(state, database, mode=Mode.OVERLAY, say=lambda _: None, now=lambda: datetime.now(UTC))
+    store = ParameterStore(
+        state,
+        database,
+        mode=Mode.OVERLAY,
+        say=lambda _: None,
+        now=lambda: datetime.now(UTC),
+        background=ThreadPoolExecutor(1),
+    )
     corrector = wire(database, store.in_force, 0.0)
     turned = {key: replace(b, drift=-b.drift, offset_a=-b.offset_a) for key, b in own.branches.items()}
     sets = dict(zip(WRONG, (replace(own, branches=turned), replace(others, vehicle=name)), strict=True))
