@@ -264,7 +264,7 @@ def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected_unless_it_only_li
 ) -> None:
     bus = ("--interface", "slcan", "--channel", line.path, "--bitrate", "250000")
     with running(*node, *bus, *options) as log:
-        for _ in range(25):
+        for _ in range(10):
             line.put(b"t1008" + MEASURED.hex().upper().encode() + b"\r")
             line.take(0.02)
     line.take(0.1)
@@ -272,7 +272,7 @@ def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected_unless_it_only_li
     assert (head, last) == ([b"C", b"S5", b"", opened, opened], b"C\r")  # python-can opens it twice
     (counted,) = re.findall(r"ended: frames in (\d+), answers (\d+)", "".join(log))
     assert counted[0] == counted[1]
-    assert int(counted[0]) > 20
+    assert int(counted[0]) > 5
     assert len(answers) == (0 if options else int(counted[0]))
     assert {text[:5] for text in answers} <= {b"t2008"}
     assert all(answer(bytes.fromhex(text[5:].decode())) == RIGHT for text in answers)
@@ -302,7 +302,7 @@ def test_serial_line_is_answered_corrected_also_after_a_disturbance(node: list[s
     with running(*node, "--interface", "serial", "--channel", line.path):
         for noise in (b"", b"\x55\x55", too_long, cut_off):
             line.put(noise)
-            time.sleep(0.3)  # a driver that reads a frame that never ends gives up after 0.1 s
+            time.sleep(0.15)  # a driver that reads a frame that never ends gives up after 0.1 s
             line.taken = b""
             for _ in range(250):
                 line.put(b"\xaa" + struct.pack("<IBI", 0, 8, 0x100) + MEASURED + b"\xbb")
@@ -311,4 +311,4 @@ def test_serial_line_is_answered_corrected_also_after_a_disturbance(node: list[s
                     break
             assert line.taken[5:10] == struct.pack("<BI", 8, 0x200)
             assert answer(line.taken[10:18]) == RIGHT
-            line.take(0.2)
+            line.take(0.05)

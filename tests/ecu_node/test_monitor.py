@@ -193,9 +193,9 @@ def test_once_prints_what_was_seen_sends_nothing_and_ends_in_1_without_any_branc
     with can.Bus(interface="virtual", channel=CHANNEL) as bus:
         frame = can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8))
         bus.send_periodic(frame, 0.01, modifier_callback=count_on)
-        assert run_ecu_node([*MONITOR, "--listen-only", "--once", "0.5"]) == 0
+        assert run_ecu_node([*MONITOR, "--listen-only", "--once", "0.2"]) == 0
         lines = capsys.readouterr().out.splitlines()
-        assert run_ecu_node([*MONITOR, "--once", "0.3", "--json"]) == 0
+        assert run_ecu_node([*MONITOR, "--once", "0.2", "--json"]) == 0
         document = json.loads(capsys.readouterr().out)
         bus.stop_all_periodic_tasks()
         assert bus.recv(0.0) is None

@@ -99,9 +99,9 @@ def test_frames_are_corrected_on_the_bus_and_others_left_alone(
 def test_a_node_listens_as_long_as_another_one_may_be_silent(
     database: VehicleDatabase, peer: can.BusABC, channel: str
 ) -> None:
-    with node_on(database, channel, period_s=0.5):
+    with node_on(database, channel, period_s=0.2):
         receive(peer, 0x5F0, 2)
-        with pytest.raises(BusError, match="0x5F0"), node_on(database, channel, period_s=0.5):
+        with pytest.raises(BusError, match="0x5F0"), node_on(database, channel, period_s=0.2):
             receive(peer, 0x5F0, 3)
         receive(peer, 0x5F0, 1)
 
@@ -110,7 +110,7 @@ def test_another_node_that_sends_its_frames_ends_it(database: VehicleDatabase, p
     with pytest.raises(BusError, match="another node sends frames 0x510"), node_on(database, channel):  # noqa: PT012
         receive(peer, 0x5F0, 1)
         peer.send(can.Message(arbitration_id=0x510, is_extended_id=False, data=bytes(8)))
-        while peer.recv(1.0) is not None:
+        while peer.recv(0.2) is not None:
             pass
 
 

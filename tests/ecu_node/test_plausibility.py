@@ -110,7 +110,7 @@ def test_a_steady_load_beside_a_gain_error_that_is_corrected_is_not_stuck(juncti
         return {"battery": motor_a + 20.0, "motor": motor_a, "heater": 20.0}
 
     junction.wrong = {"heater": lambda _: 19.1}
-    junction.run(40.0, swinging)
+    junction.run(25.0, swinging)
     assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
@@ -134,7 +134,7 @@ def test_steps_of_loads_are_no_fault(junction: Junction) -> None:
         motor_a, late_a = (200.0 if at_s % 4.0 < 1.0 else -80.0 for at_s in (time_s, late_s))
         return {"battery": motor_a + heater_a, "motor": late_a, "heater": heater_a}
 
-    junction.run(30.0, steps)
+    junction.run(15.0, steps)
     assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
 
 

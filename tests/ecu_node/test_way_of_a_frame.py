@@ -124,7 +124,7 @@ class Plain:
         return made
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(drawn=FRAMES, drift=st.floats(-0.3, 0.3), offset=st.floats(-100, 100))
 def test_gateway_changes_the_currents_and_nothing_else(
     database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]], drift: float, offset: float
@@ -138,7 +138,7 @@ def test_gateway_changes_the_currents_and_nothing_else(
         assert payload == before, "what came in is not changed"
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(drawn=FRAMES, drift=st.floats(-0.3, 0.3), offset=st.floats(-100, 100))
 def test_overlay_answers_with_each_current_and_its_quality(
     database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]], drift: float, offset: float

