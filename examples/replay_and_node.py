@@ -27,7 +27,7 @@ print(calibrator(app, f"calibrate {out}/fleet/logs/V002 {known} --layout {layout
 # %%
 # Each frame of a branch is answered by one with the corrected current:
 database = read_database(read_layout(layout))
-node = wire(database, choose_parameters(out / "result/params/V002.json", database, "V002")[0], 0.0)
+node = wire(database, choose_parameters(out / "result/params/V002.json", database, "V002"), 0.0)
 with can.Logger(out / "both.log") as log:
     for frame in read_frames(out / "fleet/unseen/V002/drive.log.gz").messages():
         log(frame)

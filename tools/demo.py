@@ -184,9 +184,9 @@ def choose_bus() -> tuple[str, str]:
 def running_node(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
     """The node's own loop in a thread."""
     database = read_database(read_layout(ROOT / LAYOUT))
-    in_force, why_not = choose_parameters(parameters, database, vehicle)
-    if why_not is not None:
-        raise UserError(why_not)
+    in_force = choose_parameters(parameters, database, vehicle)
+    if in_force.why_not is not None:
+        raise UserError(in_force.why_not)
     stop, at_work = threading.Event(), threading.Event()
     corrector = wire(database, in_force, time.monotonic())
     bus = SteadyBus(

@@ -59,8 +59,6 @@ class ParameterSource(Protocol):
 
     in_force: InForce
     """What the node works with."""
-    why_not: str | None
-    """Why it passes measured values through; None if it has parameters."""
 
     def look(self, corrector: Corrector, now_s: float) -> bool:
         """See whether other parameters are to be in force from now on, and put them; to be called now and then."""
@@ -89,7 +87,7 @@ class ParameterFile:
         self._path, self._database, self._mode, self._say = path, database, mode, say
         self._choose = partial(choose_parameters, path, database, vehicle)
         self._seen, self._due_s = signature(path), float("-inf")
-        self.in_force, self.why_not = self._choose()
+        self.in_force: InForce = self._choose()
 
     def look(self, corrector: Corrector, now_s: float) -> bool:
         """Read the file again if it was changed; whether new parameters are in force."""
@@ -99,13 +97,13 @@ class ParameterFile:
         before, self._seen = self._seen, signature(self._path)
         if before == self._seen:
             return False
-        in_force, why_not = self._choose()
+        in_force = self._choose()
         if in_force.parameters is None:
             corrector.counters.reload_failures += 1
-            self._say(f"new parameters are not used, those before stay in force: {why_not}")
+            self._say(f"new parameters are not used, those before stay in force: {in_force.why_not}")
             return False
         put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
-        self.in_force, self.why_not = in_force, None
+        self.in_force = in_force
         corrector.counters.reloads += 1
         self._say(f"parameter set {in_force.parameters.number} of vehicle {in_force.parameters.vehicle} is in force")
         return True
@@ -178,8 +176,8 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
     source = _source(options, database, mode, say)
     corrector = wire(database, source.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
     if options.dry_run:
-        text = _dry_run(bus_settings, database, mode)
-        write_output(text if source.why_not is None else f"{text}\nwould correct nothing: {source.why_not}")
+        text, why_not = _dry_run(bus_settings, database, mode), source.in_force.why_not
+        write_output(text if why_not is None else f"{text}\nwould correct nothing: {why_not}")
         return 0
     routes = None
     if is_gateway and options.interface == "socketcan":
@@ -196,7 +194,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         )
         buses = [closed_at_end.enter_context(closing(bus)) for bus in opened]
         stop = stopped_by(signal.SIGTERM, signal.SIGINT)
-        for text in _notes(options, source):
+        for text in _notes(options, source.in_force.why_not):
             say(text)
 
         def correcting() -> str:
@@ -310,12 +308,12 @@ def _names(messages: Mapping[FrameKey, Message]) -> str:
     return ", ".join(f"{message.name} (0x{key.identifier:X})" for key, message in messages.items()) or "nothing"
 
 
-def _notes(options: argparse.Namespace, source: ParameterSource) -> Iterator[str]:
+def _notes(options: argparse.Namespace, why_not: str | None) -> Iterator[str]:
     """What to know of the parameters and the buses at the start."""
     if options.params is not None:
         yield "parameters are used that nobody signed (--unsigned)"
-    if source.why_not is not None:
-        yield f"passing measured values through: {source.why_not}"
+    if why_not is not None:
+        yield f"passing measured values through: {why_not}"
     elif options.params is not None and options.vehicle is None:
         yield "the vehicle is not checked: give --vehicle or $ECU_NODE_VEHICLE"
     names = [options.channel, options.gateway] if options.gateway is not None and not options.fd else []
@@ -352,16 +350,16 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
     """
     mode = Mode.GATEWAY if is_gateway else Mode.OVERLAY
     database = node_database(layout)
-    in_force, why_not = choose_parameters(params, database, vehicle)
+    in_force = choose_parameters(params, database, vehicle)
     wire(database, in_force, start_s=0.0, mode=mode)
     warnings = list(unpublished(database, in_force, mode).values())
     if names := needs_fd(database, mode):
         warnings.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
     parameters = in_force.parameters
     return {
-        "fit": why_not is None,
+        "fit": in_force.why_not is None,
         "reason": in_force.reason.name,
-        "message": why_not,
+        "message": in_force.why_not,
         "vehicle": parameters.vehicle if parameters is not None else None,
         "parameter_set": parameters.number if parameters is not None else None,
         "warnings": warnings,

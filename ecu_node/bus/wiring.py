@@ -8,7 +8,7 @@ the other bus, and in its own name the status alone.
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple, Unpack
@@ -220,13 +220,15 @@ class InForce:
 
     parameters: VehicleParameters | None
     reason: Reason = Reason.NONE
+    why_not: str | None = field(default=None, compare=False)
+    """The reason in words, one line; None where there are parameters."""
 
     def fault(self, branch: str) -> SensorFault:
         """What is corrected on one branch; NO_FAULT where the parameters apply none."""
         return self.parameters.fault(branch) if self.parameters is not None else NO_FAULT
 
 
-def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None) -> tuple[InForce, str | None]:
+def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None) -> InForce:
     """Read parameters, and decide whether they may be applied here.
 
     Parameters
@@ -242,8 +244,6 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
     -------
     InForce
         The parameters, or the reason why measured values are passed through.
-    str or None
-        That reason in words, one line; None if the parameters fit.
     """
     where = ""  # which errors of reading name themselves
     try:
@@ -251,8 +251,8 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
         where = f"{path}: "
         check_fit(parameters, database, vehicle)
     except UnfitError as error:
-        return InForce(parameters=None, reason=error.reason), f"{where}{error}"
-    return InForce(parameters=parameters), None
+        return InForce(parameters=None, reason=error.reason, why_not=f"{where}{error}")
+    return InForce(parameters=parameters)
 
 
 def unpublished(database: VehicleDatabase, in_force: InForce, mode: Mode) -> dict[str, str]:

@@ -142,10 +142,10 @@ class ParameterStore:
         try:
             self._state = read_state(folder)
         except TrustError as error:
-            self.in_force, self.why_not = InForce(parameters=None, reason=error.reason), str(error) or None
+            self.in_force = InForce(parameters=None, reason=error.reason, why_not=str(error))
             self._unread = str(error)
         else:
-            self.in_force, self.why_not = self._in_force(self._state)
+            self.in_force = self._in_force(self._state)
 
     def look(self, corrector: Corrector, now_s: float) -> bool:
         """See whether a trial has ended, the state was changed, or time has passed; to be called now and then.
@@ -172,16 +172,16 @@ class ParameterStore:
         if self._state is None:
             return False
         self._end_expired(self._state, now_s)
-        in_force, why_not = self._in_force(self._state)
+        in_force = self._in_force(self._state)
         if in_force == self.in_force:
             return False
         put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
         corrector.counters.reloads += 1
-        self.in_force, self.why_not = in_force, why_not
+        self.in_force = in_force
         if in_force.parameters is not None:
             self._say(f"{self._state.in_force} of vehicle {self._state.vehicle} is in force")
         else:
-            self._say(f"passing measured values through: {why_not}")
+            self._say(f"passing measured values through: {in_force.why_not}")
         return True
 
     def _read_again(self) -> None:
@@ -197,14 +197,14 @@ class ParameterStore:
                 self._say(f"the state of the vehicle is not read, what was in force stays: {error}")
             self._unread = str(error)
 
-    def _in_force(self, state: VehicleState) -> tuple[InForce, str | None]:
-        """What the state says, and why there are no parameters."""
+    def _in_force(self, state: VehicleState) -> InForce:
+        """What the state says."""
         try:
             if state.in_force is None:
                 raise _why_nothing(state)
-            return InForce(parameters=self._usable(state, state.in_force)), None
+            return InForce(parameters=self._usable(state, state.in_force))
         except UnfitError as error:
-            return InForce(parameters=None, reason=error.reason), f"{self._folder}: {error}"
+            return InForce(parameters=None, reason=error.reason, why_not=f"{self._folder}: {error}")
 
     def _usable(self, state: VehicleState, found: ParameterSet) -> VehicleParameters:
         """Parameters of a set that has not expired and fits; decoded once, as the bus waits meanwhile."""

@@ -93,7 +93,7 @@ def test_a_file_that_comes_later_is_put_in_force(
     path.write_bytes(content.replace(old, new, 1))
     running = Running(path, database)
     assert (running.drift, running.corrector.reason) == (0.0, reason)
-    assert (running.file.why_not or "").startswith(f"{path}: {words}")
+    assert (running.file.in_force.why_not or "").startswith(f"{path}: {words}")
     path.write_bytes(content)
     assert running.file.look(running.corrector, 2.0)
     assert (running.corrector.reason, running.drift) == (Reason.NONE, 0.25)

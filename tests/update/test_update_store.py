@@ -110,7 +110,7 @@ def test_state_of_another_vehicle_is_not_used(correcting: Path, database: Vehicl
         correcting, database, mode=Mode.OVERLAY, say=print, now=lambda: NOW, vehicle="v2", background=AT_ONCE
     )
     assert store.in_force.reason is Reason.WRONG_VEHICLE
-    assert store.why_not is not None
+    assert store.in_force.why_not is not None
 
 
 def test_end_of_a_trial_that_cannot_be_written_now_is_written_later(correcting: Path, ended: Running) -> None:
