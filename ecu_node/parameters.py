@@ -220,7 +220,7 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
     try:
         document = read_json(content)
     except (msgspec.DecodeError, ValueError) as error:
-        raise _malformed(where, str(error)) from None
+        raise _malformed(where, str(error).partition(" - at `")[0]) from None  # its path names no key
     try:
         return msgspec.json.decode(content, type=VehicleParameters)
     except msgspec.ValidationError as error:

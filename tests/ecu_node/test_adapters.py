@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -199,9 +199,11 @@ def test_listen_only_says_whether_the_adapter_acknowledges(
 
 
 @contextmanager
-def running(*options: str) -> Iterator[list[str]]:
-    """A node in a process of its own, at work; the lines of its log, all of them after the block."""
-    command = [sys.executable, "-m", "ecu_node", *options]
+def running(
+    *options: str, program: Sequence[str] = ("-m", "ecu_node"), until: str = "running on"
+) -> Iterator[list[str]]:
+    """A node in a process of its own, from when it says so; the lines of its log, all of them after the block."""
+    command = [sys.executable, *program, *options]
     environment = {**os.environ, "CAN_CONFIG": os.environ.get("CAN_CONFIG", '{"sleep_after_open": 0}')}
     log: list[str] = []
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
@@ -209,7 +211,7 @@ def running(*options: str) -> Iterator[list[str]]:
         try:
             for line in process.stderr:
                 log.append(line)
-                if "running on" in line:
+                if until in line:
                     break
             yield log
         finally:

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import runpy
-import signal
 import socket
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from ecu_node.bus.wiring import Mode
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters, Latency
 from ecu_node.database import VehicleDatabase
+from tests.ecu_node.test_adapters import running
 from tests.ecu_node.test_node import wait_until
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, MakeDatabase, answers, corrector_for
 
@@ -199,15 +199,9 @@ def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: 
     code = f"import sys; from ecu_node.cli import run_ecu_node; {broken}; sys.exit(run_ecu_node(sys.argv[1:]))"
     options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]
     bus = ["--interface", "virtual", "--channel", "records", "--telemetry", str(tmp_path / "node.jsonl")]
-    command = [sys.executable, "-c", code, "run", *options, *bus]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        said = next(line for line in iter(process.stderr.readline, "") if "internal error" in line)
-        is_alive = process.poll() is None
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=60) == 0
-    assert is_alive
-    assert "internal error in Telemetry, which is off now; please report it: ZeroDivisionError" in said
+    fault = "internal error in Telemetry, which is off now; please report it: ZeroDivisionError"
+    with running("run", *options, *bus, program=("-c", code), until=fault) as log:
+        assert fault in log[-1]
 
 
 def test_missing_real_time_permissions_are_reported_not_fatal() -> None:
