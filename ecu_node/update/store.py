@@ -253,10 +253,8 @@ class ParameterStore:
 
     def _write(self, work: Callable[[], VehicleState], now_s: float) -> None:
         """Write a decision in the background, unless one is being written or could not be a moment ago."""
-        if self._writing is not None or now_s < self._retry_due_s:
-            return
-        self._writing = self._background.submit(work)
-        self._finish_writing(now_s)
+        if self._writing is None and now_s >= self._retry_due_s:
+            self._writing = self._background.submit(work)
 
     def _finish_writing(self, now_s: float) -> None:
         """Take a decision over once it is written; try again later if that failed, as nothing changes meanwhile."""
