@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple, Unpack
 
 import can
-from can.typechecking import CanFilter
 from cantools.database.can import Message
 
 from ecu_node.bus.adapters import Settings, connect, filters_of
@@ -469,7 +468,8 @@ def open_bus(
         If there is no such bus, or the DBC needs CAN FD and ``fd`` is not given.
     """
     require_fd(database, mode, fd=settings.get("fd", False))
-    filters = receive_filters(database, mode, own=own) if mode is Mode.OVERLAY or routed else None
+    keys = received(database).keys() | (transmitted(database, mode).keys() if own else set())
+    filters = filters_of(keys) if mode is Mode.OVERLAY or routed else None
     return connect(interface, channel, filters=filters, **settings)
 
 
@@ -477,8 +477,3 @@ def require_fd(database: VehicleDatabase, mode: Mode, *, fd: bool) -> None:
     """Raise BusError if the DBC needs CAN FD and ``fd`` is not given."""
     if not fd and (names := needs_fd(database, mode)):
         raise BusError(f"{database.layout.dbc_path}: CAN FD messages ({', '.join(names)}); start with --fd")
-
-
-def receive_filters(database: VehicleDatabase, mode: Mode, *, own: bool = True) -> list[CanFilter]:
-    """Filters for the kernel to apply: what the node needs of the vehicle, and its own messages as sent by others."""
-    return filters_of((*received(database), *(transmitted(database, mode) if own else ())))

@@ -231,15 +231,6 @@ def test_lost_frames_are_no_errors_and_a_few_errors_at_first_say_nothing(
     assert found == [E2EState.INIT] * 3 + [E2EState.VALID, E2EState.INVALID] + [E2EState.VALID] * 5
 
 
-def test_after_a_silence_a_single_frame_with_any_counter_is_not_enough(protection: Protection) -> None:
-    receiver, frames = Receiver(protection), stream(protection, 12)
-    for frame in frames:
-        receiver.check(frame)
-    receiver.restart()
-    found = [(receiver.check(frame), receiver.state) for frame in frames[5:8]]
-    assert found == [(Check.OK, state) for state in (E2EState.INVALID, E2EState.INVALID, E2EState.VALID)]
-
-
 def test_repeated_frames_are_no_intact_ones(kind: str, protect: Callable[..., Protection]) -> None:
     protection = protect(ENTRIES[kind] + "\nvalid = { window = 5, min_ok = 1, max_error = 2 }")
     receiver, (frame,) = Receiver(protection), stream(protection, 1)

@@ -15,7 +15,7 @@ from can.interfaces.virtual import VirtualBus
 
 from ecu_node.bus.node import Node
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.wiring import Mode, open_bus, receive_filters
+from ecu_node.bus.wiring import Mode, open_bus
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
@@ -360,7 +360,8 @@ def test_nothing_leaks(database: VehicleDatabase, peer: can.BusABC, channel: str
 
 
 def test_the_kernel_is_asked_for_branches_voltages_and_own_frames_only(make_database: MakeDatabase) -> None:
-    filters = receive_filters(make_database(), Mode.OVERLAY)
+    with overlay_bus(make_database(), "filters") as bus:
+        filters = bus.filters or []
     assert {(item["can_id"], item["can_mask"], item["extended"]) for item in filters} == {
         (256, 0x7FF, False),
         (512, 0x1FFFFFFF, True),

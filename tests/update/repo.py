@@ -30,6 +30,14 @@ def pass_trial(state: Path, *, passed: bool = True) -> None:
     conclude(state, on_trial, passed=passed, text="seen", now=datetime.now(UTC))
 
 
+def one_line(found: tuple[int, str, str], *words: object) -> None:
+    """Require that a command failed in one line with these words."""
+    code, out, err = found
+    assert (code, out, err.count("\n"), err[:-1].isprintable()) == (1, "", 1, True), (out, err)
+    assert err.startswith("ecu-node: ")
+    assert [word for word in words if str(word) not in err] == [], err
+
+
 class Repo:
     """A repository in ``folder / "repo"``, its keys in ``folder / "keys"``; the commands make it."""
 
@@ -68,6 +76,10 @@ class Repo:
         self.add(parameters, *options, vehicle=vehicle)
         self.publish()
 
+    def revoke(self, *options: object) -> None:
+        self.done("revoke", self.path, VEHICLE, *options)
+        self.publish()
+
     def bundle(self, vehicle: str = VEHICLE) -> Path:
         self.done("bundle", self.path, vehicle, "--out", self.folder / "bundles")
         return self.folder / "bundles" / f"{vehicle}.json.xz"
@@ -90,12 +102,7 @@ class Repo:
     def refused(self, state: Path, words: str, source: object = None) -> None:
         """Require that an update is refused in one line, and that nothing has changed."""
         before = (state / "state.json").read_bytes()
-        code, out, err = self.update(state, source)
-        assert (code, out) == (1, ""), (out, err)
-        assert err.startswith("ecu-node: ")
-        assert err.count("\n") == 1
-        assert err[:-1].isprintable()
-        assert words in err, err
+        one_line(self.update(state, source), words)
         assert (state / "state.json").read_bytes() == before
         assert words in (state / "decisions.log").read_text().splitlines()[-1]
 

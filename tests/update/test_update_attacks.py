@@ -60,8 +60,7 @@ def test_metadata_of_foreign_keys_is_refused(role: str, repo: Repo, state: Path,
 def test_rollback_is_refused(repo: Repo, state: Path) -> None:
     """Else a revocation could be held back by an old bundle."""
     old = repo.bundle().read_bytes()
-    repo.done("revoke", repo.path, "v1")
-    repo.publish()
+    repo.revoke()
     assert "nothing is in force now" in repo.updated(state, repo.bundle())
     repo.bundle().write_bytes(old)
     repo.refused(state, "older than what was accepted before", repo.folder / "bundles" / "v1.json.xz")

@@ -38,8 +38,7 @@ def command(
 ) -> Callable[[Path], list[str]]:
     """A command that changes the state of a vehicle: an update, a revocation, the end of a trial."""
     if request.param == "revoke":
-        repo.done("revoke", repo.path, "v1")
-        repo.publish()
+        repo.revoke()
     else:
         repo.offer(other)
     if request.param == "conclude":

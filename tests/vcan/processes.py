@@ -42,8 +42,8 @@ def bring_up(channel: str) -> None:
 
 def frames_of(log: Path) -> list[LoggedFrame]:
     """Frames of a candump log in their order."""
-    lines = [line.split() for line in log.read_text().splitlines()]
-    return [LoggedFrame(*line[2].split("#", 1)) for line in lines]
+    whole_lines = log.read_text().rpartition("\n")[0].splitlines()  # of one that is being written
+    return [LoggedFrame(*line.split()[2].split("#", 1)) for line in whole_lines]
 
 
 def wait_until(done: Callable[[], bool], what: str) -> None:
@@ -104,8 +104,7 @@ class Recording:
     @property
     def frames(self) -> list[LoggedFrame]:
         """Frames recorded so far."""
-        whole_lines = self.log.read_text().rpartition("\n")[0].splitlines()
-        return [LoggedFrame(*line.split()[2].split("#", 1)) for line in whole_lines]
+        return frames_of(self.log)
 
     def data_of(self, identifier: int) -> list[bytes]:
         """Data of the frames of one identifier (11 bits) so far."""

@@ -11,7 +11,7 @@ from e2e.p01 import e2e_p01_check
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
 from tests.vcan.conftest import StartNode
-from tests.vcan.processes import Recording, frames_of, play, send
+from tests.vcan.processes import Recording, frames_of, play
 from tests.vcan.small_drive import BRANCHES, VEHICLE, protected, write_drive
 
 INSTANTS = 250
@@ -95,20 +95,6 @@ def test_with_unfit_parameters_the_measured_values_pass_through(
     assert state_and_reason(database, status) == (State.PASSING_THROUGH, Reason.WRONG_VEHICLE)
     why = f"{params}: parameters are for vehicle 'v0007', this is 'v9999'"
     assert f"passing measured values through: {why}" in node.messages
-
-
-def test_frames_of_the_node_that_another_one_sends_end_it(
-    database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
-) -> None:
-    own = expected_frame(database, "battery", 0, 1000, Quality.CORRECTED)
-    with start_node(params) as node:
-        recording.wait_for(STATUS, 1)
-        send(f"510#{own.hex()}")
-        assert node.wait_for_end() == 1
-    assert recording.data_of(0x510) == [own], "it is not corrected once more"
-    assert "vcan0: another node sends frames 0x510, which only this one may send there" in node.messages.replace(
-        "'", ""
-    )
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
