@@ -103,7 +103,7 @@ def test_endless_data_is_refused(repo: Repo, new: Path) -> None:
     bomb = repo.folder / "bomb.json.xz"
     bomb.write_bytes(lzma.compress(b'{"a": "' + bytes(9_000_000) + b'"}', check=lzma.CHECK_SHA256))
     assert bomb.stat().st_size < 20_000
-    repo.refused(new, "not a whole bundle", bomb)
+    repo.refused(new, "not a whole bundle: something is missing, or too much is there", bomb)
     os.truncate(bomb, 1 << 30)
     repo.refused(new, "larger than", bomb)
 

@@ -89,9 +89,12 @@ class Drive:
         return self.corrector.state()
 
 
-def right(database: VehicleDatabase, drift: float = DRIFT, offset_a: float = OFFSET_A) -> VehicleParameters:
+def right(
+    database: VehicleDatabase, drift: float = DRIFT, offset_a: float = OFFSET_A, *, left_a: float = 0.5
+) -> VehicleParameters:
     found = parameters_for(database, battery=(drift, offset_a), motor=(0.0, 0.0))
-    return replace(found, junction_residual=JunctionResidual(measured_a=4.0, corrected_a=0.5, correction_a=4.0))
+    residual = JunctionResidual(measured_a=math.hypot(left_a, 4.0), corrected_a=left_a, correction_a=4.0)
+    return replace(found, junction_residual=residual)
 
 
 PASSED, FAILED = "has passed its trial", "has failed its trial"
@@ -122,10 +125,12 @@ def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, dat
 @pytest.mark.parametrize(
     ("drift", "offset_a"), [(-DRIFT, -OFFSET_A), (0.0, -OFFSET_A), (3.0 * DRIFT, OFFSET_A), (DRIFT, 10.0)]
 )
+@pytest.mark.parametrize("left_a", [0.5, 20.0], ids=["little", "much"])
 def test_wrong_set_never_comes_in_force(
-    vehicle: Path, database: VehicleDatabase, drift: float, offset_a: float
+    vehicle: Path, database: VehicleDatabase, drift: float, offset_a: float, left_a: float
 ) -> None:
-    drive = tried(vehicle, right(database, drift, offset_a), database)
+    """Also where the calibrator saw that much is left of the sum."""
+    drive = tried(vehicle, right(database, drift, offset_a, left_a=left_a), database)
     assert drive.told == (State.PASSING_THROUGH, Reason.NO_PARAMETERS)
     assert (read_state(vehicle).in_force, read_state(vehicle).on_trial) == (None, None)
     assert drive.has_said(FAILED)
