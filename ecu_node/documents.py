@@ -68,11 +68,7 @@ def _require_regular(found: os.stat_result) -> None:
         raise UnsuitableFileError(errno.EINVAL, f"it is {kind}; a file is expected")
 
 
-FileSignature = tuple[int, int, int, int]
-"""Times of change, size and number of a file."""
-
-
-def signature(path: Path) -> FileSignature | None:
+def signature(path: Path) -> tuple[int, int, int, int] | None:
     """Times of change, size and number of a file, which tell whether it was changed; None if there is none."""
     try:
         found = path.stat()

@@ -264,6 +264,11 @@ class _WithHeader(_Protected, frozen=True, kw_only=True):
     """First byte of the header."""
 
 
+class _WithLongDataId(_WithHeader, frozen=True, kw_only=True):
+    data_id: dict[str, _LongDataId] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+
+
 class ProfileP01(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P01"):
     """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
 
@@ -280,11 +285,8 @@ class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag
     """Data identifiers per message."""
 
 
-class ProfileP04(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P04"):
+class ProfileP04(_WithLongDataId, frozen=True, kw_only=True, tag_field="profile", tag="P04"):
     """AUTOSAR E2E profile 4: length, a counter of 16 bits, the data identifier and CRC-32."""
-
-    data_id: dict[str, _LongDataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
 
 
 class ProfileP05(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P05"):
@@ -295,11 +297,8 @@ class ProfileP06(_WithHeader, frozen=True, kw_only=True, tag_field="profile", ta
     """AUTOSAR E2E profile 6: CRC-16, length and a counter of 8 bits."""
 
 
-class ProfileP07(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P07"):
+class ProfileP07(_WithLongDataId, frozen=True, kw_only=True, tag_field="profile", tag="P07"):
     """AUTOSAR E2E profile 7: CRC-64, length, a counter of 32 bits and the data identifier."""
-
-    data_id: dict[str, _LongDataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
 
 
 class ProfileP11(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P11"):
@@ -372,6 +371,11 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
     def dbc_files(self) -> dict[str, str]:
         """DBC files as written, by bus; ``""`` where the layout names none."""
         return {bus.name: bus.dbc for bus in self.bus} or ({} if self.dbc is None else {"": self.dbc})
+
+    @property
+    def watch_signal(self) -> SignalName | None:
+        """The signal of the watch's input."""
+        return next((item.signal for item in self.input if item.name == self.watch.input), None)
 
     @property
     def branch_names(self) -> tuple[str, ...]:

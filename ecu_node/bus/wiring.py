@@ -78,7 +78,7 @@ def received(database: VehicleDatabase) -> dict[FrameKey, Message]:
     """Messages that carry the branches and what else the node needs of the vehicle, by identifier."""
     layout = database.layout
     names = [name for branch in layout.branch for name in (branch.source, branch.voltage)]
-    return _by_key(database, [*names, *(item.signal for item in layout.input if item.name == layout.watch.input)])
+    return _by_key(database, [*names, layout.watch_signal])
 
 
 def rewritten(database: VehicleDatabase) -> dict[FrameKey, Message]:
@@ -363,7 +363,7 @@ def wire(
         margin_a=layout.watch_margin_a,
         full_scale_a=layout.full_scale_a,
     )
-    for name in (item.signal for item in layout.input if item.name == layout.watch.input):
+    if (name := layout.watch_signal) is not None:
         codes = signal_codes(database, name, None, "[watch] input")
         state = HeardSignal(replace(codes, named={}), layout.max_age_s)  # a state's names are no lack of a value
         valid = (exact_code(database.signal(name)[1], value) for value in layout.watch.valid)

@@ -423,7 +423,7 @@ class JunctionSums(NamedTuple):
     corrected_a: float
 
 
-Verdict = tuple[Reason, tuple[str, ...]]
+_Verdict = tuple[Reason, tuple[str, ...]]
 """Why parameters must not be used any more, and the branches that explain it best, the best one first."""
 
 
@@ -535,9 +535,9 @@ class JunctionWatch:
     def forget(self) -> None:
         """Begin new windows."""
         self._window, self._recent = _Window(self._window_s), _Window(_PLAUSIBILITY_WINDOW_S)
-        self._jump: tuple[float, int, Verdict] | None = None
+        self._jump: tuple[float, int, _Verdict] | None = None
         """Instant at which a jump began [s], instants since, and what it looked like then."""
-        self.verdict: Verdict | None = None
+        self.verdict: _Verdict | None = None
 
     def look(self, now_s: float) -> None:
         """Take the sums of now [s], and judge them."""
@@ -573,7 +573,7 @@ class JunctionWatch:
         throughput_a = 0.5 * sum(abs(corrected) for _, corrected in self.currents_a.values())
         return math.hypot(self._sd_a, self._sd_per_a * throughput_a)
 
-    def _judge(self) -> Verdict | None:
+    def _judge(self) -> _Verdict | None:
         if (jump := self._jumped()) is not None:
             return jump
         if recent := self._recent.means(0.5):
@@ -588,7 +588,7 @@ class JunctionWatch:
         is_worse = math.sqrt(max(corrected2, 0.0)) > math.sqrt(max(measured2, 0.0)) + self._allowed_a
         return (Reason.CORRECTION_WORSE, ()) if is_worse else None
 
-    def _jumped(self) -> Verdict | None:
+    def _jumped(self) -> _Verdict | None:
         """What a jump looked like when it began; None unless there is one, and it has lasted."""
         instant_s, residual_a = self.instant_s, self._recent.moments[-1].corrected_a
         moved = {name: self._branches[name].movement(instant_s, _MOVING_S, _MOVING_FRAMES) for name in self.currents_a}
@@ -623,7 +623,7 @@ class JunctionWatch:
                 return ()
         return self._frozen(still)
 
-    def _explaining(self) -> Verdict:
+    def _explaining(self) -> _Verdict:
         """Which gain error explains the sums since they went wrong best; all branches, if an offset explains them."""
         moments = list(self._recent.moments)
         good = (number for number, moment in enumerate(moments) if abs(moment.deviations) < 1.0)
