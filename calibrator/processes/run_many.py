@@ -8,6 +8,7 @@ Every worker process has a pool of one of its own (pebble): processes that share
 do, can take each other along when one is killed.
 """
 
+import gc
 import logging
 import math
 import multiprocessing
@@ -420,12 +421,14 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
                         futures.extend(client.map(partial(_on_worker, job), unsent, pure=False))
                     try:
                         error = futures[0].exception(timeout=CONNECT_S)  # waits for it
+                        # many at a time, as each request to the scheduler costs milliseconds; others keep workers busy
+                        done = list(takewhile(lambda future: future.status == "finished", islice(futures, workers)))
+                        # those whose worker ends meanwhile would be waited for until there is another one
+                        fetch = partial(client.gather, done, asynchronous=True)
+                        outcomes = client.sync(fetch, callback_timeout=RETURN_S)
                     except TimeoutError:
                         _wait_for_worker(client, address)
                         continue
-                    # many at a time, as each request to the scheduler costs milliseconds; the others keep workers busy
-                    done = list(takewhile(lambda future: future.status == "finished", islice(futures, workers)))
-                    outcomes = client.gather(done)
                     if error is None and not done:
                         raise CancelledError  # it was lost
                 except (CancelledError, OSError):
@@ -523,5 +526,6 @@ def _silenced() -> Iterator[None]:
     try:
         yield
     finally:
+        gc.collect()  # of what is unfinished, asyncio tells only now
         for logger, level in levels.items():
             logger.setLevel(level)

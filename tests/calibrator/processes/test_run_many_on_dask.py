@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from functools import partial
@@ -30,42 +31,45 @@ LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 PLAN = FleetPlan(vehicles=6, currents=2, sparsity=80.0, magnitude=(0.05, 0.25))
 
 
-def test_lost_workers_and_hostile_items_cost_themselves_only(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "endless")
-    with DaskCluster(tmp_path) as cluster:
-        where = Workers(scheduler=cluster.address)
-        read = partial(hostile, endless=tmp_path / "endless")
-        first, *failed, last = (outcome for _, outcome in try_many(read, range(8), where, limit_s=LIMIT_S))
-        assert (first, last) == (0, 7)
-        for outcome, cause in zip(failed, CAUSES, strict=True):
-            assert isinstance(outcome, Failed)
-            assert outcome.reason.startswith(cause.partition(" by ")[0])  # a worker's process may not know the signal
+@pytest.fixture(scope="module")
+def where(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
+    """A cluster whose workers no test ends."""
+    with DaskCluster(tmp_path_factory.mktemp("cluster")) as cluster:
+        yield Workers(scheduler=cluster.address)
         assert all(worker.poll() is None for worker in cluster.workers)
-        assert list(run_many(partial(dying_once, folder=tmp_path), range(9), where)) == list(range(9))
-        assert sorted(worker.poll() is None for worker in cluster.workers) == [False, True]  # it killed one
+
+
+def test_hostile_items_cost_themselves_only(tmp_path: Path, where: Workers) -> None:
+    os.mkfifo(tmp_path / "endless")
+    read = partial(hostile, endless=tmp_path / "endless")
+    first, *failed, last = (outcome for _, outcome in try_many(read, range(8), where, limit_s=LIMIT_S))
+    assert (first, last) == (0, 7)
+    for outcome, cause in zip(failed, CAUSES, strict=True):
+        assert isinstance(outcome, Failed)
+        assert outcome.reason.startswith(cause.partition(" by ")[0])  # a worker's process may not know the signal
 
 
 def test_errors_of_function_and_items_are_not_taken_for_a_lost_scheduler(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    where: Workers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def items() -> Iterator[int]:
         yield from range(2, 60)
         raise OSError("no more")
 
-    with DaskCluster(tmp_path) as cluster:
-        where = Workers(scheduler=cluster.address)
-        results = run_many(of_no_disk, range(3), where)
-        assert next(results) == 0
-        with pytest.raises(OSError, match="no disk"):
-            next(results)
-        with pytest.raises(OSError, match="no more"):
-            list(run_many(of_no_disk, items(), where))
-        monkeypatch.setattr(module, "__version__", "0")
-        with pytest.raises(FleetError, match=r"a worker of the cluster has version .*; install version 0 there"):
-            list(run_many(abs, range(3), where))
+    results = run_many(of_no_disk, range(3), where)
+    assert next(results) == 0
+    with pytest.raises(OSError, match="no disk"):
+        next(results)
+    with pytest.raises(OSError, match="no more"):
+        list(run_many(of_no_disk, items(), where))
+    monkeypatch.setattr(module, "__version__", "0")
+    with pytest.raises(FleetError, match=r"a worker of the cluster has version .*; install version 0 there"):
+        list(run_many(abs, range(3), where))
 
 
-def test_scheduler_that_starts_only_now_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scheduler_that_starts_only_now_is_waited_for_and_a_lost_worker_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As one that is started again after it was lost."""
     monkeypatch.setattr(module, "CONNECT_S", 60.0)
     with DaskCluster(tmp_path, at_once=False) as cluster:
@@ -73,9 +77,13 @@ def test_scheduler_that_starts_only_now_is_waited_for(tmp_path: Path, monkeypatc
         start.start()
         assert list(run_many(abs, range(3), Workers(scheduler=cluster.address))) == [0, 1, 2]
         start.join()
+        once = partial(dying_once, folder=tmp_path)
+        assert list(run_many(once, range(9), Workers(scheduler=cluster.address))) == list(range(9))
+        assert sorted(worker.poll() is None for worker in cluster.workers) == [False, True]  # it killed one
 
 
 def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CONNECT_S", 2.0)
     with DaskCluster(tmp_path) as cluster:
         results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
         assert [next(results), next(results)] == [0, 1]
@@ -94,20 +102,32 @@ def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypat
             list(results)
 
 
+@pytest.mark.parametrize("is_fetching", [False, True])
 def test_run_whose_workers_all_end_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], is_fetching: bool
 ) -> None:
-    """As workers do that lack this package: what they are sent ends them."""
-    monkeypatch.setattr(module, "CONNECT_S", 3.0)
-    monkeypatch.setattr(module, "RETURN_S", 3.0)
+    """As workers do that lack this package; Dask alone waits for ever for results that ended with their worker."""
+    monkeypatch.setattr(module, "CONNECT_S", 2.0)
+    monkeypatch.setattr(module, "RETURN_S", 2.0)
     with DaskCluster(tmp_path) as cluster:
-        results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
-        assert next(results) == 0
-        for worker in cluster.workers:
-            worker.kill()
+
+        def end_workers() -> None:
+            for worker in cluster.workers:
+                worker.kill()
+
+        results = run_many(partial(gated, folder=tmp_path), range(1, 20), Workers(scheduler=cluster.address))
+        assert next(results) == 1
+        if is_fetching:
+            (tmp_path / "go").touch()
+            time.sleep(0.5)  # some are ready now, on workers that do not answer any more
+            for worker in cluster.workers:
+                worker.send_signal(signal.SIGSTOP)
+        end = Timer(0.5, end_workers)
+        end.start()
         with pytest.raises(FleetError, match=r"no worker; start .* with this package .*, and run the same command"):
             list(results)
-    assert "the scheduler has no worker now; waiting 3 s for one" in capsys.readouterr().err
+        end.join()
+    assert "the scheduler has no worker now; waiting 2 s for one" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("greeting", "reason"), [(b"", "timed out"), (b"SSH-2.0-OpenSSH", "another kind of server")])
