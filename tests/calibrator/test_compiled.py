@@ -1,5 +1,6 @@
 """Compiled code is kept in a folder that real processes share, change, break, and find closed."""
 
+import ast
 import os
 import shutil
 import subprocess
@@ -14,24 +15,21 @@ import calibrator
 from calibrator.compiled import SOURCES, compiled
 from calibrator.drive import Array
 
+ROOT = Path(calibrator.__file__).parents[1]
 LINE = "compiling the estimator"
 SCRIPT = textwrap.dedent("""
     import numpy as np
-    from calibrator.compiled import compiled_with_notice, inlined, inner
+    from calibrator.compiled import compiled_with_notice, inner
 
     @inner
     def square(x):
         return x * x
 
-    @inlined
-    def plus_one(x):
-        return x + 1.0
-
     @compiled_with_notice
     def sum_of_squares(values, out):
         out[0] = 0.0
         for value in values:
-            out[0] += plus_one(square(value)) - 1.0
+            out[0] += square(value)
 
     out = np.zeros(1)
     sum_of_squares(np.array([1.0, 2.0, 3.0]), out)
@@ -39,14 +37,18 @@ SCRIPT = textwrap.dedent("""
 """)
 
 
-def installed(folder: Path) -> Path:
-    """A copy of what is compiled, which a test may change; and a script that compiles a function of its own."""
-    source = Path(calibrator.__file__).parent
-    for name in ("__init__.py", "compiled.py", "score.py", "estimator/prior.py"):
-        (folder / "calibrator" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(source / name, folder / "calibrator" / name)
-    (folder / "script.py").write_text(SCRIPT, encoding="utf-8")
-    return folder
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of the product, which a test may change; and a script that compiles a function of its own."""
+    for package in ("calibrator", "ecu_node"):
+        shutil.copytree(ROOT / package, tmp_path / "installed" / package)
+    (tmp_path / "installed" / "script.py").write_text(SCRIPT, encoding="utf-8")
+    return tmp_path / "installed"
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "cache"
 
 
 def started(folder: Path, cache: Path | str, **environment: str) -> subprocess.Popen[str]:
@@ -68,20 +70,17 @@ def said(process: subprocess.Popen[str]) -> str:
     return error
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return installed(tmp_path / "installed")
-
-
-@pytest.fixture
-def cache(tmp_path: Path) -> Path:
-    return tmp_path / "cache"
-
-
-def test_code_is_compiled_once_and_the_user_is_told(folder: Path, cache: Path) -> None:
+def test_code_is_compiled_once_with_one_line_and_old_code_goes(folder: Path, cache: Path) -> None:
+    for age in range(6):
+        old = cache / f"compiled-{age:016d}"
+        old.mkdir(parents=True)
+        os.utime(old, (1e9 - age, 1e9 - age))
+    (cache / "mine").mkdir()
     first = said(started(folder, cache))
-    assert first.count(LINE) == 1
-    assert first.count("\n") == 1
+    assert (first.count(LINE), first.count("\n")) == (1, 1)
+    kept = sorted(path.name for path in cache.iterdir())
+    assert kept[:3] == [f"compiled-{age:016d}" for age in range(3)]
+    assert (len(kept), kept[-1]) == (5, "mine")
     assert said(started(folder, cache)) == ""
 
 
@@ -92,29 +91,34 @@ def test_of_two_processes_at_once_one_compiles(folder: Path, cache: Path) -> Non
 
 
 @pytest.mark.long
-def test_a_changed_source_is_compiled_anew(folder: Path, cache: Path) -> None:
+@pytest.mark.parametrize(
+    "changed",
+    [{}, {"NUMBA_CPU_NAME": "generic"}, {"NUMBA_CPU_FEATURES": "+sse2"}],
+    ids=["source", "processor", "its features"],
+)
+def test_another_source_or_processor_has_code_of_its_own(folder: Path, cache: Path, changed: dict[str, str]) -> None:
     said(started(folder, cache))
-    with (folder / "calibrator" / "estimator" / "prior.py").open("a", encoding="utf-8") as source:
-        source.write("# changed\n")
-    assert LINE in said(started(folder, cache))
+    if not changed:
+        with (folder / "calibrator" / "estimator" / "prior.py").open("a", encoding="utf-8") as source:
+            source.write("# changed\n")
+    assert LINE in said(started(folder, cache, **changed))
     assert len(list(cache.glob("compiled-*"))) == 2
 
 
-def test_every_file_with_compiled_functions_is_among_those_whose_change_is_noticed() -> None:
-    package = Path(calibrator.__file__).parent
-    found = {pattern: set(package.glob(pattern)) for pattern in SOURCES}
-    assert [pattern for pattern, paths in found.items() if not paths] == []
-    users = {path for path in package.rglob("*.py") if "from calibrator.compiled import" in path.read_text("utf-8")}
-    assert len(users) > 5
-    assert users - set().union(*found.values()) == set()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("variable", "other"), [("NUMBA_CPU_NAME", "generic"), ("NUMBA_CPU_FEATURES", "+sse2")])
-def test_another_processor_has_code_of_its_own(folder: Path, cache: Path, variable: str, other: str) -> None:
-    said(started(folder, cache))
-    assert LINE in said(started(folder, cache, **{variable: other}))
-    assert len(list(cache.glob("compiled-*"))) == 2
+def test_every_file_with_compiled_functions_or_their_constants_is_among_those_whose_change_is_noticed() -> None:
+    needed = set[str]()
+    for path in (ROOT / "calibrator").rglob("*.py"):
+        tree = ast.parse(path.read_text("utf-8"))
+        imports = [item for item in tree.body if isinstance(item, ast.ImportFrom) and item.module]
+        origin = {alias.name: f"{str(item.module).replace('.', '/')}.py" for item in imports for alias in item.names}
+        marks = {name for name, source in origin.items() if source == "calibrator/compiled.py"}
+        for item in tree.body:
+            if isinstance(item, ast.FunctionDef) and any(ast.unparse(mark) in marks for mark in item.decorator_list):
+                names = {part.id for line in item.body for part in ast.walk(line) if isinstance(part, ast.Name)}
+                needed |= {path.relative_to(ROOT).as_posix(), *(origin[name] for name in names & origin.keys())}
+    own = {name for name in needed if name.startswith(("calibrator/", "ecu_node/"))}
+    assert len(own) > 5
+    assert own - set(SOURCES) == set()
 
 
 @pytest.mark.long
@@ -129,30 +133,10 @@ def test_code_that_cannot_be_read_is_compiled_anew(folder: Path, cache: Path, fi
     assert all(kept.stat().st_size > len(content) for kept in cache.rglob(files))
 
 
-@pytest.mark.long
-def test_without_a_folder_that_can_be_written_every_run_compiles_and_says_why(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for _ in range(2):
-        error = said(started(folder, tmp_path / "file" / "below"))
-        assert error.count("\n") == 1
-        assert "in every run, as its cache cannot be written; CALIBRATOR_CACHE can name another folder" in error
-
-
-def test_a_home_that_cannot_be_written_is_no_obstacle(folder: Path) -> None:
-    assert "in every run" in said(started(folder, "", HOME="/proc", XDG_CACHE_HOME=""))
-
-
-def test_old_code_goes_and_foreign_files_stay(folder: Path, cache: Path) -> None:
-    for age in range(6):
-        old = cache / f"compiled-{age:016d}"
-        old.mkdir(parents=True)
-        os.utime(old, (1e9 - age, 1e9 - age))
-    (cache / "mine").mkdir()
-    said(started(folder, cache))
-    kept = sorted(path.name for path in cache.iterdir())
-    assert kept[:3] == [f"compiled-{age:016d}" for age in range(3)]
-    assert len(kept) == 5
-    assert kept[-1] == "mine"
+def test_without_a_folder_that_can_be_written_every_run_compiles_and_says_why(folder: Path) -> None:
+    error = said(started(folder, "", HOME="/proc", XDG_CACHE_HOME=""))
+    assert error.count("\n") == 1
+    assert "in every run, as its cache cannot be written; CALIBRATOR_CACHE can name another folder" in error
 
 
 @compiled
