@@ -160,10 +160,10 @@ class Repository:
         signed.version, signed.expires = live + 1, _expiry(role)
         _write(self._staged / f"{role}.json", _encoded(Metadata[Any](signed)))
 
-    def _root(self) -> Root:
-        root = self._latest("root", Root)
-        assert root is not None, "the constructor has looked"
-        return root
+    def _found(self, role: str, kind: type[_Signed]) -> _Signed:
+        found = self._latest(role, kind)
+        assert found is not None, "the constructor has looked"
+        return found
 
     def add(
         self, files: Iterable[Path], *, days: int, allow_large_step: bool, database: VehicleDatabase | None = None
@@ -252,39 +252,33 @@ class Repository:
 
     def threshold(self, role: str) -> int:
         """How many keys of a role must sign."""
-        return int(self._root().roles[role].threshold)
+        return int(self._found("root", Root).roles[role].threshold)
 
     def rotate(self, role: str, new: NewKeys) -> None:
         """Stage a root in which a role has other keys, and, for targets, all that the new keys must sign."""
-        root = self._root()
+        root = self._found("root", Root)
         for keyid in list(root.roles[role].keyids):
             root.revoke_key(keyid, role)
         _set_keys(root, role, new)
         self._stage("root", root)
         if role == "targets":
-            targets = self._latest("targets", Targets)
-            assert targets is not None
+            targets = self._found("targets", Targets)
             _delegate(targets, new)
             self._stage("targets", targets)
             for name in self._versions:
                 if name.startswith("bins-"):
-                    self._restage(name)
-
-    def _restage(self, role: str) -> None:
-        found = self._latest(role, Targets)
-        assert found is not None
-        self._stage(role, found)
+                    self._stage(name, self._found(name, Targets))
 
     def renew(self) -> None:
         """Stage root, targets and bins that expire soon; bins were signed when they were changed."""
         soon = datetime.now(UTC) + timedelta(days=_RENEW_DAYS)
-        if not (self._staged / "root.json").exists() and self._root().expires < soon:
-            self._stage("root", self._root())
+        if not (self._staged / "root.json").exists() and self._found("root", Root).expires < soon:
+            self._stage("root", self._found("root", Root))
         for role in self._versions:
             if (self._staged / f"{role}.json").exists():
                 continue
             if self._live_expiry(f"{self._versions[role]}.{role}") < soon:
-                self._restage(role)
+                self._stage(role, self._found(role, Targets))
 
     def unstage(self) -> list[str]:
         """Drop what is staged and was never published; raises RepositoryStateError before the first publication."""
@@ -330,8 +324,7 @@ class Repository:
         RepositoryStateError
             If a key belongs to no role.
         """
-        root, targets, live = self._root(), self._latest("targets", Targets), self._live("root", Root)
-        assert targets is not None
+        root, targets, live = self._found("root", Root), self._found("targets", Targets), self._live("root", Root)
         known = {*root.keys, *(live.keys if live else ()), *(targets.delegations.keys if targets.delegations else ())}
         for signer in signers:
             if signer.public_key.keyid not in known:
@@ -368,10 +361,10 @@ class Repository:
         RepositoryStateError
             If their keys are missing; vehicles see what they saw before.
         """
-        root = self._live("root", Root) if self.waiting else self._root()
+        root = self._live("root", Root) if self.waiting else self._found("root", Root)
         missing = dict(self.waiting)
         for role in ("snapshot", "timestamp"):
-            wanted = (root or self._root()).roles[role]
+            wanted = (root or self._found("root", Root)).roles[role]
             given = {signer.public_key.keyid for signer in signers} & set(wanted.keyids)
             if len(given) < wanted.threshold:
                 missing[role] = _lacking(len(given), wanted.threshold, set(wanted.keyids) - given)

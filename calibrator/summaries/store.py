@@ -150,10 +150,6 @@ class SummaryStore:
         for name in old if whole else ():
             self._files.remove(name)
 
-    def write(self, bucket: int, records: Records) -> None:
-        """Replace a bucket; as :meth:`append`."""
-        self.append(bucket, records, whole=True)
-
     def change(
         self, bucket: int, change: Callable[[Record], Record | None], new: Sequence[Record] = (), *, whole: bool = False
     ) -> None:
@@ -174,7 +170,7 @@ class SummaryStore:
                 for name, items in self.read(bucket).items()
             }
             records |= {name: [*records.get(name, ()), *items] for name, items in added.items()}
-            self.write(bucket, records)
+            self.append(bucket, records, whole=True)
 
 
 def require_store_or_nothing(storage: Storage) -> None:

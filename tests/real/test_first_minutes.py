@@ -12,10 +12,10 @@ import pytest
 
 from calibrator.drives.store import iterate_drives
 from calibrator.files.layout_files import vehicle_database
-from calibrator.recordings.write_logs import write_drive_log
 from ecu_node.layout import read_layout
 from tests.calibrator.command_here import calibrator as calibrator_here
 from tests.calibrator.doctor.artificial_logs import examined
+from tests.calibrator.drive_logs import write_drive_log
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "tesla_model3.toml"

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.recordings.write_logs import write_drive_log
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator
+from tests.calibrator.drive_logs import write_drive_log
 
 DBC = Path(__file__).parents[3] / "dbc"
 DURATION_S = 120.0

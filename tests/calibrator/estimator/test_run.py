@@ -101,7 +101,7 @@ def left_out(chunk: bytes) -> dict[str, str]:
 def rewritten(store: SummaryStore, folder: Path, bucket: int, records: Mapping[str, Sequence[Record]]) -> SummaryStore:
     """A store with one bucket of other content."""
     other = SummaryStore(storage=open_storage(folder), identity=store.identity)
-    other.write(bucket, records)
+    other.append(bucket, records, whole=True)
     return other
 
 
@@ -289,7 +289,7 @@ def test_only_those_who_drove_since_are_calibrated_and_moved_sensors_from_their_
     shutil.copytree(store.url, tmp_path / "store")
     grown = SummaryStore(storage=open_storage(tmp_path / "store"), identity=store.identity)
     records = grown.read(bucket := grown.bucket_of("V009"))
-    grown.write(bucket, {**records, "V009": [*records["V009"], record_of("V009", new, ("d2",))]})
+    grown.append(bucket, {**records, "V009": [*records["V009"], record_of("V009", new, ("d2",))]}, whole=True)
     done = calibrate(grown.url, tmp_path / "out", "--since", result, "--workers", 1)
     assert done.returncode == 0, done.stderr
     old, now = contents(result / "params"), contents(tmp_path / "out" / "params")

@@ -19,10 +19,11 @@ from can.interfaces.virtual import channels
 from calibrator.drive import Array, Channel, Drive
 from calibrator.files.layout_files import vehicle_database
 from calibrator.kirchhoff.command import kirchhoff
-from calibrator.recordings.write_logs import drive_series, encode_message, write_candump
+from calibrator.recordings.write_logs import encode_message, write_candump
 from ecu_node.cli import template_text
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator
+from tests.calibrator.drive_logs import drive_series
 
 ROOT = Path(__file__).parents[3]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"

@@ -6,9 +6,10 @@ import pytest
 from calibrator.drive import Array, Channel, Drive
 from calibrator.errors import LogError
 from calibrator.recordings.readers import read_recording
-from calibrator.recordings.write_logs import encode_message, write_candump, write_drive_log
+from calibrator.recordings.write_logs import encode_message, write_candump
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
+from tests.calibrator.drive_logs import write_drive_log
 
 POWER_DBC = """VERSION ""
 BU_: A

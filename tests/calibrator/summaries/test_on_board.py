@@ -12,7 +12,6 @@ import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.recordings.log_formats import read_frames
-from calibrator.recordings.write_logs import write_drive_log
 from calibrator.summaries.store import existing_store
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.bus.on_board_summary import OnBoardSummary, on_board_summary
@@ -21,6 +20,7 @@ from ecu_node.errors import UserError
 from ecu_node.parameters import BranchParameters
 from ecu_node.summary import decode_summary
 from tests.calibrator.conftest import run_command
+from tests.calibrator.drive_logs import write_drive_log
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
 MINUTES = 13.0
