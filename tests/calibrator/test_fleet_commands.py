@@ -55,19 +55,6 @@ def test_parameter_files_fit_their_vehicle_and_equal_the_table_which_is_plain_pa
         assert (branch.drift, branch.offset_a) == (row["drift"], row["offset_a"])
 
 
-def test_store_made_by_import_gives_the_same_parameters_as_the_logs(fleet: Path, result: Path, tmp_path: Path) -> None:
-    imported = calibrator("import", fleet / "logs", "--layout", LAYOUT, "--out", tmp_path / "store", "--workers", 1)
-    assert imported.returncode == 0, imported.stderr
-    run = calibrator(
-        *("calibrate", tmp_path / "store", "--layout", LAYOUT, "--method", "published", "--out", tmp_path / "result"),
-        *("--classifier", "perfect", "--truth", fleet / "truth.json", "--workers", 2),
-    )
-    assert run.returncode == 0, run.stderr
-    for row, expected in zip(read_results(tmp_path / "result"), read_results(result), strict=True):
-        assert row["vehicle"] == expected["vehicle"]
-        assert row["drift"] == pytest.approx(expected["drift"], abs=1e-9)
-
-
 @pytest.mark.long
 def test_nothing_is_learnt_from_a_vehicle_that_is_held_out(fleet: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"

@@ -252,5 +252,5 @@ def test_commands_that_write_wait_for_each_other(repo: Repo) -> None:
     with open_storage(repo.path).locked():
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         with pytest.raises(subprocess.TimeoutExpired):
-            process.communicate(timeout=5)
+            process.communicate(timeout=3)
     assert "0 staged roles dropped" in process.communicate(timeout=60)[0]

@@ -10,7 +10,9 @@ import pytest
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.drives.fleet_id import read_fleet_ids
+from calibrator.drives.store import recording_digest
 from calibrator.processes.run_many import Workers
+from calibrator.sources.fleet_source import find_fleet, load_drive
 from calibrator.sources.import_logs import ImportReport, import_logs
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
@@ -39,6 +41,15 @@ def test_what_is_there_is_named_and_what_is_new_is_added(
     assert (len(first.drives), first.already_there) == (1, ())
     assert ([drive.vehicle for drive in both.drives], both.already_there) == (["V002"], ("V001/drive",))
     assert f"1 drive written to {tmp_path}, 1 already there, 0 left out" in both.as_text()
+
+
+def test_drives_of_the_store_are_those_of_the_logs(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+    imported([fleet / "logs"], tmp_path, database)
+    logs, store = find_fleet(fleet).vehicles, find_fleet(tmp_path).vehicles
+    assert list(logs) == list(store) == ["V001", "V002"]
+    for vehicle, (log,) in logs.items():
+        (kept,) = store[vehicle]
+        assert recording_digest(load_drive(kept, database)) == recording_digest(load_drive(log, database))
 
 
 def test_equal_notices_are_told_once_and_json_keeps_those_of_every_drive(
@@ -109,7 +120,7 @@ def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path
     endless = tmp_path / "logs" / "V000" / "endless.log.gz"
     write_endless_log(endless)
     logs = [endless, fleet / "logs"]
-    report = import_logs(logs, database, tmp_path / "store", workers=Workers(), limit_s=5.0)
+    report = import_logs(logs, database, tmp_path / "store", workers=Workers(), limit_s=3.0)
     assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
     assert list(report.left_out) == ["V000/endless"]
-    assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 5 s and was ended; ")
+    assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 3 s and was ended; ")

@@ -78,13 +78,6 @@ def stored(place: Path) -> VehicleSummary:
     return record.found
 
 
-def from_log(folder: Path, database: VehicleDatabase) -> VehicleSummary:
-    write_drive_log(folder / "logs" / "V1" / "drive.log.gz", recorded_drive(), database)
-    arguments = ["summarise", str(folder / "logs"), "--layout", str(LAYOUT), "--out", str(folder / "of_log")]
-    assert run_command([*arguments, "--workers", "1"]) == 0
-    return stored(folder / "of_log")
-
-
 def replay(log: Path, summary: OnBoardSummary, bus: can.BusABC) -> None:
     """Play a log with its own time stamps, each frame after one of others; the node looks every 20 ms of the log."""
     looked_s = 0.0
@@ -108,25 +101,35 @@ def node_on(folder: Path, database: VehicleDatabase, delays: dict[str, float]) -
     return on_board_summary(options, bus, database, msgspec.structs.replace(parameters, branches=branches), print)
 
 
-def test_summary_made_on_board_is_that_of_the_log(tmp_path: Path, database: VehicleDatabase) -> None:
-    of_log = from_log(tmp_path, database)
-    summary = node_on(tmp_path / "vehicle", database, of_log.delays.by_branch())
-    log = tmp_path / "logs" / "V1" / "drive.log.gz"
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) -> Path:
+    """Folder of a log, its summary (of_log), and what a node that heard it wrote (vehicle)."""
+    folder = tmp_path_factory.mktemp("on_board")
+    log = folder / "logs" / "V1" / "drive.log.gz"
+    write_drive_log(log, recorded_drive(), database)
+    arguments = ["summarise", str(folder / "logs"), "--layout", str(LAYOUT), "--out", str(folder / "of_log")]
+    assert run_command([*arguments, "--workers", "1"]) == 0
+    summary = node_on(folder / "vehicle", database, stored(folder / "of_log").delays.by_branch())
     with can.Bus(interface="virtual", channel="on_board", preserve_timestamps=True) as bus:
         replay(log, summary, bus)
         for _ in range(100):  # a thread writes
-            written = [decode_summary(path.read_bytes()) for path in (tmp_path / "vehicle" / "V1").glob("*.summary")]
+            written = [decode_summary(path.read_bytes()) for path in (folder / "vehicle" / "V1").glob("*.summary")]
             if [len(record.count) for record in written] == [5]:  # what a power cut leaves: all but the last batch
                 break
             time.sleep(0.05)
         else:
             raise AssertionError("the batches are not written")
         summary.close()
-    size = sum(path.stat().st_size for path in (tmp_path / "vehicle" / "V1").iterdir())
+    return folder
+
+
+def test_summary_made_on_board_is_that_of_the_log(folder: Path, tmp_path: Path) -> None:
+    of_log = stored(folder / "of_log")
+    size = sum(path.stat().st_size for path in (folder / "vehicle" / "V1").iterdir())
     assert size < 20_000 * MINUTES / 60.0 + 5000  # besides the levels, which are there once per file
-    arguments = ["summarise", str(tmp_path / "vehicle"), "--layout", str(LAYOUT), "--out", str(tmp_path / "on_board")]
+    arguments = ["summarise", str(folder / "vehicle"), "--layout", str(LAYOUT), "--out", str(tmp_path)]
     assert run_command(arguments) == 0
-    on_board = stored(tmp_path / "on_board")
+    on_board = stored(tmp_path)
     full = of_log.summary.shortened(-(-len(of_log.summary.moments) // BATCH))
     size = np.sqrt(np.maximum(np.einsum("bii->bi", full.moments), 1e-9))
     scaled = (on_board.summary.moments - full.moments) / (size[:, :, None] * size[:, None, :])
@@ -149,17 +152,12 @@ def test_summary_made_on_board_is_that_of_the_log(tmp_path: Path, database: Vehi
 
 
 def test_unusable_record_leaves_its_vehicle_out(
-    tmp_path: Path, database: VehicleDatabase, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_drive_log(tmp_path / "V1" / "drive.log.gz", recorded_drive(), database)
-    summary = node_on(tmp_path / "vehicle", database, {})
-    with can.Bus(interface="virtual", channel="on_board", preserve_timestamps=True) as bus:
-        replay(tmp_path / "V1" / "drive.log.gz", summary, bus)
-        summary.close()
-    (path,) = (tmp_path / "vehicle" / "V1").iterdir()
+    (path,) = (folder / "vehicle" / "V1").iterdir()
     content = path.read_bytes()
-    for vehicle, damaged in {"V2": content[:300], "V3": content, "V4": b"summary"}.items():
-        (tmp_path / "vehicle" / vehicle).mkdir()
+    for vehicle, damaged in {"V1": content, "V2": content[:300], "V3": content, "V4": b"summary"}.items():
+        (tmp_path / "vehicle" / vehicle).mkdir(parents=True)
         (tmp_path / "vehicle" / vehicle / "x.summary").write_bytes(damaged)
     arguments = ["summarise", str(tmp_path / "vehicle"), "--layout", str(LAYOUT), "--out", str(tmp_path / "store")]
     capsys.readouterr()

@@ -121,7 +121,7 @@ def test_a_bad_drive_costs_its_vehicle_and_is_tried_again(tmp_path: Path, databa
 def test_drives_of_other_branches_cannot_be_added(tmp_path: Path, database: VehicleDatabase) -> None:
     drives, out = tmp_path / "drives", tmp_path / "summaries"
     write(drives, "V1", "a", database)
-    add(drives, out, database)
+    open_store(open_storage(out), EQUIPMENT, database, find_fleet(drives))
     other = Equipment(branches=("battery", "dcdc"), inputs=("speed",), fleet_inputs=("speed",), notices=())
     with pytest.raises(
         FleetError, match="cannot be added to this store: branches battery, motor against battery, dcdc"
