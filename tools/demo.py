@@ -165,7 +165,8 @@ def record_live_drive(parameters: Path, vehicle: str, *, log: Path, recording: P
                 can.Bus(channel=channel, interface=interface) as mouth,
                 progress_bar("drive", int(SECONDS), "s") as progress,
             ):
-                play_frames(frames, mouth, progress=lambda _, age_s: progress(int(age_s) + 1))
+                for age_s in play_frames(frames, mouth):
+                    progress(int(age_s) + 1)
             time.sleep(0.3)
         finally:
             notifier.stop()

@@ -47,19 +47,14 @@ def replay(
     if log.is_dir():
         raise LogError(f"{log}: a folder; give one log file ({' '.join(LOG_SUFFIXES)}, each also .gz)")
     frames, sent = read_frames(log), 0
-
-    def count(so_far: int, _: float) -> None:
-        nonlocal sent
-        sent = so_far
-        progress(so_far)
-
     try:
         with (
             progress_bar("replay", len(frames), "frames") as progress,
             connect(interface, channel, fd=fd) as bus,
         ):
             begin_s = time.monotonic()
-            play_frames(frames.messages(), bus, speed=speed, progress=count)
+            for sent, _ in enumerate(play_frames(frames.messages(), bus, speed=speed), start=1):
+                progress(sent)
             duration_s = time.monotonic() - begin_s
     except KeyboardInterrupt:
         say_error(f"calibrator replay: {sent} of {len(frames)} frames were sent")

@@ -1,7 +1,7 @@
 """A live bus: its frames as if they came from a log, and a log played onto it."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 
 import can
 
@@ -62,51 +62,37 @@ def record_bus(interface: str, channel: str | None, duration_s: float) -> Frames
     return frames
 
 
-def play_frames(
-    messages: Iterable[can.Message],
-    bus: can.BusABC,
-    *,
-    speed: float = 1.0,
-    progress: Callable[[int, float], None] | None = None,
-) -> int:
+def play_frames(messages: Iterable[can.Message], bus: can.BusABC, *, speed: float = 1.0) -> Iterator[float]:
     """Send messages in their order, at their instants.
 
     Parameters
     ----------
     messages : iterable of can.Message
-        Frames with timestamps [s]; error frames are left out, a bus makes its own.
+        Frames with timestamps [s].
     bus : can.BusABC
         Where to.
     speed : float
         1 keeps the timing, 2 halves the time, 0 goes as fast as the bus takes frames. [1]
-    progress : callable, optional
-        Called after each frame with the number of frames sent and the time since the first one in the log [s].
 
-    Returns
-    -------
-    int
-        Number of frames sent.
+    Yields
+    ------
+    float
+        Of each frame, when it is sent: its time since the first one in the log. [s]
 
     Raises
     ------
     BusError
         If the bus takes no frame for a second.
     """
-    sent = 0
     begin_s = time.monotonic()
     first_s: float | None = None
     for message in messages:
-        if message.is_error_frame:
-            continue
         first_s = message.timestamp if first_s is None else first_s
         age_s = message.timestamp - first_s
         if speed > 0.0 and (wait_s := begin_s + age_s / speed - time.monotonic()) > 0.0:
             time.sleep(wait_s)
         _send(bus, message)
-        sent += 1
-        if progress is not None:
-            progress(sent, age_s)
-    return sent
+        yield age_s
 
 
 def _send(bus: can.BusABC, message: can.Message) -> None:
