@@ -32,7 +32,7 @@ from calibrator.estimator.results import PARTS, encode_chunk, part_file, read_pa
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.vehicle_report import explained_faults, impossible, parameters_of
 from calibrator.summaries.record import Record, drives_digest, joined_records
-from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summary_store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.errors import UserError
 from ecu_node.parameters import VehicleParameters, decode_parameters

@@ -27,7 +27,7 @@ from calibrator.files.storage import open_storage
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.record import Record
-from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summary_store import SummaryStore
 from calibrator.summaries.vehicle_summary import COARSEST_PERIOD_S, summarise_drives
 from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase

@@ -44,8 +44,8 @@ from calibrator.processes.run_many import Workers, run_many
 from calibrator.sources.fleet_source import LOGS_FOLDER, find_fleet, probe_equipment
 from calibrator.summaries.identity import FEWEST_BUCKETS, StoreIdentity, read_identity
 from calibrator.summaries.record import joined_records
-from calibrator.summaries.store import SummaryStore, open_store
 from calibrator.summaries.summarise_fleet import add_drives
+from calibrator.summaries.summary_store import SummaryStore, open_store
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.terminal.progress import numbered_passes, progress_bar
 from calibrator.terminal.text import few, few_reasons

@@ -62,7 +62,7 @@ def summarise(
 def info(store: StoreArgument, json: JsonOption = False) -> None:
     """Tell how many vehicles, drives and hours a store holds, of what, and how large it is."""
     with importing():
-        from calibrator.summaries.store import look_at_store
+        from calibrator.summaries.summary_store import look_at_store
 
     print_report(look_at_store(store), json=json)
 
@@ -71,7 +71,7 @@ def info(store: StoreArgument, json: JsonOption = False) -> None:
 def check(store: StoreArgument, json: JsonOption = False) -> None:
     """Read a whole store; exit code 1 if something is damaged or left over, or two vehicles share a recording."""
     with importing():
-        from calibrator.summaries.store import look_at_store
+        from calibrator.summaries.summary_store import look_at_store
 
     report = look_at_store(store, whole=True)
     print_report(report, json=json)
@@ -83,7 +83,7 @@ def check(store: StoreArgument, json: JsonOption = False) -> None:
 def compact(store: StoreArgument, json: JsonOption = False) -> None:
     """Put the files of each bucket together, and remove damaged records, whose drives are then summarised again."""
     with importing():
-        from calibrator.summaries.store import compact_store
+        from calibrator.summaries.summary_store import compact_store
 
     buckets, removed = compact_store(store)
     text = f"{counted(buckets, 'bucket')} written anew, {counted(removed, 'damaged record')} removed"

@@ -26,7 +26,7 @@ from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.moments import LEVEL_EDGES_A, DriveSummary, FitSums
 from calibrator.summaries.record import Record
-from calibrator.summaries.store import SummaryStore, open_store, require_store_or_nothing
+from calibrator.summaries.summary_store import SummaryStore, open_store, require_store_or_nothing
 from calibrator.summaries.vehicle_summary import (
     VehicleSummary,
     ZeroCurrent,

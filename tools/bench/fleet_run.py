@@ -40,8 +40,8 @@ from calibrator.processes.run_many import Workers, run_many
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record
-from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.summariser import summarise_samples
+from calibrator.summaries.summary_store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from calibrator.terminal.progress import shown
 from ecu_node.database import read_database

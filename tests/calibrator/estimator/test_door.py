@@ -19,7 +19,7 @@ from calibrator import Fleet, FleetCalibrator, Junction, read_log
 from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.results import read_results
-from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summary_store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
 from tests.calibrator.command_here import calibrator as command

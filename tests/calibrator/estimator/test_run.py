@@ -24,7 +24,7 @@ from calibrator.files.storage import open_storage
 from calibrator.processes import run_many
 from calibrator.processes.run_many import Workers
 from calibrator.summaries.record import Record
-from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summary_store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator

@@ -21,7 +21,7 @@ from calibrator.errors import FleetError
 from calibrator.files.storage import Storage, open_storage, walk
 from calibrator.processes import run_many as module
 from calibrator.processes.run_many import Failed, Workers, run_many, try_many
-from calibrator.summaries.store import existing_store
+from calibrator.summaries.summary_store import existing_store
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.processes.dask_cluster import DaskCluster, gated, of_no_disk
 from tests.calibrator.processes.test_run_many import CAUSES, LIMIT_S, dying_once, hostile

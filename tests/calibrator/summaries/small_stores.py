@@ -14,7 +14,7 @@ from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity, store_identity, write_identity
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.record import Record
-from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summary_store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.estimator import simulated_rows

@@ -12,7 +12,7 @@ import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.recordings.log_formats import read_frames
-from calibrator.summaries.store import existing_store
+from calibrator.summaries.summary_store import existing_store
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.bus.on_board_summary import OnBoardSummary, on_board_summary
 from ecu_node.database import VehicleDatabase

@@ -18,8 +18,8 @@ from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import find_fleet
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import joined_records
-from calibrator.summaries.store import SummaryStore, open_store
 from calibrator.summaries.summarise_fleet import SummariseReport, add_drives, read_vehicle_summary
+from calibrator.summaries.summary_store import SummaryStore, open_store
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.conftest import LAYOUT
 

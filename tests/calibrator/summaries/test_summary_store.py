@@ -18,7 +18,7 @@ from calibrator.files.storage import Storage, open_storage
 from calibrator.summaries.identity import SCHEMA_VERSION, read_identity, write_identity
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import MOST_BLOCKS, SCHEMA, Record, joined_records
-from calibrator.summaries.store import SummaryStore, compact_store, look_at_store
+from calibrator.summaries.summary_store import SummaryStore, compact_store, look_at_store
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, summaries_of
 from tests.calibrator.summaries.small_stores import identity_of, random_faults, record_of, small_store
