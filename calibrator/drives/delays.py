@@ -134,16 +134,17 @@ class _Fit:
         return np.asarray((gain > GAIN_RANGE[0]) & (gain < GAIN_RANGE[1]) & (np.abs(self.delay_s) < MAX_DELAY_S))
 
 
-def estimate_delays(drives: Sequence[Drive], branches: Sequence[str]) -> BranchDelays:
+def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_s: float = MAX_SD_S) -> BranchDelays:
     """Estimate by how much the branch currents of one vehicle are seen later than the first one.
 
     Parameters
     ----------
     drives : sequence of Drive
-        Drives of one vehicle, at least one; a drive with too few good samples of a branch adds nothing.
+        Drives of one vehicle; a drive with too few good samples of a branch adds nothing.
     branches : sequence of str
-        Names of the K >= 2 branches that meet at the junction; the first, the reference, should be the one that moves
-        most.
+        Names of the K branches that meet at the junction; the first, the reference, should be the one that moves most.
+    max_sd_s : float
+        Largest standard deviation of a delay that counts as known. [s]
 
     Returns
     -------
@@ -153,14 +154,17 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str]) -> BranchD
     Raises
     ------
     DriveError
-        If a drive lacks a branch.
+        If there is no drive, a drive lacks a branch, or fewer than two branches are asked for.
     """
+    if not drives:
+        raise DriveError("no drive to estimate delays from; record at least one drive of the vehicle")
     for drive in drives:
-        if missing := [name for name in branches if name not in drive.branches]:
-            raise DriveError(
-                f"vehicle {drive.vehicle}, drive {drive.name}: no branch {', '.join(missing)}; it has "
-                f"{', '.join(drive.branches) or 'none'}; choose branches that all drives have"
-            )
+        _require_branches(drive, branches)
+    if len(branches) < 2:
+        raise DriveError(
+            f"vehicle {drives[0].vehicle}: a delay is a difference of two branches, and only "
+            f"{', '.join(branches) or 'none'} was asked for; choose at least two"
+        )
     reference = np.arange(len(branches)) == 0
     recorded = [[charge_curve(drive.branches[name]) for name in branches] for drive in drives]
     complete = [tuple(curve for curve in curves if curve is not None) for curves in recorded if None not in curves]
@@ -179,7 +183,7 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str]) -> BranchD
     )
     while True:
         found = _newton(telling, band, found, MOST_STEPS)
-        hopeless = found.free & ~(found.plausible & (found.sd_s <= HOPELESS * MAX_SD_S))
+        hopeless = found.free & ~(found.plausible & (found.sd_s <= HOPELESS * max_sd_s))
         if not hopeless.any():
             break
         worst = np.arange(len(hopeless)) == np.argmax(np.where(hopeless, found.sd_s, -1.0))
@@ -187,7 +191,7 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str]) -> BranchD
     if telling is not stretches:
         found = _newton(stretches, band, found, MOST_STEPS_ON_ALL)
     delay_s, sd_s = found.delay_s, found.sd_s
-    known = np.concatenate([[True], found.free & found.plausible & (sd_s <= MAX_SD_S)])
+    known = np.concatenate([[True], found.free & found.plausible & (sd_s <= max_sd_s)])
     return BranchDelays(
         branches=tuple(branches),
         delay_s=np.where(known, np.concatenate([[0.0], delay_s]), 0.0),
@@ -210,7 +214,13 @@ def without_delays(drive: Drive, delays: Mapping[str, float]) -> Drive:
     -------
     Drive
         The same samples, those of each named branch at the instants at which they were true. Inputs stay as they are.
+
+    Raises
+    ------
+    DriveError
+        If the drive lacks a named branch.
     """
+    _require_branches(drive, list(delays))
     return replace(
         drive,
         branches={
@@ -218,6 +228,15 @@ def without_delays(drive: Drive, delays: Mapping[str, float]) -> Drive:
             for name, channel in drive.branches.items()
         },
     )
+
+
+def _require_branches(drive: Drive, branches: Sequence[str]) -> None:
+    missing = [name for name in branches if name not in drive.branches]
+    if missing:
+        raise DriveError(
+            f"vehicle {drive.vehicle}, drive {drive.name}: no branch {', '.join(missing)}; it has "
+            f"{', '.join(drive.branches) or 'none'}; choose branches that all drives have"
+        )
 
 
 def _stretches(complete: Sequence[tuple[ChargeCurve, ...]], band: Band) -> tuple[list[_Stretch], int]:

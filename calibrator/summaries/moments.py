@@ -113,9 +113,15 @@ class DriveSummary:
         Raises
         ------
         DriveError
-            If they were made with different banks.
+            If they were made with different banks, or with different branches or columns.
         """
         common_bank([self, other])
+        shapes = [(part.branches, part.moments.shape[1:]) for part in (self, other)]
+        if shapes[0] != shapes[1]:
+            raise DriveError(
+                f"summaries of {self.branches} and {other.branches} branches with moments of shape "
+                f"{self.moments.shape[1:]} and {other.moments.shape[1:]} do not add up; summarise the drives alike"
+            )
         fits = None if self.fit is None or other.fit is None else (self.fit, other.fit)
         return replace(
             self,

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives import delays
 from calibrator.drives.delays import estimate_delays, without_delays
 from calibrator.errors import DriveError
 from tests.calibrator.drives.delayed_drives import MadeUp, made_up_drive
@@ -70,14 +69,13 @@ def test_two_motors_that_do_much_the_same_and_a_slow_converter_are_told_apart() 
     np.testing.assert_allclose(found.delay_s, [0.0, 0.18, -0.1, 0.1], atol=5e-3)
 
 
-def test_noise_at_any_phase_of_the_frames_pulls_the_delay_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noise_at_any_phase_of_the_frames_pulls_the_delay_nowhere() -> None:
     """Frames of 50 and 100 Hz whose phases stay put: the mean error over many phases and noises is zero."""
-    monkeypatch.setattr(delays, "MAX_SD_S", 0.05)
     errors_s, sds_s = [], []
     for seed in range(40):
         delay_s = 0.1 + 0.02 * seed / 40.0
         vehicle = replace(PAIR, size_a={"motor": 5.0}, delay_s={"motor": delay_s}, duration_s=100.0)
-        found = estimate_delays([made_up_drive(seed, vehicle)], TWO)
+        found = estimate_delays([made_up_drive(seed, vehicle)], TWO, max_sd_s=0.05)
         errors_s.append(found.delay_s[1] - delay_s)
         sds_s.append(found.sd_s[1])
     assert abs(np.mean(errors_s)) < 3.0 * np.std(errors_s) / np.sqrt(40.0)
@@ -85,18 +83,15 @@ def test_noise_at_any_phase_of_the_frames_pulls_the_delay_nowhere(monkeypatch: p
     assert 0.7 < np.sqrt(np.mean(z**2)) < 1.5
 
 
-def test_a_branch_of_little_more_than_its_noise_is_found_without_bias_and_with_an_honest_deviation(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_branch_of_little_more_than_its_noise_is_found_without_bias_and_with_an_honest_deviation() -> None:
     """Steps of 1.5 A under noise of 0.4 A."""
-    monkeypatch.setattr(delays, "MAX_SD_S", 0.05)
     errors_s, sds_s = [], []
     for seed in range(30):
         delay_s = 0.1 + 0.05 * seed / 30.0
         vehicle = replace(
             TRIO, size_a={"motor": 50.0, "auxiliary": 1.5}, delay_s={"auxiliary": delay_s}, duration_s=600.0
         )
-        found = estimate_delays([made_up_drive(seed, vehicle)], THREE)
+        found = estimate_delays([made_up_drive(seed, vehicle)], THREE, max_sd_s=0.05)
         assert found.known.all()
         errors_s.append(found.delay_s[2] - delay_s)
         sds_s.append(found.sd_s[2])
@@ -147,11 +142,8 @@ def without_some(channel: Channel) -> Channel:
         (with_value("motor", lambda a: np.where(a > 60.0, 1.15, 0.95) * (a - 60.0)), 3e-3),  # a gain for each sign
     ],
 )
-def test_what_a_recording_lacks_or_has_besides_moves_the_delay_little(
-    drive: Drive, within_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(delays, "MAX_SD_S", 0.02)
-    found = estimate_delays([drive], TWO)
+def test_what_a_recording_lacks_or_has_besides_moves_the_delay_little(drive: Drive, within_s: float) -> None:
+    found = estimate_delays([drive], TWO, max_sd_s=0.02)
     assert found.known.all()
     assert found.delay_s[1] == pytest.approx(0.187, abs=within_s)
 
@@ -195,9 +187,16 @@ def test_a_branch_lost_in_noise_is_flagged_and_the_others_are_still_found(durati
     assert np.isinf(found.sd_s[2])
 
 
-def test_branch_that_is_not_there_is_refused() -> None:
+def test_drives_or_branches_that_are_not_there_are_refused() -> None:
+    drive = made_up_drive(1, replace(PAIR, duration_s=1.0))
+    with pytest.raises(DriveError, match="no drive to estimate delays from"):
+        estimate_delays([], TWO)
     with pytest.raises(DriveError, match="vehicle V1, drive d: no branch heater; it has battery, motor"):
-        estimate_delays([SHORT], ("battery", "heater"))
+        estimate_delays([drive], ("battery", "heater"))
+    with pytest.raises(DriveError, match="choose at least two"):
+        estimate_delays([drive], ("battery",))
+    with pytest.raises(DriveError, match="no branch heater"):
+        without_delays(drive, {"heater": 0.1})
 
 
 def test_without_noise_delays_are_exact_those_of_slow_frames_to_a_hundredth_of_the_period() -> None:

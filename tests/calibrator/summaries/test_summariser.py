@@ -69,6 +69,8 @@ def test_what_was_summarised_differently_does_not_add_up() -> None:
     plain, filtered = (summarise_samples([drive], period_s=PERIOD_S, bank=bank) for bank in (None, a_bank(3.0)))
     with pytest.raises(DriveError, match=r"made with 2 filter banks \(.*\); expected one"):
         plain + filtered
+    with pytest.raises(DriveError, match=r"3 and 2 branches .* do not add up"):
+        plain + plain.take_branches([0, 1])
 
 
 def test_a_bank_of_other_inputs_or_of_another_period_is_refused() -> None:
