@@ -13,6 +13,7 @@ from calibrator.summaries.filter_bank import (
     FilterBank,
     Poles,
     low_passes,
+    plain_bank,
     read_bank,
 )
 
@@ -56,7 +57,8 @@ def test_columns_are_the_states_of_the_system() -> None:
 
 def test_a_bank_without_poles_is_the_plain_inputs_from_the_first_sample_on() -> None:
     u = inputs_of(2)
-    columns, used = bank_of(()).run(u, np.ones(SAMPLES, bool))
+    bank = plain_bank(NAMES, period_s=PERIOD_S)
+    columns, used = bank.run(u, np.ones(SAMPLES, bool))
     assert used.all()
     np.testing.assert_array_equal(columns, u)
 
