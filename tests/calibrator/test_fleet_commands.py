@@ -171,25 +171,19 @@ def test_score_refuses_the_truth_of_other_vehicles_or_branches(
     assert (run.returncode, message in run.stderr) == (1, True), run.stderr
 
 
-@pytest.fixture(scope="session")
-def other_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Vehicles of the same names and branches as those of `fleet`, with other faults."""
-    options = ("--vehicles", 12, "--common-drive", "--minutes", 1, "--unseen-minutes", 0.1, "--seed", 4)
-    return made_once(tmp_path_factory, "other_fleet", "simulate", *options)
-
-
 def test_truth_of_a_fleet_with_the_same_names_is_refused_before_the_work(
-    fleet: Path, other_fleet: Path, result: Path, tmp_path: Path
+    fleet: Path, result: Path, tmp_path: Path
 ) -> None:
-    run = calibrator("score", result, "--truth", other_fleet / "truth.json")
+    other, store = tmp_path / "truth.json", tmp_path / "store"
+    other.write_text(json.dumps({**json.loads((fleet / "truth.json").read_text()), "fleet_id": "other"}))
+    run = calibrator("score", result, "--truth", other)
     assert run.returncode == 1
     assert "give the truth.json that lies beside the logs of this fleet" in run.stderr
-    store = tmp_path / "store"
     log = fleet / "logs" / "V001" / "drive.log.gz"
     assert calibrator("import", log, "--layout", LAYOUT, "--out", store).returncode == 0
-    perfect = ("--method", "published", "--classifier", "perfect", "--truth", other_fleet / "truth.json")
+    perfect = ("--method", "published", "--classifier", "perfect", "--truth", other)
     for source in (fleet, fleet / "logs", store):
         run = calibrator("calibrate", source, "--layout", LAYOUT, "--out", tmp_path / "x", *perfect)
         assert run.returncode == 1
-        assert "the truth of fleet" in run.stderr
+        assert "the truth of fleet other, but" in run.stderr
         assert "identify" not in run.stderr

@@ -26,17 +26,6 @@ def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
-def test_failure_leaves_nothing(tmp_path: Path) -> None:
-    def fill() -> None:
-        with whole_folder(tmp_path / "out") as partial:
-            (partial / "x").write_text("1")
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fill()
-    assert not list(tmp_path.iterdir())
-
-
 def test_folder_in_use_is_refused_untouched(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("1")

@@ -26,28 +26,32 @@ def store(database: VehicleDatabase, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def notices(store: Path, database: VehicleDatabase, branches: list[str] | None) -> list[str]:
-    return [n for n in probe_equipment(find_fleet(store), database, branches).notices if n.startswith("branches")]
-
-
-def test_branches_that_were_not_recorded_are_named(store: Path, database: VehicleDatabase) -> None:
-    assert notices(store, database, None) == ["branches not recorded, taken as not fitted: dcdc, motor_rear"]
-
-
-def test_recorded_branches_that_were_not_asked_for_are_not_called_unrecorded(
-    store: Path, database: VehicleDatabase
+@pytest.mark.parametrize(
+    ("branches", "beside"),
+    [
+        (None, []),
+        (
+            ["battery", "motor"],
+            ["branches recorded but not asked for, missing from the junction sum: auxiliary"],
+        ),
+    ],
+)
+def test_branches_that_were_not_recorded_or_not_asked_for_are_named(
+    store: Path, database: VehicleDatabase, branches: list[str] | None, beside: list[str]
 ) -> None:
-    assert notices(store, database, ["battery", "motor"]) == [
-        "branches not recorded, taken as not fitted: dcdc, motor_rear",
-        "branches recorded but not asked for, missing from the junction sum: auxiliary",
-    ]
+    notices = [n for n in probe_equipment(find_fleet(store), database, branches).notices if n.startswith("branches")]
+    assert notices == ["branches not recorded, taken as not fitted: dcdc, motor_rear", *beside]
 
 
-def test_a_branch_asked_for_twice_is_refused(store: Path, database: VehicleDatabase) -> None:
-    with pytest.raises(FleetError, match="branch battery is asked for twice; name each branch once"):
-        probe_equipment(find_fleet(store), database, ["battery", "battery"])
-
-
-def test_an_unknown_branch_is_refused_with_the_known_ones(store: Path, database: VehicleDatabase) -> None:
-    with pytest.raises(LayoutError, match="no branch 'pack'; known are battery, motor"):
-        probe_equipment(find_fleet(store), database, ["pack", "battery"])
+@pytest.mark.parametrize(
+    ("branches", "words"),
+    [
+        (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
+        (["pack", "battery"], "no branch 'pack'; known are battery, motor"),
+    ],
+)
+def test_branches_that_cannot_be_asked_for_are_refused(
+    store: Path, database: VehicleDatabase, branches: list[str], words: str
+) -> None:
+    with pytest.raises((FleetError, LayoutError), match=words):
+        probe_equipment(find_fleet(store), database, branches)

@@ -63,9 +63,7 @@ def make(*paths: Path) -> None:
 def test_which_log_is_of_which_vehicle_and_what_is_left_out(
     tmp_path: Path, files: list[str], arguments: list[str], found: list[str], problems: list[str]
 ) -> None:
-    for name in files:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
+    make(*(tmp_path / name for name in files))
     fleet = find_logs([tmp_path / argument for argument in arguments])
     assert drives(fleet) == found
     for problem, words in zip(fleet.left_out.values(), problems, strict=True):
@@ -81,20 +79,16 @@ def test_log_at_a_url_is_of_its_folder_too() -> None:
     assert problem.startswith("memory://logs/V1/c.log.gz: nothing is there, or no logs in it")
 
 
-def test_what_is_damaged_beside_logs_is_a_problem_or_a_log_and_the_rest_goes_on(tmp_path: Path) -> None:
+def test_archive_is_a_folder_of_its_name_and_what_is_damaged_beside_logs_is_a_problem_or_a_log(tmp_path: Path) -> None:
     make(tmp_path / "V1" / "a.log", tmp_path / "V1" / "b.log")
+    with zipfile.ZipFile(tmp_path / "V2.ZIP", "w") as archive:
+        archive.writestr("a.log", "")
     (tmp_path / "old.zip").write_bytes(b"no archive")
     (tmp_path / "V1" / "c.txt.gz").write_bytes(b"not packed")
     found = find_logs([tmp_path])
-    assert drives(found) == ["V1/a", "V1/b", "V1/c"]
+    assert drives(found) == ["V1/a", "V1/b", "V1/c", "V2/a"]
     (problem,) = found.left_out.values()
     assert problem.startswith(f"{tmp_path / 'old.zip'}: not a readable archive: ")
-
-
-def test_archive_is_a_folder_of_its_name(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "V2.ZIP", "w") as archive:
-        archive.writestr("a.log", "")
-    assert drives(find_logs([tmp_path])) == ["V2/a"]
 
 
 def test_folder_of_a_vehicle_may_be_a_link(tmp_path: Path) -> None:
