@@ -43,27 +43,27 @@ def test_what_is_there_is_named_and_what_is_new_is_added(
     assert f"1 drive written to {tmp_path}, 1 already there, 0 left out" in both.as_text()
 
 
-def test_drives_of_the_store_are_those_of_the_logs(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
-    imported([fleet / "logs"], tmp_path, database)
-    logs, store = find_fleet(fleet).vehicles, find_fleet(tmp_path).vehicles
+@pytest.fixture(scope="module")
+def report(fleet: Path, tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) -> ImportReport:
+    return imported([fleet / "logs"], tmp_path_factory.mktemp("store"), database)
+
+
+def test_drives_of_the_store_are_those_of_the_logs(
+    fleet: Path, report: ImportReport, database: VehicleDatabase
+) -> None:
+    logs, store = find_fleet(fleet).vehicles, find_fleet(report.store).vehicles
     assert list(logs) == list(store) == ["V001", "V002"]
     for vehicle, (log,) in logs.items():
         (kept,) = store[vehicle]
         assert recording_digest(load_drive(kept, database)) == recording_digest(load_drive(log, database))
 
 
-def test_equal_notices_are_told_once_and_json_keeps_those_of_every_drive(
-    fleet: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
-    report = imported([fleet / "logs"], tmp_path, database)
+def test_equal_notices_are_told_once_and_json_keeps_those_of_every_drive(report: ImportReport) -> None:
     told = [line for line in report.as_text().splitlines() if "junction_box_temperature" in line]
     kept = [notice for drive in json.loads(report.as_json())["drives"] for notice in drive["notices"]]
-    kept = [notice for notice in kept if "junction_box_temperature" in notice]
-    frames = [int(re.findall(r"(\d+) of", notice)[0]) for notice in kept]
+    frames = [int(re.findall(r"(\d+) of", notice)[0]) for notice in kept if "junction_box_temperature" in notice]
     assert len(frames) == 2
-    assert told == [
-        f"  in 2 vehicles: junction_box_temperature: {sum(frames)} of {sum(frames)} frames not usable",
-    ]
+    assert told == [f"  in 2 vehicles: junction_box_temperature: {sum(frames)} of {sum(frames)} frames not usable"]
 
 
 def test_a_damaged_drive_in_the_store_is_not_taken_for_imported(
