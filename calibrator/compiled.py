@@ -157,9 +157,9 @@ def _cache_folder() -> Path | None:
     """Folder of compiled code of this source, Python, numba and processor, made if missing; None if it cannot be."""
     digest = hashlib.sha256(f"{sys.version} {numba.__version__}".encode())
     digest.update(str(cpu_target.target_context.codegen().magic_tuple()).encode())
-    for source in SOURCES:
-        digest.update((Path(__file__).parents[1] / source).read_bytes())
     try:
+        for source in SOURCES:
+            digest.update((Path(__file__).parents[1] / source).read_bytes())
         usual = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "calibrator"
         folder = Path(os.environ.get(CACHE_VARIABLE) or usual) / f"{PREFIX}{digest.hexdigest()[:16]}"
         folder.mkdir(parents=True, exist_ok=True)
