@@ -737,7 +737,9 @@ def _charges(
     drives: Sequence[Sequence[Drive]], settings: CalibrationSettings, fleet: FleetSource
 ) -> dict[str, tuple[float, float, float]]:
     """Mean current of branches over all drives of one vehicle: as measured, by their charge, its deviation. [A]"""
-    if settings.charge_ah and len(drives) != 1:
+    if not settings.charge_ah:
+        return {}
+    if len(drives) != 1:
         raise FleetError(
             f"--charge is of the recordings of one vehicle, and there are {len(fleet.vehicles)}; give those of one"
         )

@@ -88,6 +88,15 @@ def test_charge_balance_tells_an_offset(missing: float) -> None:
     assert row.offset_sd_a < 0.5
 
 
+def test_any_number_of_junctions_is_calibrated_each_by_itself() -> None:
+    """From six on they are read vehicle by vehicle, and their drives are not kept."""
+    frames = {f"V{number}": recording(number, gain=(0.0, 0.05, 0.0), seconds=60.0) for number in range(6)}
+    rows = found(frames, trusted=["battery"]).xs("motor", level="branch")
+    assert rows.gain_error.to_numpy() == pytest.approx(np.full(6, 0.05), abs=0.01)
+    alone = found({"V0": frames["V0"]}, trusted=["battery"]).loc["V0", "motor"]
+    pd.testing.assert_series_equal(rows.loc["V0"], alone, check_names=False)
+
+
 def test_branch_that_is_off_keeps_its_gain_open() -> None:
     frame = recording().assign(heater=0.0)
     frame["battery"] = -frame["motor"] + np.random.default_rng(2).normal(0.0, 0.2, len(frame))
