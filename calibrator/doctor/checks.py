@@ -12,7 +12,7 @@ import numpy as np
 from calibrator.doctor.facts import Facts
 from calibrator.drive import Drive
 from calibrator.drives.align import choose_inputs
-from calibrator.estimator.junction import summarise_junction
+from calibrator.estimator.junction_run import summarise_junction
 from calibrator.findings import Finding, worst_first
 from calibrator.kirchhoff.findings import Findings, error, hint, sum_findings, times, warning
 from calibrator.kirchhoff.sums import VOLTAGE, compare_kirchhoff

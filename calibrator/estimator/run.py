@@ -196,9 +196,9 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) 
     fleets = {"--hold-out": settings.hold_out, "--expected-faults": settings.expected_faults is not None}
     for option in (option for option, given in fleets.items() if given):
         raise ContradictionError(f"{option} is for a fleet that is compared with itself, not for single junctions")
-    from calibrator.estimator.junction import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
+    from calibrator.estimator.junction_run import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
 
-    return calibrate_junctions
+    return partial(calibrate_junctions, trusted=settings.trusted)  # here these are branches
 
 
 def _require_named(settings: CalibrationSettings, usable: Set[str], problems: Mapping[str, str], place: str) -> None:

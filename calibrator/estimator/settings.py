@@ -49,8 +49,8 @@ class CalibrationSettings:
     hold_out : frozenset of str
         Vehicles that are calibrated, but from which nothing is learnt for the others.
     trusted : frozenset of str
-        Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior. Of single
-        junctions: branches whose sensor is right.
+        Names as they were given: of vehicles whose sensors were found faultless on a bench, which carry the reference
+        of the posterior; or of branches whose sensor is right, where each vehicle is calibrated by itself.
     readings : Path, str or None
         Table of bench readings (CSV), or its text.
     alone : bool

@@ -1,0 +1,340 @@
+"""Single junctions from their recordings to a part of the result: what is read, what is known of them, what is said.
+
+The estimate is that of :mod:`calibrator.estimator.junction`.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from calibrator.drive import Array, Drive, DriveFile, Equipment, FleetSource
+from calibrator.drives.align import Samples, align, at_pace
+from calibrator.drives.charge import GAP_PERIODS
+from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
+from calibrator.errors import DriveError, FleetError
+from calibrator.estimator.junction import SEEN, JunctionKnowledge, estimate_junction, named_ratios
+from calibrator.estimator.parameter_files import RunIdentity
+from calibrator.estimator.readings import (
+    TRUSTED_DRIFT_SD,
+    TRUSTED_OFFSET_SD,
+    BenchTable,
+    bench_readings,
+    check_bench_table,
+    read_bench_table,
+    window_readings,
+)
+from calibrator.estimator.results import encode_chunk
+from calibrator.estimator.settings import CalibrationSettings
+from calibrator.estimator.vehicle_report import parameters_of, sensor_texts
+from calibrator.processes.run_many import Workers
+from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
+from calibrator.summaries.moments import BLOCK_S
+from calibrator.summaries.summariser import summarise_samples
+from calibrator.summaries.vehicle_summary import (
+    VehicleSummary,
+    most_moving_first,
+    require_possible,
+    zero_current_offsets,
+)
+from calibrator.terminal.progress import shown
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
+from ecu_node.layout import Layout
+from ecu_node.parameters import VehicleParameters
+
+__all__ = ["calibrate_junctions", "read_junction", "summarise_junction"]
+
+_Made = TypeVar("_Made")
+
+LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
+"""Least valid data, shortest block, number of blocks of a short recording, and least number beyond that of branches:
+enough to tell how sure all is."""
+FULL_BLOCK = 10
+"""Samples that a block has where there are enough."""
+MOST_MISSING = 0.05
+"""Share of a recording without samples of a branch up to which its charge is integrated. [1]"""
+JUMP = 0.02
+"""Change of a current within its largest possible delay, over full scale, that counts as a jump. [1]"""
+MOST_SHOWN = 5
+"""Vehicles whose gain ratios are shown one by one."""
+MOST_READ_HERE = 5
+"""Vehicles that are read in this process: others would take longer to start."""
+
+
+def read_junction(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleSummary:
+    """Read the drives of one vehicle, see :func:`summarise_junction`."""
+    return summarise_junction([load_drive(entry, database) for entry in entries], equipment.branches, database)
+
+
+def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], database: VehicleDatabase) -> VehicleSummary:
+    """Summarise the currents of one vehicle, in short blocks if its drives are short.
+
+    Parameters
+    ----------
+    drives : sequence of Drive
+        Of one vehicle.
+    branches : sequence of str
+        Names of the K branches.
+    database : VehicleDatabase
+        DBC and layout.
+
+    Returns
+    -------
+    VehicleSummary
+        Without inputs.
+
+    Raises
+    ------
+    DriveError
+        If a branch is missing, or there is too little valid data.
+    """
+    layout = at_pace(database.layout, drives)
+    for drive in drives:
+        require_possible(drive, layout)
+    delays = estimate_delays(drives, most_moving_first(drives, branches))
+    samples = [align(without_delays(drive, delays.by_branch()), layout, branches, inputs=()) for drive in drives]
+    samples = _without_jumps(samples, [delays.branches[k] for k in np.flatnonzero(~delays.known)], layout)
+    duration_s = layout.period_s * sum(int(part.valid.sum()) for part in samples)
+    if duration_s < LEAST_DURATION_S:
+        raise DriveError(
+            f"{duration_s:.1f} s in which all branches have usable samples; at least {LEAST_DURATION_S:g} s are "
+            f"needed; rows farther apart than the timeout_s of their branch are stale"
+        )
+    longest_s = max(BLOCK_S, FULL_BLOCK * layout.period_s)
+    block_s = max(min(longest_s, duration_s / BLOCKS), SHORTEST_BLOCK_S, layout.period_s)
+    summary = summarise_samples(samples, period_s=layout.period_s, block_s=block_s)
+    if len(summary.moments) < len(branches) + FEWEST_BLOCKS:
+        raise DriveError(
+            f"{duration_s:.1f} s of usable samples on a time base of {layout.period_s:g} s tell too little: at least "
+            f"{(len(branches) + FEWEST_BLOCKS) * block_s:.0f} s are needed"
+        )
+    return VehicleSummary(
+        vehicle=drives[0].vehicle,
+        drives=tuple(drive.name for drive in drives),
+        summary=summary,
+        delays=delays,
+        zero_current=zero_current_offsets(drives, branches, database),
+    )
+
+
+def _without_jumps(drives: Sequence[Samples], unknown: Sequence[str], layout: Layout) -> list[Samples]:
+    """Leave out samples near a jump of a branch whose delay is not known: it would be the junction's sum.
+
+    Where that would leave less than half, as on a drive that is all jumps, they stay.
+    """
+    kept = []
+    width = 2 * round(MAX_DELAY_S / layout.period_s) + 1
+    for drive in drives:
+        jump = np.zeros(len(drive.valid), bool)
+        for name in unknown:
+            current_a = drive.currents_a[:, drive.branch_names.index(name)]
+            low_a = minimum_filter1d(np.where(drive.valid, current_a, np.inf), width)
+            high_a = maximum_filter1d(np.where(drive.valid, current_a, -np.inf), width)
+            jump |= high_a - low_a > JUMP * layout.full_scale_a
+        kept.append(replace(drive, valid=drive.valid & ~jump))
+    before, after = (sum(int(drive.valid.sum()) for drive in each) for each in (drives, kept))
+    return kept if 2 * after > before else list(drives)
+
+
+def _same_error(parameters: VehicleParameters, trusted: Collection[str]) -> list[str]:
+    """Say where all gains are wrong alike against one sensor that is trusted: then that one may be wrong."""
+    others = [branch for name, branch in parameters.branches.items() if name not in trusted]
+    drifts = np.array([branch.drift for branch in others])
+    sds = np.array([branch.drift_sd for branch in others], dtype=float)
+    if len(trusted) != 1 or len(others) < 2 or not (np.abs(drifts) > SEEN * sds).all():
+        return []
+    if np.ptp(drifts) > SEEN * np.hypot(*np.sort(sds)[-2:]):
+        return []
+    (reference,), error = trusted, drifts.mean()
+    own = 1.0 / (1.0 + error) - 1.0
+    return [f"all others read {error:+z.1%} against {reference}: a gain error of its own of {own:+z.1%} looks the same"]
+
+
+def calibrate_junctions(
+    fleet: FleetSource,
+    identity: RunIdentity,
+    settings: CalibrationSettings,
+    *,
+    trusted: Collection[str],
+    workers: Workers,
+) -> tuple[Equipment, bytes, dict[str, object], list[str]]:
+    """Calibrate each vehicle by itself; with a meter all together, as they are recordings of one car.
+
+    Parameters
+    ----------
+    fleet : FleetSource
+        The recordings.
+    identity : RunIdentity
+        For the parameter files.
+    settings : CalibrationSettings
+        How.
+    trusted : collection of str
+        Branches whose sensor is right.
+    workers : Workers
+        Where the drives are read, if they are many.
+
+    Returns
+    -------
+    equipment : Equipment
+        Has the K branches.
+    part : bytes
+        Of the result: parameters of every vehicle that could be used, and why the others could not.
+    details : dict of str to JSON values
+        Gain ratios and constants, for the record of the run.
+    notices : list of str
+        What the user should know.
+
+    Raises
+    ------
+    UserError
+        If no vehicle can be used, or something is said to be known that is not there.
+    """
+    layout = identity.database.layout
+    equipment, vehicles, left_out, drives = _read(fleet, identity.database, settings, workers)
+    branches, load = equipment.branches, settings.load or layout.unmeasured_load
+    read = _known_readings(vehicles, branches, settings, layout, trusted=trusted, left_out=left_out)
+    charge_a = _charges(drives, settings, fleet)
+    groups = [range(len(vehicles))] if settings.meter is not None else [[j] for j in range(len(vehicles))]
+    parameters, junctions, notices = [], dict[str, object](), list[str]()
+    for group in groups:
+        known = JunctionKnowledge(read[..., list(group), :], load, charge_a, settings.meter)
+        try:
+            found, laws, deciding, contradictions = estimate_junction(
+                [vehicles[j] for j in group], branches, known, layout=layout, harm_limit=settings.harm_limit
+            )
+        except FleetError as error:
+            if len(groups) == 1:
+                raise
+            left_out[vehicles[group[0]].vehicle] = str(error)
+            continue
+        if contradictions:
+            why = "; ".join(contradictions)
+            notices.append(f"what is known contradicts itself, so nothing is corrected: {why}")
+        for i, j in enumerate(group):
+            name, ratios, constant_a = vehicles[j].vehicle, named_ratios(laws[i], branches), laws[i].constant_a
+            k = int(np.argmax(found.drift[i]))
+            if found.drift[i, k] >= 1.0:  # as in the schema of the parameter file
+                left_out[name] = (
+                    f"sensor {branches[k]} reads {1.0 + found.drift[i, k]:.1f} times the current; check its unit, or "
+                    f"what is known of the other sensors"
+                )
+                continue
+            expected_a = 0.0 if load is None else load.mean_a
+            mine = parameters_of(
+                vehicles[j],
+                found,
+                i,
+                identity=identity,
+                branches=branches,
+                expected_a=expected_a,
+                fleet_size=1,
+                decisive=deciding[i],
+            )
+            parameters.append(mine)
+            junctions[name] = {"gain_ratio": ratios, "constant_a": constant_a}
+            if len(vehicles) <= MOST_SHOWN:
+                said = ", ".join(f"{value:.4f} +- {sd:.4f} ({pair})" for pair, (value, sd) in ratios.items())
+                texts = [f"{branch}: {text}" for branch, text in sensor_texts(mine).items()]
+                texts.append(
+                    f"gain ratios {said}; at zero current the sensors sum to {constant_a[0]:+.2f} +- "
+                    f"{constant_a[1]:.2f} A: their offsets, and loads without a sensor"
+                )
+                notices += [f"{name}: {text}" for text in (*texts, *_same_error(mine, trusted))]
+    details = {"junction": junctions, "declared_load_a": 0.0 if load is None else load.mean_a}
+    return equipment, encode_chunk(parameters, left_out), details, notices
+
+
+def _read(
+    fleet: FleetSource, database: VehicleDatabase, settings: CalibrationSettings, workers: Workers
+) -> tuple[Equipment, list[VehicleSummary], dict[str, str], list[Sequence[Drive]]]:
+    """Branches; summaries of the vehicles that can be used, why the others cannot; drives of each, if they are few."""
+    branches, limit_s = settings.branches, settings.time_limit_s
+    if len(fleet.vehicles) > MOST_READ_HERE:
+        equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False)
+        found = read_vehicles(read_junction, fleet, equipment, database, workers=workers, limit_s=limit_s)
+        return equipment, *found, []
+    left_out = dict(fleet.left_out)
+
+    def usable(make: Callable[[Any], _Made], items: Iterable[tuple[str, Any]]) -> dict[str, _Made]:
+        """What can be made of some vehicles; why it cannot of the others goes to those left out."""
+        found = dict[str, _Made]()
+        for vehicle, item in items:
+            try:
+                found[vehicle] = make(item)
+            except UserError as problem:
+                left_out[vehicle] = str(problem)
+        if not found:
+            raise FleetError(list(left_out.values())[-1])
+        return found
+
+    entries = shown(fleet.vehicles.items(), "read drives", len(fleet.vehicles), "vehicles")
+    drives = usable(lambda mine: [load_drive(entry, database) for entry in mine], entries)
+    first = [mine[0] for mine in drives.values()]
+    equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False, drives=first)
+    vehicles = usable(lambda mine: summarise_junction(mine, equipment.branches, database), drives.items())
+    return equipment, list(vehicles.values()), left_out, list(drives.values())
+
+
+def _known_readings(
+    vehicles: Sequence[VehicleSummary],
+    branches: Sequence[str],
+    settings: CalibrationSettings,
+    layout: Layout,
+    *,
+    trusted: Collection[str],
+    left_out: Mapping[str, str],
+) -> Array:
+    """What is known of sensors, see :class:`JunctionKnowledge`; FleetError if it is of something that is not there."""
+    scale_a, names = layout.full_scale_a, [each.vehicle for each in vehicles]
+    meter = [settings.meter] if settings.meter else []
+    for option, given in {"--trusted": trusted, "--charge": settings.charge_ah, "--meter": meter}.items():
+        for name in given:
+            if name not in branches:
+                raise FleetError(f"{option} {name}: no such branch was recorded; there are {', '.join(branches)}")
+    if meter and len(vehicles) < 2:
+        raise FleetError(f"--meter {settings.meter}: one folder of recordings; give one for each of its sensors")
+    bench: BenchTable = {}
+    if settings.readings is not None:
+        bench = read_bench_table(settings.readings, branches, full_scale_a=scale_a)
+        check_bench_table(bench, names, left_out=left_out, trusted=(), full_scale_a=scale_a)
+    right = np.full((2, 2, len(names), len(branches)), np.nan)
+    for k, name in enumerate(branches):
+        if name in trusted:
+            of = slice(None) if name == settings.meter or not meter else slice(1)  # once of each sensor
+            right[0, :, of, k] = 0.0
+            right[1, 0, of, k] = max(TRUSTED_DRIFT_SD, layout.find_branch(name).uncertainty)
+            right[1, 1, of, k] = TRUSTED_OFFSET_SD * scale_a
+    return np.stack([window_readings(vehicles), bench_readings(bench, names, branches), right])
+
+
+def _charges(
+    drives: Sequence[Sequence[Drive]], settings: CalibrationSettings, fleet: FleetSource
+) -> dict[str, tuple[float, float, float]]:
+    """Mean current of branches over all drives of one vehicle: as measured, by their charge, its deviation. [A]"""
+    if not settings.charge_ah:
+        return {}
+    if len(drives) != 1:
+        raise FleetError(
+            f"--charge is of the recordings of one vehicle, and there are {len(fleet.vehicles)}; give those of one"
+        )
+    found, duration_s = {}, sum(drive.duration_s for drive in drives[0])
+    for branch, (charge_ah, sd_ah) in settings.charge_ah.items():
+        measured_as = span_s = missing_s = 0.0
+        for drive in drives[0]:
+            channel = drive.branches[branch]
+            time_s, value_a = channel.time_s[channel.good], channel.value[channel.good]
+            step_s = np.diff(time_s)
+            usual = step_s <= GAP_PERIODS * np.median(step_s) if step_s.size else step_s > 0.0
+            measured_as += float(np.trapezoid(value_a, time_s))
+            span_s += float(step_s.sum())
+            missing_s += drive.duration_s - float(step_s[usual].sum())
+        if missing_s > MOST_MISSING * duration_s:
+            raise FleetError(
+                f"--charge {branch}: {missing_s:.0f} s of {duration_s:.0f} s have no samples of it, so its charge is "
+                f"not known; leave the option out"
+            )
+        found[branch] = measured_as / span_s, charge_ah * 3600.0 / span_s, sd_ah * 3600.0 / span_s
+    return found
