@@ -1,9 +1,10 @@
-"""Random fault parameters of an artificial fleet, section IV-B of [1]_.
+"""Chance of artificial fleets: independent streams of it from one seed, and random faults, section IV-B of [1]_.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -11,7 +12,44 @@ from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Faults
 
-__all__ = ["FaultSettings", "nonzero_count"]
+__all__ = ["FaultSettings", "Purpose", "nonzero_count", "random_stream"]
+
+
+class Purpose(IntEnum):
+    """What chance is for.
+
+    numpy pads seeds with zeros, so [7], [7, 0] and [7, 0, 0] give the same numbers. In :func:`random_stream` purpose
+    and count stand in front, so that no two purposes ever share a stream.
+    """
+
+    FAULTS = 1
+    CALIBRATION_TRIP = 2
+    UNSEEN_TRIP = 3
+    FRAMES = 4
+    SIMULATION_ERROR = 5
+    TRAINING_FAULTS = 6
+    TRAINING_ERROR = 7
+    COMMON_DRIVE = 8
+    ATTACK = 9
+    START_OF_RUN = 10
+
+
+def random_stream(purpose: Purpose, *numbers: int) -> np.random.Generator:
+    """Return the generator of one purpose.
+
+    Parameters
+    ----------
+    purpose : Purpose
+        What it is for.
+    *numbers : int
+        Seed, and what tells the streams of one purpose apart, such as the number of the vehicle; not negative.
+
+    Returns
+    -------
+    numpy.random.Generator
+        The same for the same arguments, independent of all others.
+    """
+    return np.random.default_rng([int(purpose), len(numbers), *numbers])
 
 
 def nonzero_count(branches: int, sparsity: float) -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrator.artificial.random_fleet import FaultSettings
+from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
 from calibrator.artificial.trips import (
     GroundTruth,
     TripPurpose,
@@ -29,7 +29,6 @@ from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.files.folders import whole_folder
 from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fleet_id, write_truth
 from calibrator.processes.run_many import Workers, run_many
-from calibrator.random_streams import Purpose, random_stream
 from calibrator.recordings.write_logs import FrameSeries, encode_message, sent_values, write_candump
 from calibrator.terminal.progress import shown
 from ecu_node.core.signals import AMPERE, unit_factor

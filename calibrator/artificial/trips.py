@@ -15,11 +15,11 @@ from typing import Literal
 import numpy as np
 
 from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, BUILTIN_INPUTS, GroundTruth, builtin_trip
+from calibrator.artificial.random_fleet import Purpose, random_stream
 from calibrator.drive import Drive
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import iterate_drives
 from calibrator.errors import FleetError
-from calibrator.random_streams import Purpose, random_stream
 from ecu_node.layout import Layout
 
 __all__ = [

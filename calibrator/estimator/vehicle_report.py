@@ -141,7 +141,7 @@ def _probability(value: float) -> float | None:
 
 
 def deciding_evidence(
-    estimate: FleetEstimate, j: int, branches: Sequence[str], *, layout: str = "the layout"
+    estimate: FleetEstimate, j: int, branches: Sequence[str], *, layout: str
 ) -> tuple[str, Explanation | None]:
     """What would decide where it cannot be told what is faulty, or where a correction is held back.
 

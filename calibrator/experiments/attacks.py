@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrator.artificial.random_fleet import Purpose, random_stream
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults
-from calibrator.random_streams import Purpose, random_stream
 
 __all__ = ["WORLDS", "Attack", "World", "draw_attack"]
 

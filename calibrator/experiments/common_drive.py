@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from calibrator.artificial.builtin_drives import builtin_trip
-from calibrator.artificial.random_fleet import FaultSettings
+from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
 from calibrator.drive import Array
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, densest_clusters
@@ -27,15 +27,12 @@ from calibrator.experiments.trial import CommonEvidence, Trial, drawn_distributi
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.published.state_space import choose_order, identify_model
-from calibrator.random_streams import Purpose, random_stream
 from calibrator.score import UnseenDrive
 
 __all__ = ["CommonCase", "CommonDrive", "builtin_common_drive", "common_rows", "common_trial", "measured_moments"]
 
 TRAIN_SHARE = 0.8
 """Share of the drive on which models are trained; the rest is the unity drive, section IV-C. [1]"""
-DURATION_S = 3600.0
-"""An hour: 7,200 samples of unity drive at 10 Hz; the paper does not say. [s]"""
 FULL_SCALE_A = 400.0
 """Nominal maximum current of the built-in vehicle's junction, as in its layout. [A]"""
 GAIN_VARIANCE, CONSTANT_VARIANCE = 1e-10, 1e-12
@@ -116,13 +113,11 @@ class CommonDrive:
         }
 
 
-def builtin_common_drive(*, seed: int = 0, duration_s: float = DURATION_S) -> CommonDrive:
+def builtin_common_drive(duration_s: float) -> CommonDrive:
     """Take the common drive from the built-in vehicle, with all branches and the inputs of ``dbc/hv_powertrain.toml``.
 
     Parameters
     ----------
-    seed : int
-        Which trip.
     duration_s : float
         Least duration. [s]
 
@@ -131,8 +126,8 @@ def builtin_common_drive(*, seed: int = 0, duration_s: float = DURATION_S) -> Co
     FleetError
         If fastsim is not installed.
     """
-    trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, seed), duration_s=duration_s, name=f"builtin-{seed}")
-    unseen = builtin_trip(random_stream(Purpose.UNSEEN_TRIP, seed), duration_s=duration_s, name="unseen")
+    trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, 0), duration_s=duration_s, name="builtin-0")
+    unseen = builtin_trip(random_stream(Purpose.UNSEEN_TRIP, 0), duration_s=duration_s, name="unseen")
     x = trip.inputs
     power, demands = x["torque"] * x["speed"], [x[f"{name}_demand"] for name in ("heater", "aircon", "low_voltage")]
     inputs = [np.maximum(power, 0.0), np.minimum(power, 0.0), x["torque"] ** 2, *demands]

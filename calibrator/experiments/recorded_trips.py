@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.artificial.builtin_drives import builtin_trip
-from calibrator.artificial.random_fleet import FaultSettings
+from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
 from calibrator.artificial.simulate import Vehicle, vehicle_drive
 from calibrator.artificial.trips import GroundTruth, balance_branch, choose_branches, read_recorded_trips, with_branches
 from calibrator.drive import Array
@@ -24,7 +24,6 @@ from calibrator.experiments.trial import ComparedMethod, Trial, drawn_distributi
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.published.evidence import FleetEvidence
 from calibrator.published.state_space import evidence_of_models, identify_vehicle
-from calibrator.random_streams import Purpose, random_stream
 from calibrator.score import UnseenDrive
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise_samples
@@ -38,10 +37,6 @@ __all__ = [
 
 NOISE = 0.001
 """Standard deviation of the sensor noise, in fractions of full scale. [1]"""
-BUILTIN_TRIPS = 27
-"""As many as a summer of recordings has. [1]"""
-BUILTIN_DURATION_S = 1500.0
-"""As long as recorded trips are in the median. [s]"""
 FEWEST_TRIPS = 4
 """Fewer vehicles are no fleet."""
 
@@ -151,9 +146,7 @@ def read_fleet(store: Path, database: VehicleDatabase) -> RecordedFleet:
     return RecordedFleet(name=name, trips=tuple(trips), database=database)
 
 
-def builtin_fleet(
-    database: VehicleDatabase, *, trips: int = BUILTIN_TRIPS, duration_s: float = BUILTIN_DURATION_S
-) -> RecordedFleet:
+def builtin_fleet(database: VehicleDatabase, *, trips: int, duration_s: float) -> RecordedFleet:
     """Trips of the built-in vehicle, for where there are no recordings; the layout must have its names.
 
     Parameters

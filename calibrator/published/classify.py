@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.tree import DecisionTreeClassifier
 
-from calibrator.artificial.random_fleet import FaultSettings
+from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.random_streams import Purpose, random_stream
 
 __all__ = [
     "Classification", "classify_by_expected_trees", "classify_by_threshold", "classify_by_trees", "classify_by_truth",

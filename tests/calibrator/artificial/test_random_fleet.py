@@ -1,10 +1,11 @@
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
 
-from calibrator.artificial.random_fleet import FaultSettings
+from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, measured_currents, true_currents
@@ -60,3 +61,10 @@ def test_sizes_lie_in_their_range_and_sign_bias_is_the_excess_of_positive_faults
 def test_fleet_that_cannot_be_drawn_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(FleetError, match=message):
         draw(**{"vehicles": 4} | changes)
+
+
+def test_stream_is_decided_by_its_purpose_and_numbers_and_differs_from_all_others() -> None:
+    numbers = [(), (0,), (7,), (7, 0), (7, 0, 0), (0, 7)]
+    first, again = ([random_stream(p, *n).random() for p, n in product(Purpose, numbers)] for _ in range(2))
+    assert first == again
+    assert len(set(first)) == len(first)

@@ -107,13 +107,13 @@ def test_ceiling_knows_how_the_faults_were_drawn_or_is_refused() -> None:
 
 
 def test_builtin_drive_has_the_branches_asked_for_and_another_unseen_drive() -> None:
-    builtin = builtin_common_drive(seed=1, duration_s=120.0)
+    builtin = builtin_common_drive(120.0)
     drive = builtin.with_branches(3)
     for currents, all_branches in ((drive.i_s, builtin.i_s), (drive.unseen, builtin.unseen)):
         np.testing.assert_array_equal(currents[:, [0, 2]], all_branches[:, [0, 2]])
         np.testing.assert_allclose(currents.sum(axis=1), 0.0, atol=1e-9)
     assert not np.array_equal(drive.i_s[:500], drive.unseen[:500])
-    with pytest.raises(FleetError, match="9 branches: drive builtin-1 has 2 to 5"):
+    with pytest.raises(FleetError, match="9 branches: drive builtin-0 has 2 to 5"):
         builtin.with_branches(9)
     broken = np.ones((10, 2))
     with pytest.raises(DriveError, match="must sum to zero; the worst sum is 2 A"):
