@@ -10,16 +10,6 @@ FAULTS = Faults(
 )
 
 
-def test_hardware_faults_keep_the_junction_law() -> None:
-    i_s = np.array([[80.0, -80.0], [-20.0, 20.0]])
-    np.testing.assert_allclose(true_currents(i_s, FAULTS.take(0)).sum(axis=1), 0.0, atol=1e-12)
-
-
-def test_sensor_faults_break_the_junction_law() -> None:
-    i = np.array([[80.0, -80.0]])
-    np.testing.assert_allclose(measured_currents(i, FAULTS.take(0)).sum(axis=1), 0.2 * 80.0 - 3.0)
-
-
 def test_slopes_and_intercepts_reproduce_the_measured_currents() -> None:
     i_s = np.array([[80.0, -80.0], [-20.0, 20.0], [1.0, -1.0]])
     a, b = slopes_and_intercepts(FAULTS)

@@ -60,15 +60,19 @@ def tesla(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_stations_differ_by_their_gains(i3: Path) -> None:
+@pytest.fixture(scope="module")
+def stations(i3: Path) -> JunctionCalibrator:
+    return JunctionCalibrator(meter="charger", trusted=["battery"]).fit(i3 / "car", i3 / "layout.toml")
+
+
+def test_stations_differ_by_their_gains(stations: JunctionCalibrator) -> None:
     """At 124 A the battery reads 2.5 A less than one station, and 1.0 A more than the other."""
-    found = JunctionCalibrator(meter="charger", trusted=["battery"]).fit(i3 / "car", i3 / "layout.toml")
-    rows = found.parameters_.set_index(["vehicle", "branch"]).xs("charger", level="branch")
+    rows = stations.parameters_.set_index(["vehicle", "branch"]).xs("charger", level="branch")
     ratio = 1.0 / (1.0 + rows.gain_error)  # battery over charger
     assert ratio["circontrol"] == pytest.approx(0.988, abs=0.003)
     assert ratio["efacec"] == pytest.approx(1.012, abs=0.003)
     assert (rows.gain_error_sd < 0.0035).all()
-    assert not any(each.parameters.findings for each in found.vehicles_.values()), "a ramp is no fault of a sensor"
+    assert not any(each.parameters.findings for each in stations.vehicles_.values()), "a ramp is no fault of a sensor"
 
 
 def test_battery_against_both_stations_is_a_contradiction(i3: Path, tmp_path: Path) -> None:
@@ -82,14 +86,10 @@ def test_battery_against_both_stations_is_a_contradiction(i3: Path, tmp_path: Pa
     assert not pd.read_parquet(tmp_path / "r" / "results.parquet").applied.any()
 
 
-def test_offset_of_a_station_needs_the_load_of_the_car(i3: Path) -> None:
+def test_offset_of_a_station_needs_the_load_of_the_car(i3: Path, stations: JunctionCalibrator) -> None:
     """After the plug the car draws 0.7 to 0.9 A that no branch measures: declared, they leave no offset."""
-    open_, declared = (
-        JunctionCalibrator(meter="charger", trusted=["battery"], load=load)
-        .fit(i3 / "car", i3 / "layout.toml")
-        .parameters_
-        for load in (None, (0.8, 0.1))
-    )
+    knowing = JunctionCalibrator(meter="charger", trusted=["battery"], load=(0.8, 0.1))
+    open_, declared = stations.parameters_, knowing.fit(i3 / "car", i3 / "layout.toml").parameters_
     assert (open_[open_.branch == "charger"].offset_sd_a > 1.0).all()
     chargers = declared[declared.branch == "charger"]
     assert (chargers.offset_a.abs() < 3.0 * chargers.offset_sd_a).all()
@@ -109,8 +109,4 @@ def test_rear_inverter_reads_two_percent_less_than_the_battery(tesla: Path) -> N
     assert not rows.corrected.any()
     assert "the gain of motor_front needs a drive in which that current varies more" in found.summary()
     assert not any(each.parameters.findings for each in found.vehicles_.values())
-
-
-def test_sum_at_zero_current_is_the_load_of_the_tesla(tesla: Path) -> None:
-    found = JunctionCalibrator(trusted=["battery"]).fit(tesla / "drive.log.gz", tesla / "tesla_model3.toml")
-    assert any("the sensors sum to +4.1" in notice for notice in found.notices_)
+    assert any("the sensors sum to +4.1" in notice for notice in found.notices_), "the load of the car"

@@ -2,6 +2,7 @@
 
 import importlib.util
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -23,7 +24,6 @@ from calibrator.summaries.summary_store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
 from tests.calibrator.command_here import calibrator as command
-from tests.calibrator.command_here import made_once
 from tests.calibrator.estimator.test_run import contents, failing_for
 from tests.calibrator.summaries.small_stores import random_faults, small_store
 
@@ -186,15 +186,8 @@ def test_frames_of_a_layout_have_derived_inputs_limits_and_files_for_the_node(tm
         Fleet.from_frames(given, junction, inputs=["wind"])
 
 
-@pytest.fixture(scope="session")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fleet of two vehicles with a log each."""
-    options = ("--vehicles", 2, "--currents", 2, "--minutes", 2.5, "--unseen-minutes", 0.1, "--seed", 5)
-    return made_once(tmp_path_factory, "two_vehicles", "simulate", *options)
-
-
-def test_log_reads_as_a_frame_that_makes_a_fleet(logs: Path) -> None:
-    paths = sorted((logs / "logs").rglob("*.log*"))
+def test_log_reads_as_a_frame_that_makes_a_fleet(two_vehicles: Path) -> None:
+    paths = sorted((two_vehicles / "logs").rglob("*.log*"))
     log = read_log(paths[0], LAYOUT)
     found = log.to_frame()
     assert found.index.name == "time_s"
@@ -208,12 +201,13 @@ def test_log_reads_as_a_frame_that_makes_a_fleet(logs: Path) -> None:
         assert len(FleetCalibrator().fit(Fleet.from_frames(recorded, junction)).vehicles_) == 2
 
 
-def test_script_without_main_guard_reads_logs_in_processes(logs: Path, tmp_path: Path) -> None:
+def test_script_without_main_guard_reads_logs_in_processes(two_vehicles: Path, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
         f"from calibrator import Fleet, FleetCalibrator\n"
         f"print('begun')\n"
-        f"print(len(FleetCalibrator(workers=1).fit(Fleet.from_folder({str(logs)!r}, {str(LAYOUT)!r})).vehicles_))\n"
+        f"fleet = Fleet.from_folder({str(two_vehicles)!r}, {str(LAYOUT)!r})\n"
+        f"print(len(FleetCalibrator(workers=1).fit(fleet).vehicles_))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, cwd=ROOT)
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, ["begun", "2"], "")
@@ -249,6 +243,21 @@ def test_several_frames_and_bad_samples_are_taken_as_they_are() -> None:
     assert 575.0 <= parameters.provenance.duration_s <= 582.0
     assert parameters.provenance.drives == ["frame 1", "frame 2"]
     assert "at least 120 s are needed" in found.left_out_["V8"]
+
+
+def test_readings_and_trust_that_the_drives_contradict_are_named_and_the_others_are_used() -> None:
+    given = {**frames(8), "V4": frame(4, gain_error=0.1), "V5": frame(5, gain_error=0.1)}
+    offset = pd.DataFrame({"vehicle": ["V3"], "branch": "motor", "offset_a": 40.0, "offset_sd_a": 0.1})
+    readings = pd.concat([bench_rows(["V4", "V7"], 0.1), offset])  # the reading of V7 is of V4
+    found = FleetCalibrator(readings=readings, trusted=["V1", "V2", "V5"]).fit(Fleet.from_frames(given, JUNCTION))
+    said = "\n".join(notice for notice in found.notices_ if "bench" in notice or "trusted" in notice)
+    assert re.fullmatch(
+        r"only 2 of the trusted vehicles can carry the reference, 3 are needed: it is the fleet's\n"
+        r"vehicle V5 is not trusted: the gains of its sensors motor and battery differ by \+9.\d%; check it again\n"
+        r"vehicle V7: the bench reading of its battery sensor is not what its drives show.*\n"
+        r"vehicle V3: the bench reading of its motor sensor is not what its drives show.*",
+        said,
+    )
 
 
 @pytest.mark.parametrize(

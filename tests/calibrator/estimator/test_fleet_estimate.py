@@ -14,9 +14,8 @@ import pytest
 from calibrator.drive import Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
-from calibrator.estimator.fleet_task import _contradicted, _distrust
+from calibrator.estimator.fleet_task import _distrust
 from calibrator.estimator.prior import known_prior
-from calibrator.estimator.readings import BenchReading
 from calibrator.faults import Faults
 from calibrator.score import harmed
 from calibrator.summaries.moments import DriveSummary
@@ -214,29 +213,6 @@ def test_expected_share_and_known_distribution_of_the_faults_are_used() -> None:
     counts[0, :2] = 0.75, 0.25
     prior = known_prior(counts, (0.05, 0.25))
     assert learned(summaries, known=prior).models[0].prior is prior
-
-
-def test_bench_reading_that_the_drives_contradict_is_named_and_the_others_are_not() -> None:
-    truth = no_faults(10, K)
-    truth.drift[4, 1] = 0.1
-    summaries = summaries_of(truth, Conditions(samples=1200, model_error_a=0.5), seed=1)
-    reference = learned(summaries)
-    vehicles = [SimpleNamespace(vehicle=f"V{j}", summary=summary) for j, summary in enumerate(summaries)]
-
-    def estimate(some: Any) -> Any:
-        return estimate_vehicles([vehicle.summary for vehicle in some], reference)
-
-    bench = {
-        ("V7", "motor"): BenchReading(0.1, 0.001, NAN, NAN, "of V4"),
-        ("V4", "motor"): BenchReading(0.1, 0.001, NAN, NAN, "as it is"),
-        ("V4", "battery"): BenchReading(0.0, 0.001, 40.0, 0.1, "40 A too much"),
-        ("V2", "battery"): BenchReading(NAN, NAN, 0.0, 0.1, "as it is"),
-    }
-    task = cast("Any", SimpleNamespace(branches=NAMES, estimate=estimate))
-    wrong = _contradicted(task, cast("Any", vehicles), bench)
-    assert list(wrong) == [("V7", "motor"), ("V4", "battery")]
-    assert "vehicle V4: the bench reading of its battery sensor is not what its drives show" in wrong["V4", "battery"]
-    assert _contradicted(task, cast("Any", vehicles[:1]), bench) == {}
 
 
 def test_trusted_vehicles_that_do_not_carry_the_reference_are_named() -> None:

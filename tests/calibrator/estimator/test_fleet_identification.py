@@ -158,7 +158,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("identify") / "store"
     for j in range(5):
         lag_s = SLUGGISH_S if f"V{j}" == SLUGGISH else MOTOR_S
-        write_drive(folder, drive("drive", vehicle=f"V{j}", lag_s=lag_s, noise_a=0.02, seed=j), read_layout(LAYOUT))
+        write_drive(
+            folder, drive("drive", 1800, vehicle=f"V{j}", lag_s=lag_s, noise_a=0.02, seed=j), read_layout(LAYOUT)
+        )
     return folder
 
 

@@ -114,7 +114,7 @@ def test_ratios_alone_have_no_scale(motor_off: pd.DataFrame) -> None:
     assert any("0.95" in notice and "battery / motor" in notice for notice in calibrator.notices_)
 
 
-def test_unusable_vehicle_leaves_the_others_calibrated(motor_off: pd.DataFrame, tmp_path: Path) -> None:
+def test_unusable_vehicle_leaves_the_others_calibrated_as_in_python(motor_off: pd.DataFrame, tmp_path: Path) -> None:
     for name, frame in {"good": motor_off, "short": motor_off.iloc[:20], "empty": motor_off.iloc[:0]}.items():
         (tmp_path / "cars" / name).mkdir(parents=True)
         frame.rename_axis("time_s").to_csv(tmp_path / "cars" / name / "drive.csv")
@@ -126,6 +126,9 @@ def test_unusable_vehicle_leaves_the_others_calibrated(motor_off: pd.DataFrame, 
     assert "short: " in done.stdout
     assert "at least 5 s are needed" in done.stdout
     assert "next: calibrator report" in done.stderr
+    rows = pd.read_parquet(tmp_path / "r" / "results.parquet").set_index(["vehicle", "branch"]).loc["good"]
+    here = found(motor_off, trusted=["battery"]).loc["vehicle"]
+    assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
 
 
 def test_offset_of_one_of_two_has_two_explanations() -> None:
@@ -328,15 +331,6 @@ def write_layout(folder: Path, frame: pd.DataFrame) -> Path:
     branches = "".join(f'[[branch]]\nname = "{name}"\nsignal = "{name}"\nsign = 1\n' for name in frame)
     (folder / "layout.toml").write_text(f'schema = 1\nname = "car"\nfull_scale_a = 400.0\n{branches}')
     return folder / "layout.toml"
-
-
-def test_command_writes_what_python_finds(table: Path, tmp_path: Path, motor_off: pd.DataFrame) -> None:
-    layout, out = table / "layout.toml", tmp_path / "result"
-    arguments = ["calibrate", table / "drive.csv", "--layout", layout, "--trusted", "battery", "--out", out]
-    assert command(*arguments).returncode == 0
-    rows = pd.read_parquet(out / "results.parquet").set_index("branch")
-    here = found(motor_off, trusted=["battery"]).loc["vehicle"]
-    assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
 
 
 def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:

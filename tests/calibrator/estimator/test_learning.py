@@ -50,7 +50,7 @@ def same(one: FaultModel, other: FaultModel, rtol: float) -> None:
 @pytest.mark.parametrize("magnitude", [(0.05, 0.25), (0.3, 0.6)])
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magnitude: tuple[float, float]) -> None:
-    faults = random_faults(1, vehicles=60, branches=K, magnitude=magnitude)
+    faults = random_faults(1, vehicles=48, branches=K, magnitude=magnitude)
     model = learned(rows_of(faults, seed=1))
     for slab, values in ((model.prior.gain, faults.drift), (model.prior.offset, faults.offset_a)):
         sizes = np.abs(values[values != 0.0])
@@ -58,7 +58,7 @@ def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magni
         assert 0.95 * sizes.max() < slab.high < 1.3 * magnitude[1]
     assert model.prior.counts[1:].sum() == pytest.approx(faults.has_hardware_fault.mean(), abs=0.08)
     many = np.count_nonzero(np.hstack([faults.drift, faults.offset_a]), axis=1)
-    expected = np.bincount(many, minlength=2 * K + 1) / 60.0
+    expected = np.bincount(many, minlength=2 * K + 1) / 48.0
     np.testing.assert_allclose(model.prior.counts.sum(axis=0), expected, atol=0.08)
     assert not model.spread.shared.any()
     assert np.abs(model.spread.mean).max() < 0.002
@@ -74,7 +74,7 @@ def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(mon
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K: int) -> None:
     """Currents that sum to less than zero: no load gives current."""
-    faults = random_faults(12, vehicles=40, branches=K)
+    faults = random_faults(12, vehicles=24, branches=K)
     faults.offset_a[:, 0] -= 0.03
     causes = shared_by(learn_fault_models(rows_of(faults, seed=12), feed=0))
     assert causes.get((), 0.0) < 0.01
@@ -83,7 +83,7 @@ def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K:
 
 @pytest.mark.parametrize("of_sensor", [False, True])
 def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(of_sensor: bool) -> None:
-    faults, some = random_faults(13, vehicles=40, branches=2), np.arange(40) < 12
+    faults, some = random_faults(13, vehicles=24, branches=2), np.arange(24) < 8
     faults.offset_a[some, 0] += 0.03 * of_sensor
     models = learn_fault_models(rows_of(faults, seed=13, load=0.0 if of_sensor else 0.03 * some), feed=0)
     (share,), (centre,) = models[0].prior.group_share, models[0].prior.group_centre
@@ -96,7 +96,7 @@ def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(o
 def test_gain_that_all_sensors_of_a_branch_share_is_found_and_of_two_branches_either_may_have_it(
     K: int, branch: int
 ) -> None:
-    gain, faults = 0.08, random_faults(14, vehicles=30, branches=K)
+    gain, faults = 0.08, random_faults(14, vehicles=16, branches=K)
     faults.drift[:, branch] = (1.0 + gain) * (1.0 + faults.drift[:, branch]) - 1.0
     rows = rows_of(faults, seed=14)
     rows.relative[:, branch] -= np.log1p(gain)  # the fleet's model has the same error

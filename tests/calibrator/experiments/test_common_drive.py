@@ -97,7 +97,7 @@ def test_fleet_that_is_not_symmetric_defeats_the_mean_and_not_the_default() -> N
 
 
 def test_ceiling_knows_how_the_faults_were_drawn_or_is_refused() -> None:
-    case = replace(CASE, vehicles=20, sparsity=20.0)
+    case = replace(CASE, vehicles=12)
     trial = common_trial(smooth_drive(), case, 0)
     ceiling, default = (method.estimate(trial).confidence for method in (CEILING, POSTERIOR))
     assert not np.array_equal(ceiling, default)  # type: ignore[arg-type]

@@ -90,10 +90,10 @@ def test_case_with_minutes_has_the_vehicles_asked_for(fleet: RecordedFleet) -> N
 
 
 def test_delays_are_found_and_taken_out_or_left_in(fleet: RecordedFleet) -> None:
-    few, case = fleet.take(6, duration_s=200.0), RecordedCase(delay_max_s=0.3)
+    few, case = fleet.take(4, duration_s=150.0), RecordedCase(delay_max_s=0.3)
     trial, left_in = (recorded_trial(few, replace(case, delays_left_in=left), 0) for left in (False, True))
     assert trial.delay_error_s is not None
-    assert trial.delay_error_s.shape == (6, 1)
+    assert trial.delay_error_s.shape == (4, 1)
     assert np.abs(trial.delay_error_s).max() < 0.01
     assert left_in.delay_error_s is None
     np.testing.assert_array_equal(left_in.truth.drift, trial.truth.drift)

@@ -24,6 +24,7 @@ from calibrator.published.recovery import recover_fleet
 from calibrator.published.state_space import StateSpaceModel, VehicleModel, evidence_of_models
 from calibrator.score import f2_score, recovered
 from tests.calibrator.command_here import calibrator
+from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.estimator.simulated_rows import random_faults
 
 FULL_SCALE_A = 400.0
@@ -183,12 +184,9 @@ def test_vehicle_held_out_of_the_reference_moves_nothing_and_its_drive_is_not_th
     np.testing.assert_allclose(evidence.slopes, a / a[:3].mean(axis=0))
 
 
-def test_small_fleet_is_noticed_on_the_screen_and_in_the_record(tmp_path: Path) -> None:
-    files = ("--layout", Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml", "--workers", 1)
-    drawn = ("--vehicles", 2, "--minutes", 2.2, "--unseen-minutes", 0.1, "--common-drive")
-    calibrator("simulate", *drawn, *files, "--out", tmp_path / "fleet")
-    method = ("--method", "published", "--classifier", "threshold")
-    run = calibrator("calibrate", tmp_path / "fleet", *method, "--out", tmp_path / "result", *files)
+def test_small_fleet_is_noticed_on_the_screen_and_in_the_record(two_vehicles: Path, tmp_path: Path) -> None:
+    options = ("--method", "published", "--classifier", "threshold", "--layout", LAYOUT, "--workers", 1)
+    run = calibrator("calibrate", two_vehicles, *options, "--out", tmp_path / "result")
     record = json.loads((tmp_path / "result" / "run.json").read_text())
     (notice,) = (each for each in record["notices"] if each.startswith("2 vehicles are few"))
     assert f"notice: {notice}" in run.stdout
