@@ -47,7 +47,7 @@ def same(one: FaultModel, other: FaultModel, rtol: float) -> None:
     assert one.log_evidence == pytest.approx(other.log_evidence, rel=rtol)
 
 
-@pytest.mark.parametrize("magnitude", [(0.05, 0.25), (0.3, 0.6)])
+@pytest.mark.parametrize("magnitude", [(0.05, 0.25), pytest.param((0.3, 0.6), marks=pytest.mark.long)])
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magnitude: tuple[float, float]) -> None:
     faults = random_faults(1, vehicles=48, branches=K, magnitude=magnitude)
