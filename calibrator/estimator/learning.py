@@ -52,6 +52,8 @@ START_ROUNDS, ROUNDS, PRIOR_STEPS = 2, 5, 6
 """Rounds of each start, of the best ones after that, and steps of the prior in each round."""
 MOST_COMMON = 3
 """Clusters of all slopes that are started from: vehicles with a hardware fault agree with themselves. [1]"""
+MOST_WEAK = 2
+"""Clusters of intercepts that are doubted, those of the fewest vehicles. [1]"""
 KEPT_STARTS = 2
 """Starts that are climbed to their end."""
 SAME_DENSITY = 0.2
@@ -78,6 +80,8 @@ TAIL_DEGREES = 8.0
 """Degrees of freedom of Student's t, as which the vehicles differ in each row: what is far off counts less. [1]"""
 COUNT_VEHICLES = 2.5
 """Weight of the distribution (20) of sparse faults against the fleet's own numbers of faults, in vehicles."""
+OTHERS_STEPS, LEAST_OTHERS = 3, 1e-3
+"""Steps to the numbers of faults of the other vehicles, and the least share of a number that is theirs. [1]"""
 USED_FITS = 16
 """Explanations of each vehicle that the model spread is learnt from, the most probable ones."""
 LEAST_GROUP, MOST_GROUPS, GROUP_GAIN = 2.0, 2, 5.0
@@ -203,15 +207,21 @@ class _Learner:
         known, sd = rows.known[:, at.slopes], np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2)[:, at.slopes])
         agreeing = densest_clusters((rows.values[:, at.slopes] - centre[at.slopes])[known], sd[known], most=MOST_COMMON)
         common = [cluster.centre for cluster in agreeing] or [0.0]
-        centre[at.intercepts] = [self.clusters(at.intercept(k))[0] for k in range(K)]
+        own = [densest_clusters(*rows.shown(at.intercept(k))) for k in range(K)]
+        centre[at.intercepts] = [clusters[0].centre if clusters else 0.0 for clusters in own]
+        weakest = np.argsort([clusters[0].share if clusters else 0.0 for clusters in own], kind="stable")[:MOST_WEAK]
+        # The junction shows its constant most exactly. What is larger than any load comes of intercepts that few share.
         others = centre[at.intercepts].sum() - centre[intercept]
         zeros = [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
+        constants = [*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0, *zeros]
+        constants = [constant for constant in constants if abs(constant) <= LARGEST_SHARED]
         found: list[Array] = []
-        # The junction shows its constant most exactly.
-        for constant, excess in product((*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0, *zeros), common):
+        # Clusters of all intercepts and the constant say one too much: what the fewest vehicles show may be chance.
+        for follows, constant, excess in product((intercept, *map(at.intercept, weakest.tolist())), constants, common):
             start = centre.copy()
             start[at.slopes] += excess
-            start[intercept], start[at.junction] = constant - others, constant
+            start[follows] += constant - centre[at.intercepts].sum()
+            start[at.junction] = constant
             start = np.where(np.isnan(self.fixed), start, self.fixed)
             if not any(np.abs(start - other).max() < SAME_START for other in found):
                 found.append(start)
@@ -361,9 +371,7 @@ class _Learner:
         """Numbers of faults, loads and groups from the weights of the draws."""
         weight, _ = weigh(draws, prior)
         N, load = len(weight), self.parameters.load
-        of_fit = weight.sum(axis=(2, 3))
-        tally = np.zeros(prior.counts.shape)
-        np.add.at(tally, (draws.fits.hardware, draws.fits.sensor), of_fit)
+        tally = _tally(draws, weight, prior)
         counts = (tally + COUNT_VEHICLES * sparse_counts(tally)) / (N + COUNT_VEHICLES)
         if self.expected_faults is not None:
             sound, faulty = counts[:, :1], counts[:, 1:]
@@ -461,6 +469,29 @@ class _Learner:
             dispersion=1.0 + ((count * more).sum(axis=(0, 1)) + SPREAD_VEHICLES) / (N + SPREAD_VEHICLES),
             shared=spread.shared,
         )
+
+
+def _tally(draws: Draws, weight: Array, prior: Prior) -> Array:
+    """Expected number of vehicles with so many hardware and sensor faults, shape (K + 1, 2K + 1).
+
+    Each vehicle is judged by the numbers of faults of the others (CVB0 of [1]_): a few vehicles would else confirm what
+    their own faults have made likely.
+
+    .. [1] A. Asuncion et al., "On smoothing and inference for topic models", UAI 2009.
+    """
+    fits, N = draws.fits, len(weight)
+    vehicle, cell = np.arange(N)[:, None], (fits.hardware, fits.sensor)
+    of_fit = weight.sum(axis=(2, 3))
+    shown = of_fit / prior.counts[cell]
+    everybody = (N + COUNT_VEHICLES) * prior.counts
+    for _ in range(OTHERS_STEPS):
+        own = np.zeros((N, *prior.counts.shape))
+        np.add.at(own, (vehicle, *cell), of_fit)
+        of_fit = shown * np.maximum(everybody - own, LEAST_OTHERS * everybody)[vehicle, *cell]
+        of_fit /= of_fit.sum(axis=1, keepdims=True)
+    tally = np.zeros(prior.counts.shape)
+    np.add.at(tally, cell, of_fit)
+    return tally
 
 
 def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:

@@ -9,7 +9,7 @@ from calibrator.drive import Array
 from calibrator.estimator import learning
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces
 from calibrator.estimator.learning import learn_fault_models
-from calibrator.estimator.posterior import FaultModel, Spread, explain
+from calibrator.estimator.posterior import FaultModel, Spread, explain, weigh
 from calibrator.estimator.prior import Prior, first_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
@@ -79,6 +79,33 @@ def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K:
     causes = shared_by(learn_fault_models(rows_of(faults, seed=12), feed=0))
     assert causes.get((), 0.0) < 0.01
     assert max(causes, key=causes.__getitem__) == (0,)
+
+
+@pytest.mark.parametrize("seed", [8, 10])
+def test_intercepts_that_two_vehicles_share_by_chance_are_no_reference(seed: int) -> None:
+    """Where most vehicles are faulty: a whole fleet's sensors were then off by 15 % of full scale, for certain."""
+    faults = random_faults(seed, vehicles=24, branches=3, sparsity=50.0, balanced=False)
+    spread, at = learned(rows_of(faults, seed=seed)).spread, RowPlaces(3)
+    assert np.abs(spread.mean[[*np.arange(15)[at.intercepts], at.junction]]).max() < 0.003
+    assert not spread.shared.any()
+
+
+def test_vehicle_does_not_confirm_its_own_number_of_faults() -> None:
+    """One vehicle is judged by the guess alone, whatever numbers it has made likely before."""
+    errors = Errors(slope=0.1, ratio=0.03, intercept=0.05, junction=0.03)
+    rows = rows_of(random_faults(3, vehicles=1, branches=2), seed=3, errors=errors)
+    draws, guess = explain(rows, law_of(2), feed=0), first_prior(2)
+
+    def numbers(prior: Prior) -> Array:
+        tally = np.zeros(prior.counts.shape)
+        np.add.at(tally, (draws.fits.hardware, draws.fits.sensor), weigh(draws, prior)[0].sum(axis=(2, 3)))
+        return tally
+
+    alone, C = numbers(guess), learning.COUNT_VEHICLES
+    learnt = replace(guess, counts=(alone + C * guess.counts) / (1.0 + C))
+    confirmed, found = numbers(learnt), learning._tally(draws, weigh(draws, learnt)[0], learnt)
+    assert np.abs(confirmed - alone).max() > 0.05
+    np.testing.assert_allclose(found, alone, atol=0.01)
 
 
 @pytest.mark.parametrize("of_sensor", [False, True])
