@@ -52,8 +52,11 @@ START_ROUNDS, ROUNDS, PRIOR_STEPS = 2, 5, 6
 """Rounds of each start, of the best ones after that, and steps of the prior in each round."""
 MOST_COMMON = 3
 """Clusters of all slopes that are started from: vehicles with a hardware fault agree with themselves. [1]"""
-MOST_WEAK = 2
-"""Clusters of intercepts that are doubted, those of the fewest vehicles. [1]"""
+MOST_ZEROS, MOST_CHOICES = 3, 1000
+"""Clusters of the intercepts of a branch that are tried, and about how many choices of them. [1]"""
+SAME_ZEROS, NEARLY_AS_MANY = 0.005, 2
+"""Difference of two zeros in fractions of full scale below which they are one, some A as drives differ, and by how many
+vehicles a choice may be shown less often than the best."""
 KEPT_STARTS = 2
 """Starts that are climbed to their end."""
 SAME_DENSITY = 0.2
@@ -188,6 +191,33 @@ class _Learner:
         found = densest_clusters(*self.rows.shown(row), most=most, farthest=farthest)
         return [cluster.centre for cluster in found] or [0.0]
 
+    def zeros(self, constant: float) -> list[Array]:
+        """Intercepts of vehicles without faults, each of shape (K,), that add up to a constant of the junction.
+
+        All but one are clusters. Of all such choices those that most vehicles show are returned, the best first: a
+        cluster of few vehicles may be chance.
+        """
+        K = self.rows.branches
+        most = min(MOST_ZEROS, int(MOST_CHOICES ** (1.0 / K)))
+        clusters = [self.clusters(self.at.intercept(k), most) for k in range(K)]
+        chosen = []
+        for follows in range(K):
+            zeros = np.array(list(product(*(clusters[k] if k != follows else [0.0] for k in range(K)))))
+            zeros[:, follows] = constant - zeros.sum(axis=1)
+            chosen.append(zeros)
+        tried = np.concatenate(chosen)
+        vehicles = np.zeros(len(tried), np.int64)
+        for k in range(K):
+            values, sd = self.rows.shown(self.at.intercept(k))
+            near = np.abs(values[:, None] - tried[:, k]) < np.maximum(3.0 * sd, SAME_ZEROS)[:, None]
+            vehicles += np.count_nonzero(near, axis=0)
+        found: list[Array] = []
+        for i in np.argsort(-vehicles, kind="stable"):
+            apart = all(np.abs(tried[i] - other).max() > SAME_ZEROS for other in found)
+            if apart and len(found) < MOST_ZEROS and vehicles[i] >= vehicles.max() - NEARLY_AS_MANY:
+                found.append(tried[i])
+        return found
+
     def centres(self) -> list[Array]:
         """Where to start, from what vehicles agree on.
 
@@ -207,24 +237,21 @@ class _Learner:
         known, sd = rows.known[:, at.slopes], np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2)[:, at.slopes])
         agreeing = densest_clusters((rows.values[:, at.slopes] - centre[at.slopes])[known], sd[known], most=MOST_COMMON)
         common = [cluster.centre for cluster in agreeing] or [0.0]
-        own = [densest_clusters(*rows.shown(at.intercept(k))) for k in range(K)]
-        centre[at.intercepts] = [clusters[0].centre if clusters else 0.0 for clusters in own]
-        weakest = np.argsort([clusters[0].share if clusters else 0.0 for clusters in own], kind="stable")[:MOST_WEAK]
-        # The junction shows its constant most exactly. What is larger than any load comes of intercepts that few share.
+        centre[at.intercepts] = [self.clusters(at.intercept(k))[0] for k in range(K)]
         others = centre[at.intercepts].sum() - centre[intercept]
-        zeros = [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
-        constants = [*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0, *zeros]
+        # The junction shows its constant most exactly. What is larger than any load comes of zeros that few share.
+        constants = [*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0]
+        constants += [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         constants = [constant for constant in constants if abs(constant) <= LARGEST_SHARED]
         found: list[Array] = []
-        # Clusters of all intercepts and the constant say one too much: what the fewest vehicles show may be chance.
-        for follows, constant, excess in product((intercept, *map(at.intercept, weakest.tolist())), constants, common):
-            start = centre.copy()
-            start[at.slopes] += excess
-            start[follows] += constant - centre[at.intercepts].sum()
-            start[at.junction] = constant
-            start = np.where(np.isnan(self.fixed), start, self.fixed)
-            if not any(np.abs(start - other).max() < SAME_START for other in found):
-                found.append(start)
+        for constant in constants if np.isnan(self.fixed[at.junction]) else [float(self.fixed[at.junction])]:
+            for zeros, excess in product(self.zeros(constant), common):
+                start = centre.copy()
+                start[at.slopes] += excess
+                start[at.intercepts], start[at.junction] = zeros, constant
+                start = np.where(np.isnan(self.fixed), start, self.fixed)
+                if not any(np.abs(start - other).max() < SAME_START for other in found):
+                    found.append(start)
         return found
 
     def start(self, centre: Array) -> FaultModel:
