@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Unpack
 
@@ -281,16 +282,21 @@ def put_in_force(
     """
     parameters = in_force.parameters
     found = parameters.branches if parameters is not None else {}
+    takes = []  # all of them before the first is taken: either all or none
     for branch, live in zip(database.layout.branch, corrector.branches, strict=True):
         fault, said = in_force.fault(branch.name), found.get(branch.name)
         is_in_place = mode is Mode.GATEWAY or branch.corrected is None
-        live.take(
+        take = partial(
+            live.take,
             fault,
             correcting=branch_plan(database, branch, fault, mode),
             passing=AS_IT_IS if is_in_place else branch_plan(database, branch, NO_FAULT, mode),
             delay_s=(said and said.delay_s) or 0.0,
             expected_since_s=now_s if said is not None else None,
         )
+        takes.append(take)
+    for take in takes:
+        take()
     number = parameters.number % PARAMETER_SETS if parameters is not None else 0
     expected = parameters.junction_residual if parameters is not None else None
     corrector.begin(reason=in_force.reason, parameter_set=number, expected=expected)
