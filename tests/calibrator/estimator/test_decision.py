@@ -166,6 +166,19 @@ def test_offset_beside_what_a_group_shares_is_that_of_the_sensor(of_sensor: bool
     np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)
 
 
+def test_offset_that_all_sensors_of_a_branch_share_is_known_no_better_than_a_sensor_resolves() -> None:
+    shared = np.array([0.03, 0.0, 0.0, 0.0, 0.0])
+    truth, centre = no_faults(3, K), np.zeros(5 * K)
+    truth.offset_a[:, 0] = 0.03
+    centre[[3 * K - 1, 4 * K - 1]] = 0.03
+    spread = Spread(mean=centre, covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=shared)
+    law, moments = FaultModel(spread=spread, priors=((1.0, first_prior(K)),)), np.full((3, K), 0.1)
+    found = estimate_rows(rows_of(truth), [law], feed=0, mean=moments, mean_square=moments, usual=moments[:2])
+    np.testing.assert_allclose(found.offset_a[:, 0], 0.03)
+    assert (found.offset_sd_a[:, 0] > 0.0).all()
+    assert not found.offset_sd_a[:, 1].any()
+
+
 def test_group_is_the_same_whatever_its_place_in_a_fault_model() -> None:
     rows, prior = rows_of(no_faults(2, K), load=np.array([0.03, 0.0])), group_prior()
     prior = replace(prior, group_share=np.array([0.3, 0.2]), group_sd=np.array([0.001, 0.001]))
