@@ -54,9 +54,9 @@ MOST_COMMON = 3
 """Clusters of all slopes that are started from: vehicles with a hardware fault agree with themselves. [1]"""
 MOST_ZEROS, MOST_CHOICES = 3, 1000
 """Clusters of the intercepts of a branch that are tried, and about how many choices of them. [1]"""
-SAME_ZEROS, NEARLY_AS_MANY = 0.005, 2
+SAME_ZEROS, NEARLY_AS_MANY = 0.005, 3
 """Difference of two zeros in fractions of full scale below which they are one, some A as drives differ, and by how many
-vehicles a choice may be shown less often than the best."""
+votes of vehicles another choice may stay behind the best."""
 KEPT_STARTS = 2
 """Starts that are climbed to their end."""
 SAME_DENSITY = 0.2
@@ -194,27 +194,27 @@ class _Learner:
     def zeros(self, constant: float) -> list[Array]:
         """Intercepts of vehicles without faults, each of shape (K,), that add up to a constant of the junction.
 
-        All but one are clusters. Of all such choices those that most vehicles show are returned, the best first: a
-        cluster of few vehicles may be chance.
+        All but one are clusters. The first choice is of the densest ones, and the feeding branch takes what is left;
+        others follow that about as many vehicles show, or more, as a cluster of few vehicles may be chance.
         """
         K = self.rows.branches
         most = min(MOST_ZEROS, int(MOST_CHOICES ** (1.0 / K)))
         clusters = [self.clusters(self.at.intercept(k), most) for k in range(K)]
         chosen = []
-        for follows in range(K):
+        for follows in (self.feed, *(k for k in range(K) if k != self.feed)):
             zeros = np.array(list(product(*(clusters[k] if k != follows else [0.0] for k in range(K)))))
             zeros[:, follows] = constant - zeros.sum(axis=1)
             chosen.append(zeros)
         tried = np.concatenate(chosen)
-        vehicles = np.zeros(len(tried), np.int64)
-        for k in range(K):
+        votes = np.zeros(len(tried), np.int64)
+        for k, near in product(range(K), (SAME_START, SAME_ZEROS)):  # who agrees closely has two votes
             values, sd = self.rows.shown(self.at.intercept(k))
-            near = np.abs(values[:, None] - tried[:, k]) < np.maximum(3.0 * sd, SAME_ZEROS)[:, None]
-            vehicles += np.count_nonzero(near, axis=0)
-        found: list[Array] = []
-        for i in np.argsort(-vehicles, kind="stable"):
+            agree = np.abs(values[:, None] - tried[:, k]) < np.maximum(3.0 * sd, near)[:, None]
+            votes += np.count_nonzero(agree, axis=0)
+        found = [tried[0]]
+        for i in np.argsort(-votes, kind="stable"):
             apart = all(np.abs(tried[i] - other).max() > SAME_ZEROS for other in found)
-            if apart and len(found) < MOST_ZEROS and vehicles[i] >= vehicles.max() - NEARLY_AS_MANY:
+            if apart and len(found) < MOST_ZEROS and votes[i] >= votes.max() - NEARLY_AS_MANY:
                 found.append(tried[i])
         return found
 
