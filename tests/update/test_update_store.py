@@ -124,6 +124,19 @@ def test_end_of_a_trial_that_cannot_be_written_now_is_written_later(correcting: 
     assert (ended.drift, read_state(correcting).on_trial) == (OTHER_DRIFT, None)
 
 
+def test_who_changes_a_state_waits_for_another_one(correcting: Path) -> None:
+    def change() -> None:
+        with locked(correcting):
+            pass
+
+    with ThreadPoolExecutor(1) as pool:
+        with locked(correcting):
+            waiting = pool.submit(change)
+            with pytest.raises(TimeoutError):
+                waiting.result(0.1)
+        waiting.result(30.0)
+
+
 def test_trial_in_a_damaged_state_does_not_end_the_node(correcting: Path, ended: Running) -> None:
     cut(correcting / "state.json")
     ended.look(1.0, 3.0, 5.0)
