@@ -117,13 +117,13 @@ class Experiment:
         """Whether it is on recorded trips."""
         return any(isinstance(setting.case, RecordedCase) for setting in self.settings)
 
-    def small(self) -> "Experiment":
+    def small(self, vehicles: int = QUICK_VEHICLES) -> "Experiment":
         """The same with small fleets on the common drive, and few settings: shows that it runs, not the figures."""
         kept = []
         for each in self.settings:
             case = each.case
             if isinstance(case, CommonCase):
-                fewer = min(case.vehicles, QUICK_VEHICLES)
+                fewer = min(case.vehicles, vehicles)
                 case = replace(case, vehicles=fewer, training_vehicles=QUICK_TRAINING_VEHICLES)
             if not self.quick or each.x in self.quick.get(each.series, ()):
                 kept.append(replace(each, case=case))
@@ -417,9 +417,9 @@ class ExperimentResult:
         """Methods in the order of their first rows."""
         return tuple(dict.fromkeys(self.figures["method"]))
 
-    def value(self, figure: str, *, x: float, method: str) -> float:
-        """Return a figure of a method under a setting without series; KeyError if there is none."""
-        return float(self.figures.set_index([*KEYS, "figure"])["value"].to_dict()["", x, method, figure])
+    def value(self, figure: str, *, x: float, method: str, series: str = "") -> float:
+        """Return a figure of a method under a setting; KeyError if there is none."""
+        return float(self.figures.set_index([*KEYS, "figure"])["value"].to_dict()[series, x, method, figure])
 
     def to_json(self) -> str:
         """Encode as JSON."""
