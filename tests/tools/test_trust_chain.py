@@ -22,10 +22,10 @@ def test_no_vehicle_of_a_fleet_is_made_worse(
     layout = tmp_path / LAYOUT.name
     layout.write_text(f"{LAYOUT.read_text()}\n[activation]\ntrial_s = 60\n")
     (tmp_path / "hv_powertrain.dbc").write_bytes(LAYOUT.with_suffix(".dbc").read_bytes())
-    small = ("--vehicles", 24, "--minutes", 5, "--unseen-minutes", 3)
+    small = ("--vehicles", 40, "--minutes", 5, "--unseen-minutes", 3)
     chain(monkeypatch, "--layout", layout, *small, "--unmeasured", 2, 0.5)
     counts = json.loads(capsys.readouterr().out)
-    assert counts["vehicles"] == 24
+    assert counts["vehicles"] == 40
     assert counts["with_corrections"] > 15
     assert counts["refused"] == 0
     assert counts["deployed"] >= 0.9 * counts["with_corrections"]
