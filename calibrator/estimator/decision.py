@@ -383,7 +383,7 @@ def estimate_rows(
             found, estimate[j], np.stack([own, usual[0]]), np.stack([own_square, np.maximum(usual[1], usual[0] ** 2)])
         )
         sd[j] = _central_sd(found, estimate[j])
-        all_shared = (estimate[j] != 0.0) & np.isclose(sd[j], 0.0, atol=1e-9)  # one value in all draws, but for rounding
+        all_shared = (estimate[j] != 0.0) & np.isclose(sd[j], 0.0, atol=1e-9)  # one value in all draws
         sd[j, all_shared] = RESOLUTION
         faulty = found.faults != 0.0
         fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)

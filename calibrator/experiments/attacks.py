@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from calibrator.artificial.random_fleet import Purpose, random_stream
 from calibrator.drive import Array, Mask
@@ -204,6 +205,21 @@ def _spikes(scene: Scene, samples: int, share: float, signs: tuple[float, ...]) 
     return np.where(scene.rng.random(samples) < share, height_a, 0.0)
 
 
+def _one_more_gain(d: Array, o: Array, size: Array) -> tuple[Array, Array]:
+    return (1.0 + d) * (1.0 + size) - 1.0, o
+
+
+def _low_pass(x: Array, time_constant_s: float) -> Array:
+    """A current behind a filter of first order."""
+    kept = np.exp(-1.0 / (HZ * time_constant_s))
+    return np.asarray(lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0])
+
+
+def _wander(x: Array, scene: Scene) -> Array:
+    """A current whose zero goes at random, so far in a drive (one standard deviation)."""
+    return x + scene.size * np.cumsum(scene.rng.standard_normal(len(x))) / np.sqrt(len(x))
+
+
 def _later_gain(d: Array, o: Array, size: Array) -> tuple[Array, Array]:
     """What a gain that has stepped or drifted away is at the end."""
     return (1.0 + d) * (1.0 + size) - 1.0, o * (1.0 + size)
@@ -238,11 +254,17 @@ def _batch(share: float, offset_a: float) -> World:
     return World(share=share, size=size, causes=("batch",), battery=True, truth=lambda d, o, s: (d, o + s))
 
 
+def _gain_batch(share: float, drift: float) -> World:
+    """A batch of battery sensors with one more gain error."""
+    return World(share=share, size=(drift, drift), battery=True, truth=_one_more_gain)
+
+
 STEP, BENT, SPIKE = (0.15, 0.15), (0.05, 0.2), (1.0, 1.0)
 WORLDS = {
     "faults 30-60 %": World(share=0.0, magnitude=(0.3, 0.6)),
     "small errors in 30%": World(size=(0.3, 1.0), truth=lambda d, o, s: (d + 0.0015 * s, o + 0.5 * s)),
     **{f"battery {a:+g} A in {share:.0%}": _batch(share, a) for share in (1.0, 0.6) for a in (5.0, 12.0, 20.0, -12.0)},
+    **{f"battery gain +10 % in {share:.0%}": _gain_batch(share, 0.1) for share in (1.0, 0.6)},
     "load 5 A in 30%": _load(0.3, (5.0, 5.0), lambda i, s: np.full(len(i), s.size)),
     "load 10 A in 15%": _load(0.15, (10.0, 10.0), lambda i, s: np.full(len(i), s.size)),
     "load 0-10 % of |motor| in 30%": _load(0.3, (0.0, 0.1), lambda i, s: s.size * np.abs(i[:, 1]), "sign"),
@@ -256,6 +278,10 @@ WORLDS = {
     ),
     "quadratic 5-20 %": _sensor(BENT, lambda x, s: x + s.size * x**2 / s.full_scale_a, "quadratic"),
     "cubic 5-20 %": _sensor(BENT, lambda x, s: x + s.size * x**3 / s.full_scale_a**2, "cubic", "saturating"),
+    "gain by sign 5-20 %": _sensor(BENT, lambda x, s: x * np.where(x > 0.0, 1.0 + s.size, 1.0), "sign"),
+    "dead zone of 5 A": _sensor((5.0, 5.0), lambda x, s: x - np.clip(x, -abs(s.size), abs(s.size))),
+    "low-pass of 1 s": _sensor((1.0, 1.0), lambda x, s: _low_pass(x, abs(s.size))),
+    "zero wanders by 5 A": _sensor((5.0, 5.0), _wander),
     "gain step of 15 % midway": _sensor(
         STEP, lambda x, s: _earlier(x, s, np.ceil(s.progress - 0.5)), "step", truth=_later_gain
     ),

@@ -321,6 +321,28 @@ TABLE = (
         pooled=False,
     ),
     Experiment(
+        name="small",
+        title="Small fleets",
+        x_label="vehicles",
+        series_label="branches, world",
+        methods=(POSTERIOR, CEILING),
+        settings=tuple(
+            Setting(
+                x=N,
+                series=f"K={K}" + (f", {world}" if world else ""),
+                case=RecordedCase(branches=K, balanced=False, world=world, vehicles=N, minutes=40.0),
+            )
+            for K in (2, 3)
+            for world in ("", "battery +12 A in 60%", "load 10 A in 15%", "second variant x1.10 in 50%")
+            for N in (6, 12)
+        ),
+        quick={"K=2": (6,)},
+        note="S = 80, hardware faults in any vehicle.",
+        shown=("confidence", "deployed", "harmed", "worst_a", "sure_wrong"),
+        panels=("recovery_rate", "harmed"),
+        pooled=False,
+    ),
+    Experiment(
         name="coverage",
         title="Coverage: standard deviations of the parameters",
         x_label=SPARSITY,
