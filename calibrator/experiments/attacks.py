@@ -217,7 +217,7 @@ def _low_pass(x: Array, time_constant_s: float) -> Array:
 
 def _wander(x: Array, scene: Scene) -> Array:
     """A current whose zero goes at random, so far in a drive (one standard deviation)."""
-    return x + scene.size * np.cumsum(scene.rng.standard_normal(len(x))) / np.sqrt(len(x))
+    return np.asarray(x + scene.size * np.cumsum(scene.rng.standard_normal(len(x))) / np.sqrt(len(x)))
 
 
 def _later_gain(d: Array, o: Array, size: Array) -> tuple[Array, Array]:
