@@ -34,6 +34,7 @@ from calibrator.estimator.posterior import (
     weigh,
 )
 from calibrator.estimator.prior import (
+    GRID,
     LARGEST_SHARED,
     TAIL_DENSITY,
     TAIL_RANGE,
@@ -57,8 +58,10 @@ MOST_ZEROS, MOST_CHOICES = 3, 1000
 SAME_ZEROS, NEARLY_AS_MANY = 0.005, 3
 """Difference of two zeros in fractions of full scale below which they are one, some A as drives differ, and by how many
 votes of vehicles another choice may stay behind the best."""
-KEPT_STARTS = 2
-"""Starts that are climbed to their end."""
+KEPT_STARTS, HOPEFUL = 4, 15.0
+"""Starts that are climbed to their end, at most, and how far their log evidence may be below the best one's."""
+SAME_TOP = 0.005
+"""Difference in every row, in fractions of full scale, below which two starts have climbed to the same model."""
 SAME_DENSITY = 0.2
 """Logarithm of densities of sizes up to which two priors count as one."""
 KEPT_LOG_ODDS = 7.0
@@ -97,6 +100,9 @@ FINE = 1.06 ** np.arange(-8, 9)
 """Bounds that are tried about the best ones so far, relative to them. [1]"""
 TAILS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Shares of faults beyond the bounds that are tried. [1]"""
+SIZE_FAULTS, ANY_SIZE = 1.0, TAIL_DENSITY * np.gradient(GRID)
+"""Weight of a fault of any size against the fleet's own when bounds are learnt, in faults: one fault alone would have
+them close about it. Probability of its size at :data:`~calibrator.estimator.prior.GRID`, log-uniform."""
 SIZE_STARTS = ((0.004, 1.0), (0.03, 0.4), (0.1, 0.2))
 """Bounds from which the prior is climbed again: small faults that combine can stand for large ones that do not."""
 
@@ -150,9 +156,18 @@ def learn_fault_models(
 
     learner, starter = learner_of(MOST_LEARNT), learner_of(MOST_STARTED)
     climbed = [starter.climb(starter.start(centre), START_ROUNDS) for centre in learner.centres()]
-    climbed = sorted(climbed, key=lambda model: -model.log_evidence)[:KEPT_STARTS]
-    best = max((learner.climb(model, ROUNDS, begun=True) for model in climbed), key=lambda model: model.log_evidence)
-    models = learner.variants(best)
+    climbed = sorted(climbed, key=lambda model: -model.log_evidence)
+    hopeful = [model for model in climbed[:KEPT_STARTS] if model.log_evidence > climbed[0].log_evidence - HOPEFUL]
+    tops = [learner.climb(model, ROUNDS, begun=True) for model in hopeful]
+    tops = sorted(tops, key=lambda model: -model.log_evidence)
+    models: list[FaultModel] = []
+    for n, top in enumerate(tops):
+        same = any(np.abs(top.spread.mean - other.spread.mean).max() < SAME_TOP for other in tops[:n])
+        share = float(np.exp(top.log_evidence - tops[0].log_evidence))
+        if not same and share > np.exp(-KEPT_LOG_ODDS):
+            models += [replace(model, probability=share * model.probability) for model in learner.variants(top)]
+    total = sum(model.probability for model in models)
+    models = [replace(model, probability=model.probability / total) for model in models]
     return [learner.with_modes(model) for model in sorted(models, key=lambda model: -model.probability)]
 
 
@@ -301,6 +316,14 @@ class _Learner:
             (plausible, replace(best, spread=replace(best.spread, shared=shared)))
             for plausible, shared in self._shared_constants(float(best.spread.mean[at.junction]), prior)
         ]
+        if not len(prior.group_centre):
+            # Sensors of a batch agree in what they read; through their gain errors it looks like different loads.
+            shared = best.spread.shared.copy()
+            shared[-1] = True
+            batch = self.climb(replace(best, spread=replace(best.spread, shared=shared)), START_ROUNDS, begun=True)
+            if batch.prior.group_share.max(initial=0.0) > 1.0 / len(self.rows):
+                c0 = float(batch.spread.mean[at.junction])
+                found.append((_log_plausible(c0, 0.0, batch.prior, of_sensor=True), batch))
         slopes = np.array([self.clusters(at.slope(k))[0] for k in range(K)])  # with what most vehicles' sensors share
         for shared in self._shared_gains():
             mean = best.spread.mean.copy()
@@ -534,7 +557,9 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
                     grid = first if coarse and not again else getattr(best, name) * FINE
                 tried = [replace(best, **{name: float(value)}, density=np.zeros(0)) for value in grid]
                 tried = [slab for slab in tried if slab.high > 1.2 * slab.low and slab.low > TAIL_RANGE[0]]
-                evidence = size_evidence(draws, prior, kind, np.stack([slab.density for slab in tried]))
+                densities = np.stack([slab.density for slab in tried])
+                evidence = size_evidence(draws, prior, kind, densities)
+                evidence += SIZE_FAULTS * np.log(densities) @ ANY_SIZE
                 best = tried[int(np.argmax(evidence))]
                 weight = np.exp(evidence - evidence.max())
                 odds[name] = [(getattr(slab, name), w) for slab, w in zip(tried, weight / weight.sum(), strict=True)]

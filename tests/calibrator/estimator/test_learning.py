@@ -10,7 +10,7 @@ from calibrator.estimator import learning
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces
 from calibrator.estimator.learning import learn_fault_models
 from calibrator.estimator.posterior import FaultModel, Spread, explain, weigh
-from calibrator.estimator.prior import Prior, first_prior
+from calibrator.estimator.prior import GRID, Prior, first_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
@@ -90,6 +90,23 @@ def test_intercepts_that_two_vehicles_share_by_chance_are_no_reference(seed: int
     assert not spread.shared.any()
 
 
+def test_two_references_that_explain_a_fleet_as_well_are_both_kept() -> None:
+    """Half of the vehicles share a hardware offset: nothing says which half is right."""
+    faults = no_faults(8, 2)
+    faults.hardware_offset_a[:4] = [0.1, -0.1]
+    models = learn_fault_models(rows_of(faults, seed=3), feed=0)
+    zeros = [model.spread.mean[RowPlaces(2).intercepts][0] for model in models]
+    np.testing.assert_allclose(sorted(zeros), [0.0, 0.1], atol=0.003)
+    assert min(model.probability for model in models) > 0.1
+
+
+def test_one_fault_does_not_say_how_large_faults_are() -> None:
+    faults = no_faults(6, 2)
+    faults.offset_a[0, 0] = 0.25
+    density = learned(rows_of(faults, seed=3)).prior.offset.density
+    assert np.interp(0.03, GRID, density) > 0.3 * np.interp(0.25, GRID, density)
+
+
 def test_vehicle_does_not_confirm_its_own_number_of_faults() -> None:
     """One vehicle is judged by the guess alone, whatever numbers it has made likely before."""
     errors = Errors(slope=0.1, ratio=0.03, intercept=0.05, junction=0.03)
@@ -117,6 +134,17 @@ def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(o
     assert share == pytest.approx(0.3, abs=0.1)
     assert centre == pytest.approx(0.03, abs=0.001)
     assert {model.spread.shared[-1] for model in models} == {0.0, 1.0}
+
+
+def test_batch_of_sensors_whose_gains_differ_is_no_number_of_loads() -> None:
+    """The sensors read the same offset; the loads that it would be differ."""
+    faults = no_faults(8, 2)
+    faults.drift[:3, 0], faults.offset_a[:3, 0] = [-0.2, -0.1, 0.15], 0.03
+    faults.drift[3, 1], faults.offset_a[4, 1] = 0.1, 0.2
+    (model,) = learn_fault_models(rows_of(faults, seed=3), feed=0)
+    assert model.spread.shared[-1]
+    assert model.prior.group_centre == pytest.approx([0.03], abs=0.001)
+    assert model.prior.load_share < 0.05
 
 
 @pytest.mark.parametrize(("K", "branch"), [(3, 0), pytest.param(3, 2, marks=pytest.mark.long), (2, 1)])
