@@ -94,6 +94,9 @@ LEAST_GROUP, MOST_GROUPS, GROUP_GAIN = 2.0, 2, 5.0
 """Vehicles of a group, number of groups, and what one must gain in log evidence: three vehicles that agree do."""
 LEAST_SHARED_GAIN = (0.3, 0.004)
 """Share of the vehicles that agree, and size of a gain error from which on their sensors may share it. [1]"""
+LEAST_EXPECTED = 1e-6
+"""Least probability of a vehicle without and of one with a sensor fault, whatever share is expected: zero could not be
+outvoted by any evidence. [1]"""
 COARSE_LOW, COARSE_HIGH = np.geomspace(0.003, 0.4, 14), np.geomspace(0.015, 1.2, 14)
 """Bounds of sizes that are tried first: drifts [1], offsets in fractions of full scale."""
 FINE = 1.06 ** np.arange(-8, 9)
@@ -425,7 +428,7 @@ class _Learner:
         counts = (tally + COUNT_VEHICLES * sparse_counts(tally)) / (N + COUNT_VEHICLES)
         if self.expected_faults is not None:
             sound, faulty = counts[:, :1], counts[:, 1:]
-            expected = self.expected_faults
+            expected = min(max(self.expected_faults, LEAST_EXPECTED), 1.0 - LEAST_EXPECTED)
             counts = np.concatenate([(1.0 - expected) * sound / sound.sum(), expected * faulty / faulty.sum()], axis=1)
         loaded = draws.fits.support[:, :, load]
         share, centre, sd = prior.group_share.copy(), prior.group_centre.copy(), prior.group_sd.copy()

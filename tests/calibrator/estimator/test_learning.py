@@ -71,6 +71,15 @@ def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(mon
     same(learned(rows.take(np.random.default_rng(6).permutation(40))), learned(rows), rtol=1e-6)
 
 
+@pytest.mark.parametrize("expected", [0.0, 1.0])
+def test_expected_share_of_none_or_all_vehicles_leaves_a_prior(expected: float) -> None:
+    faults = no_faults(8, 2)
+    faults.drift[0, 1] = 0.1
+    models = learn_fault_models(rows_of(faults, seed=3), feed=0, expected_faults=expected)
+    for counts in (model.prior.counts for model in models):
+        assert (counts[:, 0].sum(), counts.sum()) == pytest.approx((1.0 - expected, 1.0), abs=1e-5)
+
+
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K: int) -> None:
     """Currents that sum to less than zero: no load gives current."""
