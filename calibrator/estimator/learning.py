@@ -94,6 +94,9 @@ LEAST_GROUP, MOST_GROUPS, GROUP_GAIN = 2.0, 2, 5.0
 """Vehicles of a group, number of groups, and what one must gain in log evidence: three vehicles that agree do."""
 LEAST_SHARED_GAIN = (0.3, 0.004)
 """Share of the vehicles that agree, and size of a gain error from which on their sensors may share it. [1]"""
+SURELY_SHARED = 2.0
+"""The same size over the standard deviation of one vehicle's gain ratio. Errors of the noise that is taken out of the
+junction regression are alike in all vehicles: they bias ratios by up to half of it, which no mean removes. [1]"""
 LEAST_EXPECTED = 1e-6
 """Least probability of a vehicle without and of one with a sensor fault, whatever share is expected: zero could not be
 outvoted by any evidence. [1]"""
@@ -236,37 +239,47 @@ class _Learner:
                 found.append(tried[i])
         return found
 
-    def centres(self) -> list[Array]:
-        """Where to start, from what vehicles agree on.
+    def slopes(self) -> list[Array]:
+        """Slopes of vehicles without faults, each of shape (K,), as logarithms.
 
         How much further the model is off in one branch than in the first, every vehicle tells whatever its faults, by
-        two slopes and their gain ratio; by how much in all of them, clusters of all slopes. The zero of the feeding
-        branch has clusters as well. Intercepts of a vehicle without faults add up to its junction constant, as do those
-        of a centre.
+        two slopes and their gain ratio; and clusters of the slopes, where ratios are vague. By how much in all of them,
+        clusters of all slopes.
         """
         rows, K, at = self.rows, self.rows.branches, self.at
-        centre, intercept = np.zeros(5 * K), at.intercept(self.feed)
-        first = at.slope(0)
+        by_ratios, by_clusters, first = np.zeros(K), np.zeros(K), at.slope(0)
         for k in range(1, K):
             slope, ratio = at.slope(k), at.ratio(k)
             known = rows.known[:, [first, slope, ratio]].all(axis=1)
             apart = rows.values[known, slope] - rows.values[known, first] + rows.values[known, ratio]
-            centre[slope] = np.median(apart) if known.any() else 0.0
+            by_ratios[k] = by_clusters[k] = np.median(apart) if known.any() else 0.0
+            if not known.any() or np.median(rows.shown(ratio)[1]) > LEAST_SHARED_GAIN[1]:
+                by_clusters[k] = self.clusters(slope)[0] - self.clusters(first)[0]
         known, sd = rows.known[:, at.slopes], np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2)[:, at.slopes])
-        agreeing = densest_clusters((rows.values[:, at.slopes] - centre[at.slopes])[known], sd[known], most=MOST_COMMON)
-        common = [cluster.centre for cluster in agreeing] or [0.0]
-        centre[at.intercepts] = [self.clusters(at.intercept(k))[0] for k in range(K)]
-        others = centre[at.intercepts].sum() - centre[intercept]
+        found = list[Array]()
+        for apart in (by_ratios, by_clusters) if (by_ratios != by_clusters).any() else (by_ratios,):
+            agreeing = densest_clusters((rows.values[:, at.slopes] - apart)[known], sd[known], most=MOST_COMMON)
+            found += [apart + excess for excess in [cluster.centre for cluster in agreeing] or [0.0]]
+        return found
+
+    def centres(self) -> list[Array]:
+        """Where to start, from what vehicles agree on.
+
+        Slopes and zeros are those of clusters. The zero of the feeding branch has several. Intercepts of a vehicle
+        without faults add up to its junction constant, as do those of a centre.
+        """
+        K, at = self.rows.branches, self.at
+        intercept = at.intercept(self.feed)
+        others = sum(self.clusters(at.intercept(k))[0] for k in range(K) if k != self.feed)
         # The junction shows its constant most exactly. What is larger than any load comes of zeros that few share.
         constants = [*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0]
         constants += [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         constants = [constant for constant in constants if abs(constant) <= LARGEST_SHARED]
-        found: list[Array] = []
+        slopes, found = self.slopes(), list[Array]()
         for constant in constants if np.isnan(self.fixed[at.junction]) else [float(self.fixed[at.junction])]:
-            for zeros, excess in product(self.zeros(constant), common):
-                start = centre.copy()
-                start[at.slopes] += excess
-                start[at.intercepts], start[at.junction] = zeros, constant
+            for zeros, slope in product(self.zeros(constant), slopes):
+                start = np.zeros(5 * K)
+                start[at.slopes], start[at.intercepts], start[at.junction] = slope, zeros, constant
                 start = np.where(np.isnan(self.fixed), start, self.fixed)
                 if not any(np.abs(start - other).max() < SAME_START for other in found):
                     found.append(start)
@@ -374,8 +387,10 @@ class _Learner:
         K = self.rows.branches
         off = np.zeros(K)
         for k in range(1, K):
-            for cluster in densest_clusters(*self.rows.shown(self.at.ratio(k)), widest=1.0):  # at most one
-                if cluster.share > LEAST_SHARED_GAIN[0] and abs(cluster.centre) > LEAST_SHARED_GAIN[1]:
+            values, sd = self.rows.shown(self.at.ratio(k))
+            for cluster in densest_clusters(values, sd, widest=1.0):  # at most one
+                least = max(LEAST_SHARED_GAIN[1], SURELY_SHARED * float(np.median(sd)))
+                if cluster.share > LEAST_SHARED_GAIN[0] and abs(cluster.centre) > least:
                     off[k] = cluster.centre
         if not off.any():
             return []

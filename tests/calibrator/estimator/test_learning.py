@@ -80,6 +80,17 @@ def test_expected_share_of_none_or_all_vehicles_leaves_a_prior(expected: float) 
         assert (counts[:, 0].sum(), counts.sum()) == pytest.approx((1.0 - expected, 1.0), abs=1e-5)
 
 
+@pytest.mark.parametrize("bias", [0.0, 0.04])
+def test_vague_gain_ratios_neither_move_the_centre_nor_are_a_shared_gain_error(bias: float) -> None:
+    """A ratio of a branch that hardly moves is biased alike in all vehicles, by less than its standard deviation."""
+    rows = rows_of(no_faults(24, 3), seed=4, errors=Errors(ratio=0.1))
+    by = np.zeros(15)
+    by[rows.places.ratios] = bias
+    models = learn_fault_models(moved(rows, by), feed=0)
+    assert set(shared_by(models)) == {()}
+    np.testing.assert_allclose(models[0].spread.mean[rows.places.slopes], 0.0, atol=0.002)
+
+
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K: int) -> None:
     """Currents that sum to less than zero: no load gives current."""
