@@ -56,6 +56,8 @@ DRAWS, FEWEST_DRAWS = 8192, 64
 USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
 """What curvature of good sensors, and noise and switched loads, leave in the sum, over full scale, and by how much the
 logarithm of the latter's square differs between cars. [1]"""
+STEPS = 2
+"""Gauss-Newton steps to the gains that charges and loads are seen through: ratios tell them after the first."""
 STILL = 0.003
 """Standard deviation of all currents, over full scale, up to which the car stands still. [1]"""
 SOUND_GAIN_SD, SOUND_OFFSET_SD = 0.01, 0.0025
@@ -163,8 +165,8 @@ class _System:
             design[constant, 2 * S + j] = 1.0
             design[constant, first] = load.mean_a / scale_a  # (1 + d_1) l
         charges = np.array([*known.charge_a.values()]).reshape(-1, 3) / scale_a  # mean measured = (1 + d) true + o
-        for i, name in enumerate(known.charge_a, start=N * K):
-            k = branches.index(name)
+        charged = [branches.index(name) for name in known.charge_a]
+        for i, k in enumerate(charged, start=N * K):
             design[i, [k, S + k]] = charges[i - N * K, 1], 1.0
         design[range(len(design) - len(given), len(design)), [p for p, _, _ in given]] = 1.0
         self.design = design
@@ -181,6 +183,17 @@ class _System:
             np.diag(np.where(of_gain, sd / (1.0 + value), sd / scale_a) ** 2),
         )
         self.open_sd = np.repeat([OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD], [S, S, N])
+        for _ in range(STEPS):  # 1 + d = exp(lambda), linear about the lambda that is found
+            found = self.condition(self.open_sd)[0]
+            for i, k in enumerate(charged, start=N * K):
+                measured, true, _ = charges[i - N * K]
+                design[i, k] = true * np.exp(found[k])
+                self.y[i] = measured - design[i, k] * (1.0 - found[k])
+            for j, law in enumerate(self.laws):
+                first, constant = int(self.places[j, law.order[0]]), (j + 1) * K - 1
+                gain = np.exp(found[first])
+                design[constant, [first, 2 * S + j]] = gain * load.mean_a / scale_a, gain
+                self.y[constant] = law.value[-1] + design[constant, first] * found[first]
 
     def _called(self, p: int) -> str:
         S = self.sensors

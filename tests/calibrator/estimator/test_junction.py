@@ -63,6 +63,11 @@ MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift":
             {"trusted": ["battery"], "load": (0.0, 0.1)},
             {"motor"},
         ),
+        (
+            {"gain": (0.4, 0.0, 0.0), "offset_a": (3.0, 0.0, 0.0), "load_a": 30.0},
+            {"trusted": ["motor", "heater"], "load": (30.0, 0.1)},
+            {"battery"},
+        ),
         ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
     ],
 )
@@ -77,11 +82,11 @@ def test_faults_are_within_their_deviations_and_what_is_known_well_is_corrected(
     assert (np.abs(rows.offset_a - offset_a) < 3.0 * rows.offset_sd_a).all()
 
 
-@pytest.mark.parametrize("missing", [0.0, 25.0])
-def test_charge_balance_tells_an_offset(missing: float) -> None:
+@pytest.mark.parametrize(("missing", "gain"), [(0.0, 0.1), (25.0, 0.1), (0.0, 0.4)])
+def test_charge_balance_tells_an_offset(missing: float, gain: float) -> None:
     """Also of a sensor with a gain error, and where a tenth of the samples of another branch are missing."""
-    frame = recording(offset_a=(5.0, 0.0, 0.0), gain=(0.1, 0.0, 0.0), load_a=30.0)
-    true_ah = float((frame["battery"] - 5.0).mean()) / 1.1 * SECONDS / 3600.0
+    frame = recording(offset_a=(5.0, 0.0, 0.0), gain=(gain, 0.0, 0.0), load_a=30.0)
+    true_ah = float((frame["battery"] - 5.0).mean()) / (1.0 + gain) * SECONDS / 3600.0
     frame.loc[100.0 : 100.0 + missing, "heater"] = np.nan
     row = found(frame, trusted=["motor"], charge_ah={"battery": (true_ah, 0.01)}).loc["vehicle", "battery"]
     assert row.offset_a == pytest.approx(5.0, abs=0.5)
