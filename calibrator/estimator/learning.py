@@ -443,7 +443,7 @@ class _Learner:
         counts = (tally + COUNT_VEHICLES * sparse_counts(tally)) / (N + COUNT_VEHICLES)
         if self.expected_faults is not None:
             sound, faulty = counts[:, :1], counts[:, 1:]
-            expected = min(max(self.expected_faults, LEAST_EXPECTED), 1.0 - LEAST_EXPECTED)
+            expected = float(np.clip(self.expected_faults, LEAST_EXPECTED, 1.0 - LEAST_EXPECTED))
             counts = np.concatenate([(1.0 - expected) * sound / sound.sum(), expected * faulty / faulty.sum()], axis=1)
         loaded = draws.fits.support[:, :, load]
         share, centre, sd = prior.group_share.copy(), prior.group_centre.copy(), prior.group_sd.copy()
