@@ -120,7 +120,7 @@ MISTAKES = [
     ("calibrator export cut.json LAYOUT --format dcm --out x", 1, "cut.json: not a parameter file: "),
     ("calibrator export v1.json LAYOUT --format xls --out x", 2, "'xls' is not one of 'c', 'hex', 'a2l', 'dcm'"),
     ("calibrator export v1.json LAYOUT --format dcm --out folder", 1, "folder: is "),
-    ("calibrator export v1.json LAYOUT --format csv --out x --vehicle v2", 1, "v2"),
+    ("calibrator export v1.json LAYOUT --format dcm --out x --vehicle v2", 1, "v2"),
     # keys and repositories
     ("calibrator repository key a/b --no-passphrase --out x", 2, "'a/b': a name for a file is expected"),
     ("calibrator repository publish x --key none.key", 1, "none.key: cannot read the private key: No such file"),

@@ -2,13 +2,11 @@
 
 ``HV.BRANCH.gain`` and its like are what is flashed, as the A2L places it; ``HV.BRANCH.drift`` and ``.offset`` say the
 same in physical units, for people, and ``HV.BRANCH.found...`` what was found, corrected or not. Currents are positive
-into the junction. CSV (RFC 4180) has one row per branch, of one vehicle or many; empty: not known, or does not apply.
+into the junction.
 """
 
-import csv
-import io
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -17,16 +15,13 @@ from calibrator.export.core import FRACTION_BITS, BranchValues, Checked, Image, 
 from ecu_node import __version__
 from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import printable
 from ecu_node.layout import Branch
 
-__all__ = ["Characteristic", "a2l_text", "cdfx_document", "characteristics", "csv_text", "dcm_text"]
+__all__ = ["Characteristic", "a2l_text", "cdfx_document", "characteristics", "dcm_text"]
 
 _FUNCTION = "HV_current_correction"
 _FORBIDDEN = '"\\'
 """DCM has no agreed way to write these in a text."""
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
-"""With these a spreadsheet takes a text for a formula, which may fetch and run what it likes."""
 
 
 class _Field(NamedTuple):
@@ -148,7 +143,7 @@ def _notes(checked: Checked) -> dict[str, str]:
         if not value.isprintable() or any(letter in value for letter in _FORBIDDEN):
             raise ExportError(
                 f"{checked.name}: {key} {value!r} has a quotation mark, a backslash or a control character, which "
-                f"calibration formats cannot hold; rename it, or export CSV"
+                f"calibration formats cannot hold; rename it"
             )
     return texts
 
@@ -264,71 +259,3 @@ def _extremes(database: VehicleDatabase, branch: Branch) -> list[BranchValues]:
     corners = itertools.product(*((-limit, limit) for limit in limits))
     faults = [NO_FAULT, *(SensorFault(drift=drift, offset_a=offset) for drift, offset in corners)]
     return [scaled_plan(database, branch, fault) for fault in faults]
-
-
-def csv_text(tables: Sequence[Checked]) -> str:
-    """Write parameter files as one table.
-
-    Parameters
-    ----------
-    tables : sequence of Checked
-        The parameter files, at least one.
-
-    Returns
-    -------
-    str
-        The table with its header, lines ended by CR LF; drifts and offsets are those that were found, corrected or not.
-
-    Raises
-    ------
-    ExportError
-        If a text, such as the vehicle's name, would be a formula in a spreadsheet.
-    """
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\r\n")
-    for checked in tables:
-        for name in checked.parameters.branches:
-            row = _row(checked, name)
-            if not text.tell():
-                writer.writerow(row)
-            writer.writerow([_cell(value, column, checked) for column, value in row.items()])
-    return text.getvalue()
-
-
-def _row(checked: Checked, name: str) -> dict[str, str | float | bool | None]:
-    found, source = checked.parameters.branches[name], checked.database.layout.find_branch(name).source
-    return {
-        "vehicle": checked.parameters.vehicle,
-        "parameter_set": checked.parameters.number,
-        "branch": name,
-        "signal": source,
-        "signal_unit": checked.database.signal(source)[1].unit,
-        "drift": found.drift,
-        "drift_sd": found.drift_sd,
-        "offset_a": found.offset_a,
-        "offset_sd_a": found.offset_sd_a,
-        "applied": checked.parameters.fault(name) is not NO_FAULT,
-        "held_back": found.held_back,
-        "delay_s": found.delay_s,
-        "delay_sd_s": found.delay_sd_s,
-        "fault_probability": found.fault_probability,
-        "harm_probability": found.harm_probability,
-        "identifiable": found.identifiable,
-        "verdict": checked.parameters.verdict,
-        "confidence": checked.parameters.confidence,
-        **checked.provenance,
-    }
-
-
-def _cell(value: str | float | bool | None, column: str, checked: Checked) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str) and value.startswith(_FORMULA):
-        try:
-            float(value)
-        except ValueError:
-            raise ExportError(
-                f"{printable(checked.name)}: {column} {value!r} begins as a formula does, which a spreadsheet would "
-                f"work out; rename it"
-            ) from None
-    return "" if value is None else str(value)

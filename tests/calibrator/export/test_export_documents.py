@@ -1,6 +1,5 @@
-"""DCM, CDFX and CSV as readers find them: values, units, provenance, and texts that a format cannot hold."""
+"""DCM and CDFX as readers find them: values, units, provenance, and texts that a format cannot hold."""
 
-import csv
 import dataclasses
 import logging
 import re
@@ -14,7 +13,7 @@ from msgspec.structs import replace
 
 from calibrator.errors import ExportError
 from calibrator.export.core import Checked
-from calibrator.export.tool_formats import cdfx_document, csv_text, dcm_text
+from calibrator.export.tool_formats import cdfx_document, dcm_text
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters
 from tests.calibrator.export.exports import checked_with
@@ -127,23 +126,3 @@ def test_texts_that_tools_cannot_hold_are_refused(
 ) -> None:
     with pytest.raises(ExportError, match=r"^v1\.json: vehicle '.*' has a quotation mark, a backslash or a control"):
         write(renamed(checked, vehicle))
-
-
-def test_csv_has_a_row_for_each_branch_of_each_vehicle(checked: Checked) -> None:
-    text = csv_text([checked, renamed(checked, 'b, "c"\nd'), renamed(checked, "-12")])
-    battery, motor, *others = csv.DictReader(text.splitlines(keepends=True))
-    assert text.count("\r\n") == 7
-    assert [battery[name] for name in ("branch", "signal", "signal_unit", "drift", "offset_a", "applied")] == [
-        *("battery", "HV_Battery.BatteryCurrent", "A", "0.05", "-1.23456789012345", "true"),
-    ]
-    assert [motor[name] for name in ("drift", "drift_sd", "offset_sd_a", "applied", "held_back")] == [
-        *("0.2", "0.01", "", "false", "harm limit"),
-    ]
-    assert [row["vehicle"] for row in others] == ['b, "c"\nd', 'b, "c"\nd', "-12", "-12"]
-    assert {name: battery[name] for name in checked.provenance} == checked.provenance
-
-
-@pytest.mark.parametrize("vehicle", ["=1+1", "+cmd|' /C calc'!A0", "-x", "@SUM(A1)", "\t=1", "\r=1"])
-def test_name_that_a_spreadsheet_would_run_is_refused(vehicle: str, checked: Checked) -> None:
-    with pytest.raises(ExportError, match=r"^v1\.json: vehicle ['\"].*['\"] begins as a formula does"):
-        csv_text([renamed(checked, vehicle)])
