@@ -8,16 +8,14 @@ import typer
 
 from calibrator.errors import ContradictionError, ExportError
 from calibrator.export.core import (
-    Checked,
     c_text,
     find_image,
     foreign_protection,
     image_bytes,
     intel_hex,
     read_checked,
-    s_records,
 )
-from calibrator.export.tool_formats import a2l_text, cdfx_document, dcm_text
+from calibrator.export.tool_formats import a2l_text, cdfx_text, dcm_text
 from calibrator.files.folders import require_possible_file, write_files
 from calibrator.terminal.options import JsonOption, LayoutOption
 from calibrator.terminal.text import dumps
@@ -38,14 +36,11 @@ class ExportFormat(StrEnum):
     CDFX = "cdfx"
 
 
-_S_RECORDS = (".s19", ".s28", ".s37", ".srec", ".mot")
-
-
 def export(
     params: Annotated[Path, typer.Argument(help="Parameter file.")],
     layout: LayoutOption,
     format_: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
-    output: Annotated[Path, typer.Option("--output", "--out", help="File to write; *.s19 is S-records for hex.")],
+    output: Annotated[Path, typer.Option("--output", "--out", help="File to write.")],
     elf: Annotated[
         Path | None, typer.Option("--elf", help="The control unit's linked program, for hex and a2l.")
     ] = None,
@@ -65,11 +60,21 @@ def export(
         raise ContradictionError(f"--format {format_.value} {verb} --elf PROGRAM; hex and a2l alone have one")
     database = node_database(layout)
     checked = read_checked(params, database, vehicle)
-    content = _content(checked, format_, output, elf)
+    image = find_image(elf, database) if elf is not None else None
+    if format_ is ExportFormat.CDFX:
+        content = cdfx_text(checked)
+    elif format_ is ExportFormat.DCM:
+        content = dcm_text(checked)
+    elif image is None:
+        content = c_text(checked)
+    elif format_ is ExportFormat.A2L:
+        content = a2l_text(database, image)
+    else:
+        content = intel_hex(image.address, image_bytes(checked, image.order))
     require_possible_file(output)
-    if output.exists() and not replace and output.read_bytes() != content:
+    if output.exists() and not replace and output.read_bytes() != content.encode():
         raise ExportError(f"{output}: exists; choose another --output, or replace it with --replace")
-    write_files({output: content})
+    write_files({output: content.encode()})
     notices = []
     if format_ is ExportFormat.C and (foreign := foreign_protection(database)):
         notices.append(
@@ -82,17 +87,3 @@ def export(
     for text in notices:
         say_error(f"notice: {text}")
     write_output(printable(str(output)))
-
-
-def _content(checked: Checked, format_: ExportFormat, output: Path, elf: Path | None) -> bytes:
-    if format_ is ExportFormat.CDFX:
-        return cdfx_document(checked)
-    if format_ is ExportFormat.DCM:
-        return dcm_text(checked).encode()
-    if elf is None:
-        return c_text(checked).encode()
-    image = find_image(elf, checked.database)
-    if format_ is ExportFormat.A2L:
-        return a2l_text(checked.database, image).encode()
-    write = s_records if output.suffix.lower() in _S_RECORDS else intel_hex
-    return write(image.address, image_bytes(checked, image.order)).encode()

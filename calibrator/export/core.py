@@ -299,7 +299,7 @@ def find_image(elf: Path, database: VehicleDatabase) -> Image:
 def intel_hex(address: int, data: bytes) -> str:
     """Data at an address as Intel HEX, in records of 32 bytes that do not cross a boundary of 32."""
     if address + len(data) > 1 << 32:
-        raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; HEX and S-records reach to 0xFFFFFFFF, link it below")
+        raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; HEX reaches to 0xFFFFFFFF, link it below")
 
     def record(kind: int, at: int, content: bytes) -> str:
         line = bytes([len(content)]) + at.to_bytes(2) + bytes([kind]) + content
@@ -314,20 +314,6 @@ def intel_hex(address: int, data: bytes) -> str:
         text += record(0, start & 0xFFFF, data[start - address : end - address])
         start = end
     return text + record(1, 0, b"")
-
-
-def s_records(address: int, data: bytes) -> str:
-    """Data at an address as Motorola S-records, of the smallest kind that reaches it: S19, S28 or S37."""
-    size = max(2, ((address + len(data) - 1).bit_length() + 7) // 8)
-
-    def record(kind: int, at: int, content: bytes) -> str:
-        line = at.to_bytes(size if kind else 2) + content
-        line = bytes([len(line) + 1]) + line
-        return f"S{kind}{line.hex()}{~sum(line) & 0xFF:02x}\n".upper()
-
-    starts = range(0, len(data), _RECORD_BYTES)
-    text = "".join(record(size - 1, address + start, data[start : start + _RECORD_BYTES]) for start in starts)
-    return record(0, 0, b"HV") + text + record(11 - size, 0, b"")
 
 
 def foreign_protection(database: VehicleDatabase) -> list[str]:

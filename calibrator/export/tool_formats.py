@@ -17,7 +17,7 @@ from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch
 
-__all__ = ["Characteristic", "a2l_text", "cdfx_document", "characteristics", "dcm_text"]
+__all__ = ["Characteristic", "a2l_text", "cdfx_text", "characteristics", "dcm_text"]
 
 _FUNCTION = "HV_current_correction"
 _FORBIDDEN = '"\\'
@@ -178,7 +178,7 @@ def dcm_text(checked: Checked) -> str:
     )
 
 
-def cdfx_document(checked: Checked) -> bytes:
+def cdfx_text(checked: Checked) -> str:
     """Write a parameter file as ASAM CDF 2.0, calibration data as XML.
 
     Numbers are of category VALUE, truth values BOOLEAN, texts ASCII. Each instance belongs to the feature of its branch
@@ -191,8 +191,8 @@ def cdfx_document(checked: Checked) -> bytes:
 
     Returns
     -------
-    bytes
-        The XML document, UTF-8.
+    str
+        The XML document, to be encoded as UTF-8.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def cdfx_document(checked: Checked) -> bytes:
         category, value = ("BOOLEAN", str(item.value).lower()) if is_truth else ("VALUE", repr(item.value))
         rows.append((item.name, item.full_text, category, feature, item.unit, value))
     layout = checked.database.layout
-    document = rendered(
+    return rendered(
         "parameters.cdfx",
         version=__version__,
         function=_FUNCTION,
@@ -215,7 +215,6 @@ def cdfx_document(checked: Checked) -> bytes:
         features=["general", *(f"HV.{branch}" for branch in layout.branch_names)],
         rows=rows,
     )
-    return document.encode()
 
 
 def a2l_text(database: VehicleDatabase, image: Image) -> str:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from calibrator.errors import ExportError
 from calibrator.export.core import Checked
-from calibrator.export.tool_formats import cdfx_document, dcm_text
+from calibrator.export.tool_formats import cdfx_text, dcm_text
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters
 from tests.calibrator.export.exports import checked_with
@@ -86,7 +86,7 @@ def test_dcm_is_read_back(checked: Checked, tmp_path: Path, caplog: pytest.LogCa
 
 
 def test_cdfx_follows_the_order_of_the_dtd_and_keeps_its_values(checked: Checked) -> None:
-    document = ET.fromstring(cdfx_document(checked))
+    document = ET.fromstring(cdfx_text(checked))
     for element in document.iter():
         tags, order = [child.tag for child in element], ORDER.get(element.tag, [])
         assert tags == sorted(tags, key=order.index), element.tag
@@ -113,13 +113,13 @@ def test_dcm_and_cdfx_hold_the_provenance(checked: Checked) -> None:
     wanted = {key: value for key, value in checked.provenance.items() if key != "parameter_set"}
     form = r'^TEXTSTRING HV\.(\w+)\n  LANGNAME "[^"\n]*"\n  FUNKTION \w+\n  TEXT "([^"\n]*)"\nEND$'
     assert dict(re.findall(form, dcm_text(checked), flags=re.MULTILINE)) == wanted
-    document = ET.fromstring(cdfx_document(checked))
+    document = ET.fromstring(cdfx_text(checked))
     texts = {item.findtext("LONG-NAME"): item.findtext(".//VT") for item in document.iter("SW-INSTANCE")}
     assert wanted.items() <= texts.items()
     assert document.findtext(".//DATA-FILE") == "<a>&\\udcff.json"
 
 
-@pytest.mark.parametrize("write", [dcm_text, cdfx_document])
+@pytest.mark.parametrize("write", [dcm_text, cdfx_text])
 @pytest.mark.parametrize("vehicle", ['a "b"', "a\\b", "a\nb"])
 def test_texts_that_tools_cannot_hold_are_refused(
     write: Callable[[Checked], object], vehicle: str, checked: Checked
