@@ -101,7 +101,7 @@ MISTAKES = [
     ("calibrator layout init noise --log drive.csv --out x", 1, "noise"),
     ("calibrator layout init drive.csv CURRENTS --out drive.csv", 1, "drive.csv"),
     ("calibrator layout init car.dbc gvret.csv --out x", 2, "calibrator layout init car.dbc --log gvret.csv;"),
-    ("calibrator layout init still.csv --out x.toml --yes", 1, "still.csv"),
+    ("calibrator layout init still.csv --out x.toml", 1, "still.csv"),
     ("calibrator doctor LAYOUT --log none.log", 1, "none.log: no such file"),
     ("calibrator doctor LAYOUT --log empty", 1, "empty: not a known log format"),
     ("calibrator report folder", 1, "not a result of 'calibrator calibrate'"),

@@ -4,7 +4,6 @@ import difflib
 import json
 import math
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,7 +30,7 @@ from ecu_node.database import read_database
 from ecu_node.errors import DatabaseError, printable
 from ecu_node.layout import Layout
 
-__all__ = ["Proposal", "layout_text", "look_at", "parsed_branches"]
+__all__ = ["Proposal", "candidate_lines", "layout_text", "look_at", "parsed_branches"]
 
 TYPICAL_A = 400.0
 """Full scale of many cars' junctions, where neither database nor recording tells it. [A]"""
@@ -50,6 +49,8 @@ LEAST_TIMEOUT_S, USUAL_TIMEOUT_S, LONGEST_TIMEOUT_S = 0.1, 0.5, 2.0
 TIMEOUT_STEP_S = 0.05
 STATED = "as --branches says"
 """Reason of a sign that is no guess."""
+SHOWN = 12
+"""Candidates in a list that nobody scrolls."""
 CHECKS = frozenset({"crc", "checksum", "crc8", "chk"})
 """Words of the signal that protects a message."""
 
@@ -100,12 +101,6 @@ class Proposal:
     def files(self) -> str:
         """Names of the files, for messages."""
         return " and ".join(path.name for path in (self.database, self.recording) if path is not None)
-
-    def with_branches(self, chosen: Mapping[int, str]) -> "Proposal":
-        """The same with other candidates as branches, by number and name, with signs that fit these."""
-        items = [with_usual_sign(replace(item, branch=chosen.get(k, ""))) for k, item in enumerate(self.candidates)]
-        signed = iter(find_signs([item for item in items if item.branch], self.voltage))
-        return replace(self, candidates=tuple(next(signed) if item.branch else item for item in items))
 
     def unready(self) -> str:
         """Why the branches cannot be written; empty if they can."""
@@ -190,17 +185,28 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
             for k, item in enumerate(items):
                 if item.branch.startswith("charger"):
                     items[k] = replace(item, branch="", why=ONLY_CHARGING)
-    items = close_sum(items, voltage)
-    proposal = Proposal(
+    items = [with_usual_sign(item) for item in close_sum(items, voltage)]
+    signed = iter(find_signs([item for item in items if item.branch], voltage))
+    return Proposal(
         name=name,
         database=database,
         recording=log,
-        candidates=tuple(items),
+        candidates=tuple(next(signed) if item.branch else item for item in items),
         everything=tuple(everything),
         found=tuple(found),
         voltage=voltage,
     )
-    return proposal.with_branches({k: item.branch for k, item in enumerate(items)})
+
+
+def candidate_lines(proposal: Proposal) -> list[str]:
+    """Candidates with score and reason, the branches first; at most :data:`SHOWN` and all branches."""
+    shown, lines = proposal.candidates[: max(SHOWN, len(proposal.branches))], list[str]()
+    for item in shown:
+        taken = f"{item.branch} ({item.sign:+d})" if item.branch else "not taken"
+        lines += [f"{item.points:3.0f}  {taken:<17} {item.name}", f"     {item.why or item.about}"[:79]]
+    if left := len(proposal.candidates) - len(shown):
+        lines.append(f"     and {left} more, of fewer points (--json has them all)")
+    return [*map(printable, lines)]
 
 
 def parsed_branches(text: str, proposal: Proposal) -> Proposal:
