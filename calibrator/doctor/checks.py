@@ -13,8 +13,8 @@ from calibrator.doctor.facts import Facts
 from calibrator.drive import Drive
 from calibrator.drives.align import choose_inputs
 from calibrator.estimator.junction_run import summarise_junction
-from calibrator.findings import Finding, worst_first
-from calibrator.kirchhoff.findings import Findings, error, hint, sum_findings, times, warning
+from calibrator.findings import Finding, Findings, error, hint, warning, worst_first
+from calibrator.kirchhoff.findings import sum_findings, times
 from calibrator.kirchhoff.sums import VOLTAGE, compare_kirchhoff
 from calibrator.summaries.vehicle_summary import LEAST_DURATION_S, too_slow
 from calibrator.terminal.text import figure

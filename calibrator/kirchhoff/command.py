@@ -20,8 +20,6 @@ __all__ = ["kirchhoff"]
 
 PICTURES, TABLES = (".png", ".pdf", ".svg", ".html"), (".csv", ".parquet")
 """Ends of the names of files that can be written."""
-TOLD = ("too short", "stands still", "delay")
-"""Hints that are told: what the figures cannot tell, and what no figure shows."""
 USUAL_S = 30.0
 """How long is listened to a bus. [s]"""
 USUAL_SCALE_A = 500.0
@@ -117,16 +115,14 @@ def kirchhoff(
         save_table(comparison, table)
     plausible_a = USUAL_SCALE_A if branches is not None and full_scale is None else None
     junction = look_at_junction([recording.drive], database, full_scale_a=plausible_a)
-    findings = [each for each in sum_findings(junction) if each.severity != "hint" or each.code in TOLD]
+    findings = sum_findings(junction)
     if junction.is_short or junction.stands_still:
         comparison = replace(comparison, residual=dict.fromkeys(comparison.residual))
     notices = [*map(str, recording.report.log_notices()), *comparison.notices()]
     if json:
         write_output(dumps(comparison.as_json() | {"notices": notices, "findings": findings}))
         return
-    told = [each.subject == "sum" and each.code in TOLD for each in findings]
-    notices += [f.text if is_told else f"{f.severity}: {f.line}" for f, is_told in zip(findings, told, strict=True)]
-    write_output(kirchhoff_text(comparison, notices))
+    write_output(kirchhoff_text(comparison, [*notices, *(finding.line for finding in findings)]))
     if log is not None and "after" not in comparison.stages and (step := _next_step(log, layout, branches, database)):
         say_error(f"next: calibrator {step}")
 

@@ -166,7 +166,7 @@ def test_slip_of_sign_or_unit_is_gone_when_its_advice_is_followed(
         return [line for line in lines if line.startswith("error")]  # nothing tells full scale
 
     (line,) = errors("motor [A]", "", -factor * MOTOR_A)
-    assert line.startswith(f"error: motor: {told}: ")
+    assert line.startswith(f"error    motor: {told}: ")
     assert line.endswith(advice)
     assert errors(column, sign, -factor * times * MOTOR_A) == []
     assert errors("motor", "", -1.2 * MOTOR_A) == []
