@@ -123,10 +123,9 @@ class Proposal:
             return f"the pack current is {battery.name}, but {others}"
         share = closure(self.branches, self.voltage)
         if share > OPEN:
-            names, most = (
-                ", ".join(item.branch for item in self.branches),
-                max(self.branches, key=lambda item: item.peak),
-            )
+            names = ", ".join(item.branch for item in self.branches)
+            alike = [item for item in self.branches if item.quantity == battery.quantity]
+            most = max(alike, key=lambda item: item.peak)
             unit = f"; {most.name} reaches {most.peak:,.0f}: in mA?" if most.peak > OTHER_UNIT * battery.peak else ""
             varies = f"the sum of {names} still varies by {100.0 * share:.0f} % of the greatest of them"
             return f"{varies}: a branch is missing or wrong{unit}"

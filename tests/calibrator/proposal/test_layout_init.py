@@ -234,7 +234,7 @@ def test_motor_that_does_not_follow_the_battery_is_none(tmp_path: Path) -> None:
     log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 15.0 * np.sin(5.3 * t)})
     run = calibrator("layout", "init", dbc, "--log", log)
     assert run.returncode == 1
-    assert "of the greatest of them: a branch is missing or wrong" in run.stderr
+    assert "of the greatest of them: a branch is missing or wrong; --branches" in run.stderr, "15 kW are not mA"
 
 
 def test_wrong_range_is_judged_by_the_log(tmp_path: Path) -> None:
