@@ -40,9 +40,6 @@ def kirchhoff(
             "positive out of the junction: battery=Ibat,-motor=Imot."
         ),
     ] = None,
-    full_scale: Annotated[
-        float | None, number_option("--full-scale", 0.001, 1e5, "Nominal maximum of the junction, with --branches [A]")
-    ] = None,
     parameters: Annotated[
         Path | None, typer.Option(help="Parameter file of this vehicle: correct with it, instead of corrected frames.")
     ] = None,
@@ -64,7 +61,6 @@ def kirchhoff(
         "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table": (
             (layout is None) == (branches is None)
         ),
-        "--full-scale goes with --branches; a layout has full_scale_a": full_scale is not None and branches is None,
         "--dbc goes with --layout": dbc is not None and layout is None,
         "--duration is that of a live bus; a LOG is read whole": duration is not None and log is not None,
         "--parameters belong to a layout; give --layout, not --branches": parameters is not None and layout is None,
@@ -93,7 +89,7 @@ def kirchhoff(
     if layout is not None:
         database = with_voltages(vehicle_database(layout, dbc))
     elif log is not None and (is_table(log) or not log.exists()):
-        database = layout_from_branches(str(branches), full_scale_a=full_scale, table=read_table(log))
+        database = layout_from_branches(str(branches), table=read_table(log))
     else:
         raise typer.BadParameter(
             "--branches names columns of a table; a log of frames and a bus need --layout, which 'calibrator layout "
@@ -113,7 +109,7 @@ def kirchhoff(
         draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {where}")
     if table is not None:
         save_table(comparison, table)
-    plausible_a = USUAL_SCALE_A if branches is not None and full_scale is None else None
+    plausible_a = USUAL_SCALE_A if branches is not None else None
     junction = look_at_junction([recording.drive], database, full_scale_a=plausible_a)
     findings = sum_findings(junction)
     if junction.is_short or junction.stands_still:

@@ -47,7 +47,7 @@ def table(folder: Path, digits: int = 3, **columns_a: Array) -> tuple[object, ..
     """A table of currents as they are measured, and the arguments to read it."""
     frame = pd.DataFrame({"time [s]": TABLE_S, **columns_a}).round(digits)
     frame.to_csv(folder / "table.csv", index=False)
-    return folder / "table.csv", "--branches", ",".join(f"{name}={name}" for name in columns_a), "--full-scale", 200
+    return folder / "table.csv", "--branches", ",".join(f"{name}={name}" for name in columns_a)
 
 
 @pytest.fixture(scope="module")
@@ -78,13 +78,14 @@ def test_offset_is_the_mean_of_the_sum_before_and_gone_after(log: Path) -> None:
 
 
 def test_figures_are_those_of_their_definition(tmp_path: Path) -> None:
-    found = figures(*table(tmp_path, battery=MOTOR_A + 3.0, motor=-MOTOR_A))["before"]
+    told = figures(*table(tmp_path, battery=MOTOR_A + 3.0, motor=-MOTOR_A))
+    found = told["before"]
     battery = MOTOR_A + 3.0
     wanted = {"rmse_a": np.sqrt(np.mean(battery**2)), "max_a": np.abs(battery).max(), "mean_a": battery.mean()}
     assert {key: found["battery"][key] for key in wanted} == pytest.approx(wanted, abs=1e-3)
     total = found["sum"]
     assert total["rmse_a"] ** 2 == pytest.approx(total["mean_a"] ** 2 + total["sd_a"] ** 2)
-    assert total["rmse_percent"] == pytest.approx(total["rmse_a"] / 2.0)
+    assert total["rmse_percent"] == pytest.approx(100.0 * total["rmse_a"] / told["full_scale_a"])
 
 
 def test_rows_without_a_number_are_counted_and_not_used(tmp_path: Path) -> None:
