@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from calibrator.doctor.facts import Facts
-from calibrator.drive import Drive
+from calibrator.drive import Drive, good_values
 from calibrator.drives.align import choose_inputs
 from calibrator.estimator.junction_run import summarise_junction
 from calibrator.findings import Finding, Findings, error, hint, warning, worst_first
@@ -133,7 +133,7 @@ def values(facts: Facts) -> Findings:
 
 def impossible_voltage(facts: Facts) -> Findings:
     """A voltage that powers are divided by and that no vehicle has: a slip of its unit is every such branch's."""
-    value_v = np.abs(facts.values(VOLTAGE))
+    value_v = np.abs(good_values(facts.drives, VOLTAGE))
     signal = next((item.signal for item in facts.junction.database.layout.input if item.name == VOLTAGE), "")
     if not value_v.any() or facts.logs[0].source.unit(signal) != "V":
         return
@@ -150,7 +150,7 @@ def full_scale(facts: Facts) -> Findings:
     scale_a, junction = facts.database.layout.full_scale_a, facts.junction
     right = dict(zip(junction.branches, np.abs(junction.multipliers).tolist(), strict=True))
     names = facts.database.layout.branch_names
-    values_a = {name: right.get(name, 1.0) * np.abs(facts.values(name)) for name in names}
+    values_a = {name: right.get(name, 1.0) * np.abs(good_values(facts.drives, name)) for name in names}
     peaks_a = {name: float(value_a.max(initial=0.0)) for name, value_a in values_a.items()}
     for name, peak_a in peaks_a.items():
         if peak_a > scale_a:
