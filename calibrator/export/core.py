@@ -16,9 +16,9 @@ from cantools.database.can import Message
 from elftools.common.exceptions import ELFError
 from elftools.elf.elffile import ELFFile
 from elftools.elf.sections import SymbolTableSection
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from calibrator.errors import ExportError
+from calibrator.files.templates import templates_of
 from ecu_node.bus.wiring import (
     InForce,
     Mode,
@@ -384,15 +384,8 @@ def _message(database: VehicleDatabase, message: Message, has_branches: bool) ->
 
 def rendered(template: str, **values: object) -> str:
     """One of ``templates/`` with values put in where it says ``[[ name ]]``, as braces are C's own."""
-    environment = Environment(
-        loader=PackageLoader("calibrator.export"),
-        autoescape=template.endswith(".cdfx"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-        variable_start_string="[[",
-        variable_end_string="]]",
-    )
+    braces = {"variable_start_string": "[[", "variable_end_string": "]]"}
+    environment = templates_of("calibrator.export", autoescape=template.endswith(".cdfx"), **braces)
     environment.filters |= {"comment": _comment, "int64": _int64, "printable": printable}
     return environment.get_template(template).render(**values)
 

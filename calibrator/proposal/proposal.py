@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from calibrator.errors import LogError, ProposalError
+from calibrator.files.templates import templates_of
 from calibrator.proposal.branches import (
     ONLY_CHARGING,
     TAKEN,
@@ -272,14 +272,7 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
     scale_a, scale_reason = _full_scale(proposal)
     messages = {item.message.name: item.message for item in branches if item.message}
     folder = out.absolute().parent if out is not None else Path.cwd()
-    environment = Environment(
-        loader=PackageLoader("calibrator.proposal", ""),
-        autoescape=False,  # noqa: S701 (a text, no page)
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    environment = templates_of("calibrator.proposal")
     # Texts of a database are kept from breaking a remark.
     environment.filters["plain"] = lambda text: printable(" ".join(text.split()))
     environment.filters["toml"] = partial(json.dumps, ensure_ascii=False)

@@ -25,7 +25,7 @@ static const hv_message_t messages[] = {
 static const hv_branch_t branches[] = {
 {% for branch, (number, placed, codes), voltage, (lowest, highest) in branches %}
     {[[ number ]]U, [[ signal(placed, codes) ]],
-     {% if voltage %}[[ voltage[0] ]]U, &(const hv_signal_t)[[ signal(voltage[1], voltage[2]) ]]{% else %}0U, NULL{% endif %}, [[ lowest | int64 ]], [[ [highest, greatest] | min | int64 ]]}, /* [[ branch.name | comment ]]: [[ branch.source | comment ]] */
+     {%+ if voltage %}[[ voltage[0] ]]U, &(const hv_signal_t)[[ signal(voltage[1], voltage[2]) ]]{% else %}0U, NULL{% endif %}, [[ lowest | int64 ]], [[ [highest, greatest] | min | int64 ]]}, /* [[ branch.name | comment ]]: [[ branch.source | comment ]] */
 {% endfor %}
 };
 const hv_layout_t hv_layout = {
