@@ -19,7 +19,7 @@ from selenium.webdriver.support.wait import WebDriverWait
 from calibrator.report.page import fleet_report
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import Explanation, SensorFinding
-from tests.calibrator.report.results_at_hand import sensor, six_vehicle_result, vehicle, write_result
+from tests.calibrator.report.results_at_hand import sensor, six_vehicle_result, six_vehicles, vehicle, write_result
 
 PATIENCE_S = 60.0
 
@@ -69,7 +69,10 @@ def names(browser: webdriver.Chrome) -> list[str]:
 
 
 def test_it_opens_without_an_error_and_fetches_nothing(page: webdriver.Chrome) -> None:
-    until(page, "return document.querySelectorAll('[data-figure][data-drawn]').length === 2")
+    until(
+        page,
+        "return document.querySelectorAll('.plot[data-drawn]').length === 2",
+    )
     assert page.execute_script("return document.body.dataset.failed") is None
     assert page.get_log("browser") == []
     events = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
@@ -108,6 +111,25 @@ def test_an_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     )
     assert [peak[1] for peak in peaks] == [8.0, 0.0]
     assert peaks[0][2] > peaks[1][2], "the more probable, the larger"
+
+
+def test_other_explanations_of_an_undecided_sensor_are_drawn(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
+    vehicles = six_vehicles(database)
+    rivals = [vehicles[3].explanations[0], Explanation(probability=0.4, offset_a={"battery": -12.0})]
+    vehicles[3] = replace(vehicles[3], explanations=rivals)
+    opened(browser, fleet_report(write_result(tmp_path / "r", vehicles))[0], tmp_path / "page.html")
+    until(browser, "return document.querySelector('#sensors-figure[data-drawn]')")
+    data, layout = browser.execute_script(
+        "const { data, layout } = document.getElementById('sensors-figure'); return [data, layout]"
+    )
+    battery = {trace["name"]: trace for trace in data if trace["xaxis"] == "x"}
+    assert battery["not corrected"]["y"] == [8.0]
+    assert battery["not corrected"]["error_y"]["array"] == [2.0]
+    assert battery["what it may be instead"]["y"] == [-12.0]
+    assert battery["what it may be instead"]["text"] == ["V4, 40 %"]
+    assert layout["yaxis"]["range"] == pytest.approx([-13.2, 13.2])
 
 
 def test_what_is_not_known_is_no_zero(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:

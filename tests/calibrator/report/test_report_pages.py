@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 import pytest
 from msgspec.structs import replace
 
@@ -18,7 +17,7 @@ from calibrator.report import page as page_module
 from calibrator.report.overview import share
 from calibrator.report.page import fleet_report, vehicle_report
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import Explanation, SensorFinding
+from ecu_node.parameters import SensorFinding
 from tests.calibrator.report.results_at_hand import EVIL, sensor, six_vehicles, write_result
 
 NO_HARDWARE = {"hardware_drift": 0.0, "hardware_offset_a": {}}
@@ -51,26 +50,11 @@ def visible(page: str) -> str:
     return " ".join(html.unescape(shown).split())
 
 
-def test_every_figure_is_one_that_plotly_takes(result: Path) -> None:
-    figures = facts_of(fleet_report(result)[0])["figures"]
-    assert set(figures) == {"junction", "sensors"}
-    for figure in figures.values():
-        go.Figure(**figure)  # raises for names and values that plotly does not know
-    before, after, load = figures["junction"]["data"]
-    assert (sum(before["y"]), sum(after["y"])) == (6, 6)
-    assert load["x"] == [0.3, 0.3]
-
-
-def test_other_explanations_of_an_undecided_sensor_are_drawn(tmp_path: Path, database: VehicleDatabase) -> None:
-    vehicles = six_vehicles(database)
-    rivals = [vehicles[3].explanations[0], Explanation(probability=0.4, offset_a={"battery": -12.0})]
-    vehicles[3] = replace(vehicles[3], explanations=rivals)
-    figure = facts_of(fleet_report(write_result(tmp_path / "r", vehicles))[0])["figures"]["sensors"]
-    battery = {trace["name"]: trace for trace in figure["data"] if trace["xaxis"] == "x"}
-    assert battery["not corrected"]["y"] == [8.0]
-    assert battery["what it may be instead"]["y"] == [-12.0]
-    assert battery["what it may be instead"]["text"] == ["V4, 40%"]
-    assert figure["layout"]["yaxis"]["range"] == pytest.approx([-13.2, 13.2])
+def test_sums_before_and_after_are_counted_in_bins(result: Path) -> None:
+    bins = facts_of(fleet_report(result)[0])["junction"]
+    assert (sum(bins["before"]), sum(bins["after"])) == (6, 6)
+    assert len(bins["edges"]) == len(bins["before"]) + 1
+    assert bins["load"] == 0.3
 
 
 def test_names_and_reasons_are_text_and_never_code(result: Path) -> None:
@@ -112,7 +96,7 @@ def test_the_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None
     assert "V4: a zero-current window (contactors open) would decide." in text
     assert "V1" not in text
     facts = facts_of(page)
-    assert (facts["alone"], facts["figures"]) == (True, {})
+    assert facts["alone"]
     (own,) = json.loads(packed(page, "details"))
     first, second = own["explanations"]
     assert first == {"probability": 0.6, "drift": {}, "offset_a": {"battery": 8.0}, **NO_HARDWARE}
