@@ -12,7 +12,7 @@ from calibrator.proposal.candidates import Candidate
 from calibrator.terminal.text import figure
 from calibrator.words import CURRENT, PLACES, POSITIONS, POWER, places_of, word_set, words_of
 
-__all__ = ["ONLY_CHARGING", "TAKEN", "close_sum", "closure", "find_signs", "judge_all", "with_usual_sign"]
+__all__ = ["ONLY_CHARGING", "TAKEN", "close_sum", "closure", "find_signs", "judge_all"]
 
 TAKEN = 50.0
 """Score from which on a candidate is a branch: names, comments or sender say where it flows."""
@@ -57,6 +57,7 @@ MOST_TOGETHER, MOST_TRIED = 2, 12
 MEANS = 50
 """One row of means for so many instants: loads that no branch measures are in them."""
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
+"""Why a charger is no branch beside a motor, where no log is there."""
 
 
 def _score(
@@ -167,9 +168,8 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
         if k in taken:
             judged[k] = replace(item, branch=taken[k])
         elif item.score >= TAKEN:
-            rival = next((other.name for j, other in enumerate(judged) if j in taken and other.place == item.place), "")
-            why = f"{rival.rpartition('.')[2]} fits better" if rival else ONLY_CHARGING
-            judged[k] = replace(item, why=why)
+            rival = next(other.name for j, other in enumerate(judged) if j in taken and other.place == item.place)
+            judged[k] = replace(item, why=f"{rival.rpartition('.')[2]} fits better")
     order = list(PLACES)
     return sorted(judged, key=lambda item: order.index(item.place) if item.branch else len(order))
 
@@ -177,10 +177,7 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
 def _named_branches(judged: Sequence[Candidate]) -> dict[int, str]:
     """The best candidate for each position that is named at a place, by number."""
     taken: dict[int, str] = {}
-    is_recorded = any(item.channel is not None for item in judged)
     for place in PLACES:
-        if place == "charger" and any(name.startswith("motor") for name in taken.values()) and not is_recorded:
-            continue  # it carries nothing while the motor does
         good = [k for k, item in enumerate(judged) if item.place == place and item.score >= TAKEN]
         positions = {k: "" if place == "battery" else _position(judged[k], judged) for k in good}
         if len({position for position in positions.values() if position}) > 1:
@@ -248,7 +245,7 @@ def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Ca
     return sorted(result, key=lambda item: not item.branch)
 
 
-def with_usual_sign(item: Candidate) -> Candidate:
+def _with_usual_sign(item: Candidate) -> Candidate:
     """The candidate with the sign that a comment tells, or that of convention: discharge and consumption positive."""
     gives, words = item.place in {"battery", "charger"}, set(words_of(item.comment))
     out, into = ("discharge", "charge") if gives else ("recuperation", "consumption")
@@ -281,7 +278,7 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
     Parameters
     ----------
     chosen : sequence of Candidate
-        The branches, with the usual signs.
+        The branches.
     voltage : Candidate or None
         The battery's.
 
@@ -290,9 +287,10 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
     list of Candidate
         The same with signs and how they are known; the usual ones where the recording does not tell.
     """
+    chosen = [_with_usual_sign(item) for item in chosen]
     known, places = _channels(chosen, voltage), [item.place for item in chosen]
     if "battery" not in places or not known:
-        return list(chosen)
+        return chosen
     current, battery = bands_of([known]).current_a, places.index("battery")
     # Means for a share of the rows: they tell where the currents are steady.
     mean = [float(channel.value[channel.good].mean()) for channel in known]

@@ -19,13 +19,12 @@ from calibrator.proposal.branches import (
     closure,
     find_signs,
     judge_all,
-    with_usual_sign,
 )
 from calibrator.proposal.candidates import Candidate, of_database, of_table, with_log, with_table
 from calibrator.proposal.inputs import FOR_FLEETS, computed_motor, derive, find_inputs
 from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.tables import bare_name, is_table, layout_from_branches, likely_full_scale_a, read_table
-from calibrator.words import PLACES, places_of, words_of
+from calibrator.words import places_of, words_of
 from ecu_node.database import read_database
 from ecu_node.errors import DatabaseError, printable
 from ecu_node.layout import Layout
@@ -88,9 +87,7 @@ class Proposal:
     @property
     def branches(self) -> list[Candidate]:
         """Those that are taken, in the order of a layout."""
-        order = {place: k for k, place in enumerate(PLACES)}
-        taken = [item for item in self.candidates if item.branch]
-        return sorted(taken, key=lambda item: (order.get(item.place, len(order)), -item.score))
+        return [item for item in self.candidates if item.branch]
 
     @property
     def battery(self) -> Candidate | None:
@@ -180,11 +177,11 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
     computed = None if battery is None or has_motor else computed_motor(found, voltage)
     if computed is not None:
         items.insert(1, replace(computed[0], place="motor", score=TAKEN, branch="motor"))
-        if log is None:  # a charger carries nothing while the motor does
-            for k, item in enumerate(items):
-                if item.branch.startswith("charger"):
-                    items[k] = replace(item, branch="", why=ONLY_CHARGING)
-    items = [with_usual_sign(item) for item in close_sum(items, voltage)]
+    if log is None and (has_motor or computed is not None):
+        items = [
+            replace(item, branch="", why=ONLY_CHARGING) if item.branch.startswith("charger") else item for item in items
+        ]
+    items = close_sum(items, voltage)
     signed = iter(find_signs([item for item in items if item.branch], voltage))
     return Proposal(
         name=name,
