@@ -1,4 +1,4 @@
-"""``calibrator kirchhoff``: the sum of the branch currents, from a log, a table or a live bus."""
+"""``calibrator kirchhoff``: the sum of the branch currents, from a log or a table."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
-from calibrator.terminal.options import DbcOption, JsonOption, number_option
+from calibrator.terminal.options import DbcOption, JsonOption
 from calibrator.terminal.text import dumps
 from ecu_node.program import say_error, write_output
 
@@ -20,17 +20,13 @@ __all__ = ["kirchhoff"]
 
 PICTURES, TABLES = (".png", ".pdf", ".svg", ".html"), (".csv", ".parquet")
 """Ends of the names of files that can be written."""
-USUAL_S = 30.0
-"""How long is listened to a bus. [s]"""
 USUAL_SCALE_A = 500.0
 """Currents are plausible up to it where nothing tells full scale but the currents themselves. [A]"""
 
 
 def kirchhoff(
     *,
-    log: Annotated[
-        Path | None, typer.Argument(metavar="LOG", help="Log of frames, or table of currents (.csv, .parquet ...).")
-    ] = None,
+    log: Annotated[Path, typer.Argument(help="Log of frames, or table of currents (.csv, .parquet ...).")],
     layout: Annotated[Path | None, typer.Option(help="Layout (TOML) that says what the signals mean.")] = None,
     dbc: DbcOption = None,
     branches: Annotated[
@@ -43,26 +39,16 @@ def kirchhoff(
     parameters: Annotated[
         Path | None, typer.Option(help="Parameter file of this vehicle: correct with it, instead of corrected frames.")
     ] = None,
-    interface: Annotated[str | None, typer.Option(help="Listen to a bus of this python-can interface.")] = None,
-    channel: Annotated[str | None, typer.Option(help="Channel of the bus, such as vcan0.")] = None,
-    duration: Annotated[
-        float | None,
-        number_option("--duration", 0.1, 86400.0, f"How long to listen, or until Ctrl-C; {USUAL_S:g} without it [s]"),
-    ] = None,
     plot: Annotated[Path | None, typer.Option(help=f"Draw the currents ({' '.join(PICTURES)}).")] = None,
     table: Annotated[Path | None, typer.Option(help=f"Write the currents ({' '.join(TABLES)}).")] = None,
     json: JsonOption = False,
 ) -> None:
     """Print the branch currents and their sum, before and after correction, and what is expected of right sensors."""
     for what, is_wrong in {
-        "give either a LOG, or --interface and --channel of a live bus": (
-            len({log is None, interface is not None, channel is not None}) > 1
-        ),
         "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table": (
             (layout is None) == (branches is None)
         ),
         "--dbc goes with --layout": dbc is not None and layout is None,
-        "--duration is that of a live bus; a LOG is read whole": duration is not None and log is not None,
         "--parameters belong to a layout; give --layout, not --branches": parameters is not None and layout is None,
     }.items():
         if is_wrong:
@@ -72,14 +58,13 @@ def kirchhoff(
         from calibrator.kirchhoff.junction import look_at_junction
         from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
         from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_text, save_table
-        from calibrator.recordings.live import record_bus
         from calibrator.recordings.log_files import files_in
         from calibrator.recordings.log_formats import is_log
-        from calibrator.recordings.readers import FrameSource, open_recording
+        from calibrator.recordings.readers import open_recording
         from calibrator.recordings.tables import is_table, layout_from_branches, read_table
         from ecu_node.parameters import check_fit, read_parameters
 
-    logs = filter(is_log, files_in(log)) if log is not None else ()
+    logs = filter(is_log, files_in(log))
     read = {path.resolve() for path in filter(None, (log, *logs, layout, dbc, parameters))}
     for path, ends in ((plot, PICTURES), (table, TABLES)):
         if path is not None and path.suffix.lower() not in ends:
@@ -88,25 +73,19 @@ def kirchhoff(
             raise typer.BadParameter(f"{path}: is read here and would be overwritten; choose another name")
     if layout is not None:
         database = with_voltages(vehicle_database(layout, dbc))
-    elif log is not None and (is_table(log) or not log.exists()):
+    elif is_table(log) or not log.exists():
         database = layout_from_branches(str(branches), table=read_table(log))
     else:
         raise typer.BadParameter(
-            "--branches names columns of a table; a log of frames and a bus need --layout, which 'calibrator layout "
-            "init DATABASE --log LOG --out my_car.toml' makes"
+            "--branches names columns of a table; a log of frames needs --layout, which 'calibrator layout init "
+            "DATABASE --log LOG --out my_car.toml' makes"
         )
     if (found := None if parameters is None else read_parameters(parameters)) is not None:
         check_fit(found, database, None)
-    vehicle, where = database.layout.name, f"{interface}:{channel}" if log is None else log.name
-    source = (
-        FrameSource(record_bus(str(interface), channel, duration or USUAL_S), database, where)
-        if log is None
-        else open_recording(log, database)
-    )
-    recording = source.recording(vehicle, "live" if log is None else where.partition(".")[0])
+    recording = open_recording(log, database).recording(database.layout.name, log.name.partition(".")[0])
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:
-        draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {where}")
+        draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {log.name}")
     if table is not None:
         save_table(comparison, table)
     plausible_a = USUAL_SCALE_A if branches is not None else None
@@ -119,7 +98,7 @@ def kirchhoff(
         write_output(dumps(comparison.as_json() | {"notices": notices, "findings": findings}))
         return
     write_output(kirchhoff_text(comparison, [*notices, *(finding.line for finding in findings)]))
-    if log is not None and "after" not in comparison.stages and (step := _next_step(log, layout, branches, database)):
+    if "after" not in comparison.stages and (step := _next_step(log, layout, branches, database)):
         say_error(f"next: calibrator {step}")
 
 

@@ -1,24 +1,18 @@
-"""Through the command line: the sum of the currents of logs, tables and live buses, before and after."""
+"""Through the command line: the sum of the currents of logs and tables, before and after."""
 
 import json
 import re
-import signal
 import subprocess
-import threading
-import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import can
 import numpy as np
 import pandas as pd
 import pytest
-from can.interfaces.virtual import channels
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.files.layout_files import vehicle_database
-from calibrator.kirchhoff.command import kirchhoff
 from calibrator.recordings.write_logs import encode_message, write_candump
 from ecu_node.cli import template_text
 from ecu_node.database import VehicleDatabase
@@ -260,27 +254,3 @@ def test_table_has_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> 
             "expected_sd_a",
         ]  # fmt: skip
         np.testing.assert_allclose(frame["sum_a"].mean(), 12.0, atol=0.02)
-
-
-# ---- a live bus
-
-
-@pytest.mark.parametrize("interrupted", [False, True])
-def test_live_bus_gives_figures_of_its_log(interrupted: bool, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def send() -> None:
-        while not channels.get("live"):  # until the command listens
-            time.sleep(0.01)
-        with can.Bus(interface="virtual", channel="live", preserve_timestamps=True) as bus:
-            for message in can.LogReader(log):
-                bus.send(message)
-        if interrupted:
-            time.sleep(1.0)
-            signal.raise_signal(signal.SIGINT)
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    kirchhoff(layout=LAYOUT, interface="virtual", channel="live", duration=600.0 if interrupted else 1.5, json=True)
-    sender.join()
-    found = json.loads(capsys.readouterr().out)
-    assert found["before"]["sum"]["mean_a"] == pytest.approx(12.0, abs=0.02)
-    assert found["after"]["sum"]["max_a"] < 0.03
