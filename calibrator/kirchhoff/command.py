@@ -44,15 +44,14 @@ def kirchhoff(
     json: JsonOption = False,
 ) -> None:
     """Print the branch currents and their sum, before and after correction, and what is expected of right sensors."""
-    for what, is_wrong in {
-        "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table": (
-            (layout is None) == (branches is None)
-        ),
-        "--dbc goes with --layout": dbc is not None and layout is None,
-        "--parameters belong to a layout; give --layout, not --branches": parameters is not None and layout is None,
-    }.items():
-        if is_wrong:
-            raise typer.BadParameter(what)
+    if (layout is None) == (branches is None):
+        raise typer.BadParameter(
+            "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table"
+        )
+    if dbc is not None and layout is None:
+        raise typer.BadParameter("--dbc goes with --layout")
+    if parameters is not None and layout is None:
+        raise typer.BadParameter("--parameters belong to a layout; give --layout, not --branches")
     with importing():
         from calibrator.kirchhoff.findings import sum_findings
         from calibrator.kirchhoff.junction import look_at_junction
