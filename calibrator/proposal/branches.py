@@ -10,32 +10,15 @@ from calibrator.drive import Array, Channel
 from calibrator.kirchhoff.signs import WELL_CORRELATED, Bands, bands_of, likely_multipliers, sag
 from calibrator.proposal.candidates import Candidate
 from calibrator.terminal.text import figure
-from calibrator.words import CURRENT, PLACES, POSITIONS, POWER, places_of, word_set, words_of
+from calibrator.words import CURRENT, PLACES, POSITIONS, POWER, VOCABULARY, places_of, word_set, words_of
 
 __all__ = ["ONLY_CHARGING", "TAKEN", "close_sum", "closure", "find_signs", "judge_all"]
 
 TAKEN = 50.0
 """Score from which on a candidate is a branch: names, comments or sender say where it flows."""
-NOT_MEASURED = word_set(
-    "limit limits lim max maximum min minimum mx mn available avail target tgt request requested req rq command cmd "
-    "soll grenze demand setpoint desired allowed budget capability predicted pred est optimal regen reg error "
-    "deviation phase iq id ia ib ic flux peak history avg average corrected quality checksum counter waste dissipation "
-    "heat qdot dbg debug rejection load reserve inst reserved limite maxi mini consigne threshold isolation leakage "
-    "energy over"
+NOT_MEASURED, LIMITS, ELSEWHERE, DCDC_ELSEWHERE, HIGH_VOLTAGE = (
+    word_set(VOCABULARY[name]) for name in ("not_measured", "limits", "elsewhere", "dcdc_elsewhere", "high_voltage")
 )
-"""Words of limits, demands, statistics and parts of a phase current, which are no measured flow."""
-LIMITS = word_set("limit limits request command max charging")
-"""The same in the name of a message."""
-ELSEWHERE = word_set(
-    "lv 12 12v 24 24v ulo lo fan pump blower cell brick sleep seat mirror lock brake brk steering eps epb epbm "
-    "liftgate window wiper tpms solenoid valve radar line evse ac1 fc trailer igbt gate bulkhead strut ibs ekat scr "
-    "generator alternator kupplung kompressorkupplung"
-)
-"""Words of other circuits than the high-voltage junction."""
-_OTHER_SIDE = {"dcdc": word_set("output out secondary")}
-"""The converter's low-voltage side is named by these words, not by *lv*."""
-HIGH_VOLTAGE = word_set("hv high traction trac hvb hvem bms becm pack pck lb lbc sme ess ress isolation isolationres")
-"""Words that a database of a low-voltage battery does not have beside it."""
 MAIN = ("battery", "motor")
 NAMED, NAMED_AROUND, HV, MEASURED, BESIDE = 35.0, 40.0, 15.0, 10.0, 20.0
 AGAINST, WEAK, STEADY, NEVER = -65.0, -30.0, -40.0, -150.0
@@ -67,7 +50,8 @@ def _score(
     own, near, named = set(item.own), set(item.words), PLACES.get(place, frozenset())
     # "Iheat" of a table is a heater's current; in a database, or beside a motor, heat is a loss.
     allowed = named if item.message is None and places_of(near) == {place} else set()
-    no_flow, elsewhere = own & NOT_MEASURED - allowed, near & (_OTHER_SIDE.get(place, ELSEWHERE) - named)
+    no_flow = own & NOT_MEASURED - allowed
+    elsewhere = near & (DCDC_ELSEWHERE if place == "dcdc" else ELSEWHERE) - named
     limits = set() if no_flow else (near - own) & LIMITS
     points = [
         (NAMED * bool(own & named) + NAMED_AROUND * bool(near & named), ""),
