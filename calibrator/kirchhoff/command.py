@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibrator.files.folders import require_possible_file
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import DbcOption, JsonOption
@@ -70,6 +71,8 @@ def kirchhoff(
             raise typer.BadParameter(f"{path}: expected a file name that ends with {', '.join(ends)}")
         if path is not None and path.resolve() in read:
             raise typer.BadParameter(f"{path}: is read here and would be overwritten; choose another name")
+        if path is not None:
+            require_possible_file(path)
     if layout is not None:
         database = with_voltages(vehicle_database(layout, dbc))
     elif is_table(log) or not log.exists():
@@ -79,7 +82,8 @@ def kirchhoff(
             "--branches names columns of a table; a log of frames needs --layout, which 'calibrator layout init "
             "DATABASE --log LOG --out my_car.toml' makes"
         )
-    if (found := None if parameters is None else read_parameters(parameters)) is not None:
+    found = None if parameters is None else read_parameters(parameters)
+    if found is not None:
         check_fit(found, database, None)
     recording = open_recording(log, database).recording(database.layout.name, log.name.partition(".")[0])
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
@@ -87,12 +91,11 @@ def kirchhoff(
         draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {log.name}")
     if table is not None:
         save_table(comparison, table)
-    plausible_a = USUAL_SCALE_A if branches is not None else None
-    junction = look_at_junction([recording.drive], database, full_scale_a=plausible_a)
-    findings = sum_findings(junction)
+    scale_a = USUAL_SCALE_A if branches is not None else database.layout.full_scale_a
+    junction = look_at_junction([recording.drive], database, full_scale_a=scale_a)
     if junction.is_short or junction.stands_still:
         comparison = replace(comparison, residual=dict.fromkeys(comparison.residual))
-    notices = [*map(str, recording.report.log_notices()), *comparison.notices()]
+    findings, notices = sum_findings(junction), [*map(str, recording.report.log_notices()), *comparison.notices()]
     if json:
         write_output(dumps(comparison.as_json() | {"notices": notices, "findings": findings}))
         return

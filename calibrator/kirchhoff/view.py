@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from calibrator.errors import DriveError
+from calibrator.files.folders import write_files
 from calibrator.kirchhoff.sums import BAND, SUM, Comparison
 from calibrator.terminal.text import figure, table
-from ecu_node.documents import write_atomically
 
 __all__ = ["draw_kirchhoff", "kirchhoff_text", "save_table"]
 
@@ -92,7 +91,7 @@ def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
 
     Raises
     ------
-    DriveError
+    UserError
         If it cannot be written.
     """
     every = -(-len(comparison.valid) // MOST_DRAWN)
@@ -111,7 +110,7 @@ def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
     sd_a = pd.Series(comparison.expected_sd_a, comparison.stages["before"].index)[comparison.valid][::every]
     band = comparison.expected_a + BAND * pd.DataFrame({"low": -sd_a, "high": sd_a})
     form = path.suffix.lower()[1:]
-    _write(path, _page(panels, band, title) if form == "html" else _picture(panels, band, title, form), "picture")
+    write_files({path: _page(panels, band, title) if form == "html" else _picture(panels, band, title, form)})
 
 
 def _picture(panels: _Panels, band: pd.DataFrame, title: str, form: str) -> bytes:
@@ -175,7 +174,7 @@ def save_table(comparison: Comparison, path: Path) -> None:
 
     Raises
     ------
-    DriveError
+    UserError
         If it cannot be written.
     """
     ends = {"before": "_a", "after": "_corrected_a"}
@@ -184,11 +183,4 @@ def save_table(comparison: Comparison, path: Path) -> None:
     frame[~comparison.valid] = float("nan")
     frame = frame.reset_index().round(6)
     is_csv = path.suffix.lower() == ".csv"
-    _write(path, frame.to_csv(index=False).encode() if is_csv else frame.to_parquet(None, index=False), "table")
-
-
-def _write(path: Path, content: bytes, what: str) -> None:
-    try:
-        write_atomically(path, content)
-    except OSError as error:
-        raise DriveError(f"{path}: cannot write the {what}: {error.strerror}; choose another folder") from None
+    write_files({path: frame.to_csv(index=False).encode() if is_csv else frame.to_parquet(None, index=False)})

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibrator.errors import ProposalError
-from calibrator.files.folders import require_possible_file
+from calibrator.files.folders import require_possible_file, write_files
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps
-from ecu_node.documents import write_atomically
 from ecu_node.errors import printable
 from ecu_node.program import say_error, write_output
 
@@ -75,8 +74,7 @@ def propose(
             say_error(line)
     text = "" if problem else layout_text(proposal, out)
     if out is not None and text:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(out, text.encode())
+        write_files({out: text.encode()})
     if json:
         write_output(dumps(_as_json(proposal, out if text else None, text, problem)))
     if problem:

@@ -5,11 +5,10 @@ from typing import Annotated
 
 import typer
 
-from calibrator.files.folders import require_possible_file
+from calibrator.files.folders import require_possible_file, write_files
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, number_option
 from calibrator.terminal.text import dumps
-from ecu_node.documents import write_atomically
 from ecu_node.program import write_output
 
 __all__ = ["report"]
@@ -52,7 +51,6 @@ def report(
         text, parameters = vehicle_report(result, vehicle, **options)
         about = {"parameters": parameters}
     content = text.encode()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(target, content)
+    write_files({target: content})
     said = f"{target}: {len(content) / 1e6:.2f} MB; open it in a browser"
     write_output(dumps({"page": str(target), "bytes": len(content), **about}) if json else said)

@@ -254,3 +254,12 @@ def test_table_has_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> 
             "expected_sd_a",
         ]  # fmt: skip
         np.testing.assert_allclose(frame["sum_a"].mean(), 12.0, atol=0.02)
+
+
+@pytest.mark.parametrize(("option", "name"), [("--plot", "out.html"), ("--table", "out.csv")])
+def test_link_is_no_place_for_a_file(option: str, name: str, log: Path, tmp_path: Path) -> None:
+    (tmp_path / name).symlink_to(tmp_path / "elsewhere")
+    done = run(log, "--layout", LAYOUT, option, tmp_path / name)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert f"{name}: is a link, so it cannot be replaced" in done.stderr
+    assert (tmp_path / name).is_symlink()
