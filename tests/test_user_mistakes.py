@@ -86,7 +86,7 @@ MISTAKES = [
     ("calibrator kirchhoff drive.csv --branches battery=Ibat,motor=Iother", 1, "Iother"),
     ("calibrator kirchhoff drive.csv --branches battery=Ibat,motor=Ibat", 1, "both read Ibat"),
     ("calibrator kirchhoff drive.csv --branches battery=Ibat,battery=Imot", 1, "battery is named twice"),
-    ("calibrator kirchhoff drive.csv CURRENTS --plot folder", 2, "folder: expected a file name that ends with .png"),
+    ("calibrator kirchhoff drive.csv CURRENTS --plot folder", 2, "folder: expected a file name that ends with .html"),
     ("calibrator kirchhoff drive.csv CURRENTS --plot drive.csv", 2, "drive.csv"),
     ("calibrator kirchhoff drive.csv CURRENTS --plot sum.doc", 2, "sum.doc"),
     ("calibrator kirchhoff drive.csv CURRENTS --table drive.csv", 2, "drive.csv"),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["kirchhoff"]
 
-PICTURES, TABLES = (".png", ".pdf", ".svg", ".html"), (".csv", ".parquet")
+PAGES, TABLES = (".html",), (".csv", ".parquet")
 """Ends of the names of files that can be written."""
 USUAL_SCALE_A = 500.0
 """Currents are plausible up to it where nothing tells full scale but the currents themselves. [A]"""
@@ -40,7 +40,7 @@ def kirchhoff(
     parameters: Annotated[
         Path | None, typer.Option(help="Parameter file of this vehicle: correct with it, instead of corrected frames.")
     ] = None,
-    plot: Annotated[Path | None, typer.Option(help=f"Draw the currents ({' '.join(PICTURES)}).")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw the currents, as a page to zoom in (.html).")] = None,
     table: Annotated[Path | None, typer.Option(help=f"Write the currents ({' '.join(TABLES)}).")] = None,
     json: JsonOption = False,
 ) -> None:
@@ -66,7 +66,7 @@ def kirchhoff(
 
     logs = filter(is_log, files_in(log))
     read = {path.resolve() for path in filter(None, (log, *logs, layout, dbc, parameters))}
-    for path, ends in ((plot, PICTURES), (table, TABLES)):
+    for path, ends in ((plot, PAGES), (table, TABLES)):
         if path is not None and path.suffix.lower() not in ends:
             raise typer.BadParameter(f"{path}: expected a file name that ends with {', '.join(ends)}")
         if path is not None and path.resolve() in read:

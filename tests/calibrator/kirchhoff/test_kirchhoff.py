@@ -218,12 +218,6 @@ def test_text_has_80_columns_and_ends_with_the_sum(log: Path) -> None:
     assert lines[-1].startswith("RMSE of the sum: 12.00 A measured, 0.0")
 
 
-@pytest.mark.parametrize(("name", "start"), [("out.png", b"\x89PNG"), ("out.PDF", b"%PDF"), ("out.svg", b"<?xml")])
-def test_picture_has_the_format_of_its_suffix(name: str, start: bytes, log: Path, tmp_path: Path) -> None:
-    assert run(log, "--layout", LAYOUT, "--plot", tmp_path / name).returncode == 0
-    assert (tmp_path / name).read_bytes().startswith(start)
-
-
 def test_page_needs_no_other_file(log: Path, tmp_path: Path) -> None:
     assert run(log, "--layout", LAYOUT, "--plot", tmp_path / "out.html").returncode == 0
     page = (tmp_path / "out.html").read_text()
