@@ -176,9 +176,9 @@ def readiness(facts: Facts, findings: Sequence[Finding]) -> dict[str, str]:
     """Commands in the order in which they are used, and for each what is missing; empty where nothing is."""
     errors, junction = [finding.subject for finding in findings if finding.severity == "error"], facts.junction
     wrong = f"of the errors above ({', '.join(dict.fromkeys(errors))})" if errors else ""
-    together = "" if junction.comparisons else "no log has a branch"
-    for drive in facts.drives if together else ():
-        together = _refusal(partial(compare_kirchhoff, drive, junction.database))
+    single = () if junction.comparisons else facts.drives  # none has all branches, which one may do without
+    refusals = [_refusal(partial(compare_kirchhoff, drive, junction.database)) for drive in single]
+    together = "" if junction.comparisons or "" in refusals else next(iter(refusals), "no log has a branch")
     alone = partial(summarise_junction, junction.drives, junction.branches, facts.database)
     return {
         "kirchhoff": together,
