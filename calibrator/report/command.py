@@ -38,18 +38,13 @@ def report(
 ) -> None:
     """Show a result as one HTML page, of the fleet or of one vehicle; it needs no network."""
     with importing():
-        from calibrator.report.page import fleet_report, vehicle_report
+        from calibrator.report.page import report_page
 
     target = out if out is not None else result / f"{vehicle or 'report'}.html"
     if target.suffix.lower() != ".html":
         raise typer.BadParameter(f"{target}: expected a file name that ends with .html", param_hint="--out")
     require_possible_file(target)
-    options = {"battery": battery, "limit_a": limit, "voltage_v": voltage}
-    if vehicle is None:
-        text, about = fleet_report(result, **options)
-    else:
-        text, parameters = vehicle_report(result, vehicle, **options)
-        about = {"parameters": parameters}
+    text, about = report_page(result, vehicle, battery=battery, limit_a=limit, voltage_v=voltage)
     content = text.encode()
     write_files({target: content})
     said = f"{target}: {len(content) / 1e6:.2f} MB; open it in a browser"

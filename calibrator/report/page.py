@@ -36,9 +36,9 @@ from calibrator.report.overview import (
 )
 from calibrator.terminal.text import counted, few
 from calibrator.words import is_battery
-from ecu_node.parameters import VehicleParameters, decode_parameters
+from ecu_node.parameters import decode_parameters
 
-__all__ = ["fleet_report", "vehicle_report"]
+__all__ = ["report_page"]
 
 MOST_SENSORS = 300_000
 """Sensors of the vehicles that a page lists one by one: those of 100,000 vehicles with three branches."""
@@ -62,53 +62,44 @@ LEAST_LOAD_A = 0.05
 """Load without a sensor from which on it is worth a line. [A]"""
 
 
-def fleet_report(result: Path, **options: Any) -> tuple[str, dict[str, Any]]:
-    """Make the page of a result.
-
-    Parameters
-    ----------
-    result : Path
-        Folder that ``calibrator calibrate`` wrote.
-    **options
-        ``battery``, branch of the battery (without it the one of such a name); ``limit_a``, its current limit (full
-        scale); ``voltage_v``, its voltage (the margin is given in A alone). [A], [V]
-
-    Returns
-    -------
-    page : str
-        HTML. A result of one vehicle gives the page of this vehicle.
-    numbers : dict
-        ``overview``, ``next_steps``, ``workshop`` and ``protection`` of the page.
-
-    Raises
-    ------
-    FleetError
-        If the folder is no result, or no branch has this name.
-    """
-    table = read_fleet_table(result)
-    return _page(table, table, **options)
-
-
-def vehicle_report(result: Path, vehicle: str, **options: Any) -> tuple[str, VehicleParameters]:
-    """Make the page of one vehicle of a result, with its parameters; FleetError if it is not in it, or left out.
-
-    Options as those of :func:`fleet_report`.
-    """
-    written = written_of(result, vehicle)
-    parameters = decode_parameters(written.text, f"{result}: parameters of {vehicle}")
-    table = read_fleet_table(result)
-    return _page(table.only(vehicle), table, **options)[0], parameters
-
-
-def _page(
-    table: FleetTable,
-    fleet: FleetTable,
+def report_page(
+    result: Path,
+    vehicle: str | None = None,
     *,
     battery: str | None = None,
     limit_a: float | None = None,
     voltage_v: float | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """Write the page of some vehicles: all of a fleet, or one of them; `fleet` is all of the result."""
+    """Make the page of a result, or of one of its vehicles.
+
+    Parameters
+    ----------
+    result : Path
+        Folder that ``calibrator calibrate`` wrote.
+    vehicle : str or None
+        Name of the vehicle; None: all. A result of one vehicle gives the page of this vehicle.
+    battery : str or None
+        Branch of the battery; None: the one of such a name.
+    limit_a, voltage_v : float or None
+        Its current limit, and its voltage; None: full scale, and the margin in A alone. [A], [V]
+
+    Returns
+    -------
+    page : str
+        HTML.
+    numbers : dict
+        ``overview``, ``next_steps``, ``workshop`` and ``protection`` of the page; of one vehicle its ``parameters``.
+
+    Raises
+    ------
+    FleetError
+        If the folder is no result, no branch has this name, or the vehicle is not in it, or left out.
+    """
+    parameters = None
+    if vehicle is not None:
+        parameters = decode_parameters(written_of(result, vehicle).text, f"{result}: parameters of {vehicle}")
+    fleet = read_fleet_table(result)
+    table = fleet if vehicle is None else fleet.only(vehicle)
     branch, protection = battery or next((name for name in table.branches if is_battery(name, "")), ""), None
     no_protection = f"No branch is called {BATTERY!r} or alike; name the battery's with --battery to see its margin."
     if branch in table.branches:
@@ -163,7 +154,7 @@ def _page(
         facts=facts,
         data={name: _as_text(msgspec.json.encode(each)) for name, each in packed.items()} | {"plotly": _plotly()},
     )
-    return text, numbers
+    return text, numbers if parameters is None else {"parameters": parameters}
 
 
 def _columns(
