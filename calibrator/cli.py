@@ -33,7 +33,7 @@ COMMANDS: dict[str, dict[str, tuple[Callable[..., None] | typer.Typer, list[str]
             kirchhoff,
             [
                 "kirchhoff table.csv --branches battery=Ibat,-motor=Imot --plot sum.html",
-                "kirchhoff drive.blf --layout my_car.toml --plot sum.png",
+                "kirchhoff drive.blf --layout my_car.toml --plot sum.html",
             ],
         ),
         "replay": (replay, ["replay drive.log --interface socketcan --channel vcan0"]),

@@ -4,7 +4,7 @@ A drive keeps the times of its frames; :mod:`calibrator.drives.align` puts them 
 in place and are labelled, so that what was left out can always be counted.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Channel", "Complex", "Drive", "DriveFile", "Equipment", "FleetSource", "Mask", "Samples"]
+__all__ = [
+    "Array",
+    "Channel",
+    "Complex",
+    "Drive",
+    "DriveFile",
+    "Equipment",
+    "FleetSource",
+    "Mask",
+    "Samples",
+    "good_values",
+]
 
 Array = NDArray[np.floating[Any]]
 """Real numbers; always double precision in practice."""
@@ -65,6 +76,12 @@ class Drive:
         if not channels:
             return 0.0
         return float(max(c.time_s[-1] for c in channels) - min(c.time_s[0] for c in channels))
+
+
+def good_values(drives: Iterable[Drive], name: str) -> Array:
+    """Good values of a branch [A] or of an input [its unit] over all drives; of none that a drive lacks, shape (n,)."""
+    channels = [{**drive.inputs, **drive.branches}.get(name) for drive in drives]
+    return np.concatenate([np.zeros(0), *(each.value[each.good] for each in channels if each is not None)])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,11 +1,12 @@
 """A finding: one thing that is wrong with a recording, a layout or a vehicle, or worth knowing of it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from enum import StrEnum
+from functools import partial
 
 import msgspec
 
-__all__ = ["Finding", "Severity", "worst_first"]
+__all__ = ["Finding", "Findings", "Severity", "error", "hint", "warning", "worst_first"]
 
 
 class Severity(StrEnum):
@@ -47,8 +48,12 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def line(self) -> str:
-        """The finding as one line, without its severity."""
-        return f"{self.subject}: {self.text}" + (f"; {self.advice}" if self.advice else "")
+        """The finding as one line; a terminal folds long ones."""
+        return f"{self.severity:<9}{self.subject}: {self.text}" + (f"; {self.advice}" if self.advice else "")
+
+
+Findings = Iterator[Finding]
+error, warning, hint = (partial(Finding, severity) for severity in Severity)
 
 
 def worst_first(findings: Iterable[Finding]) -> list[Finding]:

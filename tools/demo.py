@@ -98,10 +98,10 @@ def show(drives: str, out: Path) -> None:
     step(5, "the Kirchhoff sum of its currents on that trip, before and after")
     run(
         *("calibrator", "kirchhoff", out / "live.log"),
-        *("--layout", LAYOUT, "--plot", out / "kirchhoff.png", "--table", out / "kirchhoff.csv"),
+        *("--layout", LAYOUT, "--plot", out / "kirchhoff.html", "--table", out / "kirchhoff.csv"),
     )
     draw_side_by_side(out / "kirchhoff.csv", out / "before_after.png")
-    say(f"pictures: {out / 'before_after.png'}, {out / 'kirchhoff.png'}; report: {out / 'report.html'}")
+    say(f"pictures: {out / 'before_after.png'}, {out / 'kirchhoff.html'}; report: {out / 'report.html'}")
     say(
         f"the same on a virtual bus (ip link add vcan0 type vcan), with .venv/bin in front, each in its own terminal:\n"
         f"  ecu-node run --unsigned --params {parameters} --layout {LAYOUT} --interface socketcan --channel vcan0\n"

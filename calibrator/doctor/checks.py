@@ -10,11 +10,11 @@ from functools import partial
 import numpy as np
 
 from calibrator.doctor.facts import Facts
-from calibrator.drive import Drive
+from calibrator.drive import Drive, good_values
 from calibrator.drives.align import choose_inputs
 from calibrator.estimator.junction_run import summarise_junction
-from calibrator.findings import Finding, worst_first
-from calibrator.kirchhoff.findings import Findings, error, hint, sum_findings, times, warning
+from calibrator.findings import Finding, Findings, error, hint, warning, worst_first
+from calibrator.kirchhoff.findings import sum_findings, times
 from calibrator.kirchhoff.sums import VOLTAGE, compare_kirchhoff
 from calibrator.summaries.vehicle_summary import LEAST_DURATION_S, too_slow
 from calibrator.terminal.text import figure
@@ -133,7 +133,7 @@ def values(facts: Facts) -> Findings:
 
 def impossible_voltage(facts: Facts) -> Findings:
     """A voltage that powers are divided by and that no vehicle has: a slip of its unit is every such branch's."""
-    value_v = np.abs(facts.values(VOLTAGE))
+    value_v = np.abs(good_values(facts.drives, VOLTAGE))
     signal = next((item.signal for item in facts.junction.database.layout.input if item.name == VOLTAGE), "")
     if not value_v.any() or facts.logs[0].source.unit(signal) != "V":
         return
@@ -150,7 +150,7 @@ def full_scale(facts: Facts) -> Findings:
     scale_a, junction = facts.database.layout.full_scale_a, facts.junction
     right = dict(zip(junction.branches, np.abs(junction.multipliers).tolist(), strict=True))
     names = facts.database.layout.branch_names
-    values_a = {name: right.get(name, 1.0) * np.abs(facts.values(name)) for name in names}
+    values_a = {name: right.get(name, 1.0) * np.abs(good_values(facts.drives, name)) for name in names}
     peaks_a = {name: float(value_a.max(initial=0.0)) for name, value_a in values_a.items()}
     for name, peak_a in peaks_a.items():
         if peak_a > scale_a:
@@ -176,9 +176,9 @@ def readiness(facts: Facts, findings: Sequence[Finding]) -> dict[str, str]:
     """Commands in the order in which they are used, and for each what is missing; empty where nothing is."""
     errors, junction = [finding.subject for finding in findings if finding.severity == "error"], facts.junction
     wrong = f"of the errors above ({', '.join(dict.fromkeys(errors))})" if errors else ""
-    together = "" if junction.comparisons else "no log has a branch"
-    for drive in facts.drives if together else ():
-        together = _refusal(partial(compare_kirchhoff, drive, junction.database))
+    single = () if junction.comparisons else facts.drives  # none has all branches, which one may do without
+    refusals = [_refusal(partial(compare_kirchhoff, drive, junction.database)) for drive in single]
+    together = "" if junction.comparisons or "" in refusals else next(iter(refusals), "no log has a branch")
     alone = partial(summarise_junction, junction.drives, junction.branches, facts.database)
     return {
         "kirchhoff": together,

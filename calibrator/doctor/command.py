@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["doctor", "doctor_json", "doctor_text"]
 
-_SEVERITY_WIDTH = 9
-
 
 def doctor(
     layout: LayoutOption,
@@ -63,8 +61,7 @@ def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[st
         f"{facts.database.layout.path.name}: {counted(len(facts.logs), 'log')}, {figure(seconds)} s, {frames:,} frames",
         _channels("branch", facts),
         _channels("input", facts),
-        "\n".join(f"{item.severity.value:<{_SEVERITY_WIDTH}}{item.line}" for item in findings)
-        or "nothing to complain of",
+        "\n".join(finding.line for finding in findings) or "nothing to complain of",
         "\n".join([*lines, *_next_commands(facts, ready)]),
     ]
     return "\n\n".join(part for part in parts if part)

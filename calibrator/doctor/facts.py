@@ -13,6 +13,7 @@ from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import LogError
 from calibrator.kirchhoff.junction import RecordedJunction, look_at_junction
 from calibrator.kirchhoff.sums import with_voltages
+from calibrator.recordings.decode import bit_range, signal_range
 from calibrator.recordings.readers import RecordingReport, SignalSource, open_recording
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import Branch, Input, Layout
@@ -84,11 +85,6 @@ class Facts:
     drives: Sequence[Drive]
     channels: pd.DataFrame
     junction: RecordedJunction
-
-    def values(self, name: str) -> Array:
-        """Good values of a branch [A], positive into the junction, or of an input in its unit, over all logs."""
-        channels = [{**drive.inputs, **drive.branches}.get(name, NOTHING) for drive in self.drives]
-        return np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)])
 
 
 def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
@@ -179,12 +175,8 @@ def _clipped(signal: Signal, value: Array) -> int:
     """Values at an end, other than 0, of what an integer signal can show and the DBC allows; some in a row each."""
     if signal.is_float:
         return 0
-    half = 1 << (signal.length - 1)
-    codes = (-half, half - 1) if signal.is_signed else (0, 2 * half - 1)
-    low, high = sorted(float(code * signal.scale + signal.offset) for code in codes)
-    if signal.minimum or signal.maximum:
-        low = max(low, float(signal.minimum) if signal.minimum is not None else low)
-        high = min(high, float(signal.maximum) if signal.maximum is not None else high)
-    at_end: list[Mask] = [np.abs(value - end) < 0.5 * abs(float(signal.scale)) for end in (low, high) if end]
+    (low, high), span = bit_range(signal), signal_range(signal)
+    ends = max(low, span.low), min(high, span.high)
+    at_end: list[Mask] = [np.abs(value - end) < 0.5 * abs(float(signal.scale)) for end in ends if end]
     runs = (run for mask in at_end for run in np.split(mask, np.flatnonzero(np.diff(mask)) + 1))
     return sum(len(run) for run in runs if len(run) >= FEWEST_CLIPPED and run.all())

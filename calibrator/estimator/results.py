@@ -46,6 +46,7 @@ __all__ = [
     "read_results",
     "read_run",
     "report_of",
+    "result_rows",
     "write_parameter_files",
     "write_run",
     "written_of",
@@ -327,17 +328,18 @@ def written_of(result: Path, vehicle: str) -> WrittenVehicle:
 
 def left_out_of(result: Path) -> dict[str, str]:
     """Vehicles of ``results.parquet`` that have no parameters, and why; FleetError if it is none."""
-    found = _read_rows(result, ["vehicle", "branch", "reason"])
+    found = result_rows(result, ["vehicle", "branch", "reason"])
     return {row["vehicle"]: row["reason"] for row in found.filter(pc.field("branch").is_null()).to_pylist()}
 
 
 def read_results(result: Path) -> Rows:
     """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
-    rows: Rows = _read_rows(result, SCHEMA.names).to_pylist()
+    rows: Rows = result_rows(result, SCHEMA.names).to_pylist()
     return rows
 
 
-def _read_rows(result: Path, columns: list[str]) -> pa.Table:
+def result_rows(result: Path, columns: list[str]) -> pa.Table:
+    """Columns of ``results.parquet`` of a result folder; FleetError if it is none."""
     path = result / ROWS
     try:
         found = pq.read_table(path, columns=columns, use_threads=False)

@@ -1,6 +1,5 @@
-"""``calibrator export``: from parameter files to one file of another format, written whole or not at all."""
+"""``calibrator export``: from a parameter file to a file of another format, written whole or not at all."""
 
-from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -9,19 +8,16 @@ import typer
 
 from calibrator.errors import ContradictionError, ExportError
 from calibrator.export.core import (
-    Checked,
     c_text,
     find_image,
     foreign_protection,
     image_bytes,
     intel_hex,
     read_checked,
-    s_records,
 )
-from calibrator.export.tool_formats import a2l_text, cdfx_document, csv_text, dcm_text
+from calibrator.export.tool_formats import a2l_text, cdfx_text, dcm_text
 from calibrator.files.folders import require_possible_file, write_files
 from calibrator.terminal.options import JsonOption, LayoutOption
-from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps
 from ecu_node.database import node_database
 from ecu_node.errors import printable
@@ -38,17 +34,13 @@ class ExportFormat(StrEnum):
     A2L = "a2l"
     DCM = "dcm"
     CDFX = "cdfx"
-    CSV = "csv"
-
-
-_S_RECORDS = (".s19", ".s28", ".s37", ".srec", ".mot")
 
 
 def export(
-    params: Annotated[list[Path], typer.Argument(help="Parameter file; of several vehicles for csv.")],
+    params: Annotated[Path, typer.Argument(help="Parameter file.")],
     layout: LayoutOption,
     format_: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
-    output: Annotated[Path, typer.Option("--output", "--out", help="File to write; *.s19 is S-records for hex.")],
+    output: Annotated[Path, typer.Option("--output", "--out", help="File to write.")],
     elf: Annotated[
         Path | None, typer.Option("--elf", help="The control unit's linked program, for hex and a2l.")
     ] = None,
@@ -59,21 +51,30 @@ def export(
     """Take parameters to other tools, and to control units without Python.
 
     For the C core that comes with ecu_node: c is what is compiled with it, hex the calibration of one vehicle to be
-    flashed, a2l tells calibration tools where it stands. dcm (DCM 2.0) and cdfx (ASAM CDF 2.0) are for these tools,
-    csv is one row per branch. Parameters that the node would not apply are refused.
+    flashed, a2l tells calibration tools where it stands. dcm (DCM 2.0) and cdfx (ASAM CDF 2.0) are for these tools.
+    Parameters that the node would not apply are refused.
     """
     needs_elf = format_ in {ExportFormat.HEX, ExportFormat.A2L}
     if (elf is not None) != needs_elf:
         verb = "needs" if needs_elf else "takes no"
         raise ContradictionError(f"--format {format_.value} {verb} --elf PROGRAM; hex and a2l alone have one")
     database = node_database(layout)
-    reading = shown(params, "read parameters", len(params), "files") if len(params) > 1 else params
-    tables = [read_checked(path, database, vehicle) for path in reading]
-    content = _content(tables, format_, output, elf)
+    checked = read_checked(params, database, vehicle)
+    image = find_image(elf, database) if elf is not None else None
+    if format_ is ExportFormat.CDFX:
+        content = cdfx_text(checked)
+    elif format_ is ExportFormat.DCM:
+        content = dcm_text(checked)
+    elif image is None:
+        content = c_text(checked)
+    elif format_ is ExportFormat.A2L:
+        content = a2l_text(database, image)
+    else:
+        content = intel_hex(image.address, image_bytes(checked, image.order))
     require_possible_file(output)
-    if output.exists() and not replace and output.read_bytes() != content:
+    if output.exists() and not replace and output.read_bytes() != content.encode():
         raise ExportError(f"{output}: exists; choose another --output, or replace it with --replace")
-    write_files({output: content})
+    write_files({output: content.encode()})
     notices = []
     if format_ is ExportFormat.C and (foreign := foreign_protection(database)):
         notices.append(
@@ -86,24 +87,3 @@ def export(
     for text in notices:
         say_error(f"notice: {text}")
     write_output(printable(str(output)))
-
-
-def _content(tables: Sequence[Checked], format_: ExportFormat, output: Path, elf: Path | None) -> bytes:
-    if format_ is ExportFormat.CSV:
-        return csv_text(tables).encode()
-    if len(tables) != 1:
-        raise ContradictionError(
-            f"{len(tables)} parameter files: {format_.value} holds one vehicle; call it for each, or use --format csv"
-        )
-    (checked,) = tables
-    if format_ is ExportFormat.CDFX:
-        return cdfx_document(checked)
-    if format_ is ExportFormat.DCM:
-        return dcm_text(checked).encode()
-    if elf is None:
-        return c_text(checked).encode()
-    image = find_image(elf, checked.database)
-    if format_ is ExportFormat.A2L:
-        return a2l_text(checked.database, image).encode()
-    write = s_records if output.suffix.lower() in _S_RECORDS else intel_hex
-    return write(image.address, image_bytes(checked, image.order)).encode()

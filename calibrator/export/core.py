@@ -7,7 +7,6 @@ results, bit by bit, and one conversion for all gains. It is written as a C stru
 
 import json
 import struct
-from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -19,6 +18,7 @@ from elftools.elf.elffile import ELFFile
 from elftools.elf.sections import SymbolTableSection
 
 from calibrator.errors import ExportError
+from calibrator.files.templates import templates_of
 from ecu_node.bus.wiring import (
     InForce,
     Mode,
@@ -29,10 +29,10 @@ from ecu_node.bus.wiring import (
     wire,
 )
 from ecu_node.core.correction import SensorFault, correction_plan
-from ecu_node.core.signals import BitPlace, Codes, placed_signal, writable_range
+from ecu_node.core.signals import Codes, PlacedSignal, placed_signal, writable_range
 from ecu_node.database import VehicleDatabase
 from ecu_node.documents import text_digest
-from ecu_node.errors import ParameterError
+from ecu_node.errors import ParameterError, printable
 from ecu_node.layout import Branch, ProfileP01, ProfileP02
 from ecu_node.parameters import VehicleParameters, check_fit, decode_parameters, parameter_bytes
 
@@ -48,6 +48,7 @@ __all__ = [
     "image_bytes",
     "intel_hex",
     "read_checked",
+    "rendered",
     "scaled_plan",
 ]
 
@@ -97,10 +98,6 @@ class Checked:
             "layout_sha256": parameters.layout.sha256,
             "dbc_sha256": parameters.dbc.sha256,
         }
-
-    def fault(self, branch: str) -> SensorFault:
-        """What the node corrects on a branch; :data:`~ecu_node.core.correction.NO_FAULT` where it passes it through."""
-        return self.parameters.fault(branch)
 
 
 def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> Checked:
@@ -232,7 +229,7 @@ def _all_values(checked: Checked) -> list[BranchValues]:
     """Of the branches of the layout, in its order."""
     database = checked.database
     wire(database, InForce(parameters=checked.parameters), start_s=0.0, mode=Mode.GATEWAY)
-    return [branch_values(database, branch, checked.fault(branch.name)) for branch in database.layout.branch]
+    return [branch_values(database, branch, checked.parameters.fault(branch.name)) for branch in database.layout.branch]
 
 
 def _layout_digest(database: VehicleDatabase) -> int:
@@ -302,7 +299,7 @@ def find_image(elf: Path, database: VehicleDatabase) -> Image:
 def intel_hex(address: int, data: bytes) -> str:
     """Data at an address as Intel HEX, in records of 32 bytes that do not cross a boundary of 32."""
     if address + len(data) > 1 << 32:
-        raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; HEX and S-records reach to 0xFFFFFFFF, link it below")
+        raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; HEX reaches to 0xFFFFFFFF, link it below")
 
     def record(kind: int, at: int, content: bytes) -> str:
         line = bytes([len(content)]) + at.to_bytes(2) + bytes([kind]) + content
@@ -317,20 +314,6 @@ def intel_hex(address: int, data: bytes) -> str:
         text += record(0, start & 0xFFFF, data[start - address : end - address])
         start = end
     return text + record(1, 0, b"")
-
-
-def s_records(address: int, data: bytes) -> str:
-    """Data at an address as Motorola S-records, of the smallest kind that reaches it: S19, S28 or S37."""
-    size = max(2, ((address + len(data) - 1).bit_length() + 7) // 8)
-
-    def record(kind: int, at: int, content: bytes) -> str:
-        line = at.to_bytes(size if kind else 2) + content
-        line = bytes([len(line) + 1]) + line
-        return f"S{kind}{line.hex()}{~sum(line) & 0xFF:02x}\n".upper()
-
-    starts = range(0, len(data), _RECORD_BYTES)
-    text = "".join(record(size - 1, address + start, data[start : start + _RECORD_BYTES]) for start in starts)
-    return record(0, 0, b"HV") + text + record(11 - size, 0, b"")
 
 
 def foreign_protection(database: VehicleDatabase) -> list[str]:
@@ -357,102 +340,57 @@ def c_text(checked: Checked) -> str:
     LayoutError, DatabaseError, ExportError
         As :func:`image_bytes`.
     """
-    database = checked.database
-    values = _all_values(checked)
+    database, values = checked.database, _all_values(checked)
     messages, carriers = received(database), rewritten(database)
     numbers = {key: number for number, key in enumerate(messages)}
-    branches: list[str] = []
+
+    def read(name: str, codes: Codes) -> tuple[int, PlacedSignal, Codes]:
+        message, signal = database.signal(name)
+        return numbers[key_of(message)], placed_signal(message, signal), codes
+
+    branches = []
     for branch in database.layout.branch:
-        signals, voltage = branch_signals(database, branch, Mode.GATEWAY), "0U, NULL"
+        signals, voltage = branch_signals(database, branch, Mode.GATEWAY), None
         if branch.voltage is not None and signals.voltage is not None:
-            number = numbers[key_of(database.signal(branch.voltage)[0])]
-            voltage = f"{number}U, &(const hv_signal_t){_signal(database, branch.voltage, signals.voltage)}"
-        ends = ", ".join(_int(min(end, _GREATEST)) for end in writable_range(signals.target, branch.source))
-        number = numbers[key_of(database.signal(branch.source)[0])]
-        branches.append(
-            f"    {{{number}U, {_signal(database, branch.source, signals.source)},\n     {voltage}, {ends}}}, "
-            f"/* {_comment(branch.name)}: {_comment(branch.source)} */"
-        )
-    entries = [_message(database, message, key in carriers) for key, message in messages.items()]
-    unused = [BranchValues(0, 0, 0, 0, 0)] * (_BRANCHES - len(values))
-    names = [*database.layout.branch_names, *["not used"] * len(unused)]
-    rows = [
-        f"        {{{_int(item.gain)}, {_int(item.voltage_gain)}, {_int(item.bias)}, UINT64_C({item.fraction}), "
-        f"{item.applied}U}}, /* {_comment(name)} */"
-        for item, name in zip(values + unused, names, strict=True)
-    ]
-    digest, passes = f"UINT64_C(0x{_layout_digest(database):016X})", database.layout.on_bad_frame == "invalid"
-    return "\n".join(
-        [
-            "/* Written by 'calibrator export'; do not edit. Of hv_correction.h.",
-            *(f" * {key}: {_comment(value)}" for key, value in checked.provenance.items()),
-            " */",
-            '#include "hv_correction.h"',
-            "",
-            "static const hv_message_t messages[] = {",
-            *entries,
-            "};",
-            "static const hv_branch_t branches[] = {",
-            *branches,
-            "};",
-            "const hv_layout_t hv_layout = {",
-            f"    {digest}, messages, {len(entries)}U, branches, {len(branches)}U, {_bool(passes)}",
-            "};",
-            "const hv_calibration_t hv_calibration = {",
-            f"    {digest}, UINT64_C({checked.parameters.number}), {{",
-            *rows,
-            "    }",
-            "};",
-            "",
-        ]
+            voltage = read(branch.voltage, signals.voltage)
+        ends = writable_range(signals.target, branch.source)
+        branches.append((branch, read(branch.source, signals.source), voltage, ends))
+    unused = _BRANCHES - len(values)
+    names = [*database.layout.branch_names, *["not used"] * unused]
+    return rendered(
+        "hv_calibration.c",
+        provenance=checked.provenance,
+        messages=[_message(database, message, key in carriers) for key, message in messages.items()],
+        branches=branches,
+        calibration=zip(names, values + [BranchValues(0, 0, 0, 0, 0)] * unused, strict=True),
+        digest=f"0x{_layout_digest(database):016X}",
+        passes_bad_frames=database.layout.on_bad_frame == "invalid",
+        greatest=_GREATEST,
     )
 
 
-def _signal(database: VehicleDatabase, name: str, codes: Codes) -> str:
-    """Initialiser of a ``hv_signal_t``."""
-    placed, highest = placed_signal(*database.signal(name)), min(codes.highest, _GREATEST)
-    named = [_int(code) for code in sorted(codes.named) if codes.lowest <= code <= highest]
-    selectors = [
-        f"{{{_place(item.place)}, {_array('int64_t', map(_int, sorted(item.codes)))}, {len(item.codes)}U}}"
-        for item in placed.above
-    ]
-    return (
-        f"{{{_place(placed.place)}, {_array('hv_selector_t', selectors)}, {len(selectors)}U, "
-        f"{_int(codes.lowest)}, {_int(highest)}, {_array('int64_t', named)}, {len(named)}U}}"
-    )
-
-
-def _array(kind: str, items: Iterable[str]) -> str:
-    content = ", ".join(items)
-    return f"(const {kind}[]){{{content}}}" if content else "NULL"
-
-
-def _message(database: VehicleDatabase, message: Message, has_branches: bool) -> str:
-    entry = database.layout.protection(message.name)
+def _message(database: VehicleDatabase, message: Message, has_branches: bool) -> tuple[object, ...]:
+    """A message and the numbers of its ``hv_message_t``."""
+    entry, key = database.layout.protection(message.name), key_of(message)
     profile, offset, step, data_id = "HV_UNPROTECTED", 0, 0, [0]
     if isinstance(entry, ProfileP01):
         profile, offset, step = f"HV_P01_{entry.data_id_mode.upper()}", entry.offset, entry.max_delta_counter
         data_id = [*entry.data_id.get(message.name, message.frame_id & 0xFFFF).to_bytes(2, "little")]
     elif isinstance(entry, ProfileP02):
         profile, step, data_id = "HV_P02", entry.max_delta_counter, entry.data_id_list[message.name]
-    key = key_of(message)
-    identifier = f"0x{key.identifier | (key.extended << 31):X}U"
-    numbers = ", ".join(f"{number}U" for number in data_id + [0] * (_DATA_IDS - len(data_id)))
-    start = f"    {{{identifier}, {profile}, {offset}U, {step}U, {_bool(has_branches)}, {{{numbers}}}}},"
-    return f"{start} /* {_comment(message.name)} */"
+    data_ids = data_id + [0] * (_DATA_IDS - len(data_id))
+    return message.name, key.identifier | key.extended << 31, profile, offset, step, data_ids, has_branches
 
 
-def _place(place: BitPlace) -> str:
-    is_big = place.order == "big"
-    byte = place.end - 1 if is_big else place.first
-    return f"{{{byte}U, {place.shift}U, {place.length}U, {_bool(is_big)}, {_bool(place.signed)}}}"
+def rendered(template: str, **values: object) -> str:
+    """One of ``templates/`` with values put in where it says ``[[ name ]]``, as braces are C's own."""
+    braces = {"variable_start_string": "[[", "variable_end_string": "]]"}
+    environment = templates_of("calibrator.export", autoescape=template.endswith(".cdfx"), **braces)
+    environment.filters |= {"comment": _comment, "int64": _int64, "printable": printable}
+    return environment.get_template(template).render(**values)
 
 
-def _bool(value: bool) -> str:
-    return "true" if value else "false"
-
-
-def _int(number: int) -> str:
+def _int64(number: int) -> str:
     return "INT64_MIN" if number == _LEAST else f"INT64_C({number})"
 
 

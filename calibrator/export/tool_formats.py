@@ -2,33 +2,26 @@
 
 ``HV.BRANCH.gain`` and its like are what is flashed, as the A2L places it; ``HV.BRANCH.drift`` and ``.offset`` say the
 same in physical units, for people, and ``HV.BRANCH.found...`` what was found, corrected or not. Currents are positive
-into the junction. CSV (RFC 4180) has one row per branch, of one vehicle or many; empty: not known, or does not apply.
+into the junction.
 """
 
-import csv
-import io
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from calibrator.errors import ExportError
-from calibrator.export.core import FRACTION_BITS, BranchValues, Checked, Image, branch_values, scaled_plan
+from calibrator.export.core import FRACTION_BITS, BranchValues, Checked, Image, branch_values, rendered, scaled_plan
 from ecu_node import __version__
 from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import printable
 from ecu_node.layout import Branch
 
-__all__ = ["Characteristic", "a2l_text", "cdfx_document", "characteristics", "csv_text", "dcm_text"]
+__all__ = ["Characteristic", "a2l_text", "cdfx_text", "characteristics", "dcm_text"]
 
 _FUNCTION = "HV_current_correction"
 _FORBIDDEN = '"\\'
 """DCM has no agreed way to write these in a text."""
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
-"""With these a spreadsheet takes a text for a formula, which may fetch and run what it likes."""
 
 
 class _Field(NamedTuple):
@@ -111,7 +104,7 @@ def characteristics(checked: Checked) -> list[Characteristic]:
 
 
 def _flashed(checked: Checked, branch: Branch) -> Iterator[Characteristic]:
-    values = branch_values(checked.database, branch, checked.fault(branch.name))
+    values = branch_values(checked.database, branch, checked.parameters.fault(branch.name))
     for field in _fields(branch):
         number, (text, unit, bits, *_) = getattr(values, field), _FIELDS[field]
         exact = Fraction(number, 1 << bits)
@@ -125,7 +118,7 @@ def _flashed(checked: Checked, branch: Branch) -> Iterator[Characteristic]:
 
 
 def _for_people(checked: Checked, branch: str) -> Iterator[Characteristic]:
-    fault, found = checked.fault(branch), checked.parameters.branches.get(branch)
+    fault, found = checked.parameters.fault(branch), checked.parameters.branches.get(branch)
     rows: list[tuple[str, str, str, float | None]] = [
         ("drift", "measured = (1 + drift) * true + offset", "-", fault.drift),
         ("offset", "offset, positive into the junction", "A", fault.offset_a),
@@ -150,7 +143,7 @@ def _notes(checked: Checked) -> dict[str, str]:
         if not value.isprintable() or any(letter in value for letter in _FORBIDDEN):
             raise ExportError(
                 f"{checked.name}: {key} {value!r} has a quotation mark, a backslash or a control character, which "
-                f"calibration formats cannot hold; rename it, or export CSV"
+                f"calibration formats cannot hold; rename it"
             )
     return texts
 
@@ -176,24 +169,16 @@ def dcm_text(checked: Checked) -> str:
     ExportError
         If a text has a character, or a number digits, that the format cannot hold.
     """
-    notes, number = _notes(checked), checked.parameters.number
-    blocks = [
-        '* encoding="utf-8"\n* Corrections of high-voltage current sensors: true = (measured - offset) / (1 + drift)',
-        "KONSERVIERUNG_FORMAT 2.0",
-        f'FUNKTIONEN\n  FKT {_FUNCTION} "{number}" "correction of high-voltage current sensors"\nEND',
-    ]
-    for key, value in notes.items():
-        blocks.append(f'TEXTSTRING HV.{key}\n  LANGNAME "{key}"\n  FUNKTION {_FUNCTION}\n  TEXT "{value}"\nEND')
-    for item in characteristics(checked):
-        value = str(int(item.value)) if isinstance(item.value, bool) else repr(item.value)
-        blocks.append(
-            f'FESTWERT {item.name}\n  LANGNAME "{item.full_text}"\n  FUNKTION {_FUNCTION}\n'
-            f'  EINHEIT_W "{item.unit}"\n  WERT {value}\nEND'
-        )
-    return "\n\n".join(blocks) + "\n"
+    return rendered(
+        "parameters.dcm",
+        function=_FUNCTION,
+        parameter_set=checked.parameters.number,
+        notes=_notes(checked),
+        items=characteristics(checked),
+    )
 
 
-def cdfx_document(checked: Checked) -> bytes:
+def cdfx_text(checked: Checked) -> str:
     """Write a parameter file as ASAM CDF 2.0, calibration data as XML.
 
     Numbers are of category VALUE, truth values BOOLEAN, texts ASCII. Each instance belongs to the feature of its branch
@@ -206,8 +191,8 @@ def cdfx_document(checked: Checked) -> bytes:
 
     Returns
     -------
-    bytes
-        The XML document, UTF-8.
+    str
+        The XML document, to be encoded as UTF-8.
 
     Raises
     ------
@@ -219,12 +204,9 @@ def cdfx_document(checked: Checked) -> bytes:
         is_truth, feature = isinstance(item.value, bool), f"HV.{item.branch}" if item.branch else "general"
         category, value = ("BOOLEAN", str(item.value).lower()) if is_truth else ("VALUE", repr(item.value))
         rows.append((item.name, item.full_text, category, feature, item.unit, value))
-    environment = Environment(
-        loader=PackageLoader("calibrator.export"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    environment.filters["printable"] = printable
     layout = checked.database.layout
-    document = environment.get_template("parameters.cdfx").render(
+    return rendered(
+        "parameters.cdfx",
         version=__version__,
         function=_FUNCTION,
         layout=layout,
@@ -233,26 +215,6 @@ def cdfx_document(checked: Checked) -> bytes:
         features=["general", *(f"HV.{branch}" for branch in layout.branch_names)],
         rows=rows,
     )
-    return f"{document}\n".encode()
-
-
-_A2L_HEAD = """\
-ASAP2_VERSION 1 71
-/begin PROJECT HV "correction of high-voltage current sensors"
-  /begin MODULE {function} "calibration of ecu_node/c/hv_correction.c"
-    /begin MOD_COMMON "" BYTE_ORDER {order} ALIGNMENT_INT64 8 /end MOD_COMMON
-    /begin COMPU_METHOD HV.fixed_point "fixed point, {bits} bits below one" RAT_FUNC "%21.18" "-"
-      COEFFS 0 {factor} 0 0 0 1
-    /end COMPU_METHOD
-    /begin COMPU_METHOD HV.fixed_point_code "the same in codes" RAT_FUNC "%21.18" "code"
-      COEFFS 0 {factor} 0 0 0 1
-    /end COMPU_METHOD
-    /begin COMPU_METHOD HV.code "whole codes of the signal" IDENTICAL "%20.0" "code" /end COMPU_METHOD
-    /begin COMPU_METHOD HV.number "a number" IDENTICAL "%20.0" "-" /end COMPU_METHOD
-    /begin COMPU_METHOD HV.truth "whether it is so" TAB_VERB "%1.0" "-" COMPU_TAB_REF HV.truths /end COMPU_METHOD
-    /begin COMPU_VTAB HV.truths "" TAB_VERB 2 0 "false" 1 "true" /end COMPU_VTAB
-    /begin RECORD_LAYOUT HV.signed FNC_VALUES 1 A_INT64 COLUMN_DIR DIRECT /end RECORD_LAYOUT
-    /begin RECORD_LAYOUT HV.unsigned FNC_VALUES 1 A_UINT64 COLUMN_DIR DIRECT /end RECORD_LAYOUT"""
 
 
 def a2l_text(database: VehicleDatabase, image: Image) -> str:
@@ -275,27 +237,19 @@ def a2l_text(database: VehicleDatabase, image: Image) -> str:
     ExportError
         If a signal is too wide for the core.
     """
-    order = "MSB_LAST" if image.order == "little" else "MSB_FIRST"
-    lines = [_A2L_HEAD.format(function=_FUNCTION, order=order, bits=FRACTION_BITS, factor=1 << FRACTION_BITS)]
-
-    def add(name: str, text: str, place: int, field: str, limits: tuple[float, float]) -> None:
-        *_, record_layout, compu_method = _FIELDS.get(field, ("HV.unsigned", "HV.number"))
-        head = f'    /begin CHARACTERISTIC {name} "{text}" VALUE 0x{image.address + 8 * place:X} {record_layout} 0'
-        lines.append(f"{head} {compu_method} {limits[0]} {limits[1]} /end CHARACTERISTIC")
-
-    add("HV.parameter_set", "number of the parameter set", 1, "parameter_set", (0, (1 << 53) - 1))
-    for number, branch in enumerate(database.layout.branch):
+    number = _Field("number of the parameter set", "-", 0, "HV.unsigned", "HV.number")
+    items: list[tuple[object, ...]] = [("HV.parameter_set", number.text, image.address + 8, number, (0, (1 << 53) - 1))]
+    for k, branch in enumerate(database.layout.branch):
         extremes = _extremes(database, branch)
-        for field in _fields(branch):
-            text, _, bits, *_ = _FIELDS[field]
-            values, limits = [getattr(item, field) for item in extremes], (0.0, 1.0)
-            if field not in {"fraction", "applied"}:
-                slack = 1 << max(0, bits - 30)  # plans between the corners are rounded otherwise
+        for name in _fields(branch):
+            field, values, limits = _FIELDS[name], [getattr(item, name) for item in extremes], (0.0, 1.0)
+            if name not in {"fraction", "applied"}:
+                slack = 1 << max(0, field.bits - 30)  # plans between the corners are rounded otherwise
                 ends = max(min(values) - slack, -(1 << 63)), min(max(values) + slack, (1 << 63) - 1)
-                limits = (ends[0] / (1 << bits), ends[1] / (1 << bits))
-            place = 2 + len(_FIELDS) * number + list(_FIELDS).index(field)
-            add(f"HV.{branch.name}.{field}", f"{branch.name}: {text}", place, field, limits)
-    return "\n".join([*lines, "  /end MODULE", "/end PROJECT", ""])
+                limits = (ends[0] / (1 << field.bits), ends[1] / (1 << field.bits))
+            address = image.address + 8 * (2 + len(_FIELDS) * k + list(_FIELDS).index(name))
+            items.append((f"HV.{branch.name}.{name}", f"{branch.name}: {field.text}", address, field, limits))
+    return rendered("core.a2l", function=_FUNCTION, order=image.order, bits=FRACTION_BITS, items=items)
 
 
 def _extremes(database: VehicleDatabase, branch: Branch) -> list[BranchValues]:
@@ -304,71 +258,3 @@ def _extremes(database: VehicleDatabase, branch: Branch) -> list[BranchValues]:
     corners = itertools.product(*((-limit, limit) for limit in limits))
     faults = [NO_FAULT, *(SensorFault(drift=drift, offset_a=offset) for drift, offset in corners)]
     return [scaled_plan(database, branch, fault) for fault in faults]
-
-
-def csv_text(tables: Sequence[Checked]) -> str:
-    """Write parameter files as one table.
-
-    Parameters
-    ----------
-    tables : sequence of Checked
-        The parameter files, at least one.
-
-    Returns
-    -------
-    str
-        The table with its header, lines ended by CR LF; drifts and offsets are those that were found, corrected or not.
-
-    Raises
-    ------
-    ExportError
-        If a text, such as the vehicle's name, would be a formula in a spreadsheet.
-    """
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\r\n")
-    for checked in tables:
-        for name in checked.parameters.branches:
-            row = _row(checked, name)
-            if not text.tell():
-                writer.writerow(row)
-            writer.writerow([_cell(value, column, checked) for column, value in row.items()])
-    return text.getvalue()
-
-
-def _row(checked: Checked, name: str) -> dict[str, str | float | bool | None]:
-    found, source = checked.parameters.branches[name], checked.database.layout.find_branch(name).source
-    return {
-        "vehicle": checked.parameters.vehicle,
-        "parameter_set": checked.parameters.number,
-        "branch": name,
-        "signal": source,
-        "signal_unit": checked.database.signal(source)[1].unit,
-        "drift": found.drift,
-        "drift_sd": found.drift_sd,
-        "offset_a": found.offset_a,
-        "offset_sd_a": found.offset_sd_a,
-        "applied": checked.fault(name) is not NO_FAULT,
-        "held_back": found.held_back,
-        "delay_s": found.delay_s,
-        "delay_sd_s": found.delay_sd_s,
-        "fault_probability": found.fault_probability,
-        "harm_probability": found.harm_probability,
-        "identifiable": found.identifiable,
-        "verdict": checked.parameters.verdict,
-        "confidence": checked.parameters.confidence,
-        **checked.provenance,
-    }
-
-
-def _cell(value: str | float | bool | None, column: str, checked: Checked) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str) and value.startswith(_FORMULA):
-        try:
-            float(value)
-        except ValueError:
-            raise ExportError(
-                f"{printable(checked.name)}: {column} {value!r} begins as a formula does, which a spreadsheet would "
-                f"work out; rename it"
-            ) from None
-    return "" if value is None else str(value)

@@ -1,4 +1,4 @@
-"""``calibrator kirchhoff``: the sum of the branch currents, from a log, a table or a live bus."""
+"""``calibrator kirchhoff``: the sum of the branch currents, from a log or a table."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibrator.files.folders import require_possible_file
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
-from calibrator.terminal.options import DbcOption, JsonOption, number_option
+from calibrator.terminal.options import DbcOption, JsonOption
 from calibrator.terminal.text import dumps
 from ecu_node.program import say_error, write_output
 
@@ -18,21 +19,15 @@ if TYPE_CHECKING:
 
 __all__ = ["kirchhoff"]
 
-PICTURES, TABLES = (".png", ".pdf", ".svg", ".html"), (".csv", ".parquet")
+PAGES, TABLES = (".html",), (".csv", ".parquet")
 """Ends of the names of files that can be written."""
-TOLD = ("too short", "stands still", "delay")
-"""Hints that are told: what the figures cannot tell, and what no figure shows."""
-USUAL_S = 30.0
-"""How long is listened to a bus. [s]"""
 USUAL_SCALE_A = 500.0
 """Currents are plausible up to it where nothing tells full scale but the currents themselves. [A]"""
 
 
 def kirchhoff(
     *,
-    log: Annotated[
-        Path | None, typer.Argument(metavar="LOG", help="Log of frames, or table of currents (.csv, .parquet ...).")
-    ] = None,
+    log: Annotated[Path, typer.Argument(help="Log of frames, or table of currents (.csv, .parquet ...).")],
     layout: Annotated[Path | None, typer.Option(help="Layout (TOML) that says what the signals mean.")] = None,
     dbc: DbcOption = None,
     branches: Annotated[
@@ -42,92 +37,70 @@ def kirchhoff(
             "positive out of the junction: battery=Ibat,-motor=Imot."
         ),
     ] = None,
-    full_scale: Annotated[
-        float | None, number_option("--full-scale", 0.001, 1e5, "Nominal maximum of the junction, with --branches [A]")
-    ] = None,
     parameters: Annotated[
         Path | None, typer.Option(help="Parameter file of this vehicle: correct with it, instead of corrected frames.")
     ] = None,
-    interface: Annotated[str | None, typer.Option(help="Listen to a bus of this python-can interface.")] = None,
-    channel: Annotated[str | None, typer.Option(help="Channel of the bus, such as vcan0.")] = None,
-    duration: Annotated[
-        float | None,
-        number_option("--duration", 0.1, 86400.0, f"How long to listen, or until Ctrl-C; {USUAL_S:g} without it [s]"),
-    ] = None,
-    plot: Annotated[Path | None, typer.Option(help=f"Draw the currents ({' '.join(PICTURES)}).")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw the currents, as a page to zoom in (.html).")] = None,
     table: Annotated[Path | None, typer.Option(help=f"Write the currents ({' '.join(TABLES)}).")] = None,
     json: JsonOption = False,
 ) -> None:
     """Print the branch currents and their sum, before and after correction, and what is expected of right sensors."""
-    for what, is_wrong in {
-        "give either a LOG, or --interface and --channel of a live bus": (
-            len({log is None, interface is not None, channel is not None}) > 1
-        ),
-        "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table": (
-            (layout is None) == (branches is None)
-        ),
-        "--full-scale goes with --branches; a layout has full_scale_a": full_scale is not None and branches is None,
-        "--dbc goes with --layout": dbc is not None and layout is None,
-        "--duration is that of a live bus; a LOG is read whole": duration is not None and log is not None,
-        "--parameters belong to a layout; give --layout, not --branches": parameters is not None and layout is None,
-    }.items():
-        if is_wrong:
-            raise typer.BadParameter(what)
+    if (layout is None) == (branches is None):
+        raise typer.BadParameter(
+            "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table"
+        )
+    if dbc is not None and layout is None:
+        raise typer.BadParameter("--dbc goes with --layout")
+    if parameters is not None and layout is None:
+        raise typer.BadParameter("--parameters belong to a layout; give --layout, not --branches")
     with importing():
         from calibrator.kirchhoff.findings import sum_findings
         from calibrator.kirchhoff.junction import look_at_junction
         from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
         from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_text, save_table
-        from calibrator.recordings.live import record_bus
         from calibrator.recordings.log_files import files_in
         from calibrator.recordings.log_formats import is_log
-        from calibrator.recordings.readers import FrameSource, open_recording
+        from calibrator.recordings.readers import open_recording
         from calibrator.recordings.tables import is_table, layout_from_branches, read_table
         from ecu_node.parameters import check_fit, read_parameters
 
-    logs = filter(is_log, files_in(log)) if log is not None else ()
+    logs = filter(is_log, files_in(log))
     read = {path.resolve() for path in filter(None, (log, *logs, layout, dbc, parameters))}
-    for path, ends in ((plot, PICTURES), (table, TABLES)):
+    for path, ends in ((plot, PAGES), (table, TABLES)):
         if path is not None and path.suffix.lower() not in ends:
             raise typer.BadParameter(f"{path}: expected a file name that ends with {', '.join(ends)}")
         if path is not None and path.resolve() in read:
             raise typer.BadParameter(f"{path}: is read here and would be overwritten; choose another name")
+        if path is not None:
+            require_possible_file(path)
     if layout is not None:
         database = with_voltages(vehicle_database(layout, dbc))
-    elif log is not None and (is_table(log) or not log.exists()):
-        database = layout_from_branches(str(branches), full_scale_a=full_scale, table=read_table(log))
+    elif is_table(log) or not log.exists():
+        database = layout_from_branches(str(branches), table=read_table(log))
     else:
         raise typer.BadParameter(
-            "--branches names columns of a table; a log of frames and a bus need --layout, which 'calibrator layout "
-            "init DATABASE --log LOG --out my_car.toml' makes"
+            "--branches names columns of a table; a log of frames needs --layout, which 'calibrator layout init "
+            "DATABASE --log LOG --out my_car.toml' makes"
         )
-    if (found := None if parameters is None else read_parameters(parameters)) is not None:
+    found = None if parameters is None else read_parameters(parameters)
+    if found is not None:
         check_fit(found, database, None)
-    vehicle, where = database.layout.name, f"{interface}:{channel}" if log is None else log.name
-    source = (
-        FrameSource(record_bus(str(interface), channel, duration or USUAL_S), database, where)
-        if log is None
-        else open_recording(log, database)
-    )
-    recording = source.recording(vehicle, "live" if log is None else where.partition(".")[0])
+    recording = open_recording(log, database).recording(database.layout.name, log.name.partition(".")[0])
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:
-        draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {where}")
+        draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {log.name}")
     if table is not None:
         save_table(comparison, table)
-    plausible_a = USUAL_SCALE_A if branches is not None and full_scale is None else None
-    junction = look_at_junction([recording.drive], database, full_scale_a=plausible_a)
-    findings = [each for each in sum_findings(junction) if each.severity != "hint" or each.code in TOLD]
+    scale_a = USUAL_SCALE_A if branches is not None else database.layout.full_scale_a
+    junction = look_at_junction([recording.drive], database, full_scale_a=scale_a)
     if junction.is_short or junction.stands_still:
         comparison = replace(comparison, residual=dict.fromkeys(comparison.residual))
-    notices = [*map(str, recording.report.log_notices()), *comparison.notices()]
+    findings, notices = sum_findings(junction), [*map(str, recording.report.log_notices()), *comparison.notices()]
     if json:
         write_output(dumps(comparison.as_json() | {"notices": notices, "findings": findings}))
         return
-    told = [each.subject == "sum" and each.code in TOLD for each in findings]
-    notices += [f.text if is_told else f"{f.severity}: {f.line}" for f, is_told in zip(findings, told, strict=True)]
-    write_output(kirchhoff_text(comparison, notices))
-    if log is not None and "after" not in comparison.stages and (step := _next_step(log, layout, branches, database)):
+    write_output(kirchhoff_text(comparison, [*notices, *(finding.line for finding in findings)]))
+    if "after" not in comparison.stages and (step := _next_step(log, layout, branches, database)):
         say_error(f"next: calibrator {step}")
 
 

@@ -3,14 +3,13 @@
 A new check is one function more in :data:`CHECKS`, or in :data:`CHECKS_OF_MOVING` if currents must move for it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from itertools import combinations
 
 import numpy as np
 
 from calibrator.drives.delays import MAX_DELAY_S
-from calibrator.findings import Finding, Severity, worst_first
+from calibrator.findings import Finding, Findings, error, hint, warning, worst_first
 from calibrator.kirchhoff.junction import RecordedJunction
 from calibrator.kirchhoff.signs import SURE
 from calibrator.kirchhoff.sums import SUM
@@ -19,7 +18,7 @@ from calibrator.terminal.text import figure
 from calibrator.words import POSITIONS, places_of, words_of
 from ecu_node.core.signals import AMPERE
 
-__all__ = ["CHECKS", "CHECKS_OF_MOVING", "Findings", "error", "hint", "sum_findings", "times", "warning"]
+__all__ = ["CHECKS", "CHECKS_OF_MOVING", "sum_findings", "times"]
 
 ENOUGH_S = 60.0
 """Shorter recordings tell neither delays nor gains. [s]"""
@@ -49,9 +48,6 @@ adds to values that are the same. [1]"""
 
 UNITS = {factor_a: unit for unit, factor_a in AMPERE.items()}
 """Units of currents by what their values must be multiplied by."""
-
-Findings = Iterator[Finding]
-error, warning, hint = (partial(Finding, severity) for severity in Severity)
 
 
 def sum_findings(junction: RecordedJunction) -> list[Finding]:

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calibrator.drive import Array, Drive
+from calibrator.drive import Array, Drive, good_values
 from calibrator.drives.align import at_pace
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
@@ -140,8 +140,7 @@ class RecordedJunction:
             if (self.database.signal(item.signal)[1].unit or "") in _SPEED_UNITS
             and any(word in f"{item.name} {item.signal}".lower() for word in _SPEEDS)
         ]
-        channels = [drive.inputs[name] for drive in self.drives for name in inputs if name in drive.inputs]
-        seen = [float(np.abs(each.value[each.good]).max()) for each in channels if each.good.any()]
+        seen = [float(np.abs(value).max()) for name in inputs if len(value := good_values(self.drives, name))]
         return None if not seen else max(seen) if max(seen) > STILL_SPEED else 0.0
 
     @cached_property
@@ -218,12 +217,6 @@ def _multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
     return replace(drive, branches=branches)
 
 
-def _values(drives: Sequence[Drive], branch: str) -> Array:
-    """Good values of a branch over all drives. [A]"""
-    channels = [drive.branches[branch] for drive in drives if branch in drive.branches]
-    return np.concatenate([channel.value[channel.good] for channel in channels])
-
-
 def _multipliers(bands: Bands, price: Callable[[Array], float], least_a: float) -> Array:
     """Likely multipliers of the branches; a sum that varies by no more than quantisation leaves is right."""
     ones = np.ones(bands.current_a.shape[1])
@@ -234,7 +227,9 @@ def _price(
     drives: Sequence[Drive], names: Sequence[str], layout: Layout, full_scale_a: float
 ) -> Callable[[Array], float]:
     """What is held against multipliers of the branches beside the sum."""
-    peak_share = np.array([np.quantile(np.abs(_values(drives, name)), PEAK_QUANTILE) for name in names]) / full_scale_a
+    peak_share = (
+        np.array([np.quantile(np.abs(good_values(drives, name)), PEAK_QUANTILE) for name in names]) / full_scale_a
+    )
     battery = next((k for k, n in enumerate(names) if is_battery(n, layout.find_branch(n).source)), None)
     orientation = 0.0 if battery is None else _orientation(drives, names[battery])
 
@@ -262,6 +257,6 @@ def _orientation(drives: Sequence[Drive], battery: str) -> float:
     correlation = sag([(drive.branches[battery], drive.inputs[VOLTAGE]) for drive in both])
     if abs(correlation) > WELL_CORRELATED:
         return -correlation
-    value = _values(drives, battery)
+    value = good_values(drives, battery)
     spread = float(np.sqrt(np.mean(value**2)))
     return float(np.mean(value)) / spread / 3.0 if spread > 0.0 else 0.0

@@ -1,17 +1,15 @@
-"""Text, picture and table of a Kirchhoff comparison."""
+"""Text, page and table of a Kirchhoff comparison."""
 
 import html
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 
 import pandas as pd
 
-from calibrator.errors import DriveError
+from calibrator.files.folders import write_files
 from calibrator.kirchhoff.sums import BAND, SUM, Comparison
 from calibrator.terminal.text import figure, table
-from ecu_node.documents import write_atomically
 
 __all__ = ["draw_kirchhoff", "kirchhoff_text", "save_table"]
 
@@ -21,8 +19,6 @@ _BAND_COLOUR = "#D9D9D9"
 _SUMS = {"before": "black", "after": _COLOURS[1]}
 STAGES = {"before": "measured", "after": "corrected"}
 """What people call the stages of a comparison."""
-_Panels = Mapping[str, Mapping[str, tuple[pd.Series, str]]]
-"""Diagrams from top to bottom by title: name, course and colour of each line; the band belongs to the last one."""
 SLIP = 0.5
 """Magnitude of a gain error beyond which it is no sensor's but a slip of sign or unit. [1]"""
 LEAST_SHARE = 0.005
@@ -86,68 +82,43 @@ def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
     comparison : Comparison
         What is compared; one panel before and, where there are corrected currents, one after.
     path : Path
-        Picture to write, .png, .pdf, .svg, or .html, which is a page that needs no other file.
+        HTML page to write, which needs no other file.
     title : str
         Stands above the panels.
 
     Raises
     ------
-    DriveError
+    UserError
         If it cannot be written.
     """
+    from plotly.subplots import make_subplots  # noqa: PLC0415 (slow, and of no use without a picture)
+
     every = -(-len(comparison.valid) // MOST_DRAWN)
     title += f" (1 instant of {every})" if every > 1 else ""
     stages = {stage: frame[::every] for stage, frame in comparison.stages.items()}
-    panels = {}
-    for stage, frame in stages.items():
+    about, headings = f" about {figure(comparison.expected_a)} A" if comparison.expected_a else "", list[str]()
+    for stage in stages:
         rmse_a = comparison.figures[stage].loc[SUM, "rmse_a"]
         share = f"{100.0 * rmse_a / comparison.full_scale_a:.2f} % of full scale"
-        lines = {name: (frame[name], colour) for name, colour in zip(comparison.branches, cycle(_COLOURS))}
-        lines["sum of all"] = (frame[SUM], "black")
-        about = f" about {figure(comparison.expected_a)} A" if comparison.expected_a else ""
-        panels[f"{STAGES[stage]}: RMSE of the sum{about} {rmse_a:.2f} A = {share}"] = lines
-    heading = f"sum, and band of right sensors (in it: {_inside(comparison)})"
-    panels[heading] = {f"sum {STAGES[stage]}": (frame[SUM], _SUMS[stage]) for stage, frame in stages.items()}
+        headings.append(f"{STAGES[stage]}: RMSE of the sum{about} {rmse_a:.2f} A = {share}")
+    headings.append(f"sum, and band of right sensors (in it: {_inside(comparison)})")
+    rows = len(headings)
+    drawing = make_subplots(rows, shared_xaxes=True, vertical_spacing=0.07, subplot_titles=headings)
+
+    def line(name: str, course_a: pd.Series, colour: str, row: int) -> None:
+        style = {"line": {"color": colour, "width": 1.2}, "legendgroup": name, "showlegend": row in {1, rows}}
+        drawing.add_scatter(x=course_a.index, y=course_a, name=name, **style, row=row, col=1)
+
     sd_a = pd.Series(comparison.expected_sd_a, comparison.stages["before"].index)[comparison.valid][::every]
-    band = comparison.expected_a + BAND * pd.DataFrame({"low": -sd_a, "high": sd_a})
-    form = path.suffix.lower()[1:]
-    _write(path, _page(panels, band, title) if form == "html" else _picture(panels, band, title, form), "picture")
-
-
-def _picture(panels: _Panels, band: pd.DataFrame, title: str, form: str) -> bytes:
-    import matplotlib as mpl  # noqa: PLC0415 (half a second, of no use for a page)
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    with mpl.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True}):
-        drawing = Figure(figsize=(8.0, 1.0 + 2.5 * len(panels)), layout="constrained")
-        all_axes = drawing.subplots(len(panels), sharex=True)
-        all_axes[-1].fill_between(band.index, band["low"], band["high"], color=_BAND_COLOUR, lw=0, label="expected")
-        all_axes[-1].set_xlabel("time [s]")
-        for axes, (heading, lines) in zip(all_axes, panels.items(), strict=True):
-            for name, (course_a, colour) in lines.items():
-                axes.plot(course_a.index, course_a, color=colour, linewidth=0.9, label=name)
-            axes.set_title(heading, loc="left", fontsize=9)
-            axes.set_ylabel("current [A]")
-            axes.margins(x=0.0)
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-        drawing.suptitle(title, fontsize=10)
-        content = io.BytesIO()
-        drawing.savefig(content, format=form, dpi=150)
-    return content.getvalue()
-
-
-def _page(panels: _Panels, band: pd.DataFrame, title: str) -> bytes:
-    from plotly.subplots import make_subplots  # noqa: PLC0415 (of no use for a picture)
-
-    rows = len(panels)
-    drawing = make_subplots(rows, shared_xaxes=True, vertical_spacing=0.07, subplot_titles=list(panels))
-    edge = {"x": band.index, "line_width": 0, "hoverinfo": "skip", "row": rows, "col": 1}
-    drawing.add_scatter(y=band["low"], showlegend=False, **edge)
-    drawing.add_scatter(y=band["high"], fill="tonexty", fillcolor=_BAND_COLOUR, name="expected", **edge)
-    for row, lines in enumerate(panels.values(), start=1):
-        for name, (course_a, colour) in lines.items():
-            style = {"line": {"color": colour, "width": 1.2}, "legendgroup": name, "showlegend": row in {1, rows}}
-            drawing.add_scatter(x=course_a.index, y=course_a, name=name, **style, row=row, col=1)
+    edge = {"x": sd_a.index, "line_width": 0, "hoverinfo": "skip", "row": rows, "col": 1}
+    band = {"fill": "tonexty", "fillcolor": _BAND_COLOUR, "name": "expected"}
+    drawing.add_scatter(y=comparison.expected_a - BAND * sd_a, showlegend=False, **edge)
+    drawing.add_scatter(y=comparison.expected_a + BAND * sd_a, **band, **edge)
+    for row, (stage, frame) in enumerate(stages.items(), start=1):
+        for name, colour in zip(comparison.branches, cycle(_COLOURS)):
+            line(name, frame[name], colour, row)
+        line("sum of all", frame[SUM], "black", row)
+        line(f"sum {STAGES[stage]}", frame[SUM], _SUMS[stage], rows)
     drawing.update_yaxes(title_text="current [A]")
     drawing.update_xaxes(title_text="time [s]", row=rows, col=1)
     heading, height = {"text": title.replace(": ", ":<br>", 1), "font_size": 15, "yref": "container"}, 220 + 280 * rows
@@ -159,7 +130,7 @@ def _page(panels: _Panels, band: pd.DataFrame, title: str) -> bytes:
     drawing.update_annotations(x=0.0, xanchor="left", font_size=12)
     page = drawing.to_html(include_plotlyjs=True, config={"displaylogo": False, "responsive": True})
     head = f'<head><title>{html.escape(title)}</title><meta name="viewport" content="width=device-width">'
-    return str(page).replace("<head>", head, 1).encode()
+    write_files({path: str(page).replace("<head>", head, 1).encode()})
 
 
 def save_table(comparison: Comparison, path: Path) -> None:
@@ -175,7 +146,7 @@ def save_table(comparison: Comparison, path: Path) -> None:
 
     Raises
     ------
-    DriveError
+    UserError
         If it cannot be written.
     """
     ends = {"before": "_a", "after": "_corrected_a"}
@@ -184,11 +155,4 @@ def save_table(comparison: Comparison, path: Path) -> None:
     frame[~comparison.valid] = float("nan")
     frame = frame.reset_index().round(6)
     is_csv = path.suffix.lower() == ".csv"
-    _write(path, frame.to_csv(index=False).encode() if is_csv else frame.to_parquet(None, index=False), "table")
-
-
-def _write(path: Path, content: bytes, what: str) -> None:
-    try:
-        write_atomically(path, content)
-    except OSError as error:
-        raise DriveError(f"{path}: cannot write the {what}: {error.strerror}; choose another folder") from None
+    write_files({path: frame.to_csv(index=False).encode() if is_csv else frame.to_parquet(None, index=False)})

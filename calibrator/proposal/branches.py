@@ -10,32 +10,15 @@ from calibrator.drive import Array, Channel
 from calibrator.kirchhoff.signs import WELL_CORRELATED, Bands, bands_of, likely_multipliers, sag
 from calibrator.proposal.candidates import Candidate
 from calibrator.terminal.text import figure
-from calibrator.words import CURRENT, PLACES, POSITIONS, POWER, places_of, word_set, words_of
+from calibrator.words import CURRENT, PLACES, POSITIONS, POWER, VOCABULARY, places_of, word_set, words_of
 
-__all__ = ["ONLY_CHARGING", "TAKEN", "close_sum", "closure", "find_signs", "judge_all", "with_usual_sign"]
+__all__ = ["ONLY_CHARGING", "TAKEN", "close_sum", "closure", "find_signs", "judge_all"]
 
 TAKEN = 50.0
 """Score from which on a candidate is a branch: names, comments or sender say where it flows."""
-NOT_MEASURED = word_set(
-    "limit limits lim max maximum min minimum mx mn available avail target tgt request requested req rq command cmd "
-    "soll grenze demand setpoint desired allowed budget capability predicted pred est optimal regen reg error "
-    "deviation phase iq id ia ib ic flux peak history avg average corrected quality checksum counter waste dissipation "
-    "heat qdot dbg debug rejection load reserve inst reserved limite maxi mini consigne threshold isolation leakage "
-    "energy over"
+NOT_MEASURED, LIMITS, ELSEWHERE, DCDC_ELSEWHERE, HIGH_VOLTAGE = (
+    word_set(VOCABULARY[name]) for name in ("not_measured", "limits", "elsewhere", "dcdc_elsewhere", "high_voltage")
 )
-"""Words of limits, demands, statistics and parts of a phase current, which are no measured flow."""
-LIMITS = word_set("limit limits request command max charging")
-"""The same in the name of a message."""
-ELSEWHERE = word_set(
-    "lv 12 12v 24 24v ulo lo fan pump blower cell brick sleep seat mirror lock brake brk steering eps epb epbm "
-    "liftgate window wiper tpms solenoid valve radar line evse ac1 fc trailer igbt gate bulkhead strut ibs ekat scr "
-    "generator alternator kupplung kompressorkupplung"
-)
-"""Words of other circuits than the high-voltage junction."""
-_OTHER_SIDE = {"dcdc": word_set("output out secondary")}
-"""The converter's low-voltage side is named by these words, not by *lv*."""
-HIGH_VOLTAGE = word_set("hv high traction trac hvb hvem bms becm pack pck lb lbc sme ess ress isolation isolationres")
-"""Words that a database of a low-voltage battery does not have beside it."""
 MAIN = ("battery", "motor")
 NAMED, NAMED_AROUND, HV, MEASURED, BESIDE = 35.0, 40.0, 15.0, 10.0, 20.0
 AGAINST, WEAK, STEADY, NEVER = -65.0, -30.0, -40.0, -150.0
@@ -57,6 +40,7 @@ MOST_TOGETHER, MOST_TRIED = 2, 12
 MEANS = 50
 """One row of means for so many instants: loads that no branch measures are in them."""
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
+"""Why a charger is no branch beside a motor, where no log is there."""
 
 
 def _score(
@@ -66,7 +50,8 @@ def _score(
     own, near, named = set(item.own), set(item.words), PLACES.get(place, frozenset())
     # "Iheat" of a table is a heater's current; in a database, or beside a motor, heat is a loss.
     allowed = named if item.message is None and places_of(near) == {place} else set()
-    no_flow, elsewhere = own & NOT_MEASURED - allowed, near & (_OTHER_SIDE.get(place, ELSEWHERE) - named)
+    no_flow = own & NOT_MEASURED - allowed
+    elsewhere = near & (DCDC_ELSEWHERE if place == "dcdc" else ELSEWHERE) - named
     limits = set() if no_flow else (near - own) & LIMITS
     points = [
         (NAMED * bool(own & named) + NAMED_AROUND * bool(near & named), ""),
@@ -167,9 +152,8 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
         if k in taken:
             judged[k] = replace(item, branch=taken[k])
         elif item.score >= TAKEN:
-            rival = next((other.name for j, other in enumerate(judged) if j in taken and other.place == item.place), "")
-            why = f"{rival.rpartition('.')[2]} fits better" if rival else ONLY_CHARGING
-            judged[k] = replace(item, why=why)
+            rival = next(other.name for j, other in enumerate(judged) if j in taken and other.place == item.place)
+            judged[k] = replace(item, why=f"{rival.rpartition('.')[2]} fits better")
     order = list(PLACES)
     return sorted(judged, key=lambda item: order.index(item.place) if item.branch else len(order))
 
@@ -177,10 +161,7 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
 def _named_branches(judged: Sequence[Candidate]) -> dict[int, str]:
     """The best candidate for each position that is named at a place, by number."""
     taken: dict[int, str] = {}
-    is_recorded = any(item.channel is not None for item in judged)
     for place in PLACES:
-        if place == "charger" and any(name.startswith("motor") for name in taken.values()) and not is_recorded:
-            continue  # it carries nothing while the motor does
         good = [k for k, item in enumerate(judged) if item.place == place and item.score >= TAKEN]
         positions = {k: "" if place == "battery" else _position(judged[k], judged) for k in good}
         if len({position for position in positions.values() if position}) > 1:
@@ -248,7 +229,7 @@ def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Ca
     return sorted(result, key=lambda item: not item.branch)
 
 
-def with_usual_sign(item: Candidate) -> Candidate:
+def _with_usual_sign(item: Candidate) -> Candidate:
     """The candidate with the sign that a comment tells, or that of convention: discharge and consumption positive."""
     gives, words = item.place in {"battery", "charger"}, set(words_of(item.comment))
     out, into = ("discharge", "charge") if gives else ("recuperation", "consumption")
@@ -281,7 +262,7 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
     Parameters
     ----------
     chosen : sequence of Candidate
-        The branches, with the usual signs.
+        The branches.
     voltage : Candidate or None
         The battery's.
 
@@ -290,9 +271,10 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
     list of Candidate
         The same with signs and how they are known; the usual ones where the recording does not tell.
     """
+    chosen = [_with_usual_sign(item) for item in chosen]
     known, places = _channels(chosen, voltage), [item.place for item in chosen]
     if "battery" not in places or not known:
-        return list(chosen)
+        return chosen
     current, battery = bands_of([known]).current_a, places.index("battery")
     # Means for a share of the rows: they tell where the currents are steady.
     mean = [float(channel.value[channel.good].mean()) for channel in known]

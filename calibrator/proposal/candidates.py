@@ -11,7 +11,7 @@ from cantools.database.can import Database, Message, Signal
 
 from calibrator.drive import Array, Channel, Mask
 from calibrator.errors import LogError
-from calibrator.recordings.decode import decode_signal, raw_values, signal_range
+from calibrator.recordings.decode import bit_range, decode_signal, raw_values, signal_range
 from calibrator.recordings.frame_arrays import Frames, frame_key, repaired_time
 from calibrator.recordings.tables import Table, peak_of
 from calibrator.words import CURRENT, POWER, VOLTAGE, words_of
@@ -152,10 +152,7 @@ def _of_signal(message: Message, signal: Signal) -> Candidate:
     own, unit = words_of(signal.name, signal.comment), signal.unit or ""
     is_state = not unit and (signal.length < _FEWEST_BITS or bool(signal.choices))
     quantity, factor = ("", 1.0) if is_state else _quantity(signal.name, unit, partial(unit_factor, signal))
-    first = -(1 << signal.length - 1) if signal.is_signed else 0
-    codes = (first, first + (1 << signal.length) - 1)
-    low, high = sorted(factor * (code * float(signal.scale) + float(signal.offset)) for code in codes)
-    span = signal_range(signal, factor)
+    (low, high), span = bit_range(signal, factor), signal_range(signal, factor)
     if span.high - span.low >= NO_RANGE * (high - low):
         low, high = max(low, span.low), min(high, span.high)
     return Candidate(

@@ -1,20 +1,17 @@
 """``calibrator layout init``: a layout to begin with, from a database and a log, or from a table."""
 
 import shlex
-import sys
-from os import environ
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibrator.errors import ProposalError
-from calibrator.files.folders import require_possible_file
+from calibrator.files.folders import require_possible_file, write_files
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps
-from ecu_node.documents import write_atomically
 from ecu_node.errors import printable
 from ecu_node.program import say_error, write_output
 
@@ -45,7 +42,6 @@ def propose(
         str | None,
         typer.Option("--branches", help="No guess: battery=SIGNAL,-motor=SIGNAL, minus: positive out of the junction."),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing at a terminal.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Find the branches of the junction by units, names and senders, and by what a recording shows.
@@ -54,8 +50,7 @@ def propose(
     '# confirm:' and the reason.
     """
     with importing():
-        from calibrator.proposal.dialogue import ask, candidate_lines
-        from calibrator.proposal.proposal import layout_text, look_at, parsed_branches
+        from calibrator.proposal.proposal import candidate_lines, layout_text, look_at, parsed_branches
         from calibrator.recordings.log_formats import is_log
         from calibrator.recordings.tables import is_table
 
@@ -70,12 +65,8 @@ def propose(
         other = f"and {log} is none; " if log is not None and not is_log(log) else ""
         raise ProposalError(f"{source}: a log, {other}the database comes first, the log behind --log")
     proposal = look_at(source, log, _name_of(out or source))
-    asked = not (yes or json or environ.get("TERM") == "dumb") and sys.stdin.isatty() and sys.stderr.isatty()
     if branches is not None:
         proposal = parsed_branches(branches, proposal)
-        problem = proposal.unready()
-    elif asked and proposal.candidates:
-        proposal = ask(proposal)
         problem = proposal.unready()
     else:
         problem = proposal.problem()
@@ -83,8 +74,7 @@ def propose(
             say_error(line)
     text = "" if problem else layout_text(proposal, out)
     if out is not None and text:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(out, text.encode())
+        write_files({out: text.encode()})
     if json:
         write_output(dumps(_as_json(proposal, out if text else None, text, problem)))
     if problem:

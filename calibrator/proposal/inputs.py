@@ -3,10 +3,11 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from calibrator.proposal.candidates import Candidate
-from calibrator.words import PLACES, POSITIONS, word_set
+from calibrator.words import PLACES, POSITIONS, VOCABULARY, word_set
 
 __all__ = ["FOR_FLEETS", "computed_motor", "derive", "find_inputs"]
 
@@ -16,43 +17,31 @@ RPM = 0.10472
 """Of 1/min. [rad/s]"""
 SAME_MESSAGE = 2.0
 """Points of a voltage beside the battery's current."""
-_AGAINST = word_set(
-    "limit max maximum min minimum target tgt setpoint set counter checksum quality valid error flags raw gps user map "
-    "history window adaptive assist soll grenze gueltig fehler lim upper lower"
-)
-_ORDERED = "request req command cmd demand desired"
-_DEMAND = f"{_ORDERED} requested power pwr watts setpoint target soll leistung leist"
-_CAPS = "limit max min budget seat radar"
+_AGAINST = word_set(VOCABULARY["not_an_input"])
 
 
-_ROLES = {
-    "voltage": (
-        "voltage",
-        "voltage volt volts vlt u v uhv vdc hv spannung spg tension total",
-        "battery batt bat pack hv bms link",
-        f"{_ORDERED} 12 12v lv cell brick line charge charger fc dcdc inverter motor heater ptc cmpd compressor ref",
-    ),
-    "torque": (
-        "torque",
-        "torque trq tq moment drehmoment mom couple par",
-        "motor actual effective axle inverter drive",
-        f"{_ORDERED} brake blower steering eps driver wheel old fan pump",
-    ),
-    "speed": (
-        "speed",
-        "speed velocity spd rpm geschwindigkeit drehzahl drehz vitesse velocidad revolution",
-        "vehicle veh axle motor",
-        f"{_ORDERED} fan blower pump wiper steering compressor cmpd wheel lead rel object ui",
-    ),
-    "heater_demand": ("power", "heater ptc heating htr heizer heizung hzg", _ORDERED, _CAPS),
-    "aircon_demand": ("power", "aircon compressor cmpd hvac evap ac klima komp", _ORDERED, _CAPS),
-    "low_voltage_demand": ("power", "lv dcdc", _ORDERED, _CAPS),
-    "sensor_temperature": ("temperature", "temperature temp temperatur", "current box", "cabin ambient coolant cell"),
-}
-"""Of each input, in the order in which a layout lists them: its quantity, words of which its own name or comment has
-one, words of its message and sender for it, and against it."""
-_ALSO = {"power": _DEMAND, "temperature": "junction shunt sensor"}
-"""Words of which its own name or comment must have one, too."""
+class Role(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What an input is known by.
+
+    Attributes
+    ----------
+    quantity : str
+        By its unit, or else by its name.
+    wanted, also : str
+        Words of which its own name or comment has one each; without `also` one of the first is enough.
+    likely, against : str
+        Words of its message and sender for it, and against it.
+    """
+
+    quantity: str
+    wanted: str
+    likely: str
+    against: str
+    also: str = ""
+
+
+_ROLES = msgspec.convert(VOCABULARY["roles"], dict[str, Role])
+"""In the order in which a layout lists inputs."""
 _OF_TORQUE = {
     "driving_current": "positive({torque} * speed) / voltage",
     "recuperation_current": "negative({torque} * speed) / voltage",
@@ -102,12 +91,12 @@ def find_inputs(
 
 
 def _points(item: Candidate, role: str, battery: Candidate | None) -> float:
-    quantity, wanted, likely, against = _ROLES[role]
-    also, own, near, value = _ALSO.get(quantity, wanted), set(item.own), set(item.words), item.good
-    if item.quantity != quantity or not own & word_set(wanted) or not own & word_set(also):
+    known, own, near, value = _ROLES[role], set(item.own), set(item.words), item.good
+    wanted, also = word_set(known.wanted), word_set(known.also or known.wanted)
+    if item.quantity != known.quantity or not own & wanted or not own & also:
         return -1.0
-    points = 1.0 + len(near & word_set(likely)) - 4.0 * len(near & word_set(against))
-    points -= 3.0 * len(near & _AGAINST - word_set(f"{wanted} {also}"))
+    points = 1.0 + len(near & word_set(known.likely)) - 4.0 * len(near & word_set(known.against))
+    points -= 3.0 * len(near & _AGAINST - wanted - also)
     points -= 0.02 * len(item.name) + 0.5 * ("rpm" in item.own)
     if item.channel is not None:
         points += 1.0 if len(value) and np.ptp(value) > 0.0 else -2.0

@@ -4,15 +4,14 @@ import difflib
 import json
 import math
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from calibrator.errors import LogError, ProposalError
+from calibrator.files.templates import templates_of
 from calibrator.proposal.branches import (
     ONLY_CHARGING,
     TAKEN,
@@ -20,18 +19,17 @@ from calibrator.proposal.branches import (
     closure,
     find_signs,
     judge_all,
-    with_usual_sign,
 )
 from calibrator.proposal.candidates import Candidate, of_database, of_table, with_log, with_table
 from calibrator.proposal.inputs import FOR_FLEETS, computed_motor, derive, find_inputs
 from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.tables import bare_name, is_table, layout_from_branches, likely_full_scale_a, read_table
-from calibrator.words import PLACES, places_of, words_of
+from calibrator.words import places_of, words_of
 from ecu_node.database import read_database
 from ecu_node.errors import DatabaseError, printable
 from ecu_node.layout import Layout
 
-__all__ = ["Proposal", "layout_text", "look_at", "parsed_branches"]
+__all__ = ["Proposal", "candidate_lines", "layout_text", "look_at", "parsed_branches"]
 
 TYPICAL_A = 400.0
 """Full scale of many cars' junctions, where neither database nor recording tells it. [A]"""
@@ -50,6 +48,8 @@ LEAST_TIMEOUT_S, USUAL_TIMEOUT_S, LONGEST_TIMEOUT_S = 0.1, 0.5, 2.0
 TIMEOUT_STEP_S = 0.05
 STATED = "as --branches says"
 """Reason of a sign that is no guess."""
+SHOWN = 12
+"""Candidates in a list that nobody scrolls."""
 CHECKS = frozenset({"crc", "checksum", "crc8", "chk"})
 """Words of the signal that protects a message."""
 
@@ -87,9 +87,7 @@ class Proposal:
     @property
     def branches(self) -> list[Candidate]:
         """Those that are taken, in the order of a layout."""
-        order = {place: k for k, place in enumerate(PLACES)}
-        taken = [item for item in self.candidates if item.branch]
-        return sorted(taken, key=lambda item: (order.get(item.place, len(order)), -item.score))
+        return [item for item in self.candidates if item.branch]
 
     @property
     def battery(self) -> Candidate | None:
@@ -100,12 +98,6 @@ class Proposal:
     def files(self) -> str:
         """Names of the files, for messages."""
         return " and ".join(path.name for path in (self.database, self.recording) if path is not None)
-
-    def with_branches(self, chosen: Mapping[int, str]) -> "Proposal":
-        """The same with other candidates as branches, by number and name, with signs that fit these."""
-        items = [with_usual_sign(replace(item, branch=chosen.get(k, ""))) for k, item in enumerate(self.candidates)]
-        signed = iter(find_signs([item for item in items if item.branch], self.voltage))
-        return replace(self, candidates=tuple(next(signed) if item.branch else item for item in items))
 
     def unready(self) -> str:
         """Why the branches cannot be written; empty if they can."""
@@ -128,10 +120,9 @@ class Proposal:
             return f"the pack current is {battery.name}, but {others}"
         share = closure(self.branches, self.voltage)
         if share > OPEN:
-            names, most = (
-                ", ".join(item.branch for item in self.branches),
-                max(self.branches, key=lambda item: item.peak),
-            )
+            names = ", ".join(item.branch for item in self.branches)
+            alike = [item for item in self.branches if item.quantity == battery.quantity]
+            most = max(alike, key=lambda item: item.peak)
             unit = f"; {most.name} reaches {most.peak:,.0f}: in mA?" if most.peak > OTHER_UNIT * battery.peak else ""
             varies = f"the sum of {names} still varies by {100.0 * share:.0f} % of the greatest of them"
             return f"{varies}: a branch is missing or wrong{unit}"
@@ -186,21 +177,32 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
     computed = None if battery is None or has_motor else computed_motor(found, voltage)
     if computed is not None:
         items.insert(1, replace(computed[0], place="motor", score=TAKEN, branch="motor"))
-        if log is None:  # a charger carries nothing while the motor does
-            for k, item in enumerate(items):
-                if item.branch.startswith("charger"):
-                    items[k] = replace(item, branch="", why=ONLY_CHARGING)
+    if log is None and (has_motor or computed is not None):
+        items = [
+            replace(item, branch="", why=ONLY_CHARGING) if item.branch.startswith("charger") else item for item in items
+        ]
     items = close_sum(items, voltage)
-    proposal = Proposal(
+    signed = iter(find_signs([item for item in items if item.branch], voltage))
+    return Proposal(
         name=name,
         database=database,
         recording=log,
-        candidates=tuple(items),
+        candidates=tuple(next(signed) if item.branch else item for item in items),
         everything=tuple(everything),
         found=tuple(found),
         voltage=voltage,
     )
-    return proposal.with_branches({k: item.branch for k, item in enumerate(items)})
+
+
+def candidate_lines(proposal: Proposal) -> list[str]:
+    """Candidates with score and reason, the branches first; at most :data:`SHOWN` and all branches."""
+    shown, lines = proposal.candidates[: max(SHOWN, len(proposal.branches))], list[str]()
+    for item in shown:
+        taken = f"{item.branch} ({item.sign:+d})" if item.branch else "not taken"
+        lines += [f"{item.points:3.0f}  {taken:<17} {item.name}", f"     {item.why or item.about}"[:79]]
+    if left := len(proposal.candidates) - len(shown):
+        lines.append(f"     and {left} more, of fewer points (--json has them all)")
+    return [*map(printable, lines)]
 
 
 def parsed_branches(text: str, proposal: Proposal) -> Proposal:
@@ -267,14 +269,7 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
     scale_a, scale_reason = _full_scale(proposal)
     messages = {item.message.name: item.message for item in branches if item.message}
     folder = out.absolute().parent if out is not None else Path.cwd()
-    environment = Environment(
-        loader=PackageLoader("calibrator.proposal", ""),
-        autoescape=False,  # noqa: S701 (a text, no page)
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    environment = templates_of("calibrator.proposal")
     # Texts of a database are kept from breaking a remark.
     environment.filters["plain"] = lambda text: printable(" ".join(text.split()))
     environment.filters["toml"] = partial(json.dumps, ensure_ascii=False)

@@ -168,6 +168,14 @@ class SignalRange:
         return np.asarray((value >= self.low - self.slack) & (value <= self.high + self.slack))
 
 
+def bit_range(signal: Signal, factor: float = 1.0) -> tuple[float, float]:
+    """Least and greatest value that the bits of an integer signal can say, multiplied by a factor."""
+    first = -(1 << signal.length - 1) if signal.is_signed else 0
+    codes = (first, first + (1 << signal.length) - 1)
+    low, high = sorted(factor * (code * float(signal.scale) + float(signal.offset)) for code in codes)
+    return low, high
+
+
 def signal_range(signal: Signal, factor: float = 1.0) -> SignalRange:
     """Range of one signal.
 

@@ -1,65 +1,17 @@
-"""A live bus: its frames as if they came from a log, and a log played onto it."""
+"""A log played onto a live bus."""
 
 import time
 from collections.abc import Iterable, Iterator
 
 import can
 
-from calibrator.recordings.frame_arrays import Frames, frames_of
-from calibrator.recordings.log_files import reason_of
-from ecu_node.bus.adapters import connect
 from ecu_node.errors import BusError
 
-__all__ = ["play_frames", "record_bus"]
+__all__ = ["play_frames"]
 
-_POLL_S = 0.1
-"""Drivers that wait in C notice Ctrl-C only between calls. [s]"""
 _SEND_LIMIT_S = 1.0
 """A bus that takes nothing for this long has nobody listening, or is off. [s]"""
 _SEND_PAUSE_S = 0.0005
-
-
-def record_bus(interface: str, channel: str | None, duration_s: float) -> Frames:
-    """Take everything that comes over a bus for some time.
-
-    Parameters
-    ----------
-    interface, channel : str, str or None
-        Of python-can, such as ``socketcan`` and ``vcan0``.
-    duration_s : float
-        How long to listen. [s]
-
-    Returns
-    -------
-    Frames
-        At least one frame; those until then if Ctrl-C ends it early.
-
-    Raises
-    ------
-    BusError
-        If the bus cannot be opened, or nothing comes.
-    """
-    messages: list[can.Message] = []
-    try:
-        with connect(interface, channel) as bus:
-            end_s = time.monotonic() + duration_s
-            while (left_s := end_s - time.monotonic()) > 0.0:
-                message = bus.recv(timeout=min(left_s, _POLL_S))
-                if message is not None:
-                    messages.append(message)
-    except KeyboardInterrupt:
-        if not messages:
-            raise
-    except (can.CanError, OSError) as error:
-        raise BusError(
-            f"{interface}:{channel}: cannot listen to the bus: {reason_of(error)}; check --interface and --channel"
-        ) from None
-    frames = frames_of(messages)
-    if not len(frames):
-        raise BusError(
-            f"{interface}:{channel}: no frame in {duration_s:g} s; check that something is sent, or listen longer"
-        )
-    return frames
 
 
 def play_frames(messages: Iterable[can.Message], bus: can.BusABC, *, speed: float = 1.0) -> Iterator[float]:

@@ -243,9 +243,7 @@ def _index_as_columns(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.set_axis(_distinct(list(map(str, frame.columns))), axis=1)
 
 
-def layout_from_branches(
-    text: str, *, full_scale_a: float | None = None, table: Table | None = None
-) -> VehicleDatabase:
+def layout_from_branches(text: str, *, table: Table | None = None) -> VehicleDatabase:
     """Make a layout for a table out of an option.
 
     Parameters
@@ -253,8 +251,6 @@ def layout_from_branches(
     text : str
         Branches between commas, as ``battery=Ibat,-motor=Imot``: name and column, or the column alone. A minus stands
         before a current that is positive out of the junction. Quotients such as ``-motor=Pmot/Ubat`` are formulas [A].
-    full_scale_a : float, optional
-        Of the junction [A]; without it what the table makes likely.
     table : Table, optional
         Tells full scale, period and time-outs, and checks the columns.
 
@@ -281,7 +277,7 @@ def layout_from_branches(
         branches.append({**branch, "signal" if is_column else "formula": column})
     if len(branches) < 2:
         raise LayoutError(f"--branches {text}: two or more are expected, such as battery=Ibat,-motor=Imot")
-    keys: dict[str, Any] = {"schema": 1, "name": "table", "branch": branches, "full_scale_a": full_scale_a or 1.0}
+    keys: dict[str, Any] = {"schema": 1, "name": "table", "branch": branches, "full_scale_a": 1.0}
     if table is not None:
         columns = {item["name"]: table.column(item["signal"]) for item in branches if "signal" in item}
         periods_s = {name: _period_s(table.time_s[np.isfinite(table.columns[c])]) for name, c in columns.items()}
@@ -289,7 +285,7 @@ def layout_from_branches(
         peaks_a = [
             factors[name] * peak_of(table.columns[c][np.isfinite(table.columns[c])]) for name, c in columns.items()
         ]
-        keys["full_scale_a"] = full_scale_a or likely_full_scale_a(max([*peaks_a, 0.5]))
+        keys["full_scale_a"] = likely_full_scale_a(max([*peaks_a, 0.5]))
         longest_s = max(periods_s.values(), default=0.0)
         for branch in branches:
             branch["timeout_s"] = max(0.5, GAP_PERIODS * periods_s.get(branch["name"], longest_s))

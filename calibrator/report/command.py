@@ -5,11 +5,10 @@ from typing import Annotated
 
 import typer
 
-from calibrator.files.folders import require_possible_file
+from calibrator.files.folders import require_possible_file, write_files
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, number_option
 from calibrator.terminal.text import dumps
-from ecu_node.documents import write_atomically
 from ecu_node.program import write_output
 
 __all__ = ["report"]
@@ -39,20 +38,14 @@ def report(
 ) -> None:
     """Show a result as one HTML page, of the fleet or of one vehicle; it needs no network."""
     with importing():
-        from calibrator.report.page import fleet_report, vehicle_report
+        from calibrator.report.page import report_page
 
     target = out if out is not None else result / f"{vehicle or 'report'}.html"
     if target.suffix.lower() != ".html":
         raise typer.BadParameter(f"{target}: expected a file name that ends with .html", param_hint="--out")
     require_possible_file(target)
-    options = {"battery": battery, "limit_a": limit, "voltage_v": voltage}
-    if vehicle is None:
-        text, about = fleet_report(result, **options)
-    else:
-        text, parameters = vehicle_report(result, vehicle, **options)
-        about = {"parameters": parameters}
+    text, about = report_page(result, vehicle, battery=battery, limit_a=limit, voltage_v=voltage)
     content = text.encode()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(target, content)
+    write_files({target: content})
     said = f"{target}: {len(content) / 1e6:.2f} MB; open it in a browser"
     write_output(dumps({"page": str(target), "bytes": len(content), **about}) if json else said)

@@ -7,13 +7,21 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.results import SCHEMA, RunRecord, deployed_rms_a, part_file, read_part, read_run
+from calibrator.estimator.results import (
+    ROWS,
+    SCHEMA,
+    RunRecord,
+    deployed_rms_a,
+    part_file,
+    read_part,
+    read_run,
+    result_rows,
+)
 from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import few_reasons
@@ -91,16 +99,7 @@ class FleetTable:
 
 def read_fleet_table(result: Path) -> FleetTable:
     """Read the folder that ``calibrator calibrate`` wrote; FleetError if it is no result, or not a whole one."""
-    run, path = read_run(result), result / "results.parquet"
-    try:
-        frame = pd.read_parquet(path, use_threads=False)
-    except FileNotFoundError:
-        raise FleetError(f"{path}: is missing; give the whole folder that 'calibrator calibrate' wrote") from None
-    except (OSError, pa.ArrowException) as error:
-        why = str(error).partition("\n")[0]
-        raise FleetError(f"{path}: cannot be read: {why}; give a folder that 'calibrator calibrate' wrote") from None
-    if missing := [name for name in SCHEMA.names if name not in frame]:
-        raise FleetError(f"{path}: no column {', '.join(missing)}; calibrate again with this version")
+    run, frame = read_run(result), result_rows(result, SCHEMA.names).to_pandas()
     if not run.full_scale_a:
         raise FleetError(f"{result / 'run.json'}: no full_scale_a, it is of an older version; calibrate again")
     types = {field.name: {pa.bool_(): bool, pa.string(): object}.get(field.type) for field in SCHEMA}
@@ -110,8 +109,8 @@ def read_fleet_table(result: Path) -> FleetTable:
     rows, others = frame[is_row], frame[~is_row]
     if not K or rows["branch"].tolist() != list(run.branches) * (len(rows) // K):
         raise FleetError(
-            f"{path}: the rows are not those of vehicles with the branches {', '.join(run.branches)} of run.json; "
-            f"calibrate again"
+            f"{result / ROWS}: the rows are not those of vehicles with the branches {', '.join(run.branches)} of "
+            f"run.json; calibrate again"
         )
     left_out = dict(zip(others["vehicle"], others["reason"].replace("", "no reason is stored"), strict=True))
     if rows.empty:

@@ -13,9 +13,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import pandas as pd
-import plotly.graph_objects as go
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 from plotly.offline import get_plotlyjs
 
@@ -23,6 +20,7 @@ from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.estimator.parameter_files import REASONS
 from calibrator.estimator.results import written_of
+from calibrator.files.templates import templates_of
 from calibrator.report.fleet_table import FleetTable, ParameterDetails, read_details, read_fleet_table
 from calibrator.report.overview import (
     FLEET_CAUSES,
@@ -38,9 +36,9 @@ from calibrator.report.overview import (
 )
 from calibrator.terminal.text import counted, few
 from calibrator.words import is_battery
-from ecu_node.parameters import VehicleParameters, decode_parameters
+from ecu_node.parameters import decode_parameters
 
-__all__ = ["fleet_report", "vehicle_report"]
+__all__ = ["report_page"]
 
 MOST_SENSORS = 300_000
 """Sensors of the vehicles that a page lists one by one: those of 100,000 vehicles with three branches."""
@@ -56,72 +54,52 @@ DIGITS = {"drift": 6, "drift_sd": 4, "offset_a": 2, "offset_sd_a": 2, "fault_pro
 DIGITS_OF_VEHICLE = {"confidence": 3, "hardware_probability": 3, "hardware_fault": 0}
 DIGITS_OF_VEHICLE |= {"junction_rms_measured_a": 2, "duration_s": 1}
 """Decimals of the columns of sensors and of vehicles: what a reader can see."""
-BEFORE, AFTER, OTHER = "#D55E00", "#0072B2", "#767676"
-"""Of Okabe and Ito's colours, which colour-blind readers can tell apart."""
 MOST_POINTS = 1000
 """Sensors drawn one by one in each branch: those with the largest faults. A browser draws some thousand at once."""
-MOST_BESIDE = 4
-"""Panels beside each other: more leave no room for their titles."""
 SMALLEST_A = 1e-3
 """Below what any sensor resolves; where a logarithmic axis begins. [A]"""
 LEAST_LOAD_A = 0.05
 """Load without a sensor from which on it is worth a line. [A]"""
-RIVAL, RIVALS = 0.02, "what it may be instead"
-"""Probability from which on another explanation of a sensor is drawn, and its label. [1]"""
-MARKERS = {
-    "corrected": {"color": AFTER, "symbol": "circle"},
-    "not corrected": {"color": BEFORE, "symbol": "circle"},
-    RIVALS: {"color": BEFORE, "symbol": "circle-open"},
-}
 
 
-def fleet_report(result: Path, **options: Any) -> tuple[str, dict[str, Any]]:
-    """Make the page of a result.
-
-    Parameters
-    ----------
-    result : Path
-        Folder that ``calibrator calibrate`` wrote.
-    **options
-        ``battery``, branch of the battery (without it the one of such a name); ``limit_a``, its current limit (full
-        scale); ``voltage_v``, its voltage (the margin is given in A alone). [A], [V]
-
-    Returns
-    -------
-    page : str
-        HTML. A result of one vehicle gives the page of this vehicle.
-    numbers : dict
-        ``overview``, ``next_steps``, ``workshop`` and ``protection`` of the page.
-
-    Raises
-    ------
-    FleetError
-        If the folder is no result, or no branch has this name.
-    """
-    table = read_fleet_table(result)
-    return _page(table, table, **options)
-
-
-def vehicle_report(result: Path, vehicle: str, **options: Any) -> tuple[str, VehicleParameters]:
-    """Make the page of one vehicle of a result, with its parameters; FleetError if it is not in it, or left out.
-
-    Options as those of :func:`fleet_report`.
-    """
-    written = written_of(result, vehicle)
-    parameters = decode_parameters(written.text, f"{result}: parameters of {vehicle}")
-    table = read_fleet_table(result)
-    return _page(table.only(vehicle), table, **options)[0], parameters
-
-
-def _page(
-    table: FleetTable,
-    fleet: FleetTable,
+def report_page(
+    result: Path,
+    vehicle: str | None = None,
     *,
     battery: str | None = None,
     limit_a: float | None = None,
     voltage_v: float | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """Write the page of some vehicles: all of a fleet, or one of them; `fleet` is all of the result."""
+    """Make the page of a result, or of one of its vehicles.
+
+    Parameters
+    ----------
+    result : Path
+        Folder that ``calibrator calibrate`` wrote.
+    vehicle : str or None
+        Name of the vehicle; None: all. A result of one vehicle gives the page of this vehicle.
+    battery : str or None
+        Branch of the battery; None: the one of such a name.
+    limit_a, voltage_v : float or None
+        Its current limit, and its voltage; None: full scale, and the margin in A alone. [A], [V]
+
+    Returns
+    -------
+    page : str
+        HTML.
+    numbers : dict
+        ``overview``, ``next_steps``, ``workshop`` and ``protection`` of the page; of one vehicle its ``parameters``.
+
+    Raises
+    ------
+    FleetError
+        If the folder is no result, no branch has this name, or the vehicle is not in it, or left out.
+    """
+    parameters = None
+    if vehicle is not None:
+        parameters = decode_parameters(written_of(result, vehicle).text, f"{result}: parameters of {vehicle}")
+    fleet = read_fleet_table(result)
+    table = fleet if vehicle is None else fleet.only(vehicle)
     branch, protection = battery or next((name for name in table.branches if is_battery(name, "")), ""), None
     no_protection = f"No branch is called {BATTERY!r} or alike; name the battery's with --battery to see its margin."
     if branch in table.branches:
@@ -140,11 +118,7 @@ def _page(
     reasons = dict[str, str](REASONS.items())
     if "reference" not in table.run.details:  # no fleet
         reasons["reference in doubt"] = "only ratios of gains are known"
-    figures = {}
-    if not alone:
-        sums_a = table.of_vehicles("junction_rms_measured_a"), table.deployed_a
-        figures["junction"] = _junction_figure(*sums_a, expected_a=overview["unmeasured_a"])
-        figures["sensors"] = _sensor_figure(table, files)
+    sums_a = table.of_vehicles("junction_rms_measured_a"), table.deployed_a
     detailed = [
         {
             "explanations": files[j].explanations,
@@ -162,7 +136,8 @@ def _page(
         "fleet_causes": FLEET_CAUSES,
         "evidence": names,
         "ratios": sum(not name.startswith(("intercept ", "junction ", "offset ")) for name in names),
-        "figures": figures,
+        "junction": _junction_bins(*sums_a, expected_a=overview["unmeasured_a"]),
+        "most_points": MOST_POINTS,
     }
     packed = {"columns": _columns(table, listed, files, reasons), "details": detailed}
     moved = np.argwhere(table["moved"] != "")[:MOST_MOVED].tolist()
@@ -179,7 +154,7 @@ def _page(
         facts=facts,
         data={name: _as_text(msgspec.json.encode(each)) for name, each in packed.items()} | {"plotly": _plotly()},
     )
-    return text, numbers
+    return text, numbers if parameters is None else {"parameters": parameters}
 
 
 def _columns(
@@ -224,108 +199,24 @@ def _plotly() -> str:
 @cache
 def _template() -> Any:
     """Template of the page: what is put into it is escaped, but for files of this package and base64."""
-    environment = Environment(
-        loader=PackageLoader("calibrator.report", "assets"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = templates_of("calibrator.report", "assets", autoescape=True)
     environment.policies["json.dumps_function"] = lambda value, **_: msgspec.json.encode(value).decode()
-    environment.globals |= {"amperes": amperes, "counted": counted, "percent": percent, "probability": probability}
-    environment.globals |= {
-        "few": few,
-        "share": share,
-        "MOST_POINTS": MOST_POINTS,
-        "MOST_WORKSHOP": MOST_WORKSHOP,
-        "SIGMAS": SIGMAS,
-    }
+    environment.globals |= {each.__name__: each for each in (amperes, counted, few, percent, probability, share)}
+    environment.globals |= {"MOST_POINTS": MOST_POINTS, "MOST_WORKSHOP": MOST_WORKSHOP, "SIGMAS": SIGMAS}
     return environment.get_template("page.html")
 
 
-# ---- figures; assets/page.js adds fonts and grids
+def _junction_bins(before_a: Array, after_a: Array, *, expected_a: float | None) -> dict[str, Any]:
+    """Distributions of the Kirchhoff sum's root mean square over vehicles: B + 1 edges [A], and counts in the B bins.
 
-
-def _json(figure: go.Figure) -> msgspec.Raw:
-    return msgspec.Raw(figure.update_layout(template="none").to_json().encode())
-
-
-def _junction_figure(before_a: Array, after_a: Array, *, expected_a: float | None) -> msgspec.Raw:
-    """Distributions of the Kirchhoff sum's root mean square over vehicles, on a logarithmic axis.
-
-    Counts in bins, so that a page holds no more for a million vehicles than for a hundred.
+    So a page holds no more for a million vehicles than for a hundred. The load without a sensor [A] lies between the
+    edges; None if it is not worth a line.
     """
     before_a, after_a = (np.maximum(values[np.isfinite(values)], SMALLEST_A) for values in (before_a, after_a))
     load_a = abs(expected_a or 0.0)
-    marks = [load_a] if load_a >= LEAST_LOAD_A else []
-    both = np.concatenate([marks, before_a, after_a, [] if len(before_a) else [SMALLEST_A]])
+    load = [load_a] if load_a >= LEAST_LOAD_A else []
+    both = np.concatenate([load, before_a, after_a, [] if len(before_a) else [SMALLEST_A]])
     bins = int(np.clip(3.0 * np.sqrt(len(before_a)), 12, 60))  # few bins for few vehicles
     edges = np.geomspace(both.min() / 1.05, both.max() * 1.05, bins + 1)
-    figure, most = go.Figure(), 0
-    for name, values, colour in (("as measured", before_a, BEFORE), ("after correction", after_a, AFTER)):
-        counts = np.histogram(values, edges)[0].tolist()
-        most = max(most, *counts)
-        figure.add_scatter(
-            x=[float(edges[0]), *edges.tolist()],
-            y=[0, *counts, 0],
-            name=name,
-            line={"shape": "hv", "color": colour, "width": 1.5},
-            fill="tozeroy",
-            hovertemplate=f"{name}<br>from %{{x:.3g}} A: %{{y}} vehicles<extra></extra>",
-        )
-    for x in marks:
-        style, name = {"color": OTHER, "dash": "dash", "width": 1.5}, f"load without a sensor: {x:.1f} A"
-        figure.add_scatter(x=[x, x], y=[0, most], mode="lines", line=style, name=name)
-    figure.update_xaxes(type="log", dtick="D2", title_text="RMS of a vehicle's Kirchhoff sum [A]")
-    figure.update_yaxes(title_text="vehicles", rangemode="tozero")
-    return _json(figure.update_layout(height=260))
-
-
-def _sensor_figure(table: FleetTable, files: Mapping[int, ParameterDetails]) -> msgspec.Raw:
-    """Gain error over offset of the largest faults, one panel per branch, and what else the undecided ones may be."""
-    K, figure, points = len(table.branches), go.Figure(), list[tuple[object, ...]]()
-    for k, branch in enumerate(table.branches):
-        faulty = np.flatnonzero(table["faulty"][:, k])
-        shown = faulty[np.argsort(-table["error_a"][faulty, k], kind="stable")][:MOST_POINTS]
-        for j in shown.tolist():
-            label = "corrected" if table["applied"][j, k] else "not corrected"
-            numbers = (table[name][j, k] for name in ("drift", "offset_a", "drift_sd", "offset_sd_a"))
-            points.append((k, label, table.vehicle[j], *numbers))
-            for each in files[j].explanations[1:] if label == "not corrected" and j in files else ():
-                if each.probability >= RIVAL:
-                    what, values = f"{table.vehicle[j]}, {each.probability:.0%}", (each.drift, each.offset_a)
-                    points.append((k, RIVALS, what, *(value.get(branch, 0.0) for value in values), 0.0, 0.0))
-    frame = pd.DataFrame(points, columns=["k", "label", "vehicle", "drift", "offset_a", "drift_sd", "offset_sd_a"])
-    first = ~frame["label"].duplicated()
-    frame = frame.fillna(0.0)
-    for k, branch in enumerate(table.branches):
-        x, y = (frame[name][frame["k"] == k] for name in ("drift", "offset_a"))
-        for letter, values, title in (
-            ("x", 100.0 * x, f"{branch}: gain error [%]"),
-            ("y", y, "" if k else "offset [A]"),
-        ):
-            largest = 1.1 * max(1.0, values.abs().max())
-            figure.layout[f"{letter}axis{k + 1 if k else ''}"] = {
-                "title": {"text": title},
-                "range": [-largest, largest],
-            }
-    for (k, label), part in frame.groupby(["k", "label"], sort=False):
-        axis, bars = str(k + 1 if k else ""), {"thickness": 0.7, "width": 0}
-        figure.add_scatter(
-            x=(100.0 * part["drift"]).round(3).tolist(),
-            y=part["offset_a"].round(3).tolist(),
-            error_x={"array": (100.0 * part["drift_sd"]).round(3).tolist(), **bars},
-            error_y={"array": part["offset_sd_a"].round(3).tolist(), **bars},
-            text=part["vehicle"].tolist(),
-            mode="markers",
-            marker={"size": 7, "opacity": 0.7, **MARKERS[label]},
-            name=label,
-            legendgroup=label,
-            showlegend=bool(first[part.index].any()),
-            xaxis=f"x{axis}",
-            yaxis=f"y{axis}",
-            hovertemplate="%{text}<br>gain error %{x:.2f} %<br>offset %{y:.2f} A<extra></extra>",
-        )
-    rows = -(-K // MOST_BESIDE)
-    grid = {"rows": rows, "columns": -(-K // rows), "pattern": "independent", "ygap": 0.25}
-    return _json(figure.update_layout(height=340 * rows, grid=grid))
+    before, after = (np.histogram(values, edges)[0].tolist() for values in (before_a, after_a))
+    return {"edges": edges.tolist(), "before": before, "after": after, "load": load[0] if load else None}

@@ -86,16 +86,15 @@ def key(
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-    passphrase = os.environ.get(_PASSPHRASE) or None
-    if (passphrase is None) != plain:
+    passphrase = os.environ.get(_PASSPHRASE, "")
+    if bool(passphrase) == plain:
         raise ContradictionError(f"give either a passphrase for the private key (${_PASSPHRASE}) or --no-passphrase")
-    if passphrase is not None and len(passphrase) < _SHORTEST_PASSPHRASE:
+    if not plain and len(passphrase) < _SHORTEST_PASSPHRASE:
         raise ContradictionError(f"${_PASSPHRASE}: at least {_SHORTEST_PASSPHRASE} characters are expected")
     if not name or not name.isprintable() or "/" in name or name.startswith("."):
         raise ContradictionError(f"{name!r}: a name for a file is expected")
-    pem, encryption = serialization.Encoding.PEM, serialization.NoEncryption()
-    if passphrase is not None:
-        encryption = serialization.BestAvailableEncryption(os.fsencode(passphrase))  # type: ignore[assignment]
+    pem, secret = serialization.Encoding.PEM, os.fsencode(passphrase)
+    encryption = serialization.NoEncryption() if plain else serialization.BestAvailableEncryption(secret)
     made = Ed25519PrivateKey.generate()
     private, public = out / f"{name}.key", out / f"{name}.pub"
     contents = {
@@ -112,10 +111,10 @@ def key(
     except OSError as error:
         for left in written:
             left.unlink()
+        why = f"cannot be written: {error.strerror}"
         if isinstance(error, FileExistsError) and path != out:
-            advice = "there is a key already; take another name, it cannot be made again"
-            raise UserError(f"{path}: {advice}") from None
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+            why = "there is a key already; take another name, it cannot be made again"
+        raise UserError(f"{path}: {why}") from None
     facts = {"signer": name, "private_key": str(private), "public_key": str(public)}
     _tell(facts, f"{private}  {public}", json=json)
 

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -57,7 +57,8 @@ _RENEW_DAYS = 60
 _SHOWN = 3
 """Roles that a message names."""
 
-_Signed = TypeVar("_Signed", Root, Timestamp, Snapshot, Targets)
+_KINDS: Mapping[str, type[Signed]] = {"root": Root, "snapshot": Snapshot, "timestamp": Timestamp}
+"""Metadata of each role; of all others it is :class:`Targets`."""
 
 
 class NewKeys(NamedTuple):
@@ -99,9 +100,9 @@ class Repository:
         self._versions: dict[str, int] = {}
         self._snapshot_version = self._timestamp_version = 0
         if (self._metadata / "timestamp.json").exists():
-            timestamp = self._read(self._metadata / "timestamp.json", Timestamp).signed
+            timestamp = self._read(self._metadata / "timestamp.json").signed
             self._timestamp_version, self._snapshot_version = timestamp.version, timestamp.snapshot_meta.version
-            snapshot = self._read(self._metadata / f"{self._snapshot_version}.snapshot.json", Snapshot).signed
+            snapshot = self._read(self._metadata / f"{self._snapshot_version}.snapshot.json").signed
             self._versions = {name.removesuffix(".json"): item.version for name, item in snapshot.meta.items()}
 
     @classmethod
@@ -132,38 +133,29 @@ class Repository:
         )
         return cls(folder)
 
-    def _read(self, path: Path, kind: type[_Signed]) -> Metadata[Any]:
+    def _read(self, path: Path) -> Metadata[Any]:
+        """Metadata of the role that the file is named after."""
         with _readable(path):
             found: Metadata[Any] = Metadata.from_file(str(path))
-            if not isinstance(found.signed, kind):
+            if not isinstance(found.signed, _KINDS.get(path.stem.rpartition(".")[2], Targets)):
                 raise ValueError("it is of another role")
         return found
 
-    def _live(self, role: str, kind: type[_Signed]) -> _Signed | None:
+    def _live(self, role: str) -> Any:
+        """What vehicles see of a role; None before it was published."""
         version = self._root_version if role == "root" else self._versions.get(role, 0)
-        if not version:
-            return None
-        found: _Signed = self._read(self._metadata / f"{version}.{role}.json", kind).signed
-        return found
+        return self._read(self._metadata / f"{version}.{role}.json").signed if version else None
 
-    def _latest(self, role: str, kind: type[_Signed]) -> _Signed | None:
-        """What is staged for a role, else what is live."""
+    def _latest(self, role: str) -> Any:
+        """What is staged for a role, else what is live; None if it is neither, which root and targets always are."""
         path = self._staged / f"{role}.json"
-        if not path.exists():
-            return self._live(role, kind)
-        found: _Signed = self._read(path, kind).signed
-        return found
+        return self._read(path).signed if path.exists() else self._live(role)
 
     def _stage(self, role: str, signed: Signed) -> None:
         """Keep the next version of a role; what was staged before has lost its signatures."""
         live = self._root_version if role == "root" else self._versions.get(role, 0)
         signed.version, signed.expires = live + 1, _expiry(role)
         _write(self._staged / f"{role}.json", _encoded(Metadata[Any](signed)))
-
-    def _found(self, role: str, kind: type[_Signed]) -> _Signed:
-        found = self._latest(role, kind)
-        assert found is not None, "the constructor has looked"
-        return found
 
     def add(
         self, files: Iterable[Path], *, days: int, allow_large_step: bool, database: VehicleDatabase | None = None
@@ -218,7 +210,7 @@ class Repository:
             added[target] = len(content), digest, facts
         lifted = []
         for role, added in bins.items():
-            targets = self._latest(role, Targets) or Targets()
+            targets: Targets = self._latest(role) or Targets()
             for target, (length, digest, facts) in added.items():
                 before = targets.targets.get(target)
                 revoked = _facts(before).revoked if before else []
@@ -235,7 +227,7 @@ class Repository:
         for vehicle in vehicles:
             path = target_path(vehicle)
             role = _BINS.get_role_for_target(path)
-            targets = bins.get(role) or self._latest(role, Targets)
+            targets = bins.get(role) or self._latest(role)
             if targets is None or path not in targets.targets:
                 raise RepositoryStateError(f"{self._folder}: no parameters of vehicle {vehicle!r} here")
             file = targets.targets[path]
@@ -252,33 +244,30 @@ class Repository:
 
     def threshold(self, role: str) -> int:
         """How many keys of a role must sign."""
-        return int(self._found("root", Root).roles[role].threshold)
+        return int(self._latest("root").roles[role].threshold)
 
     def rotate(self, role: str, new: NewKeys) -> None:
         """Stage a root in which a role has other keys, and, for targets, all that the new keys must sign."""
-        root = self._found("root", Root)
+        root: Root = self._latest("root")
         for keyid in list(root.roles[role].keyids):
             root.revoke_key(keyid, role)
         _set_keys(root, role, new)
         self._stage("root", root)
         if role == "targets":
-            targets = self._found("targets", Targets)
+            targets: Targets = self._latest("targets")
             _delegate(targets, new)
             self._stage("targets", targets)
             for name in self._versions:
                 if name.startswith("bins-"):
-                    self._stage(name, self._found(name, Targets))
+                    self._stage(name, self._latest(name))
 
     def renew(self) -> None:
         """Stage root, targets and bins that expire soon; bins were signed when they were changed."""
         soon = datetime.now(UTC) + timedelta(days=_RENEW_DAYS)
-        if not (self._staged / "root.json").exists() and self._found("root", Root).expires < soon:
-            self._stage("root", self._found("root", Root))
-        for role in self._versions:
-            if (self._staged / f"{role}.json").exists():
-                continue
-            if self._live_expiry(f"{self._versions[role]}.{role}") < soon:
-                self._stage(role, self._found(role, Targets))
+        live = {"root": self._root_version, **self._versions}
+        for role, version in live.items():
+            if not (self._staged / f"{role}.json").exists() and self._live_expiry(f"{version}.{role}") < soon:
+                self._stage(role, self._live(role))
 
     def unstage(self) -> list[str]:
         """Drop what is staged and was never published; raises RepositoryStateError before the first publication."""
@@ -324,14 +313,14 @@ class Repository:
         RepositoryStateError
             If a key belongs to no role.
         """
-        root, targets, live = self._found("root", Root), self._found("targets", Targets), self._live("root", Root)
+        root, targets, live = self._latest("root"), self._latest("targets"), self._live("root")
         known = {*root.keys, *(live.keys if live else ()), *(targets.delegations.keys if targets.delegations else ())}
         for signer in signers:
             if signer.public_key.keyid not in known:
                 raise RepositoryStateError(f"{self._folder}: key {signer.public_key.keyid[:8]} belongs to no role here")
         for role in sorted(path.stem for path in self._staged.glob("*.json")):
             path = self._staged / f"{role}.json"
-            metadata = self._read(path, Root) if role == "root" else self._read(path, Targets)
+            metadata = self._read(path)
             self._staged_versions[role] = metadata.signed.version
             delegators: list[Root | Targets] = [targets] if role.startswith("bins-") else [root]
             if role == "root" and live is not None:
@@ -361,10 +350,10 @@ class Repository:
         RepositoryStateError
             If their keys are missing; vehicles see what they saw before.
         """
-        root = self._live("root", Root) if self.waiting else self._found("root", Root)
+        root = self._live("root") if self.waiting else self._latest("root")
         missing = dict(self.waiting)
         for role in ("snapshot", "timestamp"):
-            wanted = (root or self._found("root", Root)).roles[role]
+            wanted = (root or self._latest("root")).roles[role]
             given = {signer.public_key.keyid for signer in signers} & set(wanted.keyids)
             if len(given) < wanted.threshold:
                 missing[role] = _lacking(len(given), wanted.threshold, set(wanted.keyids) - given)
@@ -409,7 +398,7 @@ class Repository:
                 f"{self._folder}: no vehicle takes it since {until:%Y-%m-%d}, when its metadata expired; publish first"
             )
         role = _BINS.get_role_for_target(path)
-        targets = self._live(role, Targets)
+        targets = self._live(role)
         if targets is None or path not in targets.targets:
             raise RepositoryStateError(f"{self._folder}: no parameters of vehicle {vehicle!r} are published here")
         names = [f"metadata/{version}.root.json" for version in range(1, self._root_version + 1)]

@@ -16,10 +16,10 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 from selenium.webdriver.support.wait import WebDriverWait
 
-from calibrator.report.page import fleet_report
+from calibrator.report.page import report_page
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import Explanation, SensorFinding
-from tests.calibrator.report.results_at_hand import sensor, six_vehicle_result, vehicle, write_result
+from tests.calibrator.report.results_at_hand import sensor, six_vehicle_result, six_vehicles, vehicle, write_result
 
 PATIENCE_S = 60.0
 
@@ -32,7 +32,7 @@ def result(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) 
 @pytest.fixture
 def page(browser: webdriver.Chrome, result: Path, tmp_path: Path) -> webdriver.Chrome:
     """The report of the fleet, opened and set up."""
-    return opened(browser, fleet_report(result)[0], tmp_path / "report.html")
+    return opened(browser, report_page(result)[0], tmp_path / "report.html")
 
 
 def opened(browser: webdriver.Chrome, text: str, path: Path) -> webdriver.Chrome:
@@ -69,7 +69,10 @@ def names(browser: webdriver.Chrome) -> list[str]:
 
 
 def test_it_opens_without_an_error_and_fetches_nothing(page: webdriver.Chrome) -> None:
-    until(page, "return document.querySelectorAll('[data-figure][data-drawn]').length === 2")
+    until(
+        page,
+        "return document.querySelectorAll('.plot[data-drawn]').length === 2",
+    )
     assert page.execute_script("return document.body.dataset.failed") is None
     assert page.get_log("browser") == []
     events = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
@@ -110,13 +113,32 @@ def test_an_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     assert peaks[0][2] > peaks[1][2], "the more probable, the larger"
 
 
+def test_other_explanations_of_an_undecided_sensor_are_drawn(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
+    vehicles = six_vehicles(database)
+    rivals = [vehicles[3].explanations[0], Explanation(probability=0.4, offset_a={"battery": -12.0})]
+    vehicles[3] = replace(vehicles[3], explanations=rivals)
+    opened(browser, report_page(write_result(tmp_path / "r", vehicles))[0], tmp_path / "page.html")
+    until(browser, "return document.querySelector('#sensors-figure[data-drawn]')")
+    data, layout = browser.execute_script(
+        "const { data, layout } = document.getElementById('sensors-figure'); return [data, layout]"
+    )
+    battery = {trace["name"]: trace for trace in data if trace["xaxis"] == "x"}
+    assert battery["not corrected"]["y"] == [8.0]
+    assert battery["not corrected"]["error_y"]["array"] == [2.0]
+    assert battery["what it may be instead"]["y"] == [-12.0]
+    assert battery["what it may be instead"]["text"] == ["V4, 40 %"]
+    assert layout["yaxis"]["range"] == pytest.approx([-13.2, 13.2])
+
+
 def test_what_is_not_known_is_no_zero(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
     lost = replace(sensor(), drift_sd=None, offset_sd_a=None, fault_probability=None, delay_s=None)
     items = [
         vehicle(database, "V1", lost, lost, verdict="cannot tell"),
         vehicle(database, "V2", sensor(), replace(sensor(), identifiable=False)),
     ]
-    opened(browser, fleet_report(write_result(tmp_path / "r", items))[0], tmp_path / "page.html")
+    opened(browser, report_page(write_result(tmp_path / "r", items))[0], tmp_path / "page.html")
     assert {row[0]: row[5] for row in rows(browser)} == {"V1": "not known", "V2": "not known"}
     text = vehicle_text(browser, "V1")
     assert "battery not known not known not known not known does not correct it: not known well enough" in text
@@ -184,7 +206,7 @@ def test_junction_opens_without_an_error(browser: webdriver.Chrome, database: Ve
     item = vehicle(database, "car", sensor(0.1, 4.0, apply=True), mixed, explanations=rivals)
     item = replace(item, hardware_fault=replace(item.hardware_fault, probability=None))
     result = write_result(tmp_path / "r", [item], evidence=False)
-    opened(browser, fleet_report(result)[0], tmp_path / "car.html")
+    opened(browser, report_page(result)[0], tmp_path / "car.html")
     assert browser.get_log("browser") == []
     assert browser.execute_script("return document.body.dataset.failed") is None
     text = browser.find_element(By.TAG_NAME, "main").text
@@ -199,7 +221,7 @@ def test_junction_opens_without_an_error(browser: webdriver.Chrome, database: Ve
     assert axes == [[["battery", "motor"], [1.5, -0.5]]] * 2
     item = replace(item, findings=[SensorFinding(cause="wander", probability=0.9, text="the sum wanders")])
     result = write_result(tmp_path / "unfit", [item], evidence=False)
-    opened(browser, fleet_report(result)[0], tmp_path / "unfit.html")
+    opened(browser, report_page(result)[0], tmp_path / "unfit.html")
     text = browser.find_element(By.TAG_NAME, "main").text
     assert "No: a gain error" in text
     assert "Not known: this calibration" not in text

@@ -46,7 +46,7 @@ def test_calibrator_takes_a_fleet_from_logs_to_reports_and_exports(
     for kind in ("dcm", "cdfx", "csv", "c"):
         calibrator(venv, tmp_path, "export", parameters, *layout, "--format", kind, "--out", f"out-{kind}")
     calibrator(venv, tmp_path, "layout", "init", car / "hv_powertrain.dbc", "--log", drive, "--out", "guessed.toml")
-    assert json.loads(calibrator(venv, tmp_path, "kirchhoff", drive, *layout, "--plot", "x.png", "--json"))["instants"]
+    assert json.loads(calibrator(venv, tmp_path, "kirchhoff", drive, *layout, "--plot", "x.html", "--json"))["instants"]
     played = calibrator(venv, tmp_path, "replay", drive, "--interface", "virtual", "--channel", "x", "--speed", 0)
     assert " frames in " in played
 

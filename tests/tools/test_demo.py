@@ -20,7 +20,7 @@ def test_every_step_runs_up_to_the_picture(
     assert [line[4] for line in printed.splitlines() if line.startswith("=== ")] == list("12345")
     assert "RMSE of the sum" in printed
     assert "put into V" in printed
-    for picture in ("kirchhoff.png", "before_after.png"):
+    for picture in ("kirchhoff.html", "before_after.png"):
         assert (out / picture).stat().st_size > 0
     assert "#" in (out / "live.log").read_text()
 

@@ -160,7 +160,7 @@ def all_codes(checked: Checked, program: Path, *, voltage: int | None = None, bi
     total = 0
     for number, branch in enumerate(checked.database.layout.branch):
         signals = branch_signals(checked.database, branch, Mode.GATEWAY)
-        codes, fault = signals.source, checked.fault(branch.name)
+        codes, fault = signals.source, checked.parameters.fault(branch.name)
         plan, place = correction_plan(signals, fault), codes.place
         if place.length > bits or (branch.voltage is not None) != (voltage is not None):
             continue

@@ -11,7 +11,7 @@ from selenium.webdriver.support.wait import WebDriverWait
 
 from bench.fleet_run import calibrate, make_store, watched
 from bench.row import Row
-from calibrator.report.page import fleet_report
+from calibrator.report.page import report_page
 
 __all__ = ["rows"]
 
@@ -29,7 +29,7 @@ def rows(*, quick: bool) -> list[Row]:
         make_store(store, vehicles=vehicles, branches=3)
         watched(calibrate(store, result))
         started = time.perf_counter()
-        page.write_text(fleet_report(result)[0])
+        page.write_text(report_page(result)[0])
         written_s, ready_s = time.perf_counter() - started, median(ready_times_s(page))
         what = f"report of {vehicles} vehicles"
         return [

@@ -6,7 +6,8 @@
   const K = facts.branches.length, R = facts.evidence.length;
   const ROWS = 50, PRINT_WIDTH = 680, UNKNOWN = "not known";
   const LEAST_RIVAL = 0.02, RESOLVED = 0.002, FITS = 3, MISFITS = 4;
-  const BEFORE = "#D55E00", AFTER = "#0072B2", IDEAL = "#1b1f24";
+  const BEFORE = "#D55E00", AFTER = "#0072B2", OTHER = "#767676", IDEAL = "#1b1f24"; // Okabe and Ito: for all eyes
+  const RIVALS = "what it may be instead", MOST_BESIDE = 4; // panels: more leave no room for their titles
 
   // ---- compressed data -----------------------------------------------------------------------------------------
   async function unpack(id) {
@@ -88,6 +89,46 @@
     place.dataset.drawn = "true";
   }
 
+  // Distributions of the Kirchhoff sum over vehicles, on a logarithmic axis.
+  function junctionFigure({ edges, before, after, load }) {
+    const steps = (name, counts, color) => ({ name, x: [edges[0], ...edges], y: [0, ...counts, 0], mode: "lines", fill: "tozeroy",
+      line: { shape: "hv", color, width: 1.5 }, hovertemplate: `${name}<br>from %{x:.3g} A: %{y} vehicles<extra></extra>` });
+    const data = [steps("as measured", before, BEFORE), steps("after correction", after, AFTER)];
+    if (load !== null) data.push({ name: `load without a sensor: ${load.toFixed(1)} A`, x: [load, load], y: [0, Math.max(...before, ...after)],
+      mode: "lines", line: { color: OTHER, dash: "dash", width: 1.5 } });
+    const layout = { height: 260, xaxis: { type: "log", dtick: "D2", title: { text: "RMS of a vehicle's Kirchhoff sum [A]" } },
+      yaxis: { title: { text: "vehicles" }, rangemode: "tozero" } };
+    return { data, layout };
+  }
+
+  // Gain error over offset of the largest faults, a panel for each branch, and what else those may be that are not corrected.
+  function sensorsFigure(columns, details) {
+    const markers = { corrected: { color: AFTER }, "not corrected": { color: BEFORE }, [RIVALS]: { color: BEFORE, symbol: "circle-open" } };
+    const data = [], rows = Math.ceil(K / MOST_BESIDE), inLegend = new Set(), known = (value) => value || 0;
+    const layout = { height: 340 * rows, grid: { rows, columns: Math.ceil(K / rows), pattern: "independent", ygap: 0.25 } };
+    facts.branches.forEach((name, k) => {
+      const axis = k ? k + 1 : "", points = Object.keys(markers).map((label) => [label, []]), [corrected, open, rivals] = points.map(([, own]) => own);
+      const faulty = [...columns.vehicle.keys()].filter((j) => columns.faulty[j * K + k]).sort((a, b) => errorOf(columns, b * K + k) - errorOf(columns, a * K + k));
+      for (const j of faulty.slice(0, facts.most_points)) {
+        const i = j * K + k, vehicle = columns.vehicle[j];
+        (columns.applied[i] ? corrected : open).push({ text: vehicle, x: 100 * known(columns.drift[i]), y: known(columns.offset_a[i]),
+          dx: 100 * known(columns.drift_sd[i]), dy: known(columns.offset_sd_a[i]) });
+        for (const rival of columns.applied[i] ? [] : (details[j]?.explanations ?? []).slice(1)) if (rival.probability >= LEAST_RIVAL)
+          rivals.push({ text: `${vehicle}, ${percent(rival.probability, 0)}`, x: 100 * faultOf(rival, 1, name), y: faultOf(rival, 2, name), dx: 0, dy: 0 });
+      }
+      const all = points.flatMap(([, own]) => own), range = (values) => [-1.1, 1.1].map((end) => end * values.reduce((most, value) => Math.max(most, Math.abs(value)), 1));
+      layout[`xaxis${axis}`] = { title: { text: `${name}: gain error [%]` }, range: range(all.map(({ x }) => x)) };
+      layout[`yaxis${axis}`] = { title: { text: k ? "" : "offset [A]" }, range: range(all.map(({ y }) => y)) };
+      for (const [label, own] of points.filter(([, own]) => own.length)) {
+        const of = (key) => own.map((point) => point[key]), bars = (key) => ({ type: "data", array: of(key), thickness: 0.7, width: 0 });
+        data.push({ name: label, legendgroup: label, showlegend: !inLegend.has(label), xaxis: `x${axis}`, yaxis: `y${axis}`, mode: "markers", text: of("text"), x: of("x"), y: of("y"),
+          error_x: bars("dx"), error_y: bars("dy"), marker: { size: 7, opacity: 0.7, ...markers[label] }, hovertemplate: "%{text}<br>gain error %{x:.2f} %<br>offset %{y:.2f} A<extra></extra>" });
+        inLegend.add(label);
+      }
+    });
+    return { data, layout };
+  }
+
   for (const [event, size] of [["beforeprint", { width: PRINT_WIDTH }], ["afterprint", { width: null, autosize: true }]])
     window.addEventListener(event, () => {
       for (const place of document.querySelectorAll(".plot[data-drawn]")) window.Plotly.relayout(place, size);
@@ -95,13 +136,14 @@
 
   // ---- the table of vehicles -----------------------------------------------------------------------------------
   const sensors = (j) => facts.branches.map((_, k) => j * K + k);
+  const errorOf = (columns, i) => Math.abs(columns.drift[i] || 0) * facts.full_scale_a + Math.abs(columns.offset_a[i] || 0); // at full scale [A]
   const named = (columns, j, is) => facts.branches.filter((_, k) => is(j * K + k)).join(", ");
   const correctedOf = (columns, j) => named(columns, j, (i) => columns.applied[i] && columns.faulty[i]);
 
   function listing(columns) {
     const names = columns.vehicle, N = names.length, largest = new Float64Array(N);
     for (let i = 0; i < N * K; i++) {
-      const error = Math.abs(columns.drift[i]) * facts.full_scale_a + Math.abs(columns.offset_a[i]), j = Math.floor(i / K);
+      const error = errorOf(columns, i), j = Math.floor(i / K);
       if (columns.faulty[i] && error > largest[j]) largest[j] = error;
     }
     const open = (j) => sensors(j).some((i) => columns.unknown[i]);
@@ -351,7 +393,9 @@
     else vehicles(columns);
     await loadPlotly();
     document.body.dataset.ready = String(Math.round(performance.now()));
-    for (const place of document.querySelectorAll("[data-figure]")) await draw(place, facts.figures[place.dataset.figure]);
+    if (facts.alone) return;
+    await draw($("junction-figure"), junctionFigure(facts.junction));
+    await draw($("sensors-figure"), sensorsFigure(columns, await loadDetails()));
   }
   start().catch(fail);
 })();

@@ -345,3 +345,18 @@ def test_exchanged_branches_of_other_signs_are_an_error(log: Path, layout: Path,
     code, said = calibrated(tmp_path, log, layout, "--trusted", "battery")
     assert code == 1
     assert "check sign and unit of branch" in said
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0)])
+def test_one_log_with_a_sum_is_enough_for_kirchhoff_in_any_order(
+    order: tuple[int, ...], layout: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    logs, whole = [], cut(true_drive(), 60.0)
+    for names in (("battery", "motor"), ("battery", "dcdc"), ("battery",)):
+        folder = tmp_path / "_".join(names)
+        folder.mkdir()
+        part = replace(whole, branches={name: whole.branches[name] for name in names})
+        logs.append(write_log(folder, part, database))
+    told = examined(layout, *(logs[k] for k in order))
+    assert "kirchhoff" in told.report["ready"]
+    assert "calibrate --trusted" in told.report["not_ready"]

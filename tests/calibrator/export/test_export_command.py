@@ -1,10 +1,8 @@
 """``calibrator export``: one file, written whole or not at all, and what is refused with one line."""
 
-import csv
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 
 from calibrator.errors import ContradictionError, ExportError
 from ecu_node.database import VehicleDatabase
@@ -22,7 +20,7 @@ def params(database: VehicleDatabase, tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("form", ["c", "dcm", "cdfx", "csv"])
+@pytest.mark.parametrize("form", ["c", "dcm", "cdfx"])
 def test_file_is_written_where_asked_and_replaced_only_if_asked(form: str, params: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / f"v1.{form}"
     arguments = (params, "--format", form, "--output", out)
@@ -38,19 +36,11 @@ def test_file_is_written_where_asked_and_replaced_only_if_asked(form: str, param
     assert (out.read_bytes(), len(list(out.parent.iterdir()))) == (content, 1)
 
 
-def test_several_vehicles_are_one_table(database: VehicleDatabase, params: Path, tmp_path: Path) -> None:
-    write_parameters(replace(parameters_for(database, motor=(0.1, 0.0)), vehicle="v2"), tmp_path / "v2.json")
-    assert export(params, tmp_path / "v2.json", "--format", "csv", "--output", tmp_path / "all.csv").exit_code == 0
-    with (tmp_path / "all.csv").open(newline="") as file:
-        assert [(row["vehicle"], row["branch"]) for row in csv.DictReader(file)] == [("v1", "battery"), ("v2", "motor")]
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("v1.json", "--format", "dcm"), "2 parameter files: dcm holds one vehicle; .* --format csv"),
         (("--format", "hex"), "--format hex needs --elf PROGRAM"),
-        (("--format", "csv", "--elf", "v1.json"), "--format csv takes no --elf PROGRAM"),
+        (("--format", "dcm", "--elf", "v1.json"), "--format dcm takes no --elf PROGRAM"),
     ],
 )
 def test_contradictions_of_the_command_line_are_refused(words: tuple[str, ...], message: str, params: Path) -> None:

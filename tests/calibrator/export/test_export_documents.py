@@ -1,6 +1,5 @@
-"""DCM, CDFX and CSV as readers find them: values, units, provenance, and texts that a format cannot hold."""
+"""DCM and CDFX as readers find them: values, units, provenance, and texts that a format cannot hold."""
 
-import csv
 import dataclasses
 import logging
 import re
@@ -14,7 +13,7 @@ from msgspec.structs import replace
 
 from calibrator.errors import ExportError
 from calibrator.export.core import Checked
-from calibrator.export.tool_formats import cdfx_document, csv_text, dcm_text
+from calibrator.export.tool_formats import cdfx_text, dcm_text
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters
 from tests.calibrator.export.exports import checked_with
@@ -87,7 +86,7 @@ def test_dcm_is_read_back(checked: Checked, tmp_path: Path, caplog: pytest.LogCa
 
 
 def test_cdfx_follows_the_order_of_the_dtd_and_keeps_its_values(checked: Checked) -> None:
-    document = ET.fromstring(cdfx_document(checked))
+    document = ET.fromstring(cdfx_text(checked))
     for element in document.iter():
         tags, order = [child.tag for child in element], ORDER.get(element.tag, [])
         assert tags == sorted(tags, key=order.index), element.tag
@@ -114,36 +113,16 @@ def test_dcm_and_cdfx_hold_the_provenance(checked: Checked) -> None:
     wanted = {key: value for key, value in checked.provenance.items() if key != "parameter_set"}
     form = r'^TEXTSTRING HV\.(\w+)\n  LANGNAME "[^"\n]*"\n  FUNKTION \w+\n  TEXT "([^"\n]*)"\nEND$'
     assert dict(re.findall(form, dcm_text(checked), flags=re.MULTILINE)) == wanted
-    document = ET.fromstring(cdfx_document(checked))
+    document = ET.fromstring(cdfx_text(checked))
     texts = {item.findtext("LONG-NAME"): item.findtext(".//VT") for item in document.iter("SW-INSTANCE")}
     assert wanted.items() <= texts.items()
     assert document.findtext(".//DATA-FILE") == "<a>&\\udcff.json"
 
 
-@pytest.mark.parametrize("write", [dcm_text, cdfx_document])
+@pytest.mark.parametrize("write", [dcm_text, cdfx_text])
 @pytest.mark.parametrize("vehicle", ['a "b"', "a\\b", "a\nb"])
 def test_texts_that_tools_cannot_hold_are_refused(
     write: Callable[[Checked], object], vehicle: str, checked: Checked
 ) -> None:
     with pytest.raises(ExportError, match=r"^v1\.json: vehicle '.*' has a quotation mark, a backslash or a control"):
         write(renamed(checked, vehicle))
-
-
-def test_csv_has_a_row_for_each_branch_of_each_vehicle(checked: Checked) -> None:
-    text = csv_text([checked, renamed(checked, 'b, "c"\nd'), renamed(checked, "-12")])
-    battery, motor, *others = csv.DictReader(text.splitlines(keepends=True))
-    assert text.count("\r\n") == 7
-    assert [battery[name] for name in ("branch", "signal", "signal_unit", "drift", "offset_a", "applied")] == [
-        *("battery", "HV_Battery.BatteryCurrent", "A", "0.05", "-1.23456789012345", "true"),
-    ]
-    assert [motor[name] for name in ("drift", "drift_sd", "offset_sd_a", "applied", "held_back")] == [
-        *("0.2", "0.01", "", "false", "harm limit"),
-    ]
-    assert [row["vehicle"] for row in others] == ['b, "c"\nd', 'b, "c"\nd', "-12", "-12"]
-    assert {name: battery[name] for name in checked.provenance} == checked.provenance
-
-
-@pytest.mark.parametrize("vehicle", ["=1+1", "+cmd|' /C calc'!A0", "-x", "@SUM(A1)", "\t=1", "\r=1"])
-def test_name_that_a_spreadsheet_would_run_is_refused(vehicle: str, checked: Checked) -> None:
-    with pytest.raises(ExportError, match=r"^v1\.json: vehicle ['\"].*['\"] begins as a formula does"):
-        csv_text([renamed(checked, vehicle)])

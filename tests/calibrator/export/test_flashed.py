@@ -17,7 +17,7 @@ from pya2l.parser import A2lParser
 
 from bench.c_core import build, check_frames, vehicle
 from calibrator.errors import ExportError
-from calibrator.export.core import Checked, find_image, image_bytes, intel_hex, read_checked, s_records
+from calibrator.export.core import Checked, find_image, image_bytes, intel_hex, read_checked
 from ecu_node.parameters import write_parameters
 from tests.calibrator.export.exports import checked_with, export, needs, refused
 from tests.ecu_node.vehicles import MakeDatabase, parameters_for
@@ -60,12 +60,11 @@ def flashed(program: Path, out: Path, memory: Mapping[int, bytes]) -> Path:
     return out
 
 
-@pytest.mark.parametrize("suffix", ["hex", "s19"])
-def test_hex_flashes_the_vehicle(suffix: str, vehicles: tuple[Path, Checked], tmp_path: Path) -> None:
+def test_hex_flashes_the_vehicle(vehicles: tuple[Path, Checked], tmp_path: Path) -> None:
     program, checked = vehicles
     with pytest.raises(ValueError, match="C core"):
         check_frames(checked, program, Random(1), 1_000)
-    file = bincopy.BinFile(str(written(vehicles, "hex", tmp_path / f"v1.{suffix}")))
+    file = bincopy.BinFile(str(written(vehicles, "hex", tmp_path / "v1.hex")))
     memory = {segment.address: bytes(segment.data) for segment in file.segments}
     assert check_frames(checked, flashed(program, tmp_path / "flashed", memory), Random(1), 20_000) > 5_000
 
@@ -115,13 +114,12 @@ def test_a2l_is_the_same_for_all_vehicles_of_a_layout(vehicles: tuple[Path, Chec
 
 
 @pytest.mark.parametrize("address", [0, 0xFFF0, 0x00FF_FFF0, 0x8000_FFF1, (1 << 32) - 656])
-def test_hex_and_s_records_hold_any_address(address: int) -> None:
+def test_hex_holds_any_address(address: int) -> None:
     data = Random(1).randbytes(656)
-    for text in (intel_hex(address, data), s_records(address, data)):
-        file = bincopy.BinFile()
-        file.add(text)
-        assert (file.minimum_address, bytes(file.as_binary())) == (address, data)
-    with pytest.raises(ExportError, match="HEX and S-records reach to 0xFFFFFFFF"):
+    file = bincopy.BinFile()
+    file.add(intel_hex(address, data))
+    assert (file.minimum_address, bytes(file.as_binary())) == (address, data)
+    with pytest.raises(ExportError, match="HEX reaches to 0xFFFFFFFF"):
         intel_hex((1 << 32) - 100, data)
 
 

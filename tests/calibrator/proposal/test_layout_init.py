@@ -1,4 +1,4 @@
-"""``calibrator layout init``: databases with the units, names and ranges of real ones, logs, tables, the dialogue."""
+"""``calibrator layout init``: databases with the units, names and ranges of real ones, logs, tables."""
 
 import json
 import time
@@ -16,7 +16,6 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import Layout, read_layout
 from tests.calibrator.command_here import calibrator
 from tests.calibrator.doctor.artificial_logs import DBC, true_drive, write_log
-from tests.calibrator.screen import Screen
 
 HEAD = 'VERSION ""\nBU_: BMS INV OBC EMS CLIMA Battery\n'
 PACK = """BO_ 1 PackStatus: 8 BMS
@@ -235,7 +234,7 @@ def test_motor_that_does_not_follow_the_battery_is_none(tmp_path: Path) -> None:
     log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 15.0 * np.sin(5.3 * t)})
     run = calibrator("layout", "init", dbc, "--log", log)
     assert run.returncode == 1
-    assert "of the greatest of them: a branch is missing or wrong" in run.stderr
+    assert "of the greatest of them: a branch is missing or wrong; --branches" in run.stderr, "15 kW are not mA"
 
 
 def test_wrong_range_is_judged_by_the_log(tmp_path: Path) -> None:
@@ -353,7 +352,7 @@ def test_current_that_closes_the_sum_is_a_branch_whatever_its_name(tmp_path: Pat
 
 def test_current_in_another_unit_than_its_header_says_is_named(tmp_path: Path) -> None:
     path = columns(tmp_path / "x.csv", "Ibat", "Imot", scale=1000.0)
-    run = calibrator("layout", "init", path, "--out", tmp_path / "x.toml", "--yes")
+    run = calibrator("layout", "init", path, "--out", tmp_path / "x.toml")
     assert run.returncode == 1
     assert "in mA?" in run.stderr
     assert not (tmp_path / "x.toml").exists()
@@ -420,42 +419,3 @@ def test_json_has_every_candidate(tmp_path: Path) -> None:
     run = calibrator("layout", "init", database_file(tmp_path, INVERTER), "--json")
     assert run.returncode == 1
     assert json.loads(run.stdout)["problem"].startswith("no pack current found")
-
-
-# ---- the dialogue
-
-
-def screen(*arguments: object) -> Screen:
-    return Screen("-m", "calibrator", "layout", "init", *map(str, arguments))
-
-
-DOWN = "\x1b[B"
-
-
-def test_dialogue_takes_and_leaves(tmp_path: Path) -> None:
-    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
-    shown = screen(dbc, "--log", log_file(dbc, DRIVING), "--out", tmp_path / "car.toml")
-    lines = shown.until("q quit")
-    assert len(lines) <= 24
-    assert max(map(len, lines)) <= 80
-    assert any("[x]" in line and "HeaterCurrent" in line for line in lines)
-    shown.press(f"{DOWN}{DOWN} ")
-    assert any("[ ]" in line and "HeaterCurrent" in line for line in shown.until("q quit"))
-    shown.press("\r")
-    code, text = shown.ended()
-    assert code == 0
-    assert "branches battery, motor;" in text
-    assert {b.name: b.sign for b in read_layout(tmp_path / "car.toml").branch} == {"battery": 1, "motor": -1}
-
-
-def test_dialogue_writes_what_does_not_close_only_when_asked_again(tmp_path: Path) -> None:
-    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
-    log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 0.2e-3 * motor_a(t) * volts(t)})
-    shown = screen(dbc, "--log", log, "--out", tmp_path / "car.toml")
-    shown.until("q quit")
-    shown.press("\r")
-    shown.until("enter again writes it, but the sum of battery, motor")
-    assert not (tmp_path / "car.toml").exists()
-    shown.press("\r")
-    assert shown.ended()[0] == 0
-    assert (tmp_path / "car.toml").exists()

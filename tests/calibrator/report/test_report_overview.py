@@ -106,5 +106,5 @@ def test_result_whose_rows_are_not_those_of_its_run_is_refused(result: Path) -> 
 
 def test_damaged_result_is_named(result: Path) -> None:
     (result / "results.parquet").write_bytes(b"PAR1")
-    with pytest.raises(FleetError, match=r"results\.parquet: cannot be read: .*; give a folder"):
+    with pytest.raises(FleetError, match=r"results\.parquet: not a result of .*; name a folder"):
         read_fleet_table(result)

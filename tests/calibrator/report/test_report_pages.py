@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 import pytest
 from msgspec.structs import replace
 
 from calibrator.errors import FleetError
 from calibrator.report import page as page_module
 from calibrator.report.overview import share
-from calibrator.report.page import fleet_report, vehicle_report
+from calibrator.report.page import report_page
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import Explanation, SensorFinding
+from ecu_node.parameters import SensorFinding
 from tests.calibrator.report.results_at_hand import EVIL, sensor, six_vehicles, write_result
 
 NO_HARDWARE = {"hardware_drift": 0.0, "hardware_offset_a": {}}
@@ -51,42 +50,27 @@ def visible(page: str) -> str:
     return " ".join(html.unescape(shown).split())
 
 
-def test_every_figure_is_one_that_plotly_takes(result: Path) -> None:
-    figures = facts_of(fleet_report(result)[0])["figures"]
-    assert set(figures) == {"junction", "sensors"}
-    for figure in figures.values():
-        go.Figure(**figure)  # raises for names and values that plotly does not know
-    before, after, load = figures["junction"]["data"]
-    assert (sum(before["y"]), sum(after["y"])) == (6, 6)
-    assert load["x"] == [0.3, 0.3]
-
-
-def test_other_explanations_of_an_undecided_sensor_are_drawn(tmp_path: Path, database: VehicleDatabase) -> None:
-    vehicles = six_vehicles(database)
-    rivals = [vehicles[3].explanations[0], Explanation(probability=0.4, offset_a={"battery": -12.0})]
-    vehicles[3] = replace(vehicles[3], explanations=rivals)
-    figure = facts_of(fleet_report(write_result(tmp_path / "r", vehicles))[0])["figures"]["sensors"]
-    battery = {trace["name"]: trace for trace in figure["data"] if trace["xaxis"] == "x"}
-    assert battery["not corrected"]["y"] == [8.0]
-    assert battery["what it may be instead"]["y"] == [-12.0]
-    assert battery["what it may be instead"]["text"] == ["V4, 40%"]
-    assert figure["layout"]["yaxis"]["range"] == pytest.approx([-13.2, 13.2])
+def test_sums_before_and_after_are_counted_in_bins(result: Path) -> None:
+    bins = facts_of(report_page(result)[0])["junction"]
+    assert (sum(bins["before"]), sum(bins["after"])) == (6, 6)
+    assert len(bins["edges"]) == len(bins["before"]) + 1
+    assert bins["load"] == 0.3
 
 
 def test_names_and_reasons_are_text_and_never_code(result: Path) -> None:
-    page, _ = fleet_report(result)
+    page, _ = report_page(result)
     assert EVIL not in page
     assert page.count("&lt;script&gt;document.title") == 5  # the notice, what was left out, why, and both in the step
 
 
 def test_the_page_fetches_nothing(result: Path) -> None:
-    page, _ = fleet_report(result)
+    page, _ = report_page(result)
     assert not re.search(r'(src|href)="(?!#|data:)', page)
     assert "default-src 'none'" in page
 
 
 def test_the_page_has_its_numbers_without_its_script(result: Path) -> None:
-    text = visible(fleet_report(result)[0])
+    text = visible(report_page(result)[0])
     for part in ("7 vehicles looked at", "2 corrected (33 %)", "2 for the workshop", "10.50 A Kirchhoff sum"):
         assert part in text
     assert "V3 the vehicle hardware 97.0 % its currents differ from the fleet's: all −6.00 %, battery +2.00 A" in text
@@ -95,16 +79,16 @@ def test_the_page_has_its_numbers_without_its_script(result: Path) -> None:
 
 def test_of_a_very_large_fleet_those_with_a_fault_are_listed(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_module, "MOST_SENSORS", 11)
-    page, report = fleet_report(result)
+    page, report = report_page(result)
     assert len(columns_of(page)["vehicle"]) == 5
     assert report["overview"]["vehicles"] == 6
     assert "5 of 6 vehicles are listed" in visible(page)
 
 
 def test_the_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None:
-    page, parameters = vehicle_report(result, "V4")
+    page, about = report_page(result, "V4")
     text = visible(page)
-    assert parameters.vehicle == "V4"
+    assert about["parameters"].vehicle == "V4"
     assert text.count("Vehicle V4") == 1
     assert "One of the 6 vehicles of at hand" in text
     assert "cannot tell verdict; confidence of the estimate 97.0 %" in text
@@ -112,7 +96,7 @@ def test_the_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None
     assert "V4: a zero-current window (contactors open) would decide." in text
     assert "V1" not in text
     facts = facts_of(page)
-    assert (facts["alone"], facts["figures"]) == (True, {})
+    assert facts["alone"]
     (own,) = json.loads(packed(page, "details"))
     first, second = own["explanations"]
     assert first == {"probability": 0.6, "drift": {}, "offset_a": {"battery": 8.0}, **NO_HARDWARE}
@@ -132,20 +116,20 @@ def test_findings_are_in_the_workshop_list_and_with_the_vehicle(tmp_path: Path, 
         findings=findings,
     )
     result = write_result(tmp_path / "r", vehicles)
-    for page in (vehicle_report(result, "V5")[0], fleet_report(result)[0]):
+    for page in (report_page(result, "V5")[0], report_page(result)[0]):
         text = visible(page)
         assert "V5 motor inverted 99.3 % motor: its sign is turned." in text
         assert "V5 the vehicle load 90.0 % 5 A flow where <no> sensor is." in text
         found = [each for row in json.loads(packed(page, "details")) for each in row["findings"]]
         assert ("motor", "inverted", 0.993) in [(each["branch"], each["cause"], each["probability"]) for each in found]
-    assert "Workshop list" not in visible(vehicle_report(result, "V1")[0])
+    assert "Workshop list" not in visible(report_page(result, "V1")[0])
 
 
 def test_a_vehicle_that_was_left_out_is_told_why(result: Path) -> None:
     with pytest.raises(FleetError, match="it was left out: cannot be read"):
-        vehicle_report(result, f"log of {EVIL}")
+        report_page(result, f"log of {EVIL}")
     with pytest.raises(FleetError, match="no vehicle 'V99' in it"):
-        vehicle_report(result, "V99")
+        report_page(result, "V99")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibrator.report.overview import SIGMAS
-from calibrator.report.page import fleet_report
+from calibrator.report.page import report_page
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters
 from tests.calibrator.report.results_at_hand import sensor, vehicle, write_result
@@ -25,10 +25,10 @@ Margin = Callable[..., tuple[Any, str]]
 def margin(tmp_path: Path, database: VehicleDatabase) -> Margin:
     """The margin of a fleet with some battery sensors, and the text of its page."""
 
-    def of(*batteries: BranchParameters, **options: float) -> tuple[Any, str]:
+    def of(*batteries: BranchParameters, **options: Any) -> tuple[Any, str]:
         items = [vehicle(database, f"V{j}", battery, sensor()) for j, battery in enumerate(batteries, start=1)]
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
-        text, report = fleet_report(write_result(folder, items), **options)
+        text, report = report_page(write_result(folder, items), **options)
         return report["protection"], visible(text)
 
     return of
