@@ -1,4 +1,4 @@
-"""Random vehicles for fuzz tests: DBC, layout and parameters with all that the node knows, drawn from a seed.
+"""Random vehicles: DBC, layout and parameters with all that the node knows, drawn from a seed.
 
 Signals of 1 to 64 bits in both byte orders and on any bit, multiplexed or not, with negative factors, ranges and named
 codes; powers with their voltage; every profile of protection; messages of 1 to 64 bytes with 11 and 29 bits of
@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from math import floor
+from math import ceil, floor
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -62,7 +62,7 @@ class Codes:
         self.span = self.width
         if signal.minimum is not None and signal.maximum is not None:
             ends = [self.exact_code(Fraction(str(end)) * factor) for end in (signal.minimum, signal.maximum)]
-            self.span = int(min(ends)), int(max(ends))
+            self.span = max(self.width[0], ceil(min(ends))), min(self.width[1], floor(max(ends)))
 
     @property
     def zero(self) -> int:

@@ -1,46 +1,29 @@
-"""Random frames through the node's core in both modes, each compared with what must come of it; ends at a wrong bit.
+"""What must come of a frame in the node, by cantools (signals) and fractions (correction), in both modes.
 
-    python -m bench.node_fuzz --frames 10000000
-
-Frames are those of :mod:`bench.c_core`; every few thousand of them another random vehicle takes its turn
-(:mod:`bench.fuzz_vehicles`). What is drawn depends on the seed alone.
-
-What must come is told by cantools (signals) and fractions (correction). The exact code is rounded, halves up; the node
-may come out as if the value were greater by less than 2^-10 of a code. Which frames are intact and in order is told by
-the node's own receiver, which tests/ecu_node/test_e2e.py compares with AUTOSAR's words.
+The exact code is rounded, halves up; the node may come out as if the value were greater by less than 2^-10 of a code.
+Which frames are intact and in order is told by the node's receiver, which test_e2e.py compares with AUTOSAR's words.
 """
 
-import argparse
-import sys
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from math import floor
-from pathlib import Path
-from random import Random
 from typing import Any, NamedTuple
 
 from cantools.database.can import Message, Signal
+from cantools.database.errors import DecodeError
 
-from bench.c_core import frames as random_frames
-from bench.fuzz_vehicles import Codes, draw_vehicle, mask_of
-from calibrator.terminal.progress import shown
 from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.e2e import Check, E2EState, Receiver, protection_of
 from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch
 from ecu_node.parameters import BranchParameters, VehicleParameters
+from tests.ecu_node.random_vehicles import Codes, mask_of
 
-__all__ = ["Oracle", "WrongFrameError", "fuzz"]
+__all__ = ["Oracle", "require_right"]
 
-FRAMES_PER_VEHICLE = 20_000
 _TOLERANCE = Fraction(1, 1024)
 """Of a code."""
-
-
-class WrongFrameError(Exception):
-    """The node made something else of a frame than it must."""
 
 
 class _Outcome(NamedTuple):
@@ -59,7 +42,13 @@ def _end(message: Message, signal: Signal) -> int:
 def _codes(message: Message, data: bytes) -> dict[str, int]:
     """Codes of the signals that are whole in a payload, by cantools."""
     whole = data.ljust(message.length, b"\0")
-    found: Any = message.decode(whole, decode_choices=False, scaling=False)
+    found: Any
+    try:
+        found = message.decode(whole, decode_choices=False, scaling=False)
+    except DecodeError:  # a page that the DBC does not have
+        others = [signal for signal in message.signals if not signal.multiplexer_ids and not signal.is_multiplexer]
+        plain = Message(message.frame_id, message.name, message.length, others)
+        found = plain.decode(whole, decode_choices=False, scaling=False)
     return {
         signal.name: found[signal.name]
         for signal in message.signals
@@ -233,66 +222,22 @@ class Oracle:
         return f"{message.name}: a bit that is nobody's is set" if int.from_bytes(data, "little") & ~mask else None
 
 
-def fuzz(frames: int, seed: int = 0, frames_per_vehicle: int = FRAMES_PER_VEHICLE) -> Iterator[int]:
-    """Send random frames through an overlay node and a gateway.
-
-    Parameters
-    ----------
-    frames : int
-        How many in all.
-    seed : int
-        Of all that is drawn.
-    frames_per_vehicle : int
-        After so many another vehicle is drawn.
-
-    Yields
-    ------
-    int
-        How many frames were right so far.
-
-    Raises
-    ------
-    WrongFrameError
-        At the first frame of which something else came than must.
-    """
-    for done in range(0, frames, frames_per_vehicle):
-        rng, count = Random(f"{seed} {done}"), min(frames_per_vehicle, frames - done)
-        with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
-            database, parameters = draw_vehicle(rng, Path(folder))
-        drawn = list(random_frames(database, rng, count))
-        for mode in Mode:
-            oracle = Oracle(database, parameters, mode)
-            corrector = wire(database, InForce(parameters=parameters), 0.0, mode=mode)
-            sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}
-            for number, (identifier, data) in enumerate(drawn):
-                if data is None:  # a silence, after which the node forgets
-                    continue
-                if mode is Mode.GATEWAY:
-                    made = sources[identifier].forward(bytearray(data), 1e-3 * number)
-                    sent = [] if made is None else [(identifier, bytes(made))]
-                else:
-                    answers = sources[identifier].answer(bytearray(data), 1e-3 * number)
-                    sent = [(item.key[0] | item.key[1] << 31, bytes(item.data)) for item in answers]
-                if (problem := oracle.problem(identifier, data, sent)) is not None:
-                    place = f"seed {seed}, vehicle of frame {done}, {mode.name.lower()}, frame {number}"
-                    shown = " ".join(f"{key:X}#{answer.hex()}" for key, answer in sent) or "nothing"
-                    raise WrongFrameError(f"{place}: {identifier:X}#{data.hex()} -> {shown}: {problem}")
-        yield done + count
-
-
-def main() -> None:
-    """Try as many frames as asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--frames", type=int, default=10_000_000)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    vehicles = arguments.frames // FRAMES_PER_VEHICLE
-    try:
-        done = max(shown(fuzz(arguments.frames, arguments.seed), "fuzz", vehicles, "vehicles"), default=0)
-    except WrongFrameError as error:
-        sys.exit(f"{error}")
-    print(f"{done} frames right in both modes")
-
-
-if __name__ == "__main__":
-    main()
+def require_right(
+    database: VehicleDatabase, parameters: VehicleParameters, mode: Mode, frames: Iterable[tuple[int, bytes]]
+) -> None:
+    """Send frames, a millisecond apart, through the node's core, and require of each what must come of it."""
+    oracle = Oracle(database, parameters, mode)
+    corrector = wire(database, InForce(parameters=parameters), 0.0, mode=mode)
+    sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}
+    for number, (identifier, data) in enumerate(frames):
+        source, payload = sources[identifier], bytearray(data)
+        if mode is Mode.GATEWAY:
+            made = source.forward(payload, 1e-3 * number)
+            sent = [] if made is None else [(identifier, bytes(made))]
+        else:
+            answers = source.answer(payload, 1e-3 * number)
+            sent = [(item.key[0] | item.key[1] << 31, bytes(item.data)) for item in answers]
+        shown = " ".join(f"{key:X}#{answer.hex()}" for key, answer in sent) or "nothing"
+        place, problem = f"{mode.name.lower()}, frame {number}", oracle.problem(identifier, data, sent)
+        assert problem is None, f"{place}: {identifier:X}#{data.hex()} -> {shown}: {problem}"
+        assert payload == data, "what came in is not changed"
