@@ -37,7 +37,7 @@ SHORT, ROUND = 15, 150
 def rows(*, quick: bool) -> list[Row]:
     """Measure; figures of SocketCAN are left out where there is none, which is said on standard error."""
     found = core_rows(20 if quick else 100) + process_rows(100_000 if quick else 10_000_000)
-    words = ("-m", "bench.node_socketcan", "--frames", "1000" if quick else "10000", "--json")
+    words = ("-m", "bench.node_socketcan", "--frames", "1000" if quick else "10000", "--as-json")
     command: list[str | Path] = [ROOT / "tools" / "with_vcan", sys.executable, *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, env=ENVIRONMENT)
     if done.returncode == NO_KERNEL:

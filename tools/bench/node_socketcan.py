@@ -9,7 +9,6 @@ a system call costs ten times more than on a bare machine, and all share one pro
 rates.
 """
 
-import argparse
 import json
 import shutil
 import signal
@@ -25,6 +24,7 @@ from pathlib import Path
 from statistics import median, quantiles
 
 import can
+import typer
 
 from bench.c_core import CORE
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle, plain_job
@@ -193,21 +193,16 @@ def _pass_on(kind: str) -> None:
             signal.pause()
 
 
-def main() -> None:
-    """Measure and print one line per row, or JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--frames", type=int, default=20_000)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--peer", choices=("bare", "plain"), help="be one of the other ways, until it is ended")
-    arguments = parser.parse_args()
-    if arguments.peer:
-        _pass_on(arguments.peer)
-    found = rows(arguments.frames)
-    if arguments.json:
+def main(*, frames: int = 20_000, as_json: bool = False, peer: str = "") -> None:
+    """Measure and print one line per row, or JSON; with --peer be one of the other ways until it is ended."""
+    if peer:
+        _pass_on(peer)
+    found = rows(frames)
+    if as_json:
         print(json.dumps([vars(row) for row in found]))
     else:
         show(found)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)
