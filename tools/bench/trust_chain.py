@@ -11,7 +11,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
@@ -32,6 +32,7 @@ from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.readers import Recording, read_recording
 from calibrator.terminal.progress import shown
 from ecu_node.bus.wiring import Mode, wire
+from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import State
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
@@ -153,37 +154,50 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
     turned = {key: replace(b, drift=-b.drift, offset_a=-b.offset_a) for key, b in own.branches.items()}
     sets = dict(zip(WRONG, (replace(own, branches=turned), replace(others, vehicle=name)), strict=True))
     trials = {kind: ParameterTrial(found, database, corrector.branches) for kind, found in sets.items()}
-    in_force_s, look_s, start_s = float("inf"), LOOK_EVERY_S, None
-    driven = state / "driven.log"
-    with can.Logger(driven) as log:
-        for message in read_frames(folder / "fleet" / "unseen" / name / "drive.log.gz").messages():
-            start_s = message.timestamp if start_s is None else start_s
-            time_s = message.timestamp - start_s
-            while look_s <= time_s:
-                corrector.look(look_s)
-                if store.look(corrector, look_s):
-                    in_force_s = min(in_force_s, look_s)
-                for kind, trial in [*trials.items()]:
-                    if (result := trial.look(look_s)) is not None:
-                        outcome[f"{kind}: passed"] = result.passed
-                        del trials[kind]
-                look_s += LOOK_EVERY_S
-            log(message)
-            source = corrector.sources.get((message.arbitration_id, message.is_extended_id))
-            for answer in source.answer(message.data, time_s) if source is not None else ():
-                log(can.Message(message.timestamp, *answer.key, channel=message.channel, data=answer.data))
+    passed_s: dict[str, float] = {}
+    """When a set came into force, or passed its trial."""
+
+    def look(time_s: float) -> None:
+        corrector.look(time_s)
+        if store.look(corrector, time_s):
+            passed_s.setdefault("own", time_s)
+        for kind, trial in [*trials.items()]:
+            if (result := trial.look(time_s)) is not None:
+                del trials[kind]
+                if result.passed:
+                    passed_s[kind] = time_s
+
+    unseen, driven = folder / "fleet" / "unseen" / name / "drive.log.gz", state / "driven.log"
+    _replay(unseen, corrector, look, driven)
     truth = read_truth(folder / "fleet" / "truth.json").vehicles[name]
     traces = _traces(read_recording(driven, database, vehicle=name, name="unseen"), truth)
     driven.unlink()
+    outcome |= {f"{kind}: passed": kind in passed_s for kind in WRONG}
     outcome |= {f"{kind}: worse": _makes_worse(found, traces) for kind, found in sets.items()}
-    outcome |= {"passed": in_force_s < float("inf"), "fell_back": corrector.state()[0] is not State.CORRECTING}
+    outcome |= {"passed": "own" in passed_s, "fell_back": corrector.state()[0] is not State.CORRECTING}
     if outcome["passed"]:
-        after = {branch: _errors_a(trace, in_force_s) for branch, trace in traces.items()}
+        after = {branch: _errors_a(trace, passed_s["own"]) for branch, trace in traces.items()}
         outcome["worse"] = any(_is_worse(errors) for errors in after.values())
         outcome |= {f"{what}_a": max(after[each][what] for each in corrected) for what in ("measured", "published")}
     if not outcome["passed"] or outcome["fell_back"] or outcome["worse"]:
         print(f"{name}: {outcome}", file=sys.stderr)
     return outcome
+
+
+def _replay(drive: Path, corrector: Corrector, look: Callable[[float], None], out: Path) -> None:
+    """Play a log to a node, which looks at the junction in between, and record it with the answers."""
+    look_s, start_s = LOOK_EVERY_S, None
+    with can.Logger(out) as log:
+        for message in read_frames(drive).messages():
+            start_s = message.timestamp if start_s is None else start_s
+            time_s = message.timestamp - start_s
+            while look_s <= time_s:
+                look(look_s)
+                look_s += LOOK_EVERY_S
+            log(message)
+            source = corrector.sources.get((message.arbitration_id, message.is_extended_id))
+            for answer in source.answer(message.data, time_s) if source is not None else ():
+                log(can.Message(message.timestamp, *answer.key, channel=message.channel, data=answer.data))
 
 
 def _traces(driven: Recording, truth: VehicleTruth) -> dict[str, pd.DataFrame]:
