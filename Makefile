@@ -86,9 +86,8 @@ soak: setup              ## the node at the full load of a CAN FD bus, 10^7 fram
 	HV_WATCH_HOURS=24 $(BIN)/python -m pytest -n 2 tests/real/test_watch_on_real_drives.py
 
 fuzz: setup              ## 10^7 random frames through node and C core, 10^6 changed bundles (hours)
-	PYTHONPATH=tools $(BIN)/python -m bench.update_fuzz
-	PYTHONPATH=tools $(BIN)/python -m bench.node_fuzz
-	PYTHONPATH=tools $(BIN)/python -m bench.c_core compare
+	HV_BUNDLES=1000000 HV_FRAMES=10000000 $(TEST) tests/update/test_changed_bundles.py \
+		tests/ecu_node/test_random_vehicles.py tests/calibrator/export/test_c_core.py
 	PYTHONPATH=tools $(BIN)/python -m bench.c_core fuzz --seconds 3600
 
 release-check: coverage bench experiments fuzz mutants package ## all that is measured for a release, on one commit (hours)

@@ -15,14 +15,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain, takewhile
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import can
 import pandas as pd
 import typer
 from matplotlib.figure import Figure
 
-from calibrator.errors import FleetError
 from calibrator.estimator.vehicle_report import explained
 from calibrator.fleet_truth import FleetTruth, read_truth
 from calibrator.recordings.live import play_frames
@@ -46,6 +45,7 @@ MINUTES = 4
 """Length of the trip that each vehicle is calibrated on. [min]"""
 SECONDS = 12.0
 """Length of the live drive. [s]"""
+BUS: dict[str, Any] = {"interface": "virtual", "channel": "demo"}
 MARKER = ".made-by-demo"
 
 
@@ -65,12 +65,6 @@ def main(
     if Path.cwd() != ROOT:
         raise UserError(f"the commands of the demo are those of a checkout: run it in {ROOT}")
     started = time.monotonic()
-    show(drives, out)
-    say(f"done in {time.monotonic() - started:.0f} s; everything is in {out}")
-
-
-def show(drives: str, out: Path) -> None:
-    """Run all steps."""
     make_empty(out)
     fleet, result = out / "fleet", out / "result"
     source = import_recordings(drives, out) if drives != "builtin" else "builtin"
@@ -108,6 +102,7 @@ def show(drives: str, out: Path) -> None:
         f"  ecu-node monitor --layout {LAYOUT} --interface socketcan --channel vcan0\n"
         f"  calibrator replay {unseen} --interface socketcan --channel vcan0"
     )
+    say(f"done in {time.monotonic() - started:.0f} s; everything is in {out}")
 
 
 def make_empty(out: Path) -> None:
@@ -131,13 +126,12 @@ def import_recordings(folder: str, out: Path) -> str:
 
 def faulty_vehicles(truth: FleetTruth) -> list[str]:
     """First vehicles with most faulty sensors."""
-    faulty = {
-        name: sum(bool(v.drift[branch] or v.offset_a[branch]) for branch in v.drift)
-        for name, v in truth.vehicles.items()
-    }
-    if not any(faulty.values()):
-        raise FleetError("no vehicle of the fleet has a faulty sensor; choose another seed")
-    return sorted(faulty, key=lambda name: -faulty[name])[:HELD_OUT]
+
+    def faulty_sensors(name: str) -> int:
+        found = truth.vehicles[name]
+        return sum(bool(found.drift[branch] or found.offset_a[branch]) for branch in found.drift)
+
+    return sorted(truth.vehicles, key=faulty_sensors, reverse=True)[:HELD_OUT]
 
 
 def corrected_vehicle(result: Path, held_out: list[str]) -> str:
@@ -153,36 +147,24 @@ def corrected_vehicle(result: Path, held_out: list[str]) -> str:
 
 def record_live_drive(parameters: Path, vehicle: str, *, log: Path, recording: Path) -> None:
     """Play the first seconds of a log onto a bus in real time with the node on it, and record what passes."""
-    interface, channel = choose_bus()
-    say(f"bus: {interface} {channel}; {SECONDS:.0f} s in real time")
+    say(f"python-can's virtual bus; {SECONDS:.0f} s in real time")
     messages = read_frames(log).messages()
     first = next(messages)
     frames = chain([first], takewhile(lambda message: message.timestamp < first.timestamp + SECONDS, messages))
-    with running_node(parameters, vehicle, interface, channel), can.Bus(channel=channel, interface=interface) as ears:
-        notifier = can.Notifier(ears, [can.Logger(recording)], timeout=0.1)
-        try:
-            with (
-                can.Bus(channel=channel, interface=interface) as mouth,
-                progress_bar("drive", int(SECONDS), "s") as progress,
-            ):
-                for age_s in play_frames(frames, mouth):
-                    progress(int(age_s) + 1)
-            time.sleep(0.3)
-        finally:
-            notifier.stop()
-
-
-def choose_bus() -> tuple[str, str]:
-    """vcan0 where the kernel has SocketCAN, else python-can's virtual bus."""
-    try:
-        can.Bus(channel="vcan0", interface="socketcan").shutdown()
-    except (OSError, can.CanError):
-        return "virtual", "demo"
-    return "socketcan", "vcan0"
+    with (
+        running_node(parameters, vehicle),
+        can.Bus(**BUS) as ears,
+        can.Bus(**BUS) as mouth,
+        progress_bar("drive", int(SECONDS), "s") as progress,
+        can.Notifier(ears, [can.Logger(recording)], timeout=0.1),
+    ):
+        for age_s in play_frames(frames, mouth):
+            progress(int(age_s) + 1)
+        time.sleep(0.3)  # for the last answers
 
 
 @contextmanager
-def running_node(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
+def running_node(parameters: Path, vehicle: str) -> Iterator[None]:
     """The node's own loop in a thread."""
     database = read_database(read_layout(ROOT / LAYOUT))
     in_force = choose_parameters(parameters, database, vehicle)
@@ -190,11 +172,7 @@ def running_node(parameters: Path, vehicle: str, interface: str, channel: str) -
         raise UserError(in_force.why_not)
     stop, at_work = threading.Event(), threading.Event()
     corrector = wire(database, in_force, time.monotonic())
-    bus = SteadyBus(
-        lambda: open_bus(database, interface=interface, channel=channel, fd=False, mode=Mode.OVERLAY),
-        corrector.counters,
-        say,
-    )
+    bus = SteadyBus(lambda: open_bus(database, **BUS, fd=False, mode=Mode.OVERLAY), corrector.counters, say)
     run_node = Node(bus, bus, corrector, period_s=0.1).run
     node = threading.Thread(target=run_node, args=(stop.is_set, at_work.set))
     node.start()

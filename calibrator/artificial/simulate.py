@@ -35,7 +35,7 @@ from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch, Layout, split_signal
 
-__all__ = ["FleetPlan", "Vehicle", "draw_vehicles", "simulate_fleet", "trip_of", "vehicle_drive", "vehicle_frames"]
+__all__ = ["FleetPlan", "Vehicle", "simulate_fleet", "vehicle_drive", "vehicle_frames"]
 
 WRITTEN_DOWN = ("seed", "sparsity", "magnitude", "balanced", "symmetric", "common_drive", "noise")
 """Fields of the plan that stand in the truth, too."""
@@ -158,8 +158,8 @@ def _write_vehicle(
     """Write ``logs/NAME/drive.log.gz`` and ``unseen/NAME/drive.log.gz`` of one vehicle, and return its truth."""
     number, vehicle = numbered
     rng = random_stream(Purpose.FRAMES, seed, number)
-    calibration = trip_of(trips, vehicle, number, "calibration", database.layout)
-    unseen = trip_of(trips, vehicle, number, "unseen", database.layout)
+    calibration = _trip_of(trips, vehicle, number, "calibration", database.layout)
+    unseen = _trip_of(trips, vehicle, number, "unseen", database.layout)
     for kind, trip in (("logs", calibration), ("unseen", unseen)):
         target = folder / kind / vehicle.name
         target.mkdir(parents=True, exist_ok=True)
@@ -267,7 +267,7 @@ def simulate_fleet(
     """
     layout = database.layout
     branches = choose_branches(layout, trips.branches, plan.currents)
-    vehicles = draw_vehicles(plan, layout, branches)
+    vehicles = _draw_vehicles(plan, layout, branches)
     with whole_folder(out) as folder:
         write = partial(_write_vehicle, folder=folder, database=database, trips=trips, seed=plan.seed)
         written = run_many(write, enumerate(vehicles), Workers(processes=workers))
@@ -288,7 +288,7 @@ def simulate_fleet(
     return fleet
 
 
-def draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -> list[Vehicle]:
+def _draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -> list[Vehicle]:
     """Draw the vehicles of a fleet, each with what is wrong with it; of a plan, a layout, and the names of branches."""
     rng = random_stream(Purpose.FAULTS, plan.seed)
     faults = plan.draw(rng, vehicles=plan.vehicles, branches=len(branches), full_scale_a=layout.full_scale_a)
@@ -306,7 +306,7 @@ def draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) ->
     ]
 
 
-def trip_of(trips: TripSource, vehicle: Vehicle, number: int, purpose: TripPurpose, layout: Layout) -> GroundTruth:
+def _trip_of(trips: TripSource, vehicle: Vehicle, number: int, purpose: TripPurpose, layout: Layout) -> GroundTruth:
     """Trip of vehicle ``number``, with its branches alone; the layout says which of them takes the balance."""
     branches = vehicle.branches
     return with_branches(trips.trip(number, purpose), branches, balance_branch(layout, branches))

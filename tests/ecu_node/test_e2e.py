@@ -2,11 +2,15 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from ecu_node.core.e2e import Check, E2EState, Protection, Receiver, protection_of
 from ecu_node.errors import LayoutError
+from ecu_node.layout import E2EWindow
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, MakeDatabase
 
 SIZE = 24
@@ -236,6 +240,45 @@ def test_repeated_frames_are_no_intact_ones(kind: str, protect: Callable[..., Pr
     receiver, (frame,) = Receiver(protection), stream(protection, 1)
     states = [receiver.check(frame) and receiver.state for _ in range(6)]
     assert states[1:] == [E2EState.VALID] * 4 + [E2EState.INVALID]
+
+
+WINDOW = st.builds(E2EWindow, window=st.integers(1, 12), min_ok=st.integers(0, 6), max_error=st.integers(0, 6))
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    windows=st.tuples(WINDOW, WINDOW, WINDOW),
+    steps=st.lists(st.sampled_from(("corrupt", 0, 1, 1, 1, 1, 2, 3, 4, 7)), max_size=60),
+)
+def test_any_frames_are_judged_and_the_state_follows_as_autosar_says(
+    protection: Protection, windows: tuple[E2EWindow, E2EWindow, E2EWindow], steps: list[int | str]
+) -> None:
+    protection = replace(protection, windows=windows)
+    receiver, payload, counter = Receiver(protection), bytearray(b"\xa5" * SIZE), protection.modulus - 9
+    state, past = E2EState.INIT, list[Check]()
+    for step in steps:
+        if isinstance(step, str):
+            wanted = Check.CORRUPT
+        else:
+            counter = (counter + step) % protection.modulus
+            protection.counter.put(payload, counter)
+            protection.seal(payload)
+            is_first = all(check is Check.CORRUPT for check in past)
+            by_step = {0: Check.REPEATED, 1: Check.OK, 2: Check.LOST, 3: Check.LOST}
+            wanted = Check.OK if is_first else by_step.get(step, Check.JUMPED)
+        assert receiver.check(payload if wanted is not Check.CORRUPT else damaged(payload)) is wanted
+        if wanted is Check.CORRUPT and not past:
+            continue
+        past.append(wanted)
+        window = windows[state]
+        last = past[-window.window :]
+        if last.count(Check.CORRUPT) > window.max_error:
+            state = E2EState.INVALID
+        elif last.count(Check.OK) + last.count(Check.LOST) >= window.min_ok:
+            state = E2EState.VALID
+        elif state is E2EState.VALID:
+            state = E2EState.INVALID
+        assert receiver.state is state
 
 
 # ---- mistakes

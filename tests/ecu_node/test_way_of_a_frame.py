@@ -1,4 +1,4 @@
-"""A frame's way through the node beside the same written plainly: one signal after the other, by the plan's formula."""
+"""A frame's way through the node beside what must come of it, for layouts that take each way in the core."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,13 +7,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ecu_node.bus.wiring import InForce, Mode, branch_plan, wire
-from ecu_node.core.correction import AS_IT_IS
-from ecu_node.core.e2e import Check, Receiver, protection_of
-from ecu_node.core.signals import AMPERE, placed_signal, read_codes
-from ecu_node.core.status import Quality
+from ecu_node.bus.wiring import Mode
+from ecu_node.core.e2e import protection_of
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import read_layout, split_signal
+from ecu_node.layout import read_layout
+from tests.ecu_node.oracle import require_right
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, parameters_for
 
 HEADER = ' SG_ Crc : 0|8@1+ (1,0) [0|255] "" Node\n SG_ Alive : 8|4@1+ (1,0) [0|14] "" Node\n'
@@ -62,7 +60,7 @@ FRAMES = st.lists(
 )
 
 
-def stream(database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]]) -> list[bytearray]:
+def stream(database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]]) -> list[bytes]:
     """Frames of which most are intact and in order."""
     protection = protection_of(database, database.message("Pair"))
     frames, counter = [], 0
@@ -77,99 +75,15 @@ def stream(database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]]) 
             protection.seal(payload)
             if damage == 5:
                 payload[-1] ^= 1
-        frames.append(payload)
+        frames.append(bytes(payload))
     return frames
 
 
-class Plain:
-    """What comes of the frames of the message Pair."""
-
-    def __init__(self, database: VehicleDatabase, in_force: InForce, mode: Mode) -> None:
-        message = database.message("Pair")
-        protection = protection_of(database, message)
-        self.receiver = Receiver(protection) if protection is not None else None
-        self.seal = protection.seal if protection is not None else None
-        self.branches = []
-        for branch in database.layout.branch[:2]:
-            signal = database.signal(branch.source)[1]
-            fault = in_force.fault(branch.name)
-            corrects = fault.applied
-            is_in_place = mode is Mode.GATEWAY or branch.corrected is None
-            plan = AS_IT_IS if is_in_place and not corrects else branch_plan(database, branch, fault, mode)
-            codes = read_codes(signal, AMPERE, branch.name)
-            self.branches.append((branch, placed_signal(message, signal), codes, plan))
-
-    def is_usable(self, payload: bytearray) -> bool:
-        return self.receiver is None or self.receiver.check(payload) in {Check.OK, Check.LOST}
-
-    def results(self, payload: bytearray) -> dict[str, tuple[int, int | None]]:
-        """Measured and corrected code per branch in the frame; a code that is no value has none."""
-        found = {}
-        for branch, signal, codes, plan in self.branches:
-            code = signal.code(payload) if len(payload) >= signal.end else None
-            if code is not None:
-                found[branch.name] = code, plan.apply(code) if codes.is_value(code) else None
-        return found
-
-    def forwarded(self, payload: bytearray) -> bytearray | None:
-        if not self.is_usable(payload):
-            return None
-        made = bytearray(payload)
-        results = self.results(payload)
-        for branch, signal, _, _ in self.branches:
-            if branch.name in results and results[branch.name][1] is not None:
-                signal.place.put(made, results[branch.name][1] or 0)
-        if made != payload and self.seal is not None:
-            self.seal(made)
-        return made
-
-
+@pytest.mark.parametrize("mode", list(Mode))
 @settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(drawn=FRAMES, drift=st.floats(-0.3, 0.3), offset=st.floats(-100, 100))
-def test_gateway_changes_the_currents_and_nothing_else(
-    database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]], drift: float, offset: float
+def test_each_current_is_corrected_and_nothing_else_changed(
+    database: VehicleDatabase, mode: Mode, drawn: Sequence[tuple[bytes, int, bool]], drift: float, offset: float
 ) -> None:
-    in_force = InForce(parameters=parameters_for(database, battery=(drift, offset), motor=(0.0, -offset)))
-    source = wire(database, in_force, 0.0, mode=Mode.GATEWAY).sources[256, False]
-    plain = Plain(database, in_force, Mode.GATEWAY)
-    for number, payload in enumerate(stream(database, drawn)):
-        before = bytes(payload)
-        assert source.forward(payload, 0.01 * number) == plain.forwarded(payload)
-        assert payload == before, "what came in is not changed"
-
-
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(drawn=FRAMES, drift=st.floats(-0.3, 0.3), offset=st.floats(-100, 100))
-def test_overlay_answers_with_each_current_and_its_quality(
-    database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]], drift: float, offset: float
-) -> None:
-    in_force = InForce(parameters=parameters_for(database, battery=(drift, offset), motor=(0.01, -offset)))
-    source = wire(database, in_force, 0.0).sources[256, False]
-    plain = Plain(database, in_force, Mode.OVERLAY)
-    protection = protection_of(database, database.message("PairOut"))
-    last: dict[str, int | None] = {}
-    answers = 0
-    for number, payload in enumerate(stream(database, drawn)):
-        found = source.answer(payload, 0.01 * number)
-        if not plain.is_usable(payload):
-            assert not found
-            continue
-        results = plain.results(payload)
-        (target,) = found
-        if protection is not None:
-            assert protection.is_sound(target.data)
-            assert target.data[1] & 0xF == answers % 15
-        answers += 1
-        signals = database.message("PairOut").decode_simple(bytes(target.data), scaling=False, decode_choices=False)
-        for branch, signal, _, _ in plain.branches:
-            if branch.name in results:
-                last[branch.name] = results[branch.name][1]
-            elif len(payload) < signal.end:
-                last[branch.name] = None
-            assert branch.corrected is not None
-            target_signal = database.signal(branch.corrected)[1]
-            value = last.get(branch.name)
-            missing = next(int(code) for code, name in (target_signal.choices or {}).items() if name == "SNA")
-            assert signals[split_signal(branch.corrected)[1]] == (missing if value is None else value)
-            if branch.name == "battery":
-                assert (signals["Quality"] == Quality.CORRECTED) == (value is not None and bool(drift or offset))
+    parameters = parameters_for(database, battery=(drift, offset), motor=(0.0, -offset))
+    require_right(database, parameters, mode, [(256, payload) for payload in stream(database, drawn)])

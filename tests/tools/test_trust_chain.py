@@ -4,26 +4,19 @@ import json
 from pathlib import Path
 
 import pytest
+from typer import BadParameter
 
 from bench import trust_chain
 from tests.ecu_node.vehicles import LAYOUT
 
 
-def chain(monkeypatch: pytest.MonkeyPatch, *options: object) -> None:
-    monkeypatch.setattr("sys.argv", ["trust_chain", *map(str, options)])
-    trust_chain.main()
-
-
 @pytest.mark.long
-def test_no_vehicle_of_a_fleet_is_made_worse(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_vehicle_of_a_fleet_is_made_worse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("fastsim")
     layout = tmp_path / LAYOUT.name
     layout.write_text(f"{LAYOUT.read_text()}\n[activation]\ntrial_s = 60\n")
     (tmp_path / "hv_powertrain.dbc").write_bytes(LAYOUT.with_suffix(".dbc").read_bytes())
-    small = ("--vehicles", 40, "--minutes", 5, "--unseen-minutes", 3)
-    chain(monkeypatch, "--layout", layout, *small, "--unmeasured", 2, 0.5)
+    trust_chain.main(layout=layout, vehicles=40, minutes=5, unseen_minutes=3, unmeasured=(2.0, 0.5))
     counts = json.loads(capsys.readouterr().out)
     assert counts["vehicles"] == 40
     assert counts["with_corrections"] > 15
@@ -36,9 +29,6 @@ def test_no_vehicle_of_a_fleet_is_made_worse(
         assert counts[f"of_these_passed_{kind}"] < 0.2 * counts[f"wrong_sets_on_trial_{kind}"]
 
 
-def test_trips_that_end_before_the_trial_does_are_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        chain(monkeypatch, "--unseen-minutes", 5)
-    assert f"--unseen-minutes: the trial of {LAYOUT} alone takes 300 s; give more" in capsys.readouterr().err
+def test_trips_that_end_before_the_trial_does_are_refused() -> None:
+    with pytest.raises(BadParameter, match=r"--unseen-minutes: the trial of .*\.toml alone takes 300 s; give more"):
+        trust_chain.main(unseen_minutes=5)

@@ -1,29 +1,28 @@
-"""The C core beside the node: the same bits, and how large and how fast it is.
+"""The C core: how large and how fast it is, and whether any bytes do it harm.
 
-python -m bench.c_core compare            all codes of all signals of 8 to 24 bits, and 10^7 random frames
 python -m bench.c_core measure            bytes and instructions per frame (gcc, binutils, valgrind)
 python -m bench.c_core fuzz --seconds S   libFuzzer with the sanitizers of memory and undefined behaviour (clang)
+
+tests/calibrator/export/test_c_core.py compares it with the node.
 """
 
-import argparse
 import re
 import subprocess
 import tempfile
-from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice, product
 from pathlib import Path
 from random import Random
 from struct import Struct
+from typing import Literal
+
+import typer
 
 import ecu_node
-from bench.fuzz_vehicles import draw_vehicle
 from bench.row import LAYOUT, Row, show
 from bench.true_parameters import true_parameters
-from calibrator.errors import ExportError
 from calibrator.export.core import Checked, c_text
-from ecu_node.bus.wiring import InForce, Mode, branch_signals, received, wire
-from ecu_node.core.correction import correction_plan
+from ecu_node.bus.wiring import received
 from ecu_node.core.e2e import protection_of
 from ecu_node.core.signals import BitPlace, bit_place
 from ecu_node.database import VehicleDatabase, read_database
@@ -36,9 +35,8 @@ RECORD = Struct("<IBB64s")
 """A frame: identifier (bit 31: of 29 bits), length, result (0 as it was, 1 changed, 2 held back), payload."""
 
 _HERE = Path(__file__).parent
-_SILENCE = 255
+SILENCE = 255
 """As a length: all messages were silent for so long that counters and voltages are forgotten."""
-_SILENCE_S = 1e7  # longer than any time-out
 
 
 def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
@@ -90,46 +88,8 @@ def _put_edge(place: BitPlace, payload: bytearray, rng: Random) -> None:
     place.put(payload, min(max(edge, place.lowest), place.highest))
 
 
-def by_the_node(checked: Checked, given: Iterable[tuple[int, bytes | None]]) -> Iterator[bytes]:
-    """What the node makes of frames as a gateway, as records."""
-    corrector = wire(checked.database, InForce(parameters=checked.parameters), 0.0, mode=Mode.GATEWAY)
-    sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}
-    now_s = 0.0
-    for identifier, payload in given:
-        if payload is None:
-            now_s += _SILENCE_S
-            yield RECORD.pack(identifier, _SILENCE, 0, b"")
-            continue
-        made = sources[identifier].forward(bytearray(payload), now_s)
-        result = 2 if made is None else int(made != payload)
-        yield RECORD.pack(identifier, len(payload), result, payload if made is None else made)
-
-
-def check_frames(checked: Checked, program: Path, rng: Random, count: int) -> int:
-    """Send random frames through node and core.
-
-    Returns
-    -------
-    int
-        How many were changed.
-
-    Raises
-    ------
-    ValueError
-        If they differ in one frame, naming it.
-    """
-    given = list(frames(checked.database, rng, count))
-    wanted = list(by_the_node(checked, given))
-    found = run(program, b"".join(_record(*frame) for frame in given))
-    if found != b"".join(wanted):
-        pairs = zip(given, wanted, RECORD.iter_unpack(found), strict=True)
-        frame, want, got = next(item for item in pairs if item[1] != RECORD.pack(*item[2]))
-        raise ValueError(f"frame {frame[0]:X} {frame[1]!r}: node {RECORD.unpack(want)}, C core {got}")
-    return sum(record[5] == 1 for record in wanted)
-
-
-def _record(identifier: int, payload: bytes | None) -> bytes:
-    return RECORD.pack(identifier, _SILENCE if payload is None else len(payload), 0, payload or b"")
+def record(identifier: int, payload: bytes | None) -> bytes:
+    return RECORD.pack(identifier, SILENCE if payload is None else len(payload), 0, payload or b"")
 
 
 def build(checked: Checked, folder: Path, *, compiler: str = "gcc", flags: tuple[str, ...] = ("-O2",)) -> Path:
@@ -149,82 +109,6 @@ def run(program: Path, given: bytes, *words: str) -> bytes:
     return subprocess.run([program, *words], input=given, stdout=subprocess.PIPE, check=True).stdout
 
 
-def all_codes(checked: Checked, program: Path, *, voltage: int | None = None, bits: int = 24) -> int:
-    """Compare all codes of all branches of up to so many bits, and return how many they were.
-
-    Raises
-    ------
-    ValueError
-        If node and core differ in one, naming it.
-    """
-    total = 0
-    for number, branch in enumerate(checked.database.layout.branch):
-        signals = branch_signals(checked.database, branch, Mode.GATEWAY)
-        codes, fault = signals.source, checked.parameters.fault(branch.name)
-        plan, place = correction_plan(signals, fault), codes.place
-        if place.length > bits or (branch.voltage is not None) != (voltage is not None):
-            continue
-        passed = not fault.applied or not (signals.voltage is None or signals.voltage.is_value(voltage or 0))
-        words = (str(number), str(place.lowest), str(place.highest), "-" if voltage is None else str(voltage))
-        found = array("q", run(program, b"", *words))
-        apply, is_value, u = plan.apply, codes.is_value, voltage or 0
-        width = range(place.lowest, place.highest + 1)
-        wanted = array("q", [code if passed or not is_value(code) else apply(code, u) for code in width])
-        if found != wanted:
-            code, got, want = next(item for item in zip(width, found, wanted, strict=True) if item[1] != item[2])
-            raise ValueError(f"{branch.source}: code {code}: node {want}, C core {got}")
-        total += len(found)
-    return total
-
-
-def widths(folder: Path) -> Iterator[Checked]:
-    """Vehicles that have between them signals of 8 to 24 bits, signed and unsigned, with names at an end."""
-    for lengths in (range(8, 14), range(14, 20), range(20, 25)):
-        messages, tables, branches = [], [], []
-        for number, (length, sign) in enumerate(product(lengths, "+-"), start=1):
-            signal = f'I : 0|{length}@1{sign} (0.5,{-(1 << length - 2) if sign == "+" else 0}) [0|0] "A" X'
-            messages.append(f"BO_ {number} M{number}: 8 Sensor\n SG_ {signal}\n")
-            tables.append(f'VAL_ {number} I {(1 << length - (sign == "-")) - 1} "SNA";\n')
-            branches.append(f'{{ name = "b{number}", sign = 1, signal = "M{number}.I" }}')
-        (folder / "widths.dbc").write_text("".join(['VERSION ""\nBU_: Sensor X\n', *messages, *tables]))
-        text = f'schema = 1\nname = "w"\ndbc = "widths.dbc"\nfull_scale_a = 50.0\nbranch = [{", ".join(branches)}]\n'
-        (folder / "widths.toml").write_text(text)
-        yield vehicle(folder / "widths.toml")
-
-
-def drawn_vehicles(rng: Random, folder: Path) -> Iterator[Checked]:
-    """Random vehicles without end, of which the core has room for all signals and knows all protections."""
-    while True:
-        drawn = draw_vehicle(rng)
-        drawn.layout["e2e"] = [entry for entry in drawn.layout["e2e"] if entry["profile"] in {"P01", "P02"}]
-        database, parameters = drawn.load(folder)
-        checked = Checked(name="drawn", digest="0" * 64, parameters=parameters, database=database)
-        try:
-            c_text(checked)
-        except ExportError:
-            continue
-        yield checked
-
-
-def compare(folder: Path, count: int) -> list[Row]:
-    """All codes, and random frames of the vehicle with everything and of random ones."""
-    codes = sum(all_codes(checked, build(checked, folder)) for checked in widths(folder))
-    whole = vehicle()
-    program, rng, done, changed = build(whole, folder), Random(3), 0, 0
-    codes += all_codes(whole, program) + sum(all_codes(whole, program, voltage=u) for u in (0, 1, 4000, 8000, 16383))
-    for checked in drawn_vehicles(rng, folder):
-        for subject in (whole, checked):
-            changed += check_frames(subject, build(subject, folder), rng, 100_000)
-            done += 100_000
-        if done >= count:
-            break
-    return [
-        Row(name="C core = node, codes compared, no difference", value=codes, unit="1"),
-        Row(name="C core = node, random frames, no difference", value=done, unit="1"),
-        Row(name="of these changed", value=changed, unit="1"),
-    ]
-
-
 def measure(folder: Path, count: int = 10_000, flags: Sequence[str] = ("-Os", "-O2")) -> Iterator[Row]:
     """Bytes of code, and instructions of a frame of the project's own battery message, with and without E2E."""
     (folder / "bare.toml").write_text(LAYOUT.read_text().split("[e2e]")[0])
@@ -237,7 +121,7 @@ def measure(folder: Path, count: int = 10_000, flags: Sequence[str] = ("-Os", "-
             total = sum(map(int, size.splitlines()[1].split()[:3]))
             yield Row(name=f"C core, gcc {flag}, {part}.o", value=total, unit="byte")
         battery = checked.database.message("HV_Battery").frame_id
-        given = (_record(*frame) for frame in frames(checked.database, Random(4), 40 * count) if frame[0] == battery)
+        given = (record(*frame) for frame in frames(checked.database, Random(4), 40 * count) if frame[0] == battery)
         options = ("--collect-atstart=no", "--toggle-collect=hv_forward", "--quiet", f"--callgrind-out-file={out}")
         command: list[str | Path] = ["valgrind", "--tool=callgrind", *options, program]
         subprocess.run(command, input=b"".join(islice(given, count)), capture_output=True, check=True)
@@ -258,21 +142,14 @@ def fuzz(folder: Path, seconds: int) -> None:
     subprocess.run([folder / "fuzz", *words], cwd=folder, check=True)
 
 
-def main() -> None:
-    """Do what the command line asks for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("compare", "measure", "fuzz"))
-    parser.add_argument("--frames", type=int, default=10_000_000, help="random ones to compare; 10^7 without it")
-    parser.add_argument("--seconds", type=int, default=60)
-    arguments = parser.parse_args()
+def main(what: Literal["measure", "fuzz"], *, seconds: int = 60) -> None:
+    """Measure the C core, or fuzz it for so long."""
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
-        if arguments.what == "fuzz":
-            fuzz(Path(name), arguments.seconds)
-        elif arguments.what == "compare":
-            show(compare(Path(name), arguments.frames))
+        if what == "fuzz":
+            fuzz(Path(name), seconds)
         else:
             show(list(measure(Path(name))))
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -9,7 +9,8 @@ from statistics import median
 from selenium import webdriver
 from selenium.webdriver.support.wait import WebDriverWait
 
-from bench.fleet_run import calibrate, make_store, watched
+from bench.fleet_run import calibrated
+from bench.fleets import make_store
 from bench.row import Row
 from calibrator.report.page import report_page
 
@@ -27,7 +28,7 @@ def rows(*, quick: bool) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         store, result, page = (Path(folder) / name for name in ("store", "result", "report.html"))
         make_store(store, vehicles=vehicles, branches=3)
-        watched(calibrate(store, result))
+        calibrated(store, result)
         started = time.perf_counter()
         page.write_text(report_page(result)[0])
         written_s, ready_s = time.perf_counter() - started, median(ready_times_s(page))

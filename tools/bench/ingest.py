@@ -18,9 +18,8 @@ import numpy as np
 import psutil
 from threadpoolctl import threadpool_limits
 
+from bench.fleets import simulated_fleet
 from bench.row import LAYOUT, Row
-from calibrator.artificial.simulate import FleetPlan, simulate_fleet
-from calibrator.artificial.trips import BuiltinTrips
 from calibrator.drive import Channel, DriveFile, Equipment
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import list_drives, write_drive
@@ -33,7 +32,6 @@ from ecu_node.layout import read_layout, split_signal
 __all__ = ["rows"]
 
 Result = TypeVar("Result")
-PLAN = FleetPlan(vehicles=1, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.1)
 MINUTES, QUICK_MINUTES = 10.0, 3.0
 """Of the log. [min]"""
 READINGS = 5
@@ -60,9 +58,8 @@ def rows(*, quick: bool) -> list[Row]:
     """
     database, minutes = read_database(read_layout(LAYOUT)), QUICK_MINUTES if quick else MINUTES
     with tempfile.TemporaryDirectory() as place, threadpool_limits(1):
-        folder, trips = Path(place), BuiltinTrips(seed=0, duration_s=60.0 * minutes, unseen_s=60.0)
-        simulate_fleet(PLAN, trips, database, folder / "fleet", workers=1)
-        (packed,) = (folder / "fleet" / "logs").glob("*/*.log.gz")
+        folder = Path(place)
+        (packed,) = simulated_fleet(folder / "fleet", vehicles=1, minutes=minutes).glob("logs/*/*.log.gz")
         log = folder / "drive.log"
         log.write_bytes(gzip.decompress(packed.read_bytes()))
         logs = {"BLF": _as(log, ".blf"), "candump": log, "ASC": _as(log, ".asc"), "MF4": _as(log, ".mf4")}

@@ -6,13 +6,13 @@ beside it is :mod:`bench.node_child`. Rates and latencies on SocketCAN: :mod:`be
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle, plain_job
 from bench.row import Row
@@ -27,6 +27,7 @@ NO_KERNEL = 2
 """Exit code of tools/with_vcan where there is no SocketCAN."""
 ONE_CODE_A = 0.1
 """cantools rounds halves to even codes, the node upwards. [A]"""
+PATIENCE_S = 60.0
 STARTS = 5
 """Of which the median counts."""
 SHORT, ROUND = 15, 150
@@ -36,7 +37,7 @@ SHORT, ROUND = 15, 150
 def rows(*, quick: bool) -> list[Row]:
     """Measure; figures of SocketCAN are left out where there is none, which is said on standard error."""
     found = core_rows(20 if quick else 100) + process_rows(100_000 if quick else 10_000_000)
-    words = ("-m", "bench.node_socketcan", "--frames", "1000" if quick else "10000", "--json")
+    words = ("-m", "bench.node_socketcan", "--frames", "1000" if quick else "10000", "--as-json")
     command: list[str | Path] = [ROOT / "tools" / "with_vcan", sys.executable, *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, env=ENVIRONMENT)
     if done.returncode == NO_KERNEL:
@@ -100,26 +101,27 @@ def _require_equal(vehicle: BenchVehicle, mode: Mode) -> None:
 
 
 def process_rows(frames: int) -> list[Row]:
-    """Time to the first corrected frame and memory of a real ``ecu-node run``, after so many frames."""
+    """Time until a real ``ecu-node run`` is ready, and its memory after so many frames."""
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         vehicle = make_vehicle(Path(folder))
-        starts = [_watched(vehicle, SHORT) for _ in range(STARTS)]
-        long = _watched(vehicle, frames)
-    if long["wrong"] or long["received"] != frames or long["heavy_modules"] or long["code"]:
-        raise RuntimeError(f"the node's process is not what it should be: {long}")
+        ready_s = median(_run_node(vehicle, SHORT)[0] for _ in range(STARTS))
+        _, first_mib, last_mib = _run_node(vehicle, frames)
     label = "ecu-node run, gateway on the virtual bus"  # listens for 0.15 s before it is ready: 1.5 status periods
-    extras = f"{long['beside_mib'] - long['ready_mib']:.1f} MiB of which belong to the thread, bus and frames beside it"
-    after, growth = f"{label}: memory after {frames:,} frames, {extras}", long["end_mib"] - long["beside_mib"]
     return [
-        Row(name=f"{label}: process to first corrected frame", value=median(s["start_s"] for s in starts), unit="s"),
-        Row(name=f"{label}: process to ready", value=median(s["ready_s"] for s in starts), unit="s"),
-        Row(name=after, value=long["end_mib"], unit="MiB"),
-        Row(name=f"{label}: growth from the first frame to the last", value=growth, unit="MiB"),
+        Row(name=f"{label}: process to ready", value=ready_s, unit="s"),
+        Row(name=f"{label}: memory after {frames:,} frames", value=last_mib, unit="MiB"),
+        Row(name=f"{label}: growth from the first frame to the last", value=last_mib - first_mib, unit="MiB"),
     ]
 
 
-def _watched(vehicle: BenchVehicle, frames: int) -> dict[str, Any]:
-    """Start a node in a process of its own, let it correct frames, and end it; what was seen."""
+def _run_node(vehicle: BenchVehicle, frames: int) -> tuple[float, float, float]:
+    """Start a node in a process of its own, let it correct frames, and end it.
+
+    Returns
+    -------
+    tuple of float
+        Time until it is ready [s], memory after the first and after the last frame [MiB].
+    """
     channels = ["node in", "node out"]
     job = {
         "arguments": vehicle.command("--interface", "virtual", "--channel", channels[0], "--gateway", channels[1]),
@@ -128,10 +130,18 @@ def _watched(vehicle: BenchVehicle, frames: int) -> dict[str, Any]:
         "frames": [frame.hex() for frame in vehicle.frames[:ROUND]],
         "expected": [frame.hex() for frame in vehicle.corrected(Mode.GATEWAY)[:ROUND]],
         "count": frames,
-        "created_s": time.monotonic(),
     }
-    command = [sys.executable, "-m", "bench.node_child", json.dumps(job)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=ENVIRONMENT)
-    if done.returncode or "received" not in done.stdout:
-        raise RuntimeError(f"the node did not run: {done.stdout}{done.stderr}")
-    return dict(json.loads(done.stdout))
+    command, address = [sys.executable, "-m", "bench.node_child", json.dumps(job)], f"bench-node-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(f"\0{address}")
+        manager.settimeout(PATIENCE_S)
+        environment, pipe, start_s = {**ENVIRONMENT, "NOTIFY_SOCKET": f"@{address}"}, subprocess.PIPE, time.monotonic()
+        with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
+            while not manager.recv(4096).startswith(b"READY=1"):
+                pass
+            ready_s = time.monotonic() - start_s
+            printed, said = process.communicate("ready\n")
+    if process.returncode:
+        raise RuntimeError(f"the node did not run: {said}")
+    first_mib, last_mib = json.loads(printed)
+    return ready_s, first_mib, last_mib

@@ -1,17 +1,14 @@
-"""A real ``ecu-node run`` on the virtual bus, in a process with a thread that sends to it and watches it.
+"""A real ``ecu-node run`` on the virtual bus, with a thread beside it that sends to it; started by :mod:`bench.node`.
 
-Started by :mod:`bench.node` with its arguments as JSON; prints what it saw as JSON. What stands beside the node
-here is one thread, one bus with its queue, and a few frames; the node's memory is read before they are there, and when
-they are. Imports nothing that the node itself does not.
+The thread waits for a line on standard input, sends frames, compares what comes of them, and ends the node; what it saw
+is printed as JSON. Imports nothing that the node itself does not: the memory measured here is the node's.
 """
 
 import json
 import os
 import signal
-import socket
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -22,61 +19,40 @@ _PATIENCE_S = 5.0
 
 def main() -> None:
     """Run the node until the thread beside it has seen enough."""
-    job, seen = json.loads(sys.argv[1]), dict[str, float]()
-    address = f"\0bench-node-{os.getpid()}"
-    ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    ready.bind(address)
-    os.environ["NOTIFY_SOCKET"] = "@" + address[1:]
-    threading.Thread(target=_watch, args=(job, ready, seen), daemon=True).start()
-    from ecu_node.cli import run_ecu_node as ecu_node  # noqa: PLC0415  # its start is measured
+    job = json.loads(sys.argv[1])
+    threading.Thread(target=_send, args=(job,), daemon=True).start()
+    from ecu_node.cli import run_ecu_node  # noqa: PLC0415  # its start is measured
 
-    seen["code"] = ecu_node(job["arguments"])
-    print(json.dumps(seen))
+    sys.exit(run_ecu_node(job["arguments"]))
 
 
-def _watch(job: dict[str, Any], ready: socket.socket, seen: dict[str, float]) -> None:
-    """Wait for the node as a service manager does, send to it, receive from it, and end it."""
+def _send(job: dict[str, Any]) -> None:
+    """Send ``count`` frames, print how much memory there was after the first and the last one, and end the node."""
     try:
-        while not ready.recv(4096).startswith(b"READY=1"):
-            pass
-        threading.Thread(target=_drain, args=(ready,), daemon=True).start()
-        _look(job, seen)
+        sys.stdin.readline()
+        import can  # noqa: PLC0415  # as the node has imported it
+
+        expected, memory_mib = [bytes.fromhex(text) for text in job["expected"]], list[float]()
+        messages = [can.Message(arbitration_id=job["identifier"], is_extended_id=False, data=bytes.fromhex(text))
+                    for text in job["frames"]]  # fmt: skip
+        source, target = (can.Bus(channel, "virtual", ignore_config=True) for channel in job["channels"])
+        with source, target:
+            sent = 0
+            while sent < job["count"]:
+                block = range(sent, min(sent + _BLOCK, job["count"]) if sent else 1)
+                for k in block:
+                    source.send(messages[k % len(messages)])
+                for k in block:
+                    while (message := target.recv(_PATIENCE_S)) and message.arbitration_id != job["identifier"]:
+                        pass
+                    if message is None or message.data != expected[k % len(expected)]:
+                        raise ValueError(f"frame {k}: {message} came instead of {expected[k % len(expected)].hex()}")
+                sent = block.stop
+                if sent == 1:
+                    memory_mib.append(_memory_mib())
+        print(json.dumps([*memory_mib, _memory_mib()]), flush=True)
     finally:
         os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _drain(ready: socket.socket) -> None:
-    while ready.recv(4096):
-        pass
-
-
-def _look(job: dict[str, Any], seen: dict[str, float]) -> None:
-    """Times since the process was created, resident memory, and frames that came."""
-    seen |= {"ready_s": time.monotonic() - job["created_s"], "ready_mib": _memory_mib()}
-    import can  # noqa: PLC0415  # as the node has imported it
-
-    frames, expected = ([bytes.fromhex(text) for text in job[name]] for name in ("frames", "expected"))
-    messages = [can.Message(arbitration_id=job["identifier"], is_extended_id=False, data=frame) for frame in frames]
-    source, target = (can.Bus(channel, "virtual", ignore_config=True) for channel in job["channels"])
-    sent = received = wrong = 0
-    with source, target:
-        while received < job["count"]:
-            block = min(_BLOCK, job["count"] - sent) if received else 1
-            for k in range(sent, sent + block):
-                source.send(messages[k % len(messages)])
-            sent += block
-            while received < sent:
-                message = target.recv(_PATIENCE_S)
-                if message is None:
-                    raise TimeoutError(f"frame {received} never came")
-                if message.arbitration_id == job["identifier"]:
-                    wrong += message.data != expected[received % len(expected)]
-                    received += 1
-            if received == 1:
-                seen |= {"start_s": time.monotonic() - job["created_s"], "beside_mib": _memory_mib()}
-        seen |= {"end_mib": _memory_mib(), "received": received, "wrong": wrong}
-        heavy = ("numpy", "pandas", "asammdf", "cvxpy", "matplotlib")
-        seen["heavy_modules"] = sum(name in sys.modules for name in heavy)
 
 
 def _memory_mib() -> float:

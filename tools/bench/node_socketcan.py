@@ -9,7 +9,6 @@ a system call costs ten times more than on a bare machine, and all share one pro
 rates.
 """
 
-import argparse
 import json
 import shutil
 import signal
@@ -21,10 +20,12 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from statistics import median, quantiles
 
 import can
+import typer
 
 from bench.c_core import CORE
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle, plain_job
@@ -41,7 +42,8 @@ ROUNDS = 3
 WINDOW = 64
 """Frames that are on their way at most: a socket's buffer holds some hundreds."""
 PATIENCE_S = 60.0
-WHAT = ("rate, frames/s", "latency, median, us", "latency, 99.9 %, us")
+FIGURES = {"rate": "frames/s", "latency, median": "us", "latency, 99.9 %": "us"}
+"""Of each way, with their units."""
 QUIET_S = 0.5
 """When no frame comes for this long none is on its way. [s]"""
 LATENCY_SHARE = 10
@@ -62,19 +64,15 @@ def rows(frames: int) -> list[Row]:
             "ecu-node": ([*python, "ecu_node", *node], corrected),
         }
         rounds = [{name: _measured(*way, vehicle, frames) for name, way in ways.items()} for _ in range(ROUNDS)]
-    best = {
-        name: {what: (max if what == "rate, frames/s" else min)(found[name][what] for found in rounds) for what in WHAT}
-        for name in ways
-    }
     found = []
-    for name, figures in best.items():
-        for what, value in figures.items():
-            (label, _, unit), ours = what.rpartition(", "), best["ecu-node"][what]
-            row = Row(name=f"SocketCAN, {name}: {label}", value=value, unit=unit)
-            if name != "ecu-node":
-                ratio = value / ours if label == "rate" else ours / value
-                row = replace(row, peer=f"as the peer of ecu-node, {ours:.3g} {unit}", ratio=ratio)
-            found.append(row)
+    for name, (what, unit) in product(ways, FIGURES.items()):
+        best = max if what == "rate" else min
+        value, ours = (best(figures[way][what] for figures in rounds) for way in (name, "ecu-node"))
+        row = Row(name=f"SocketCAN, {name}: {what}", value=value, unit=unit)
+        if name != "ecu-node":
+            ratio = value / ours if what == "rate" else ours / value
+            row = replace(row, peer=f"as the peer of ecu-node, {ours:.3g} {unit}", ratio=ratio)
+        found.append(row)
     return found
 
 
@@ -153,7 +151,7 @@ class _Line:
             self._require(self._sent - 1)
             latencies_s.append(time.monotonic() - start_s)
         slow_us = 1e6 * quantiles(latencies_s, n=1000, method="inclusive")[998]
-        return dict(zip(WHAT, (1.0 / per_frame_s, 1e6 * median(latencies_s), slow_us), strict=True))
+        return dict(zip(FIGURES, (1.0 / per_frame_s, 1e6 * median(latencies_s), slow_us), strict=True))
 
     def _require(self, number: int) -> None:
         found = self.receive(PATIENCE_S)
@@ -193,21 +191,16 @@ def _pass_on(kind: str) -> None:
             signal.pause()
 
 
-def main() -> None:
-    """Measure and print one line per row, or JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--frames", type=int, default=20_000)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--peer", choices=("bare", "plain"), help="be one of the other ways, until it is ended")
-    arguments = parser.parse_args()
-    if arguments.peer:
-        _pass_on(arguments.peer)
-    found = rows(arguments.frames)
-    if arguments.json:
+def main(*, frames: int = 20_000, as_json: bool = False, peer: str = "") -> None:
+    """Measure and print one line per row, or JSON; with --peer be one of the other ways until it is ended."""
+    if peer:
+        _pass_on(peer)
+    found = rows(frames)
+    if as_json:
         print(json.dumps([vars(row) for row in found]))
     else:
         show(found)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

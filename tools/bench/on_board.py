@@ -4,15 +4,14 @@ import tempfile
 import time
 from pathlib import Path
 
+from bench.fleets import simulated_fleet
 from bench.row import LAYOUT, Row
-from calibrator.artificial.simulate import FleetPlan, simulate_fleet
-from calibrator.artificial.trips import BuiltinTrips
 from calibrator.recordings.log_formats import read_frames
 from calibrator.sources.fleet_source import find_fleet, probe_equipment
 from calibrator.summaries.summarise_fleet import read_vehicle_summary
 from ecu_node.bus.on_board_summary import OnBoardSummary
 from ecu_node.core.signals import FrameKey
-from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
 __all__ = ["rows"]
@@ -21,16 +20,14 @@ __all__ = ["rows"]
 def rows(*, quick: bool) -> list[Row]:
     """Measure share of a core and size."""
     vehicles, minutes = (1, 10.0) if quick else (2, 60.0)
-    database, trips = read_database(read_layout(LAYOUT)), BuiltinTrips(seed=0, duration_s=60 * minutes, unseen_s=60.0)
-    plan = FleetPlan(vehicles=vehicles, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.1)
     with tempfile.TemporaryDirectory() as place:
-        simulate_fleet(plan, trips, database, Path(place) / "fleet", workers=1)
-        return _replayed(Path(place), database)
+        simulated_fleet(Path(place) / "fleet", vehicles=vehicles, minutes=minutes)
+        return _replayed(Path(place))
 
 
-def _replayed(folder: Path, database: VehicleDatabase) -> list[Row]:
+def _replayed(folder: Path) -> list[Row]:
     """Cost of the summaries of all vehicles, with the delays that their logs tell."""
-    fleet = find_fleet(folder / "fleet")
+    database, fleet = read_database(read_layout(LAYOUT)), find_fleet(folder / "fleet")
     equipment = probe_equipment(fleet, database, None)
     spent_s = driven_s = 0.0
     for vehicle, entries in fleet.vehicles.items():

@@ -23,7 +23,7 @@ from calibrator.published.recovery import BasisPursuit
 
 __all__ = ["rows"]
 
-VEHICLES, QUICK_VEHICLES = {2: 300, 4: 150}, 4
+VEHICLES, QUICK_VEHICLES = {2: 300, 3: 300, 4: 150, 6: 16, 8: 8}, 4
 """Of a fleet, by number of branches."""
 SOLVED, QUICK_SOLVED = 40, 2
 """Vehicles that the peer solves."""

@@ -6,7 +6,6 @@ Each vehicle has a parameter file of the size that the calibrator writes. All ar
 the second time, and a vehicle that took the first publication verifies the bundle of the second one.
 """
 
-import argparse
 import resource
 import tempfile
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import typer
 from msgspec.structs import replace
 from securesystemslib.signer import SSlibKey
 from tuf.api.metadata import SuccinctRoles
@@ -33,7 +33,7 @@ UPDATES = 20
 """Of which the quickest counts: others on the machine make it longer, nothing makes it shorter."""
 
 
-def sampled(vehicles: int) -> list[int]:
+def one_bin(vehicles: int) -> list[int]:
     """The vehicles of one bin, and one of each other bin: bundle and snapshot are those of the whole fleet."""
     bins, found = SuccinctRoles([], 1, BIN_BITS, "bins"), dict[str, list[int]]()
     for number in range(vehicles):
@@ -102,16 +102,14 @@ def verify_times_s(state: Path, bundle: Path, database: VehicleDatabase) -> tupl
     return min(times_s)
 
 
-def main() -> None:
-    """Measure, and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--vehicles", type=int, default=10_000)
-    parser.add_argument("--sampled", action="store_true", help="one bin of the fleet alone: bundle and time to verify")
-    parser.add_argument("--folder", type=Path, help="where to work; needs about 15 GB for 10^6 vehicles")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="repository-", dir=options.folder) as folder:
-        show(measured(Path(folder), sampled(options.vehicles) if options.sampled else range(options.vehicles)))
+def main(*, vehicles: int = 10_000, sampled: bool = False) -> None:
+    """Measure; if sampled, one bin of the fleet alone, which gives size of a bundle and time to verify.
+
+    10^6 vehicles need about 15 GB in the folder for temporary files (TMPDIR).
+    """
+    with tempfile.TemporaryDirectory(prefix="repository-") as folder:
+        show(measured(Path(folder), one_bin(vehicles) if sampled else range(vehicles)))
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

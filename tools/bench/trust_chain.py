@@ -7,33 +7,36 @@ node takes its signed file, tries it, and corrects a drive that nobody has seen.
 are on trial: with signs turned, and of another vehicle. Prints how many vehicles came how far, as JSON.
 """
 
-import argparse
 import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import can
 import pandas as pd
+import typer
 from msgspec.structs import replace
 
+from bench.fleets import calibrator
 from bench.published import Publisher
 from bench.row import LAYOUT
 from calibrator.fleet_truth import VehicleTruth, read_truth
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.recordings.log_formats import read_frames
+from calibrator.recordings.readers import Recording, read_recording
 from calibrator.terminal.progress import shown
-from ecu_node.bus.wiring import Mode, branch_signals, key_of, wire
-from ecu_node.core.signals import Codes, FrameKey
+from ecu_node.bus.wiring import Mode, wire
+from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import State
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
-from ecu_node.layout import read_layout, split_signal
+from ecu_node.layout import read_layout
 from ecu_node.parameters import VehicleParameters, read_parameters
 from ecu_node.update.client import provision, update
 from ecu_node.update.store import ParameterStore
@@ -47,45 +50,42 @@ WRONG = ("signs_turned", "of_another_vehicle")
 """Kinds of wrong sets."""
 
 
-def main() -> None:
-    """Drive a fleet through the whole chain, and count what became of its vehicles."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--layout", type=Path, default=LAYOUT)
-    parser.add_argument("--vehicles", type=int, default=500)
-    parser.add_argument("--unmeasured", nargs=2, default=("0", "0"), help="as of calibrator simulate [A]")
-    parser.add_argument("--minutes", type=float, default=10.0, help="least length of each trip to learn from [min]")
-    parser.add_argument("--unseen-minutes", type=float, default=10.0, help="of each unseen trip, with trial [min]")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
-    given = parser.parse_args()
-    trial_s = read_layout(given.layout).activation.trial_s
-    if 60.0 * given.unseen_minutes <= trial_s:
-        parser.error(f"--unseen-minutes: the trial of {given.layout} alone takes {trial_s:g} s; give more")
+def main(
+    *,
+    layout: Path = LAYOUT,
+    vehicles: int = 500,
+    unmeasured: tuple[float, float] = (0.0, 0.0),
+    minutes: float = 10.0,
+    unseen_minutes: float = 10.0,
+    seed: int = 0,
+    workers: int = 2,
+) -> None:
+    """Drive a fleet through the whole chain, and count what became of its vehicles.
+
+    Options are those of calibrator simulate: load without a sensor [A], least length of the trips to learn from, and of
+    the unseen trips, on which the trial is made. [min]
+    """
+    trial_s = read_layout(layout).activation.trial_s
+    if 60.0 * unseen_minutes <= trial_s:
+        raise typer.BadParameter(f"--unseen-minutes: the trial of {layout} alone takes {trial_s:g} s; give more")
     with tempfile.TemporaryDirectory(prefix="chain-") as name:
-        print(json.dumps(score(driven_fleet(Path(name), given)), indent=2))
-
-
-def driven_fleet(folder: Path, given: argparse.Namespace) -> pd.DataFrame:
-    """What became of each vehicle of a fleet that is simulated, calibrated, published and driven."""
-    fleet, result = folder / "fleet", folder / "result"
-    common = ("--layout", given.layout, "--workers", given.workers)
-    lengths = ("--minutes", given.minutes, "--unseen-minutes", given.unseen_minutes)
-    faults = ("--currents", 3, "--sparsity", 80, "--magnitude", 0.02, 0.1, "--unmeasured", *given.unmeasured)
-    some = ("--vehicles", given.vehicles, "--seed", given.seed, "--delay", 100)
-    for words in (
-        ("simulate", *some, *lengths, *faults, *common, "--out", fleet),
-        ("calibrate", fleet, *common, "--out", result),
-    ):
-        command = [sys.executable, "-m", "calibrator", *map(str, words)]
-        subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
-    files = sorted((result / "params").glob("*.json"))
-    publisher = Publisher(folder / "repository", people=2)
-    publisher.add(files)
-    publisher.publish()
-    names = [path.stem for path in files]
-    pairs = zip(names, [*names[1:], names[0]], strict=True)
-    driven = run_many(partial(drive, folder, given.layout), pairs, Workers(processes=given.workers))
-    return pd.DataFrame(shown(driven, "drive, corrected", len(names), "vehicles"))
+        folder = Path(name)
+        fleet, result, common = folder / "fleet", folder / "result", ("--layout", layout, "--workers", workers)
+        plan = ("--vehicles", vehicles, "--seed", seed, "--minutes", minutes, "--unseen-minutes", unseen_minutes)
+        sensors = ("--currents", 3, "--delay", 100, "--unmeasured", *unmeasured)
+        faults = ("--sparsity", 80, "--magnitude", 0.02, 0.1)
+        simulate = calibrator("simulate", *plan, *sensors, *faults, *common, "--out", fleet)
+        for words in (simulate, calibrator("calibrate", fleet, *common, "--out", result)):
+            subprocess.run(words, stdout=subprocess.DEVNULL, check=True)
+        files = sorted((result / "params").glob("*.json"))
+        publisher = Publisher(folder / "repository", people=2)
+        publisher.add(files)
+        publisher.publish()
+        names = [path.stem for path in files]
+        pairs = zip(names, [*names[1:], names[0]], strict=True)
+        driven = run_many(partial(drive, folder, layout), pairs, Workers(processes=workers))
+        outcomes = pd.DataFrame(shown(driven, "drive, corrected", len(names), "vehicles"))
+    print(json.dumps(score(outcomes), indent=2))
 
 
 def score(outcomes: pd.DataFrame) -> dict[str, float]:
@@ -154,36 +154,29 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
     turned = {key: replace(b, drift=-b.drift, offset_a=-b.offset_a) for key, b in own.branches.items()}
     sets = dict(zip(WRONG, (replace(own, branches=turned), replace(others, vehicle=name)), strict=True))
     trials = {kind: ParameterTrial(found, database, corrector.branches) for kind, found in sets.items()}
-    branches = {each: database.layout.find_branch(each) for each in own.branches}
-    signals = {each: branch_signals(database, branch, Mode.OVERLAY) for each, branch in branches.items()}
-    seen: dict[str, list[tuple[float, float, float]]] = {each: [] for each in branches}
-    in_force_s, look_s, start_s = float("inf"), LOOK_EVERY_S, None
-    for message in read_frames(folder / "fleet" / "unseen" / name / "drive.log.gz").messages():
-        start_s = message.timestamp if start_s is None else start_s
-        time_s, key = message.timestamp - start_s, FrameKey(message.arbitration_id, message.is_extended_id)
-        while look_s <= time_s:
-            corrector.look(look_s)
-            if store.look(corrector, look_s):
-                in_force_s = min(in_force_s, look_s)
-            for kind, trial in [*trials.items()]:
-                if (result := trial.look(look_s)) is not None:
-                    outcome[f"{kind}: passed"] = result.passed
-                    del trials[kind]
-            look_s += LOOK_EVERY_S
-        if key in corrector.sources:
-            made = {target.key: target.data for target in corrector.sources[key].answer(message.data, time_s)}
-            for each, branch in branches.items():
-                if key_of(database.message(split_signal(branch.source)[0])) == key:
-                    answer = made[key_of(database.message(split_signal(branch.corrected or branch.source)[0]))]
-                    measured_a = _current_a(signals[each].source, message.data)
-                    published_a = _current_a(signals[each].target, answer)
-                    seen[each].append((time_s, branch.sign * measured_a, branch.sign * published_a))
+    passed_s: dict[str, float] = {}
+    """When a set came into force, or passed its trial."""
+
+    def look(time_s: float) -> None:
+        corrector.look(time_s)
+        if store.look(corrector, time_s):
+            passed_s.setdefault("own", time_s)
+        for kind, trial in [*trials.items()]:
+            if (result := trial.look(time_s)) is not None:
+                del trials[kind]
+                if result.passed:
+                    passed_s[kind] = time_s
+
+    unseen, driven = folder / "fleet" / "unseen" / name / "drive.log.gz", state / "driven.log"
+    _replay(unseen, corrector, look, driven)
     truth = read_truth(folder / "fleet" / "truth.json").vehicles[name]
-    traces = {each: _trace(rows, truth, each) for each, rows in seen.items()}
+    traces = _traces(read_recording(driven, database, vehicle=name, name="unseen"), truth)
+    driven.unlink()
+    outcome |= {f"{kind}: passed": kind in passed_s for kind in WRONG}
     outcome |= {f"{kind}: worse": _makes_worse(found, traces) for kind, found in sets.items()}
-    outcome |= {"passed": in_force_s < float("inf"), "fell_back": corrector.state()[0] is not State.CORRECTING}
+    outcome |= {"passed": "own" in passed_s, "fell_back": corrector.state()[0] is not State.CORRECTING}
     if outcome["passed"]:
-        after = {each: _errors_a(trace, in_force_s) for each, trace in traces.items()}
+        after = {branch: _errors_a(trace, passed_s["own"]) for branch, trace in traces.items()}
         outcome["worse"] = any(_is_worse(errors) for errors in after.values())
         outcome |= {f"{what}_a": max(after[each][what] for each in corrected) for what in ("measured", "published")}
     if not outcome["passed"] or outcome["fell_back"] or outcome["worse"]:
@@ -191,23 +184,36 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
     return outcome
 
 
-def _current_a(codes: Codes, payload: bytes | bytearray) -> float:
-    """Current in a payload in the sensor's sign, NaN where there is none. [A]"""
-    code = codes.place.extract(payload)
-    is_there = code is not None and codes.is_value(code)
-    return float(codes.scale) * code + float(codes.offset) if is_there and code is not None else float("nan")
+def _replay(drive: Path, corrector: Corrector, look: Callable[[float], None], out: Path) -> None:
+    """Play a log to a node, which looks at the junction in between, and record it with the answers."""
+    look_s, start_s = LOOK_EVERY_S, None
+    with can.Logger(out) as log:
+        for message in read_frames(drive).messages():
+            start_s = message.timestamp if start_s is None else start_s
+            time_s = message.timestamp - start_s
+            while look_s <= time_s:
+                look(look_s)
+                look_s += LOOK_EVERY_S
+            log(message)
+            source = corrector.sources.get((message.arbitration_id, message.is_extended_id))
+            for answer in source.answer(message.data, time_s) if source is not None else ():
+                log(can.Message(message.timestamp, *answer.key, channel=message.channel, data=answer.data))
 
 
-def _trace(rows: list[tuple[float, float, float]], truth: VehicleTruth, branch: str) -> pd.DataFrame:
-    """A branch in each of its frames: time [s], measured, published and true current, that of its known fault. [A]"""
-    trace = pd.DataFrame(rows, columns=["second", "measured", "published"])
-    return trace.assign(true=(trace["measured"] - truth.offset_a[branch]) / (1.0 + truth.drift[branch]))
+def _traces(driven: Recording, truth: VehicleTruth) -> dict[str, pd.DataFrame]:
+    """Of each branch measured, published and true current, that of its known fault [A], over the time [s]."""
+    traces = {}
+    for branch, measured in driven.drive.branches.items():
+        both = {"measured": measured, "published": driven.corrected[branch]}
+        trace = pd.DataFrame({what: pd.Series(one.value, one.time_s)[one.good] for what, one in both.items()})
+        traces[branch] = trace.assign(true=(trace["measured"] - truth.offset_a[branch]) / (1.0 + truth.drift[branch]))
+    return traces
 
 
 def _errors_a(trace: pd.DataFrame, since_s: float = 0.0) -> dict[str, float]:
     """Root mean square errors of means of one second, from a time on [s]; the sensor's noise apart. [A]"""
-    part = trace[trace["second"] >= since_s].dropna()
-    means = part.groupby(part["second"].astype(int)).mean()
+    part = trace.loc[since_s:].dropna()
+    means = part.groupby(part.index.astype(int)).mean()
     return {what: float(((means[what] - means["true"]) ** 2).mean() ** 0.5) for what in ("measured", "published")}
 
 
@@ -229,4 +235,4 @@ def _makes_worse(parameters: VehicleParameters, traces: Mapping[str, pd.DataFram
 if __name__ == "__main__":
     from bench import trust_chain  # processes of run_many find its functions by this name
 
-    trust_chain.main()
+    typer.run(trust_chain.main)

@@ -15,10 +15,11 @@ from dcmReader.dcm_reader import DcmReader
 from elftools.elf.elffile import ELFFile
 from pya2l.parser import A2lParser
 
-from bench.c_core import build, check_frames, vehicle
+from bench.c_core import build, vehicle
 from calibrator.errors import ExportError
 from calibrator.export.core import Checked, find_image, image_bytes, intel_hex, read_checked
 from ecu_node.parameters import write_parameters
+from tests.calibrator.export.c_core import check_frames
 from tests.calibrator.export.exports import checked_with, export, needs, refused
 from tests.ecu_node.vehicles import MakeDatabase, parameters_for
 

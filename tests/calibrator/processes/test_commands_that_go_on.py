@@ -3,6 +3,8 @@
 import gzip
 import json
 import os
+import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.fleet_run import killed_runs
+from bench.fleets import make_store
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from ecu_node.database import VehicleDatabase
@@ -20,12 +22,22 @@ from tests.calibrator.processes.dask_cluster import DaskCluster
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 ENVIRONMENT = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
 HUGE_BYTES = 100 * 10**9
+KILLS = int(os.environ.get("HV_KILLS", "4"))
+"""Runs of each command that are killed."""
 
 
-def started(command: str, given: Path, out: Path, *options: object) -> "subprocess.Popen[str]":
+def started(
+    command: str, given: Path, out: Path, *options: object, process_group: int | None = None
+) -> "subprocess.Popen[str]":
     line = [sys.executable, "-m", "calibrator", command, given, "--layout", LAYOUT, "--out", out, *options]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(list(map(str, line)), stdout=pipe, stderr=pipe, text=True, env=ENVIRONMENT)
+    return subprocess.Popen(
+        list(map(str, line)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+        process_group=process_group,
+    )
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -64,8 +76,34 @@ def test_hostile_log_is_left_out_with_its_reason_within_its_limits(tmp_path: Pat
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["import", "summarise", "calibrate"])
-def test_command_killed_at_any_moment_gives_the_identical_result_when_run_again(tmp_path: Path, command: str) -> None:
-    assert killed_runs(tmp_path, 20 if command == "calibrate" else 4, 4, command) == 4
+def test_command_killed_at_any_moment_gives_the_identical_result_when_run_again(
+    tmp_path: Path, database: VehicleDatabase, command: str
+) -> None:
+    if command == "calibrate":
+        given = tmp_path / "summaries"
+        make_store(given, vehicles=500)
+    else:
+        given = fleet_of(4, tmp_path, database)
+
+    def run(out: Path, limit_s: float | None = None) -> None:
+        """Run to the end, or kill it with all its processes after so long. [s]"""
+        with started(command, given, out, "--workers", 2, process_group=0) as process:
+            try:
+                said = process.communicate(timeout=limit_s)[1]
+                assert process.returncode == 0, said
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    start_s = time.monotonic()
+    run(whole)
+    whole_s, chance = time.monotonic() - start_s, random.Random(0)
+    for _ in range(KILLS):
+        run(killed, chance.uniform(0.0, whole_s))
+        if command != "calibrate" or not killed.exists():  # calibrate refuses a folder with a result
+            run(killed)
+        assert contents(killed) == contents(whole)
+        shutil.rmtree(killed)
 
 
 @pytest.mark.long

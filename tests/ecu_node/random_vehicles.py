@@ -1,4 +1,4 @@
-"""Random vehicles for fuzz tests: DBC, layout and parameters with all that the node knows, drawn from a seed.
+"""Random vehicles: DBC, layout and parameters with all that the node knows, drawn from a seed.
 
 Signals of 1 to 64 bits in both byte orders and on any bit, multiplexed or not, with negative factors, ranges and named
 codes; powers with their voltage; every profile of protection; messages of 1 to 64 bytes with 11 and 29 bits of
@@ -7,27 +7,26 @@ identifier. cantools says where there is room for a signal, and writes the DBC.
 
 import json
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from math import floor
+from math import ceil, floor
 from pathlib import Path
 from random import Random
-from typing import Any, NamedTuple
+from typing import Any
 
 from cantools.database.can import Database, Message, Signal
 from cantools.database.can.node import Node
 from cantools.database.conversion import BaseConversion
 from cantools.database.errors import Error as DatabaseError
 from cantools.database.utils import start_bit
-from e2e import p01, p02, p04, p05, p06, p07, p11
 
 from bench.true_parameters import true_parameters
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters
 
-__all__ = ["PROFILES", "Codes", "FuzzVehicle", "draw_vehicle", "mask_of"]
+__all__ = ["Codes", "draw_vehicle", "mask_of"]
 
 _SCALES = ("0.1", "-0.05", "1", "0.02", "0.001", "-0.25", "3", "0.0078125", "100", "-1")
 _OFFSETS = ("0", "0", "-400", "12.5", "-0.3")
@@ -48,25 +47,8 @@ _SETTINGS = {
 }
 
 
-class Profile(NamedTuple):
-    """A profile of AUTOSAR: function of autosar-e2e, bits of the header, place of the counter and its codes."""
-
-    protect: Callable[..., None]
-    header_bits: int
-    counter_byte: int
-    counter_bits: int
-    modulus: int
-
-
-PROFILES = {
-    "P01": Profile(p01.e2e_p01_protect, 12, 1, 4, 15),
-    "P02": Profile(p02.e2e_p02_protect, 12, 1, 4, 16),
-    "P04": Profile(p04.e2e_p04_protect, 96, 2, 16, 1 << 16),
-    "P05": Profile(p05.e2e_p05_protect, 24, 2, 8, 256),
-    "P06": Profile(p06.e2e_p06_protect, 40, 4, 8, 256),
-    "P07": Profile(p07.e2e_p07_protect, 160, 12, 32, 1 << 32),
-    "P11": Profile(p11.e2e_p11_protect, 12, 1, 4, 15),
-}
+HEADER_BITS = {"P01": 12, "P02": 12, "P04": 96, "P05": 24, "P06": 40, "P07": 160, "P11": 12, "counter CRC8": 16}
+"""Of the kinds of protection: what a message needs beside it."""
 
 
 class Codes:
@@ -80,7 +62,7 @@ class Codes:
         self.span = self.width
         if signal.minimum is not None and signal.maximum is not None:
             ends = [self.exact_code(Fraction(str(end)) * factor) for end in (signal.minimum, signal.maximum)]
-            self.span = int(min(ends)), int(max(ends))
+            self.span = max(self.width[0], ceil(min(ends))), min(self.width[1], floor(max(ends)))
 
     @property
     def zero(self) -> int:
@@ -112,28 +94,6 @@ def mask_of(signal: Signal) -> int:
     if signal.byte_order == "little_endian":
         return sum(1 << place for place in places)
     return sum(1 << (place - place % 8 + 7 - place % 8) for place in places)
-
-
-@dataclass(kw_only=True)
-class FuzzVehicle:
-    """All of it: the layout as it stands in its file, messages of the DBC by name, and faults of branches by name."""
-
-    layout: dict[str, Any]
-    messages: dict[str, Message]
-    faults: dict[str, BranchParameters]
-
-    def signal(self, name: str) -> tuple[Message, Signal]:
-        """Message and signal of a name in the layout."""
-        message, signal = name.split(".")
-        return self.messages[message], self.messages[message].get_signal_by_name(signal)
-
-    def load(self, folder: Path) -> tuple[VehicleDatabase, VehicleParameters]:
-        """Write layout and DBC, and read them as the node does."""
-        database = Database([*self.messages.values()], nodes=[Node("Sensor"), Node("Corrector")])
-        (folder / "fuzz.dbc").write_text(database.as_dbc_string())
-        (folder / "fuzz.toml").write_text("".join(f"{key} = {_toml(value)}\n" for key, value in self.layout.items()))
-        found = read_database(read_layout(folder / "fuzz.toml"))
-        return found, true_parameters(found, self.faults)
 
 
 def _toml(value: Any) -> str:
@@ -187,18 +147,40 @@ class _Draft:
         return None
 
 
-def draw_vehicle(rng: Random) -> FuzzVehicle:
-    """Draw a vehicle with at least two branches, one of which an overlay node publishes."""
+def draw_vehicle(
+    rng: Random, folder: Path, kinds: Collection[str] = HEADER_BITS.keys()
+) -> tuple[VehicleDatabase, VehicleParameters]:
+    """Draw a vehicle with at least two branches, one of which an overlay node publishes.
+
+    Parameters
+    ----------
+    rng : Random
+        Of all that is drawn.
+    folder : Path
+        For layout and DBC, which are read as the node does.
+    kinds : collection of str
+        Kinds of protection that its messages may have.
+
+    Returns
+    -------
+    tuple of VehicleDatabase and VehicleParameters
+        Layout and DBC, and parameters that fit them.
+    """
     while True:
-        found = _draw(rng)
-        branches = found.layout["branch"]
-        if len(branches) >= 2 and any("corrected" in branch for branch in branches):
-            return found
+        layout, messages, faults = _draw(rng, kinds)
+        if len(layout["branch"]) >= 2 and any("corrected" in branch for branch in layout["branch"]):
+            break
+    dbc = Database(messages, nodes=[Node("Sensor"), Node("Corrector")]).as_dbc_string()
+    (folder / "fuzz.dbc").write_text(dbc)
+    (folder / "fuzz.toml").write_text("".join(f"{key} = {_toml(value)}\n" for key, value in layout.items()))
+    database = read_database(read_layout(folder / "fuzz.toml"))
+    return database, true_parameters(database, faults)
 
 
-def _draw(rng: Random) -> FuzzVehicle:
-    sources = [_draw_message(rng, f"In{k}", k) for k in range(rng.randint(1, 4))]
-    targets = [_draw_message(rng, f"Out{k}", 4 + k, least_size=8) for k in range(rng.randint(1, 3))]
+def _draw(rng: Random, kinds: Collection[str]) -> tuple[dict[str, Any], list[Message], dict[str, BranchParameters]]:
+    """Layout as it stands in its file, messages of the DBC, and faults by branch."""
+    sources = [_draw_message(rng, f"In{k}", k, kinds) for k in range(rng.randint(1, 4))]
+    targets = [_draw_message(rng, f"Out{k}", 4 + k, kinds, least_size=8) for k in range(rng.randint(1, 3))]
     net, branches, faults = None, list[dict[str, Any]](), dict[str, BranchParameters]()
     if rng.random() < 0.5:
         voltage = _draw_signal(rng, "Net", rng.choice((6, 8, 12)), ["V"], scales=("0.01", "0.5", "-0.1"))
@@ -230,7 +212,7 @@ def _draw(rng: Random) -> FuzzVehicle:
     used = [draft for draft in (*sources, *targets) if draft.name in named]
     layout = {**_SETTINGS, "on_bad_frame": rng.choice(("hold", "invalid")), "branch": branches}
     layout["e2e"] = [draft.e2e for draft in used if draft.e2e]
-    return FuzzVehicle(layout=layout, messages={draft.name: draft.message() for draft in used}, faults=faults)
+    return layout, [draft.message() for draft in used], faults
 
 
 def _draw_target(rng: Random, name: str, draft: _Draft, units: Sequence[str]) -> dict[str, str]:
@@ -248,14 +230,14 @@ def _draw_target(rng: Random, name: str, draft: _Draft, units: Sequence[str]) ->
     return {key: signal_name for key, signal_name in found.items() if signal_name is not None}
 
 
-def _draw_message(rng: Random, name: str, low: int, least_size: int = 1) -> _Draft:
+def _draw_message(rng: Random, name: str, low: int, kinds: Collection[str], least_size: int = 1) -> _Draft:
     """A message whose identifier ends in these three bits."""
     extended = rng.random() < 0.3
     frame_id = rng.getrandbits(26 if extended else 8) << 3 | low
     size = rng.choice([size for size in _SIZES if size >= least_size])
     draft = _Draft(name=name, frame_id=frame_id, extended=extended, size=size)
     if rng.random() < 0.7:
-        _draw_protection(rng, draft)
+        _draw_protection(rng, draft, kinds)
     if least_size == 1 and rng.random() < 0.35:
         before, selector = [*draft.signals], Signal("Selector", 0, rng.randint(1, 3), is_multiplexer=True)
         filler = Signal("Filler", 0, 1, multiplexer_ids=[*range(1 << selector.length)], multiplexer_signal="Selector")
@@ -292,40 +274,44 @@ def _set_codes(signal: Signal, names: dict[int, str]) -> None:
     signal.conversion = BaseConversion.factory(scale=signal.scale, offset=signal.offset, choices=choices)
 
 
-def _draw_protection(rng: Random, draft: _Draft) -> None:
-    """Draw a profile that fits a message and leaves room in it, if there is one."""
-    fitting = [name for name, profile in PROFILES.items() if profile.header_bits <= 8 * (draft.size - 1)]
-    seldom = [name for name in fitting if name in {"P04", "P07"}]  # they fit few messages
-    name = rng.choice([*fitting, *seldom, "P01", "counter CRC8"])
-    entry: dict[str, Any] = {"messages": [draft.name], "profile": name, "max_delta_counter": rng.randint(1, 4)}
+def _draw_protection(rng: Random, draft: _Draft, kinds: Collection[str]) -> None:
+    """Draw a protection that fits a message and leaves room in it, if there is one."""
+    fitting = [name for name in kinds if HEADER_BITS[name] <= 8 * (draft.size - 1)]
+    fitting += [name for name in fitting if name in {"P04", "P07"}]  # they fit few messages
+    if not fitting:
+        return
+    draft.e2e = {"messages": [draft.name], "profile": rng.choice(fitting), "max_delta_counter": rng.randint(1, 4)}
     each_by_itself = rng.random() < 0.5
     for state in ("init", "valid", "invalid"):
-        size = 1 if each_by_itself else rng.randint(1, 12)
-        least = {"min_ok": rng.randint(0, (size + 1) // 2), "max_error": rng.randint(0, size // 2)}
-        entry[state] = {"window": size, **({"min_ok": 0, "max_error": 1} if each_by_itself else least)}
-    if name == "counter CRC8":
-        if draft.size < 3:
-            return
-        byte, counter_byte = rng.sample(range(min(draft.size, 4)), 2)
-        counter_bit = 8 * counter_byte + rng.choice((0, 3, 4))
-        draft.signals += [Signal("Crc", 8 * byte, 8), Signal("Counter", counter_bit, 4)]
-        entry |= {"counter": "Counter", "crc": "Crc", "algorithm": rng.choice(("sae_j1850", "autosar"))}
-        entry |= {"counter_modulus": rng.choice((15, 16)), "data_id_bytes": rng.choice((0, 1, 2))}
-        entry["data_id_at"] = rng.choice(("before", "after"))
-    elif name not in fitting:
-        return
+        size = rng.randint(1, 12)
+        windows = {"window": size, "min_ok": rng.randint(0, (size + 1) // 2), "max_error": rng.randint(0, size // 2)}
+        draft.e2e[state] = {"window": 1, "min_ok": 0, "max_error": 1} if each_by_itself else windows
+    draft.e2e |= _counter_crc8(rng, draft) if draft.e2e["profile"] == "counter CRC8" else _autosar(rng, draft)
+
+
+def _counter_crc8(rng: Random, draft: _Draft) -> dict[str, Any]:
+    byte, counter_byte = rng.sample(range(min(draft.size, 4)), 2)
+    draft.signals += [Signal("Crc", 8 * byte, 8), Signal("Counter", 8 * counter_byte + rng.choice((0, 3, 4)), 4)]
+    return {
+        "counter": "Counter",
+        "crc": "Crc",
+        "algorithm": rng.choice(("sae_j1850", "autosar")),
+        "counter_modulus": rng.choice((15, 16)),
+        "data_id_bytes": rng.choice((0, 1, 2)),
+        "data_id_at": rng.choice(("before", "after")),
+    }
+
+
+def _autosar(rng: Random, draft: _Draft) -> dict[str, Any]:
+    profile, bits, entry = draft.e2e["profile"], HEADER_BITS[draft.e2e["profile"]], dict[str, Any]()
+    if profile == "P02":
+        entry["data_id_list"] = {draft.name: [*rng.randbytes(16)]}
     else:
-        bits, offset = PROFILES[name].header_bits, 0
-        if name == "P02":
-            entry["data_id_list"] = {draft.name: [*rng.randbytes(16)]}
-        else:
-            offset = entry["offset"] = rng.choice((0, 0, 0, rng.randrange(draft.size - (bits + 7) // 8)))
-            if rng.random() < 0.5:
-                longest = 0xFFFFFFFF if name in {"P04", "P07"} else 0xFFFF
-                entry["data_id"] = {draft.name: rng.randrange(longest + 1)}
-        if name in {"P01", "P11"}:
-            modes = ("both", "both", "nibble", *(("alternating", "low") if name == "P01" else ()))
-            entry["data_id_mode"] = rng.choice(modes)
-        bits += 4 * (entry.get("data_id_mode") == "nibble")
-        draft.header = [Signal("Header", 8 * offset, bits)]
-    draft.e2e = entry
+        entry["offset"] = rng.choice((0, 0, 0, rng.randrange(draft.size - (bits + 7) // 8)))
+        if rng.random() < 0.5:
+            entry["data_id"] = {draft.name: rng.getrandbits(32 if profile in {"P04", "P07"} else 16)}
+    if profile in {"P01", "P11"}:
+        entry["data_id_mode"] = rng.choice(("both", "both", "nibble", *(("alternating", "low") * (profile == "P01"))))
+        bits += 4 * (entry["data_id_mode"] == "nibble")
+    draft.header = [Signal("Header", 8 * entry.get("offset", 0), bits)]
+    return entry

@@ -1,0 +1,243 @@
+"""What must come of a frame in the node, by cantools (signals) and fractions (correction), in both modes.
+
+The exact code is rounded, halves up; the node may come out as if the value were greater by less than 2^-10 of a code.
+Which frames are intact and in order is told by the node's receiver, which test_e2e.py compares with AUTOSAR's words.
+"""
+
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from math import floor
+from typing import Any, NamedTuple
+
+from cantools.database.can import Message, Signal
+from cantools.database.errors import DecodeError
+
+from ecu_node.bus.wiring import InForce, Mode, wire
+from ecu_node.core.e2e import Check, E2EState, Receiver, protection_of
+from ecu_node.core.status import Quality
+from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Branch
+from ecu_node.parameters import BranchParameters, VehicleParameters
+from tests.ecu_node.random_vehicles import Codes, mask_of
+
+__all__ = ["Oracle", "require_right"]
+
+_TOLERANCE = Fraction(1, 1024)
+"""Of a code."""
+
+
+class _Outcome(NamedTuple):
+    """Least and greatest code that may come of a branch, None for no value, and its quality."""
+
+    allowed: tuple[int, int] | None
+    quality: Quality
+
+
+def _end(message: Message, signal: Signal) -> int:
+    """Bytes that a frame needs to have a signal, and the selector that tells whether it is there."""
+    selectors = [item for item in message.signals if item.is_multiplexer and signal.multiplexer_ids]
+    return max((mask_of(item).bit_length() + 7) // 8 for item in (signal, *selectors))
+
+
+def _codes(message: Message, data: bytes) -> dict[str, int]:
+    """Codes of the signals that are whole in a payload, by cantools."""
+    whole = data.ljust(message.length, b"\0")
+    found: Any
+    try:
+        found = message.decode(whole, decode_choices=False, scaling=False)
+    except DecodeError:  # a page that the DBC does not have
+        others = [signal for signal in message.signals if not signal.multiplexer_ids and not signal.is_multiplexer]
+        plain = Message(message.frame_id, message.name, message.length, others)
+        found = plain.decode(whole, decode_choices=False, scaling=False)
+    return {
+        signal.name: found[signal.name]
+        for signal in message.signals
+        if signal.name in found and _end(message, signal) <= len(data)
+    }
+
+
+class _Branch:
+    """One branch in one mode: what must come of its last frame."""
+
+    def __init__(self, database: VehicleDatabase, branch: Branch, fault: BranchParameters, mode: Mode) -> None:
+        self.sign, self.is_power = branch.sign, branch.power is not None
+        self.message, self.source = database.signal(branch.source)
+        self.codes = Codes(self.source, branch.no_value)
+        self.target = database.signal(branch.corrected) if branch.corrected else None
+        self.quality = database.signal(branch.quality)[1] if branch.quality else None
+        self._published_as = self.codes
+        if mode is Mode.OVERLAY and self.target is not None:
+            self._published_as = Codes(self.target[1])
+        self._drift, self._offset_a = (Fraction(str(number)) for number in (fault.drift, fault.offset_a))
+        self.corrects = fault.apply and bool(self._drift or self._offset_a)
+        self.outcome, self._seen = _Outcome(None, Quality.NOT_AVAILABLE), False
+
+    def spoil(self) -> None:
+        """A frame came that must not be used."""
+        if self._seen:
+            self.outcome = _Outcome(None, Quality.INVALID)
+
+    def take(self, code: int, volts: Fraction | None) -> None:
+        """Take the code of an intact frame, at a voltage, if it is known."""
+        self._seen = True
+        if not self.codes.is_value(code):
+            is_named = code in self.codes.gaps
+            self.outcome = _Outcome(None, Quality.NOT_AVAILABLE if is_named else Quality.INVALID)
+        elif self.corrects and self.is_power and self._offset_a and volts is None:
+            self.outcome = _Outcome(None, Quality.NOT_AVAILABLE)
+        elif not self.corrects and self._published_as is self.codes:
+            self.outcome = _Outcome((code, code), Quality.PASSED_THROUGH)
+        else:
+            self.outcome = self._published(self.codes.worth(code), volts)
+
+    def _published(self, measured: Fraction, volts: Fraction | None) -> _Outcome:
+        """Of a current, in the sensor's own sign, i = (i_m - o) / (1 + d); of a power the same times the voltage."""
+        if self.corrects:
+            u = (volts or Fraction(0)) if self.is_power else Fraction(1)
+            measured = (measured - self.sign * self._offset_a * u) / (1 + self._drift)
+        exact = self._published_as.exact_code(measured) + Fraction(1, 2)
+        lowest, highest = self._published_as.ends
+        least, most = (min(max(floor(value), lowest), highest) for value in (exact, exact + _TOLERANCE))
+        return _Outcome((least, most), Quality.CORRECTED if self.corrects else Quality.PASSED_THROUGH)
+
+
+class Oracle:
+    """Follows the frames of a vehicle in one mode.
+
+    Parameters
+    ----------
+    database, parameters, mode : VehicleDatabase, VehicleParameters, Mode
+        As the node has them.
+    """
+
+    def __init__(self, database: VehicleDatabase, parameters: VehicleParameters, mode: Mode) -> None:
+        layout, no_fault = database.layout, BranchParameters(drift=0.0, offset_a=0.0, apply=False)
+        self._is_gateway, self._passes_invalid = mode is Mode.GATEWAY, layout.on_bad_frame == "invalid"
+        self._branches = [
+            _Branch(database, branch, parameters.branches.get(branch.name, no_fault), mode) for branch in layout.branch
+        ]
+        names = {item.message.name for item in self._branches}
+        names |= {item.target[0].name for item in self._branches if item.target is not None}
+        voltages = [branch.voltage for branch in layout.branch if branch.voltage is not None]
+        self._voltage = database.signal(voltages[0]) if voltages else None
+        self._volts: Fraction | None = None
+        if self._voltage is not None:
+            names.add(self._voltage[0].name)
+        messages = [database.message(name) for name in names]
+        self._messages = {item.frame_id | item.is_extended_frame << 31: item for item in messages}
+        self._protections = {
+            item.name: found for item in messages if (found := protection_of(database, item)) is not None
+        }
+        self._receivers = {name: Receiver(found) for name, found in self._protections.items()}
+        self._counters = dict.fromkeys(names, -1)
+
+    def problem(self, identifier: int, data: bytes, sent: Sequence[tuple[int, bytes]]) -> str | None:
+        """Take a frame and what the node sent for it.
+
+        Parameters
+        ----------
+        identifier : int
+            Of the frame; bit 31: of 29 bits.
+        data : bytes
+            Its payload.
+        sent : sequence of (int, bytes)
+            Identifiers and payloads of what was sent.
+
+        Returns
+        -------
+        str or None
+            What is wrong; None if all is well.
+        """
+        message = self._messages[identifier]
+        own, receiver = [item for item in self._branches if item.message is message], self._receivers.get(message.name)
+        check = receiver.check(bytearray(data)) if receiver is not None else Check.OK
+        codes, is_new = _codes(message, data), check <= Check.LOST
+        if is_new and self._voltage is not None and self._voltage[0] is message:
+            net = self._voltage[1]  # it comes before the branches of the same frame
+            if net.name in codes:
+                is_value = Codes(net).is_value(codes[net.name])
+                self._volts = Codes(net).worth(codes[net.name]) if is_value else None
+        used = is_new or (self._is_gateway and self._passes_invalid and check is not Check.CORRUPT)
+        for item in own if used else ():
+            if len(data) < _end(message, item.source):  # bits are beyond the end
+                item.spoil()
+            elif item.source.name in codes:
+                item.take(codes[item.source.name], self._volts)
+        if self._is_gateway:
+            if used:
+                return self._rewritten(message, own, data, sent)
+            expected = [(identifier, data)] if self._passes_invalid or not own else []
+            return None if sent == expected else f"a frame that is {check.name} was not held back or left alone"
+        if not used and not self._passes_invalid:
+            return f"a frame that is {check.name} was answered" if sent else None
+        if not used or (receiver is not None and receiver.state is E2EState.INVALID):
+            for item in own:
+                item.spoil()
+        wanted = {item.target[0].name for item in own if item.target is not None}
+        answered = [self._messages[number].name for number, _ in sent]
+        if sorted(answered) != sorted(wanted):
+            return f"frames {answered} were sent, must be {sorted(wanted)}"
+        problems = (self._wrong_answer(self._messages[number], answer) for number, answer in sent)
+        return next((text for text in problems if text is not None), None)
+
+    def _rewritten(
+        self, message: Message, own: Sequence[_Branch], data: bytes, sent: Sequence[tuple[int, bytes]]
+    ) -> str | None:
+        """What is wrong with a frame that a gateway passes on."""
+        if len(sent) != 1 or self._messages.get(sent[0][0]) is not message or len(sent[0][1]) != len(data):
+            return "another frame was sent"
+        made, mask = sent[0][1], 0
+        before, after, protection = _codes(message, data), _codes(message, made), self._protections.get(message.name)
+        for item in own:
+            if (name := item.source.name) in before:
+                lowest, highest = item.outcome.allowed or (before[name], before[name])
+                if not lowest <= after[name] <= highest:
+                    return f"{name} is {after[name]}, must be {lowest} to {highest}, was {before[name]}"
+                mask |= mask_of(item.source)
+        if made != data and protection is not None:
+            mask |= protection.header_mask
+            if not protection.is_sound(bytearray(made)) or protection.counter_of(made) != protection.counter_of(data):
+                return "the rewritten frame has a wrong CRC, or another counter"
+        changed = (int.from_bytes(data, "little") ^ int.from_bytes(made, "little")) & ~mask
+        return f"bits {changed:X} changed, which are nobody's business" if changed else None
+
+    def _wrong_answer(self, message: Message, data: bytes) -> str | None:
+        """What is wrong with a frame that an overlay node sends."""
+        codes, protection, mask = _codes(message, data), self._protections.get(message.name), 0
+        for item in self._branches:
+            if item.target is None or item.target[0] is not message:
+                continue
+            target, quality = item.target[1], item.quality
+            missing = next(code for code, text in (target.choices or {}).items() if text == "SNA")
+            lowest, highest = item.outcome.allowed or (missing, missing)
+            told = codes[quality.name] if quality is not None else item.outcome.quality
+            if not lowest <= codes[target.name] <= highest or told != item.outcome.quality:
+                return f"{target.name} is {codes[target.name]} of quality {told}, must be {item.outcome}"
+            mask |= mask_of(target) | (mask_of(quality) if quality is not None else 0)
+        if protection is not None:
+            mask |= protection.header_mask
+            self._counters[message.name] = (self._counters[message.name] + 1) % protection.modulus
+            if not protection.is_sound(bytearray(data)) or protection.counter_of(data) != self._counters[message.name]:
+                return f"{message.name}: wrong CRC or counter"
+        return f"{message.name}: a bit that is nobody's is set" if int.from_bytes(data, "little") & ~mask else None
+
+
+def require_right(
+    database: VehicleDatabase, parameters: VehicleParameters, mode: Mode, frames: Iterable[tuple[int, bytes]]
+) -> None:
+    """Send frames, a millisecond apart, through the node's core, and require of each what must come of it."""
+    oracle = Oracle(database, parameters, mode)
+    corrector = wire(database, InForce(parameters=parameters), 0.0, mode=mode)
+    sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}
+    for number, (identifier, data) in enumerate(frames):
+        source, payload = sources[identifier], bytearray(data)
+        if mode is Mode.GATEWAY:
+            made = source.forward(payload, 1e-3 * number)
+            sent = [] if made is None else [(identifier, bytes(made))]
+        else:
+            answers = source.answer(payload, 1e-3 * number)
+            sent = [(item.key[0] | item.key[1] << 31, bytes(item.data)) for item in answers]
+        shown = " ".join(f"{key:X}#{answer.hex()}" for key, answer in sent) or "nothing"
+        place, problem = f"{mode.name.lower()}, frame {number}", oracle.problem(identifier, data, sent)
+        assert problem is None, f"{place}: {identifier:X}#{data.hex()} -> {shown}: {problem}"
+        assert payload == data, "what came in is not changed"

@@ -1,0 +1,49 @@
+"""Random frames of random vehicles through the node's core, each compared with what must come of it.
+
+``HV_FRAMES=10000000 pytest -n auto tests/ecu_node/test_random_vehicles.py`` tries so many.
+"""
+
+import os
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from bench.c_core import frames
+from ecu_node.bus.wiring import Mode
+from ecu_node.core.corrector import Source
+from tests.ecu_node.oracle import require_right
+from tests.ecu_node.random_vehicles import draw_vehicle
+
+EACH, ALWAYS = 1_000, 3
+"""Frames of a vehicle; vehicles that are tried in every run of the tests."""
+VEHICLES = [
+    number if number < ALWAYS else pytest.param(number, marks=pytest.mark.long)
+    for number in range(-(-int(os.environ.get("HV_FRAMES", "40000")) // EACH))
+]
+
+
+@pytest.mark.parametrize("seed", VEHICLES)
+def test_frames_of_a_random_vehicle_are_right_in_both_modes(seed: int, tmp_path: Path) -> None:
+    rng = Random(seed)
+    database, parameters = draw_vehicle(rng, tmp_path)
+    drawn = [(identifier, data) for identifier, data in frames(database, rng, EACH) if data is not None]
+    for mode in Mode:
+        require_right(database, parameters, mode, drawn)
+
+
+@pytest.mark.parametrize(("mode", "method"), [(Mode.OVERLAY, "answer"), (Mode.GATEWAY, "forward")])
+def test_a_wrong_bit_is_noticed(monkeypatch: pytest.MonkeyPatch, mode: Mode, method: str, tmp_path: Path) -> None:
+    right = getattr(Source, method)
+
+    def damaged(source: Source, payload: bytearray, now_s: float) -> object:
+        made = right(source, payload, now_s)
+        for item in [made] if isinstance(made, bytearray) else [target.data for target in made or ()]:
+            item[0] ^= 1
+        return made
+
+    monkeypatch.setattr(Source, method, damaged)
+    database, parameters = draw_vehicle(Random(0), tmp_path)
+    drawn = [(identifier, data) for identifier, data in frames(database, Random(0), 500) if data is not None]
+    with pytest.raises(AssertionError, match=rf"{mode.name.lower()}, frame \d+: .* -> .*#.*: "):
+        require_right(database, parameters, mode, drawn)
