@@ -55,17 +55,15 @@ MOST_COMMON = 3
 """Clusters of all slopes that are started from: vehicles with a hardware fault agree with themselves. [1]"""
 MOST_ZEROS, MOST_CHOICES = 3, 1000
 """Clusters of the intercepts of a branch that are tried, and about how many choices of them. [1]"""
-SAME_ZEROS, NEARLY_AS_MANY = 0.005, 3
-"""Difference of two zeros in fractions of full scale below which they are one, some A as drives differ, and by how many
-votes of vehicles another choice may stay behind the best."""
-KEPT_STARTS, HOPEFUL = 4, 15.0
-"""Starts that are climbed to their end, at most, and how far their log evidence may be below the best one's."""
-SAME_TOP = 0.005
-"""Difference in every row, in fractions of full scale, below which two starts have climbed to the same model."""
+SAME_REFERENCE, NEARLY_AS_MANY = 0.005, 3
+"""Difference of two references in a row below which they are one, some A as drives differ, and by how many votes of
+vehicles another choice of zeros may stay behind the best."""
 SAME_DENSITY = 0.2
 """Logarithm of densities of sizes up to which two priors count as one."""
 KEPT_LOG_ODDS = 7.0
 """Logarithm of the odds against the best model up to which another one is kept."""
+STARTED_LOG_ODDS, MOST_RIVALS = 15.0, 4
+"""The same after the first rounds, which look at fewer vehicles, and number of references that are kept."""
 SAME_START = 0.001
 """Difference of two starts in every row, in fractions of full scale, below which they are one."""
 LEAST_SHARED = 0.001
@@ -158,22 +156,12 @@ def learn_fault_models(
 
     def learner_of(most: int) -> _Learner:
         some = order[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
-        return _Learner(rows.take(np.sort(some)), feed, fixed, known, expected_faults)
+        return _Learner(rows.take(np.sort(some)), feed, fixed, known, expected_faults, declared=load is not None)
 
     learner, starter = learner_of(MOST_LEARNT), learner_of(MOST_STARTED)
     climbed = [starter.climb(starter.start(centre), START_ROUNDS) for centre in learner.centres()]
-    climbed = sorted(climbed, key=lambda model: -model.log_evidence)
-    hopeful = [model for model in climbed[:KEPT_STARTS] if model.log_evidence > climbed[0].log_evidence - HOPEFUL]
-    tops = [learner.climb(model, ROUNDS, begun=True) for model in hopeful]
-    tops = sorted(tops, key=lambda model: -model.log_evidence)
-    models: list[FaultModel] = []
-    for n, top in enumerate(tops):
-        same = any(np.abs(top.spread.mean - other.spread.mean).max() < SAME_TOP for other in tops[:n])
-        share = float(np.exp(top.log_evidence - tops[0].log_evidence))
-        if not same and share > np.exp(-KEPT_LOG_ODDS):
-            models += [replace(model, probability=share * model.probability) for model in learner.variants(top)]
-    total = sum(model.probability for model in models)
-    models = [replace(model, probability=model.probability / total) for model in models]
+    references = [learner.climb(model, ROUNDS, begun=True) for model in learner.rivals(climbed, STARTED_LOG_ODDS)]
+    models = learner.variants(learner.rivals(references, KEPT_LOG_ODDS))
     return [learner.with_modes(model) for model in sorted(models, key=lambda model: -model.probability)]
 
 
@@ -181,12 +169,19 @@ class _Learner:
     """Expectation maximisation on the evidence of one fleet."""
 
     def __init__(
-        self, rows: EvidenceRows, feed: int, fixed: Array, known: Prior | None, expected_faults: float | None
+        self,
+        rows: EvidenceRows,
+        feed: int,
+        fixed: Array,
+        known: Prior | None,
+        expected_faults: float | None,
+        *,
+        declared: bool,
     ) -> None:
         K = rows.branches
         self.rows, self.feed, self.fixed, self.known = rows, feed, fixed, known
         self.at, self.parameters = rows.places, ParameterPlaces(K)
-        self.expected_faults = expected_faults
+        self.expected_faults, self.declared = expected_faults, declared
         self.free = centre_rows(K) & np.isnan(fixed)
         least_sd = np.empty(5 * K)
         least_sd[self.at.relative], least_sd[self.at.constant] = LEAST_SPREAD
@@ -228,13 +223,13 @@ class _Learner:
             chosen.append(zeros)
         tried = np.concatenate(chosen)
         votes = np.zeros(len(tried), np.int64)
-        for k, near in product(range(K), (SAME_START, SAME_ZEROS)):  # who agrees closely has two votes
+        for k, near in product(range(K), (SAME_START, SAME_REFERENCE)):  # who agrees closely has two votes
             values, sd = self.rows.shown(self.at.intercept(k))
             agree = np.abs(values[:, None] - tried[:, k]) < np.maximum(3.0 * sd, near)[:, None]
             votes += np.count_nonzero(agree, axis=0)
         found = [tried[0]]
         for i in np.argsort(-votes, kind="stable"):
-            apart = all(np.abs(tried[i] - other).max() > SAME_ZEROS for other in found)
+            apart = all(np.abs(tried[i] - other).max() > SAME_REFERENCE for other in found)
             if apart and len(found) < MOST_ZEROS and votes[i] >= votes.max() - NEARLY_AS_MANY:
                 found.append(tried[i])
         return found
@@ -325,26 +320,37 @@ class _Learner:
         alone = replace(prior, group_share=np.zeros(0), group_centre=np.zeros(0), group_sd=np.zeros(0))
         return replace(model, spread=replace(spread, mean=mean), priors=((1.0, alone),), log_evidence=-np.inf)
 
-    def variants(self, best: FaultModel) -> list[FaultModel]:
-        """The same model with each cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
-        K, prior, at = self.rows.branches, best.prior, self.at
+    def rivals(self, models: Sequence[FaultModel], log_odds: float) -> list[FaultModel]:
+        """The best model, and those about as good with another reference: which of them is right is then open."""
+        found = list[FaultModel]()
+        for model in sorted(models, key=lambda model: -model.log_evidence):
+            apart = (np.abs(model.spread.mean - other.spread.mean).max() > SAME_REFERENCE for other in found)
+            if all(apart) and (not found or model.log_evidence > found[0].log_evidence - log_odds):
+                found.append(model)
+        return found[:MOST_RIVALS]
+
+    def variants(self, references: Sequence[FaultModel]) -> list[FaultModel]:
+        """These models with each cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
+        K, at = self.rows.branches, self.at
         found = [
-            (plausible, replace(best, spread=replace(best.spread, shared=shared)))
-            for plausible, shared in self._shared_constants(float(best.spread.mean[at.junction]), prior)
+            (plausible, replace(model, spread=replace(model.spread, shared=shared)))
+            for model in references
+            for plausible, shared in self._shared_constants(float(model.spread.mean[at.junction]), model.prior)
         ]
-        if not len(prior.group_centre):
-            # Sensors of a batch agree in what they read; through their gain errors it looks like different loads.
-            shared = best.spread.shared.copy()
-            shared[-1] = True
-            batch = self.climb(replace(best, spread=replace(best.spread, shared=shared)), START_ROUNDS, begun=True)
-            if batch.prior.group_share.max(initial=0.0) > 1.0 / len(self.rows):
-                c0 = float(batch.spread.mean[at.junction])
-                found.append((_log_plausible(c0, 0.0, batch.prior, of_sensor=True), batch))
+        for model in references:
+            if not len(model.prior.group_centre):
+                # Sensors of a batch agree in what they read; through their gain errors it looks like different loads.
+                shared = np.append(model.spread.shared[:-1], 1.0)
+                spread = replace(model.spread, shared=shared)
+                batch = self.climb(replace(model, spread=spread), START_ROUNDS, begun=True)
+                if batch.prior.group_share.max(initial=0.0) > 1.0 / len(self.rows):
+                    c0 = float(batch.spread.mean[at.junction])
+                    found.append((_log_plausible(c0, 0.0, batch.prior, of_sensor=True), batch))
         slopes = np.array([self.clusters(at.slope(k))[0] for k in range(K)])  # with what most vehicles' sensors share
-        for shared in self._shared_gains():
-            mean = best.spread.mean.copy()
+        for model, shared in product(references, self._shared_gains()):
+            mean = model.spread.mean.copy()
             mean[at.slopes] = np.where(self.free[at.slopes], slopes - shared[K : 2 * K], mean[at.slopes])
-            fresh = replace(self.start(mean), spread=replace(best.spread, mean=mean, shared=shared))
+            fresh = replace(self.start(mean), spread=replace(model.spread, mean=mean, shared=shared))
             found.append((0.0, self.climb(fresh, START_ROUNDS)))
         if len(found) > 1:
             climbed = [(plausible, self.climb(model, START_ROUNDS, begun=True)) for plausible, model in found]
@@ -352,7 +358,7 @@ class _Learner:
             found = [
                 (p, model)
                 for p, model in climbed
-                if not model.spread.shared[-1] or model.prior.group_share.max() > 1.0 / len(self.rows)
+                if not model.spread.shared[-1] or model.prior.group_share.max(initial=0.0) > 1.0 / len(self.rows)
             ]
         evidence = np.array([model.log_evidence for _, model in found])
         of_gains = np.array([model.spread.shared[K : 2 * K].any() for _, model in found])
@@ -490,6 +496,8 @@ class _Learner:
         )
         for _ in range(PRIOR_STEPS):
             prior, grouped = self._next_shares(draws, prior), self._next_shares(draws, grouped)
+        if self.declared and grouped.group_share.max() > 0.5:  # most vehicles have the load that is declared
+            return prior
         gain = float(weigh(draws, grouped)[1].sum() - weigh(draws, prior)[1].sum())
         return grouped if gain > GROUP_GAIN else prior
 

@@ -101,6 +101,27 @@ def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K:
     assert max(causes, key=causes.__getitem__) == (0,)
 
 
+@pytest.mark.parametrize(("offset", "load"), [(0.02, 0.0), (0.15, None)])
+def test_whose_offset_all_vehicles_have_is_open_if_it_is_no_load(offset: float, load: float | None) -> None:
+    """The load is declared, or the offset is larger than any load that a fleet shares."""
+    faults = no_faults(12, 3)
+    faults.offset_a[:, 1] += offset
+    models = learn_fault_models(rows_of(faults, seed=5), feed=0, load=load)
+    by_branch = np.zeros(3)
+    for model in models:
+        by_branch[np.argmin(model.spread.mean[RowPlaces(3).intercepts])] += model.probability
+    assert by_branch.max() < 0.9
+
+
+def test_most_vehicles_are_no_group_beside_a_declared_load() -> None:
+    """What eight of twelve sensors share is their offset: the four others show the load that is declared."""
+    faults = no_faults(12, 3)
+    faults.offset_a[:8, 1] += 0.02
+    for model in learn_fault_models(rows_of(faults, seed=5), feed=0, load=0.0):
+        assert model.prior.group_share.max(initial=0.0) < 0.1
+        np.testing.assert_allclose(model.spread.mean[RowPlaces(3).intercepts], 0.0, atol=0.002)
+
+
 @pytest.mark.parametrize("seed", [8, 10])
 def test_intercepts_that_two_vehicles_share_by_chance_are_no_reference(seed: int) -> None:
     """Where most vehicles are faulty: a whole fleet's sensors were then off by 15 % of full scale, for certain."""
