@@ -47,7 +47,7 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
     tried : ParameterSet
         The set that was on trial.
     passed : bool
-        Whether it did as it promised; a set that has expired meanwhile did not.
+        Whether it did as it promised; a set that has expired meanwhile is not used all the same.
     text : str
         What was seen, for the log.
     now : datetime
@@ -67,18 +67,19 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
         state = read_state(folder)
         if state.on_trial != tried:
             return state
-        latest = max(now, state.latest)
+        latest, event = max(now, state.latest), "in force" if passed else "failed"
         try:
             require_not_expired(tried, state, now)
-        except TrustError as error:  # a clock that jumps ahead for a moment must not be believed for ever
-            passed, text, latest = False, str(error), state.latest
-        if passed:
-            state = replace(state, in_force=tried, before=state.in_force, on_trial=None, failed=None, ended=None)
-        else:
-            state = replace(state, on_trial=None, failed=tried)
-        state = replace(state, latest=latest)
+        except TrustError as error:
+            # A clock that jumps ahead for a moment must not be believed for ever: an update may bring the set again.
+            latest, text, event = state.latest, str(error), "expired" if passed else "failed"
+        if event == "in force":
+            state = replace(state, in_force=tried, before=state.in_force, failed=None, ended=None)
+        elif event == "failed":
+            state = replace(state, failed=tried)
+        state = replace(state, on_trial=None, latest=latest)
         write_state(folder, state)
-        add_decision(folder, "in force" if passed else "failed", f"{tried}: {text}", now)
+        add_decision(folder, event, f"{tried}: {text}", now)
     return state
 
 

@@ -186,6 +186,8 @@ def test_set_expires_for_good_and_a_clock_behind_is_not_believed(
     conclude(state, tried, passed=True, text="seen", now=now + timedelta(days=2))
     assert numbers(state)[:2] == [300, None], "it expired before its trial ended"
     assert read_state(state).latest < now + timedelta(days=1), "a clock that jumped ahead is not kept"
+    assert update(state, str(repo.path), database, now).startswith("on trial"), "nor has the set failed by it"
+    conclude(state, tried, passed=True, text="seen", now=now + timedelta(days=2))
     with pytest.raises(TrustError, match="expired at"):
         update(state, str(repo.path), database, now + timedelta(days=40))  # the timestamp has expired by then
     found = held_set(state)
