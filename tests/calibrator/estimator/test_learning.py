@@ -141,6 +141,27 @@ def test_two_references_that_explain_a_fleet_as_well_are_both_kept() -> None:
     assert min(model.probability for model in models) > 0.1
 
 
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_sound_vehicles_that_differ_by_half_a_percent_have_no_hardware_faults(seed: int) -> None:
+    faults = no_faults(8, 3)
+    faults.hardware_drift[:] = np.random.default_rng(seed).normal(0.0, 0.005, 8)
+    faults.drift[0, 0] = faults.offset_a[1, 1] = 0.1
+    model = learned(rows_of(faults, seed=seed, errors=Errors(slope=0.0005)))
+    assert model.prior.counts[1:].sum() < 0.05
+    spread = np.sqrt(np.diag(model.spread.covariance)[RowPlaces(3).slopes])
+    np.testing.assert_allclose(spread, np.std(faults.hardware_drift), rtol=0.6)
+
+
+def test_vehicle_with_two_gain_errors_that_are_alike_is_no_reference() -> None:
+    """Each of the eleven others would have the same hardware fault of 11 %."""
+    faults = no_faults(12, 3)
+    faults.hardware_drift[:] = np.random.default_rng(0).normal(0.0, 0.005, 12)
+    faults.drift[3, 1:], faults.drift[4, 2] = [-0.099, -0.101], 0.12
+    models = learn_fault_models(rows_of(faults, seed=0, errors=Errors(slope=0.0005)), feed=0)
+    right = [np.abs(model.spread.mean[RowPlaces(3).slopes]).max() < 0.01 for model in models]
+    assert sum(model.probability for model, near in zip(models, right, strict=True) if near) > 0.95
+
+
 def test_one_fault_does_not_say_how_large_faults_are() -> None:
     faults = no_faults(6, 2)
     faults.offset_a[0, 0] = 0.25
