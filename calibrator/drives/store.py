@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Channel, Drive, DriveFile
 from calibrator.errors import DriveError
-from calibrator.files.storage import Storage, StorageError, open_storage
+from calibrator.files.storage import Storage, open_storage
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 from ecu_node.summary import SummaryFile, decode_summary
@@ -103,7 +103,9 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
     Raises
     ------
     DriveError
-        If vehicle or drive has a name that is no file name, or the file cannot be written.
+        If vehicle or drive has a name that is no file name.
+    StorageError
+        If the file cannot be written.
     """
     require_plain_name(drive.vehicle, "vehicle")
     require_plain_name(drive.name, f"vehicle {drive.vehicle}: drive")
@@ -124,10 +126,7 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd", use_dictionary=False)
     folder = _folder(store, drive.vehicle)
-    try:
-        folder.write(f"{drive.name}.parquet", buffer.getvalue())
-    except StorageError as error:
-        raise DriveError(str(error)) from None
+    folder.write(f"{drive.name}.parquet", buffer.getvalue())
     return f"{folder.url}/{drive.name}.parquet"
 
 

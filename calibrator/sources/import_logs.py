@@ -10,7 +10,7 @@ from pathlib import Path
 from calibrator.drive import DriveFile
 from calibrator.drives.fleet_id import read_fleet_ids, write_fleet_ids
 from calibrator.drives.store import has_drive, remove_leftovers, write_drive
-from calibrator.files.storage import Storage, local_copy, open_storage
+from calibrator.files.storage import Storage, StorageError, local_copy, open_storage
 from calibrator.processes.run_many import Failed, Workers, try_many_shown
 from calibrator.recordings.readers import read_recording
 from calibrator.sources.fleet_source import find_logs
@@ -88,6 +88,11 @@ def import_logs(
     -------
     ImportReport
         What was written, what was there already, and what was left out and why.
+
+    Raises
+    ------
+    StorageError
+        If a drive cannot be written: the others could not be either.
     """
     found, start_s = find_logs(logs), time.time()
     left_out, drives, already_there = dict(found.left_out), list[ImportedDrive](), list[str]()
@@ -99,6 +104,8 @@ def import_logs(
     )
     with closing(outcomes):
         for log, outcome in outcomes:
+            if isinstance(outcome, StorageError):
+                raise outcome
             if isinstance(outcome, ImportedDrive):
                 drives.append(outcome)
             elif isinstance(outcome, Failed):
@@ -127,14 +134,17 @@ def _above(place: str, levels: int) -> list[str]:
     return ["/".join(parts[:-level]) for level in range(1, levels + 1) if len(parts) > level + 1]
 
 
-def _import_one(log: DriveFile, database: VehicleDatabase, store: str) -> ImportedDrive | None:
-    """Import one log; None if it was imported before."""
+def _import_one(log: DriveFile, database: VehicleDatabase, store: str) -> ImportedDrive | StorageError | None:
+    """Import one log; None if it was imported before, StorageError if its drive cannot be written."""
     if has_drive(store, log.vehicle, log.name, database.layout):
         return None
     with local_copy(log.place) as path:
         recording = read_recording(path, database, vehicle=log.vehicle, name=log.name)
     drive = recording.drive
-    write_drive(store, drive, database.layout)
+    try:
+        write_drive(store, drive, database.layout)
+    except StorageError as error:
+        return error
     return ImportedDrive(
         vehicle=drive.vehicle,
         name=drive.name,

@@ -80,6 +80,10 @@ def connect(
         bus = can.Bus(**config, ignore_config=True)
     except (can.CanError, OSError, ValueError, TypeError, KeyError, NotImplementedError) as error:
         raise BusError(f"{interface} {channel}: cannot open the bus: {error_text(error)}") from None
+    except (ImportError, NameError) as error:  # python-can's kvaser calls functions of a driver that it did not find
+        raise BusError(
+            f"{interface} {channel}: cannot open the bus: {error}; install the driver of the adapter"
+        ) from None
     if bus.channel_info == can.BusABC.channel_info:
         bus.channel_info = f"{interface} {channel}"  # what an interface does not tell of itself
     opened = socketcan_socket(bus)
@@ -197,8 +201,8 @@ def _wrong_rates(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterato
     for name in ("bitrate", "data_bitrate") if fd else ("bitrate",):
         if name not in rates:
             yield (
-                f"no {name}: this adapter sets the speed of the bus, and a wrong one disturbs it; give ecu-node "
-                f"--{name.replace('_', '-')} BIT_PER_S, or {name} in section [{channel}] of can.conf"
+                f"no {name}: this adapter sets the speed of the bus, and a wrong one disturbs it; put {name} into "
+                f"section [{channel}] of can.conf (for ecu-node also --{name.replace('_', '-')} BIT_PER_S)"
             )
         elif not isinstance(rates[name], int) or rates[name] <= 0:
             yield f"{name} = {rates[name]}: a number of bit/s is expected, such as 250000"

@@ -71,7 +71,7 @@ def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
             "pcan kvaser vector slcan gs_usb ixxat cantact",
             {},
             {},
-            "no bitrate: .* give ecu-node --bitrate BIT_PER_S, or",
+            "no bitrate: .* put bitrate into section .* also --bitrate BIT_PER_S",
         ),
         ("kvaser vector ixxat", {}, {"fd": True, "bitrate": 500_000}, "no data_bitrate: .* --data-bitrate BIT_PER_S"),
         ("pcan slcan nixnet", {}, FD_RATES, r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"),
@@ -99,6 +99,13 @@ def test_speed_that_would_be_another_one_is_refused(
     for interface in interfaces.split():
         with pytest.raises(BusError, match=f"^{interface} 1: .*{words}"):
             connect(interface, "1", **settings)
+
+
+@pytest.mark.parametrize("interface", ["kvaser", "neovi"])
+def test_driver_that_is_missing_is_said(interface: str) -> None:
+    """python-can calls functions of a driver that it did not find."""
+    with pytest.raises(BusError, match=f"^{interface} 0: cannot open the bus: .*; install the driver of the adapter"):
+        connect(interface, "0", bitrate=500_000)
 
 
 # ---- python-can's configuration

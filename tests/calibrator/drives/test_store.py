@@ -9,6 +9,7 @@ import pytest
 from calibrator.drive import Channel, Drive
 from calibrator.drives.store import iterate_drives, list_drives, read_drive_file, write_drive
 from calibrator.errors import DriveError
+from calibrator.files.storage import StorageError
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
@@ -100,5 +101,5 @@ def test_a_folder_that_is_no_store_is_refused(tmp_path: Path) -> None:
 
 def test_a_store_that_cannot_be_written_is_named(tmp_path: Path, layout: Layout) -> None:
     (tmp_path / "store").write_text("a file")
-    with pytest.raises(DriveError, match=r"cannot write it: .*; choose another folder"):
+    with pytest.raises(StorageError, match=r"cannot write it: .*; choose another folder"):
         write_drive(tmp_path / "store", some_drive(), layout)

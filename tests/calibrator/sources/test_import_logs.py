@@ -11,6 +11,7 @@ from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import recording_digest
+from calibrator.files.storage import StorageError
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import find_fleet, load_drive
 from calibrator.sources.import_logs import ImportReport, import_logs
@@ -124,3 +125,13 @@ def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path
     assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
     assert list(report.left_out) == ["V000/endless"]
     assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 3 s and was ended; ")
+
+
+def test_import_ends_where_a_drive_cannot_be_written(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+    """As on a full disk: all further drives would be lost one by one, with exit code 0."""
+    (tmp_path / "drives").mkdir()
+    (tmp_path / "drives" / "V001").write_text("a file")
+    with pytest.raises(StorageError, match=r"V001/drive\.parquet: cannot write it: Not a directory"):
+        imported([fleet / "logs"], tmp_path, database)
+    (tmp_path / "drives" / "V001").unlink()
+    assert len(imported([fleet / "logs"], tmp_path, database).drives) == 2
