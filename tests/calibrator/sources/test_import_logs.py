@@ -2,6 +2,8 @@ import gzip
 import json
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import fsspec
@@ -11,7 +13,6 @@ from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import recording_digest
-from calibrator.files.storage import StorageError
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import find_fleet, load_drive
 from calibrator.sources.import_logs import ImportReport, import_logs
@@ -127,11 +128,11 @@ def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path
     assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 3 s and was ended; ")
 
 
-def test_import_ends_where_a_drive_cannot_be_written(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
-    """As on a full disk: all further drives would be lost one by one, with exit code 0."""
-    (tmp_path / "drives").mkdir()
-    (tmp_path / "drives" / "V001").write_text("a file")
-    with pytest.raises(StorageError, match=r"V001/drive\.parquet: cannot write it: Not a directory"):
-        imported([fleet / "logs"], tmp_path, database)
-    (tmp_path / "drives" / "V001").unlink()
+def test_full_disk_ends_an_import(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+    """All further drives would be lost one by one, with exit code 0."""
+    command = [sys.executable, "-m", "calibrator", "import", fleet / "logs", "--layout", LAYOUT, "--out", tmp_path]
+    limited = ["prlimit", "--fsize=1000", *command]
+    found = subprocess.run(limited, capture_output=True, text=True, check=False)
+    assert found.returncode == 1
+    assert "drive.parquet: cannot write it: File too large; " in found.stderr.splitlines()[-1]
     assert len(imported([fleet / "logs"], tmp_path, database).drives) == 2
