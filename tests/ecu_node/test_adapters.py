@@ -92,7 +92,7 @@ def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
         ("ixxat", CLASSIC_TIMING, {}, "python-can cannot set a bit timing there; take f_clock out"),
     ],
 )
-def test_speed_that_would_be_another_one_is_refused(
+def test_wrong_speed_is_refused(
     interfaces: str, config: dict[str, object], settings: Any, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAN_CONFIG", json.dumps(config))
@@ -104,9 +104,7 @@ def test_speed_that_would_be_another_one_is_refused(
 # ---- python-can's configuration
 
 
-def test_each_channel_has_its_section_and_the_command_line_goes_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_line_overrides_the_section_of_a_channel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "can.conf").write_text("[default]\nbitrate = 125000\n[1]\nbitrate = 250000\nserial = 1234\n")
     assert bus_config("vector", "1") == {"interface": "vector", "channel": 1, "bitrate": 250_000, "serial": 1234}
     assert bus_config("vector", "2")["bitrate"] == 125_000
@@ -136,9 +134,7 @@ def test_whether_an_interface_carries_can_fd_is_known_from_its_mtu(interface: st
 # ---- a dry run
 
 
-def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
-    node: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dry_run_prints_what_it_would_open(node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     adapter = ["--interface", "pcan", "--channel", "PCAN_USBBUS1"]  # its library is not here: opening it would fail
     assert run_ecu_node([*node, *adapter, "--bitrate", "250000", "--dry-run"]) == 0
     captured = capsys.readouterr()
@@ -154,7 +150,7 @@ def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
     assert "no bitrate" in capsys.readouterr().err
 
 
-def test_dry_run_prints_a_bit_timing_once(
+def test_dry_run_prints_bit_timing(
     node: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
@@ -188,9 +184,7 @@ def test_dry_run_of_a_gateway_prints_both_ways(node: list[str], capsys: pytest.C
         ("virtual", "nothing is sent$"),
     ],
 )
-def test_listen_only_says_whether_the_adapter_acknowledges(
-    interface: str, words: str, node: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_listen_only_names_ack(interface: str, words: str, node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
     assert run_ecu_node([*node, "--interface", interface, "--channel", "c0", *rate, "--listen-only", "--dry-run"]) == 0
     *_, sends, last = capsys.readouterr().out.splitlines()
@@ -261,7 +255,7 @@ def answer(data: bytes) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("options", "opened"), [((), b"O"), (("--listen-only",), b"L")])
-def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected_unless_it_only_listens(
+def test_slcan_answers_at_its_bit_rate(
     node: list[str], line: SerialLine, options: tuple[str, ...], opened: bytes
 ) -> None:
     bus = ("--interface", "slcan", "--channel", line.path, "--bitrate", "250000")
@@ -281,7 +275,7 @@ def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected_unless_it_only_li
     assert any("listen-only: nothing is sent, and no frame acknowledged" in text for text in log) == bool(options)
 
 
-def test_node_tells_which_branch_it_does_not_publish_and_that_no_branch_sends(
+def test_unpublished_and_silent_branches_are_reported(
     node: list[str], line: SerialLine, make_database: MakeDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In its log, and the second one also to the service manager."""

@@ -80,7 +80,7 @@ def test_wrong_use_is_one_line_and_2(arguments: str, words: str, capsys: pytest.
     assert words in line
 
 
-def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gateway_is_one(
+def test_layout_without_own_signals_needs_a_gateway(
     make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The options of run are those of check."""
@@ -96,7 +96,7 @@ def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gate
     assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
 
 
-def test_fault_that_is_not_applied_is_said(
+def test_check_reports_fault_not_applied(
     database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parameters = msgspec.structs.replace(parameters_for(database, battery=(0.25, 5.0)), vehicle="v\x1b[2J")
@@ -108,9 +108,7 @@ def test_fault_that_is_not_applied_is_said(
     assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
 
 
-def test_can_fd_that_run_would_need_is_said(
-    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_warns_of_can_fd(make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
     files = ["--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
@@ -118,7 +116,7 @@ def test_can_fd_that_run_would_need_is_said(
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
 
 
-def test_unfit_parameters_end_in_1_and_say_why_also_for_a_vehicle_of_the_environment(
+def test_unfit_parameters_end_in_1(
     params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run_ecu_node(check(params, "--vehicle", "v2", "--json")) == 1

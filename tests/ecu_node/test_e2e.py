@@ -135,9 +135,7 @@ def test_any_flipped_bit_is_noticed(protection: Protection) -> None:
         (ENTRIES["P11"] + '\ndata_id_mode = "nibble"', "2a10000000000000"),
     ],
 )
-def test_first_frame_is_that_of_the_examples_of_autosar(
-    protect: Callable[..., Protection], entry: str, expected: str
-) -> None:
+def test_first_frame_equals_autosar_example(protect: Callable[..., Protection], entry: str, expected: str) -> None:
     payload = bytearray(len(bytes.fromhex(expected)))
     protection = protect(entry)
     protection.before_first(payload)
@@ -146,9 +144,7 @@ def test_first_frame_is_that_of_the_examples_of_autosar(
 
 
 @pytest.mark.parametrize(("profile", "identity"), [("P04", 0x12345678), ("P05", 0x5678), ("P07", 0x12345678)])
-def test_data_identifier_is_the_identifier_of_the_message_where_none_is_given(
-    protect: Callable[..., Protection], profile: str, identity: int
-) -> None:
+def test_default_data_id_is_the_message_id(protect: Callable[..., Protection], profile: str, identity: int) -> None:
     long = ROOM.replace("BO_ 700", f"BO_ {0x80000000 | 0x12345678}")
     protection = protect(autosar(profile, "offset = 3"), room=long)
     assert protection.identity == identity
@@ -174,7 +170,7 @@ def crc8(data: bytes, polynomial: int) -> int:
         (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 255 }", b"\xff", b"", 0x1D),
     ],
 )
-def test_the_crc_of_a_control_unit_is_what_its_words_say(
+def test_crc_of_a_control_unit_is_as_described(
     protect: Callable[..., Protection], entry: str, before: bytes, after: bytes, polynomial: int
 ) -> None:
     protection = protect(entry)
@@ -207,9 +203,7 @@ def test_every_byte_of_a_long_counter_is_compared_with_the_next_one(protection: 
 # ---- the message as a whole
 
 
-def test_more_corrupt_frames_than_allowed_make_a_message_invalid_until_enough_are_intact(
-    kind: str, protect: Callable[..., Protection]
-) -> None:
+def test_message_is_invalid_until_enough_frames_are_intact(kind: str, protect: Callable[..., Protection]) -> None:
     windows = "valid = { window = 6, min_ok = 1, max_error = 2 }\ninvalid = { window = 4, min_ok = 3, max_error = 0 }"
     protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
     receiver, invalid = Receiver(protection), []
@@ -219,9 +213,7 @@ def test_more_corrupt_frames_than_allowed_make_a_message_invalid_until_enough_ar
     assert invalid == [14, 15, 16, 17], "the third error of six; four frames without one make it valid again"
 
 
-def test_lost_frames_are_no_errors_and_a_few_errors_at_first_say_nothing(
-    kind: str, protect: Callable[..., Protection]
-) -> None:
+def test_lost_frames_are_no_errors(kind: str, protect: Callable[..., Protection]) -> None:
     windows = "init = { window = 4, min_ok = 3, max_error = 1 }\nvalid = { window = 4, min_ok = 4, max_error = 0 }"
     protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
     receiver, found = Receiver(protection), []
@@ -265,7 +257,7 @@ HEADS = [("[e2e]", "[e2e]"), ('[[e2e]]\nprofile = "P01"\nmessages = ["Net"]\n[[e
     ],
 )
 @pytest.mark.parametrize(("head", "place"), HEADS)
-def test_a_wrong_entry_is_named_by_its_place_as_it_was_written(
+def test_wrong_entry_is_named_by_its_place(
     protect: Callable[..., Protection], head: str, place: str, entry: str, words: str
 ) -> None:
     with pytest.raises(LayoutError, match=rf"small\.toml: {re.escape(place)}.*{re.escape(words)}") as caught:
@@ -287,7 +279,7 @@ def test_a_wrong_entry_is_named_by_its_place_as_it_was_written(
         (OEM, "36|4@1+", "36|4@1-", "message Room: signal Count cannot count from 0 to 7$"),
     ],
 )
-def test_a_message_that_cannot_be_protected_so_is_refused(
+def test_unfit_message_is_refused(
     protect: Callable[..., Protection], entry: str, old: str, new: str, words: str
 ) -> None:
     with pytest.raises(LayoutError, match=words):

@@ -47,7 +47,7 @@ def test_only_the_current_and_the_crc_change(database: VehicleDatabase, offset_a
     assert (corrector.counters.frames_in, corrector.counters.rewritten, corrector.counters.answers) == (17, 16, 0)
 
 
-def test_foreign_frames_are_told_until_10_s_after_the_last(database: VehicleDatabase) -> None:
+def test_foreign_frames_are_reported_for_10_s(database: VehicleDatabase) -> None:
     corrector, found = gateway_for(database, battery=(0.25, 5.0)), []
     for k in range(1200):
         passed_on(corrector, battery(database, k % 15), 0.01 * k)
@@ -131,7 +131,7 @@ def test_a_frame_too_short_for_one_signal_keeps_it_out(make_database: MakeDataba
     ("profile", "offset", "branch"),
     [("P01", 0, "battery"), ("P04", 0, "battery"), ("P06", 1, "battery"), ("P07", 3, "motor"), ("P11", 2, "motor")],
 )
-def test_a_branch_that_overlaps_the_header_is_refused(
+def test_branch_overlapping_header_is_refused(
     make_database: MakeDatabase, profile: str, offset: int, branch: str
 ) -> None:
     layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'

@@ -86,9 +86,7 @@ def as_sent(message: can.Message) -> tuple[object, ...]:
     return message.arbitration_id, kinds, message.dlc, bytes(message.data)
 
 
-def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
-    database: VehicleDatabase, ends: Ends, channel: str
-) -> None:
+def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, vehicle = ends
     sent = random_frames(database, 2000)
     with gateway(database, channel) as (corrector, _):
@@ -104,9 +102,7 @@ def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
     assert sensors.recv(0.0) is None, "nothing comes back"
 
 
-def test_branch_frame_that_waited_too_long_is_not_passed_on(
-    database: VehicleDatabase, ends: Ends, channel: str
-) -> None:
+def test_branch_frame_that_waited_too_long_is_held_back(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     with gateway(database, channel) as (corrector, _), VirtualBus(f"{channel} a", preserve_timestamps=True) as bus:
         for counter, age_s in enumerate((0.0, 5.0, 0.0)):
             data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
@@ -127,7 +123,7 @@ class BlockingBus(VirtualBus):
         super().send(msg, timeout)
 
 
-def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
+def test_watchdog_starves_if_way_back_is_stuck(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)
@@ -147,9 +143,7 @@ def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
         wait_until(lambda: True in works)
 
 
-def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
-    database: VehicleDatabase, ends: Ends, channel: str
-) -> None:
+def test_frames_from_before_the_start_are_not_passed_on(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     ended = threading.Event()
 
     def send_early() -> None:
@@ -186,7 +180,7 @@ WORDS = "another node sends frames 0x(110|5F0), which only this one may send the
 
 
 @pytest.mark.parametrize(("origin", "identifier"), [("vehicle", 0x110), ("vehicle", 0x5F0), ("sensors", 0x5F0)])
-def test_frames_that_only_it_may_send_are_dropped_and_counted_and_end_nothing(
+def test_foreign_frames_are_dropped_and_counted(
     database: VehicleDatabase, ends: Ends, channel: str, origin: str, identifier: int
 ) -> None:
     sensors, vehicle = ends

@@ -122,7 +122,7 @@ def test_a_diagnostics_database_is_refused(make_database: MakeDatabase, tmp_path
 
 @pytest.mark.parametrize("mark", [1 << 31, 0])
 @pytest.mark.parametrize("more", ["", 'VAL_ 258 Gone 1 "On";\n'])
-def test_29_bit_identifiers_that_are_not_marked_and_names_for_values_of_no_signal_are_put_right(
+def test_unmarked_29_bit_identifiers_and_stray_names_are_read(
     make_database: MakeDatabase, mark: int, more: str
 ) -> None:
     """As they stand in many public DBCs."""

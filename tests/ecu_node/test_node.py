@@ -77,7 +77,7 @@ def peer(channel: str) -> Iterator[can.BusABC]:
 
 
 @pytest.mark.parametrize("filters", [True, False])
-def test_frames_are_corrected_on_the_bus_and_others_left_alone(
+def test_node_corrects_branch_frames_only(
     database: VehicleDatabase, peer: can.BusABC, channel: str, *, filters: bool
 ) -> None:
     with node_on(database, channel, None if filters else lambda: VirtualBus(channel)) as corrector:
@@ -96,9 +96,7 @@ def test_frames_are_corrected_on_the_bus_and_others_left_alone(
     assert (corrector.counters.frames_in, corrector.counters.answers) == (100, 100)
 
 
-def test_a_node_listens_as_long_as_another_one_may_be_silent(
-    database: VehicleDatabase, peer: can.BusABC, channel: str
-) -> None:
+def test_second_node_on_the_bus_refuses_to_start(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
     with node_on(database, channel, period_s=0.2):
         receive(peer, 0x5F0, 2)
         with pytest.raises(BusError, match="0x5F0"), node_on(database, channel, period_s=0.2):
@@ -145,9 +143,7 @@ class EchoingBus(VirtualBus):
         self.queue.put(deepcopy(msg))
 
 
-def test_own_frames_that_come_back_are_counted_and_nothing_more(
-    database: VehicleDatabase, peer: can.BusABC, channel: str
-) -> None:
+def test_own_frames_that_come_back_are_only_counted(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
     with node_on(database, "", lambda: EchoingBus(channel)) as corrector:
         receive(peer, 0x5F0, 1)
         peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=protected(database, "HV_Battery", 0)))
@@ -172,9 +168,7 @@ def test_a_gateway_of_which_one_direction_fails_ends(database: VehicleDatabase, 
             running.result(LONGEST_WAIT_S)
 
 
-def test_a_send_queue_that_stays_full_is_told_and_when_it_opens_again(
-    channel: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_send_queue_that_stays_full_is_reported_until_it_is_free(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     said, states = list[str](), list[str]()
     full = failing(channel, sending=can.CanOperationError("Transmit buffer full"))
     now_s, frame = time.monotonic(), can.Message(arbitration_id=1)
@@ -277,7 +271,7 @@ class SetClock:
         return time.time() + self.ahead_s
 
 
-def test_a_frame_that_comes_after_the_clock_was_set_is_not_taken_for_an_old_one(
+def test_frame_after_a_clock_step_is_not_old(
     database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     bus = SetClockBus(channel)
@@ -299,7 +293,7 @@ def wait_until(done: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-def test_a_bus_that_can_be_opened_but_is_down_is_not_said_to_be_open(channel: str) -> None:
+def test_bus_that_is_down_is_not_reported_as_open(channel: str) -> None:
     down = can.CanOperationError("Network is down", errno.ENETDOWN)
     opened = iter([*(failing(channel, receiving=down) for _ in range(3)), VirtualBus(channel)])
     said, counters = list[str](), Counters()
@@ -309,7 +303,7 @@ def test_a_bus_that_can_be_opened_but_is_down_is_not_said_to_be_open(channel: st
     assert [line.partition(": ")[2].partition(":")[0] for line in said] == ["the bus failed", "the bus is open again"]
 
 
-def test_a_bus_off_that_is_told_as_the_bus_opens_again_is_counted(peer: can.BusABC, channel: str) -> None:
+def test_bus_off_reported_at_reopening_is_counted(peer: can.BusABC, channel: str) -> None:
     gone = failing(f"{channel} before", receiving=can.CanOperationError("Network is down", errno.ENETDOWN))
     opened, counters = iter([gone, VirtualBus(channel)]), Counters()
     peer.send(can.Message(arbitration_id=0x40, is_error_frame=True))
@@ -335,9 +329,7 @@ def test_a_frame_that_the_bus_never_takes_holds_up_none_behind_it(peer: can.BusA
     assert [receive(peer, identifier, 1)[0].arbitration_id for identifier in (1, 3)] == [1, 3]
 
 
-def test_a_bus_of_which_only_sending_tells_that_it_is_gone_is_opened_again(
-    database: VehicleDatabase, peer: can.BusABC, channel: str
-) -> None:
+def test_bus_whose_sending_fails_is_opened_again(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
     """The kernel tells it once."""
     gone = can.CanOperationError("No such device or address", errno.ENXIO)
     buses = iter([failing(channel, sending=gone), overlay_bus(database, channel)])

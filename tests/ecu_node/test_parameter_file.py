@@ -49,9 +49,7 @@ def test_a_changed_file_is_put_in_force_within_a_second(path: Path, database: Ve
 
 
 @pytest.mark.parametrize("cut", [0, 1, 300])
-def test_a_file_that_is_half_written_changes_nothing_and_counts_once_it_is_whole(
-    path: Path, database: VehicleDatabase, tmp_path: Path, cut: int
-) -> None:
+def test_half_written_file_changes_nothing(path: Path, database: VehicleDatabase, tmp_path: Path, cut: int) -> None:
     running = Running(path, database)
     write_parameters(parameters_for(database, battery=(0.125, 5.0)), tmp_path / "new.json")
     whole = (tmp_path / "new.json").read_bytes()
@@ -85,7 +83,7 @@ def test_a_file_that_is_gone_or_of_another_vehicle_changes_nothing(path: Path, d
         (b'"v1"', b'"v2"', Reason.WRONG_VEHICLE, "parameters are for vehicle 'v2', this is 'v1'"),
     ],
 )
-def test_a_file_that_comes_later_is_put_in_force(
+def test_later_file_is_used(
     path: Path, database: VehicleDatabase, old: bytes, new: bytes, reason: Reason, words: str
 ) -> None:
     """What stood there at the start is not used, and why is published."""

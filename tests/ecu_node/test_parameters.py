@@ -99,9 +99,7 @@ values = st.one_of(
 
 @settings(suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
-def test_schema_and_reader_agree_wherever_any_value_is_put_or_a_key_left_out(
-    database: VehicleDatabase, data: st.DataObject
-) -> None:
+def test_schema_and_reader_agree_on_any_change_of_a_document(database: VehicleDatabase, data: st.DataObject) -> None:
     finding = {"branch": "battery", "cause": "inverted", "probability": 0.99, "text": "battery: its sign is turned."}
     document = as_document(parameters_for(database, battery=(0.1, -2.5))) | {"findings": [finding]}
     *outer, last = data.draw(st.sampled_from([*_paths(document)[1:], ("extra",)]))
@@ -196,7 +194,7 @@ def test_a_file_of_version_1_0_is_read_unless_it_has_a_sensor_model(database: Ve
         ({"expected_a": -150.0, "delay_s": None}, None),
     ],
 )
-def test_parameters_beyond_the_limits_of_the_layout_do_not_fit_unless_they_are_not_applied(
+def test_parameters_beyond_limits_do_not_fit(
     database: VehicleDatabase, change: dict[str, Any], words: str | None
 ) -> None:
     expected = {key: value for key, value in change.items() if key == "expected_a"}
@@ -276,7 +274,7 @@ NUMBER = b'"number":300'
     ],
     ids=count(),
 )
-def test_what_is_no_parameter_file_is_one_line(
+def test_malformed_file_is_one_line(
     database: VehicleDatabase, tmp_path: Path, content: bytes | Callable[[bytes], bytes], words: str
 ) -> None:
     sound = msgspec.json.encode(parameters_for(database, battery=(0.1, -2.5), motor=(0.1, 1.0)))
@@ -296,7 +294,7 @@ def test_what_is_no_parameter_file_is_one_line(
         ("", "not a parameter file: it is a folder", Reason.MALFORMED_PARAMETERS),
     ],
 )
-def test_what_is_in_the_way_of_reading_is_told(tmp_path: Path, name: str, words: str, reason: Reason) -> None:
+def test_unreadable_parameter_file_is_named(tmp_path: Path, name: str, words: str, reason: Reason) -> None:
     (tmp_path / "p.json").write_bytes(b"{}")
     with pytest.raises(UnfitError, match=words) as caught:
         read_parameters(tmp_path / name)

@@ -16,7 +16,7 @@ def junction(tmp_path: Path) -> Junction:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("jump_a", [50.0, -200.0])
-def test_a_jump_of_a_sensor_ends_the_correction_within_100_ms(junction: Junction, name: str, jump_a: float) -> None:
+def test_jump_of_a_sensor_ends_the_correction_within_100_ms(junction: Junction, name: str, jump_a: float) -> None:
     junction.run(15.0, driving)
     junction.wrong = {name: lambda shown_a: shown_a + jump_a}
     junction.run(10.0, driving)
@@ -33,7 +33,7 @@ def test_a_jump_of_a_sensor_ends_the_correction_within_100_ms(junction: Junction
     ("name", "gain", "growth_per_s", "within_s"),
     [("motor", 1.2, 0, 5), ("battery", 0.8, 0, 5), ("battery", 3, 0, 5), ("battery", 1, 0.01, 30)],
 )
-def test_a_gain_that_changes_ends_the_correction_within_5_s_and_one_that_grows_is_told(
+def test_gain_change_ends_correction(
     junction: Junction, name: str, gain: float, growth_per_s: float, within_s: float
 ) -> None:
     junction.run(15.0, driving)
@@ -44,7 +44,7 @@ def test_a_gain_that_changes_ends_the_correction_within_5_s_and_one_that_grows_i
     assert junction.corrected_after == 0
 
 
-def test_an_offset_that_creeps_is_told_of_all_branches_that_may_have_it(junction: Junction) -> None:
+def test_creeping_offset_names_all_branches_that_may_have_it(junction: Junction) -> None:
     def parked(_: float) -> dict[str, float]:
         return {"battery": 6.0, "motor": 0.0, "heater": 6.0}
 
@@ -56,7 +56,7 @@ def test_an_offset_that_creeps_is_told_of_all_branches_that_may_have_it(junction
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_jump_at_constant_currents_without_noise_is_told_of_whoever_may_have_it(tmp_path: Path, name: str) -> None:
+def test_jump_at_constant_currents_names_whoever_may_have_it(tmp_path: Path, name: str) -> None:
     def charging(_: float) -> dict[str, float]:
         return {"battery": -80.0, "motor": -92.0, "heater": 12.0}
 

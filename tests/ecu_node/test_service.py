@@ -91,7 +91,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     return at
 
 
-def test_the_same_line_comes_once_in_ten_seconds(
+def test_repeated_line_is_limited_to_one_in_10_s(
     clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = Log()

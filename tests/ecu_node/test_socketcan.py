@@ -86,7 +86,7 @@ def test_written_frames_match_python_can_for_every_kind(ends: Ends) -> None:
             assert frame.is_remote_frame or data == bytes(frame.data)
 
 
-def test_an_error_frame_is_told_as_one(ends: Ends) -> None:
+def test_error_frame_is_read_as_one(ends: Ends) -> None:
     link, far = ends
     far.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))
     (message,) = received(link, 1)

@@ -129,9 +129,7 @@ def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tm
 
 
 @pytest.mark.parametrize("target", [".", "pipe", ("no-such-host.invalid", 5000), ("a" * 64, 5000)])
-def test_target_that_takes_nothing_never_blocks_and_is_said(
-    target: str | tuple[str, int], make_outlet: Any, tmp_path: Path
-) -> None:
+def test_unusable_target_is_reported(target: str | tuple[str, int], make_outlet: Any, tmp_path: Path) -> None:
     """A folder, a pipe without a reader, a host without an address, and one that no name server could know."""
     os.mkfifo(tmp_path / "pipe")
     outlet = make_outlet(tmp_path / target if isinstance(target, str) else target)
@@ -166,9 +164,7 @@ def test_example_takes_the_currents_out_of_a_line(make_outlet: Any, tmp_path: Pa
     assert currents((tmp_path / "node.jsonl").read_text()) == {VSS: -60.0, "motor": -80.0}
 
 
-def test_line_that_fits_in_part_is_taken_back(
-    make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_line_written_in_part_is_removed(make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, write = tmp_path / "node.jsonl", os.write
     outlet = make_outlet(path)
     monkeypatch.setattr(os, "write", lambda file, line: write(file, line[:7] if line.startswith(b'{"time"') else line))
@@ -204,7 +200,7 @@ def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: 
         assert fault in log[-1]
 
 
-def test_missing_real_time_permissions_are_reported_not_fatal() -> None:
+def test_missing_real_time_permissions_are_reported() -> None:
     code = (
         "import os; from contextlib import suppress; from ecu_node.bus.service import be_real_time\n"
         "user = os.geteuid()\n"

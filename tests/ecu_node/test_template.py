@@ -19,9 +19,7 @@ def check(params: Path) -> list[str]:
     return ["check", "--params", str(params), "--layout", str(LAYOUT), "--vehicle", "my car", "--json"]
 
 
-def test_the_template_of_a_layout_fits_it_at_once_and_corrects_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_template_fits_its_layout_and_corrects_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_ecu_node(["template", "--layout", str(LAYOUT), "--vehicle", "my car"]) == 0
     (tmp_path / "V.json").write_text(capsys.readouterr().out)
     assert run_ecu_node(check(tmp_path / "V.json")) == 0
@@ -37,7 +35,7 @@ def test_the_template_of_a_layout_fits_it_at_once_and_corrects_nothing(
         ("", 0.0, (State.PASSING_THROUGH, Reason.CORRECTION_WORSE)),
     ],
 )
-def test_the_sum_is_judged_about_the_load_that_the_layout_declares(
+def test_sum_is_judged_about_the_declared_load(
     make_database: MakeDatabase, load: str, expected_a: float, state: tuple[State, Reason]
 ) -> None:
     """The battery shows 4 A too little and feeds a load of 6.1 A that no branch measures: about 0 A it looks better."""
@@ -57,9 +55,7 @@ def test_the_sum_is_judged_about_the_load_that_the_layout_declares(
     assert corrector.state() == state
 
 
-def test_template_of_a_load_beyond_the_limits_is_refused(
-    make_database: MakeDatabase, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_template_refuses_load_beyond_limits(make_database: MakeDatabase, capsys: pytest.CaptureFixture[str]) -> None:
     database = make_database(f"{SMALL_LAYOUT}\nunmeasured_load = {{ mean_a = 200.0, sd_a = 1.0 }}\n")
     assert run_ecu_node(["template", "--layout", str(database.layout.path), "--vehicle", "v1"]) == 1
     assert "[unmeasured_load] mean_a = 200 is beyond the layout's limit of 160 A" in capsys.readouterr().err

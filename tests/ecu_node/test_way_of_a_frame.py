@@ -126,7 +126,7 @@ class Plain:
 
 @settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(drawn=FRAMES, drift=st.floats(-0.3, 0.3), offset=st.floats(-100, 100))
-def test_gateway_changes_the_currents_and_nothing_else(
+def test_gateway_changes_nothing_else(
     database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]], drift: float, offset: float
 ) -> None:
     in_force = InForce(parameters=parameters_for(database, battery=(drift, offset), motor=(0.0, -offset)))
@@ -140,7 +140,7 @@ def test_gateway_changes_the_currents_and_nothing_else(
 
 @settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(drawn=FRAMES, drift=st.floats(-0.3, 0.3), offset=st.floats(-100, 100))
-def test_overlay_answers_with_each_current_and_its_quality(
+def test_overlay_answers_with_every_current(
     database: VehicleDatabase, drawn: Sequence[tuple[bytes, int, bool]], drift: float, offset: float
 ) -> None:
     in_force = InForce(parameters=parameters_for(database, battery=(drift, offset), motor=(0.01, -offset)))

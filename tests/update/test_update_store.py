@@ -71,7 +71,7 @@ def mend(path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("damage", [without, cut, a_folder])
-def test_state_that_is_damaged_under_a_running_node_leaves_what_was_in_force(
+def test_damaged_state_keeps_what_is_in_force(
     damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
 ) -> None:
     running, path = Running(correcting, database), correcting / "state.json"
@@ -91,7 +91,7 @@ def test_state_that_is_damaged_under_a_running_node_leaves_what_was_in_force(
 
 
 @pytest.mark.parametrize("damage", [without, cut, a_folder])
-def test_node_that_starts_with_a_damaged_state_passes_through_until_it_is_mended(
+def test_node_passes_through_until_damaged_state_is_mended(
     damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
 ) -> None:
     path = correcting / "state.json"
@@ -144,9 +144,7 @@ def test_trial_in_a_damaged_state_does_not_end_the_node(correcting: Path, ended:
     assert all(line.isprintable() for line in ended.said)
 
 
-def test_state_that_could_not_be_read_for_a_moment_is_read_again(
-    correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_state_is_read_again(correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a revocation would not be heeded before the next start."""
 
     def broken_disk(folder: Path) -> VehicleState:
@@ -161,7 +159,7 @@ def test_state_that_could_not_be_read_for_a_moment_is_read_again(
     assert running.corrector.reason is Reason.REVOKED
 
 
-def test_slow_disk_does_not_hold_the_node_up_at_the_end_of_a_trial(
+def test_slow_disk_does_not_hold_the_node_up(
     correcting: Path, ended: Running, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writing, may_go_on = threading.Event(), threading.Event()
@@ -185,9 +183,7 @@ def test_slow_disk_does_not_hold_the_node_up_at_the_end_of_a_trial(
     assert any("has passed its trial: seen" in line for line in running.said)
 
 
-def test_set_that_expires_during_its_trial_leaves_what_was_in_force(
-    correcting: Path, ended: Running, other: VehicleParameters
-) -> None:
+def test_set_expiring_on_trial_changes_nothing(correcting: Path, ended: Running, other: VehicleParameters) -> None:
     put_on_trial(correcting, other, days=1)
     ended.look(2.0, 2.1)
     ended.now = NOW + timedelta(days=2)
@@ -197,9 +193,7 @@ def test_set_that_expires_during_its_trial_leaves_what_was_in_force(
     assert ended.said[-1].split(" is ")[1].startswith("not in force, though its trial went well")
 
 
-def test_trial_begins_only_with_a_set_that_fits_and_holds(
-    correcting: Path, other: VehicleParameters, database: VehicleDatabase
-) -> None:
+def test_trial_needs_a_valid_set(correcting: Path, other: VehicleParameters, database: VehicleDatabase) -> None:
     put_on_trial(correcting, other, days=-1)
     running = Running(correcting, database)
     running.look(*range(0, 110, 2))

@@ -92,7 +92,7 @@ def test_a_gateway_changes_currents_and_crcs_and_nothing_else(
     assert node.messages.endswith(f"{counted}\n")
 
 
-def test_frames_of_the_vehicle_arrive_at_the_sensors_once(
+def test_way_back_passes_all_frames_once(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, "--gateway", OTHER_CHANNEL) as node:

@@ -96,7 +96,7 @@ def wait_for_state(recording: Recording, state: State, reason: Reason) -> None:
     wait_until(lambda: state_of(recording.data_of(STATUS)[-1]) == (state, reason), f"the state {state.name}")
 
 
-def test_other_frames_go_on_while_the_gateway_is_killed_and_started_again(
+def test_frames_pass_while_the_gateway_is_killed(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY) as node:
@@ -123,9 +123,7 @@ def test_other_frames_go_on_while_the_gateway_is_killed_and_started_again(
     assert again.process.returncode is not None
 
 
-def test_the_rules_go_with_the_gateway_both_ways(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
+def test_rules_end_with_the_gateway(params: Path, start_node: StartNode, other_recording: Recording) -> None:
     with start_node(params, *GATEWAY, "--fd") as node:
         other_recording.wait_for(STATUS, 1)
         assert len(rules()) == 2 * RULES, "both ways, classic and FD"
@@ -160,7 +158,7 @@ def test_rules_that_vanish_are_set_again(params: Path, start_node: StartNode) ->
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin")
 
 
-def test_without_rights_the_node_carries_all_frames_and_says_so(
+def test_node_carries_all_frames_without_rights(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY, by=WITHOUT_RIGHTS) as node:
@@ -176,7 +174,7 @@ def test_without_rights_the_node_carries_all_frames_and_says_so(
     ) in node.messages
 
 
-def test_without_the_module_the_node_carries_all_frames_and_says_so(
+def test_node_carries_all_frames_without_module(
     params: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     run_tool("rmmod", "can-gw")
@@ -192,7 +190,7 @@ def test_without_the_module_the_node_carries_all_frames_and_says_so(
     assert "the kernel carries no frames (its module can-gw is needed)" in node.messages
 
 
-def test_rules_that_nobody_here_may_change_are_told(
+def test_rules_left_by_a_privileged_gateway_refuse_start(
     params: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY) as node:
@@ -220,7 +218,7 @@ def test_rules_for_an_interface_that_has_just_gone_are_refused_in_one_line() -> 
             routes.set()
 
 
-def test_foreign_branch_frames_are_dropped_and_reported(
+def test_foreign_branch_frames_are_reported(
     params: Path, drive: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     command = ["cangen", OTHER_CHANNEL, "-I", f"{BATTERY:X}", "-D", FOREIGN, "-L", "8", "-g", "1"]
@@ -302,7 +300,7 @@ def joined() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("killed", [False, True], ids=["at work", "killed before"])
-def test_buses_that_are_joined_end_the_gateway_and_its_rules_so_that_no_storm_stays(
+def test_joined_buses_end_the_gateway_without_a_storm(
     params: Path, drive: Path, tmp_path: Path, start_node: StartNode, other_recording: Recording, killed: bool
 ) -> None:
     words = "which only this one may send there; two nodes on one bus, or two buses that are joined? Stop one"

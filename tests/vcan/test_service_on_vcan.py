@@ -55,7 +55,7 @@ def test_the_monitor_shows_branches_sums_and_node(patient: VehicleDatabase, tmp_
     assert abs(view["sums"]["corrected_a"]) < 3.0
 
 
-def test_the_node_needs_no_capability(
+def test_node_needs_no_capability(
     start_node: StartNode, database: VehicleDatabase, params: Path, tmp_path: Path, recording: Recording
 ) -> None:
     """As in deploy/ecu-node@.service: an empty bounding set, no ambient capabilities, no new privileges."""
@@ -69,9 +69,7 @@ def test_the_node_needs_no_capability(
         assert node.stop() == 0
 
 
-def test_real_time_is_first_in_first_out_on_one_processor_with_locked_memory(
-    start_node: StartNode, params: Path
-) -> None:
+def test_real_time_is_fifo_on_one_processor_with_locked_memory(start_node: StartNode, params: Path) -> None:
     with start_node(params, "--realtime") as node:
         number = node.process.pid
         status = Path(f"/proc/{number}/status").read_text()
@@ -83,7 +81,7 @@ def test_real_time_is_first_in_first_out_on_one_processor_with_locked_memory(
     assert locked_kb > 1000
 
 
-def test_a_memory_lock_that_a_filter_of_system_calls_forbids_is_told() -> None:
+def test_forbidden_memory_lock_is_reported() -> None:
     strace = shutil.which("strace")
     if strace is None:
         pytest.skip("no strace here (apt-get install strace)")
