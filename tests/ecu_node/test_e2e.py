@@ -1,7 +1,7 @@
 """End-to-end protection: what is accepted, what is counted out; the libraries find the frames sound."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 
@@ -100,16 +100,6 @@ def test_the_header_is_crc_and_counter_and_no_other_bit_is_written(kind: str, pr
     assert {Receiver(protection).check(bytearray(size)) for size in range(len(header))} == {Check.CORRUPT}
 
 
-def test_sealing_keeps_the_counter(protection: Protection) -> None:
-    for frame in stream(protection, 20):
-        before = protection.counter_of(frame)
-        frame[-1] ^= 0xFF
-        assert not protection.is_sound(frame)
-        protection.seal(frame)
-        assert protection.is_sound(frame)
-        assert protection.counter_of(frame) == before
-
-
 def test_a_corrupt_frame_changes_neither_counter_nor_a_state_that_nothing_has_set(protection: Protection) -> None:
     (first, second), receiver = stream(protection, 2), Receiver(protection)
     found = [(receiver.check(frame), receiver.state) for frame in (damaged(first), first, damaged(second), second)]
@@ -117,11 +107,15 @@ def test_a_corrupt_frame_changes_neither_counter_nor_a_state_that_nothing_has_se
     assert found == [(Check.CORRUPT, E2EState.INIT), ok, corrupt, ok]
 
 
-def test_any_flipped_bit_is_noticed(protection: Protection) -> None:
+def test_any_flipped_bit_is_noticed_and_sealing_keeps_the_counter(protection: Protection) -> None:
     (frame,) = stream(protection, 1)
     for bit in range(8 * SIZE):
         flipped = bytearray((int.from_bytes(frame, "little") ^ 1 << bit).to_bytes(SIZE, "little"))
         assert Receiver(protection).check(flipped) is Check.CORRUPT
+        counter = protection.counter_of(flipped)
+        protection.seal(flipped)
+        assert protection.is_sound(flipped)
+        assert protection.counter_of(flipped) == counter
 
 
 @pytest.mark.parametrize(
@@ -203,31 +197,31 @@ def test_every_byte_of_a_long_counter_is_compared_with_the_next_one(protection: 
 # ---- the message as a whole
 
 
-def test_message_is_invalid_until_enough_frames_are_intact(kind: str, protect: Callable[..., Protection]) -> None:
-    windows = "valid = { window = 6, min_ok = 1, max_error = 2 }\ninvalid = { window = 4, min_ok = 3, max_error = 0 }"
+@pytest.mark.parametrize(
+    ("windows", "sent", "spoilt", "states"),
+    [
+        (
+            "valid = { window = 6, min_ok = 1, max_error = 2 }\ninvalid = { window = 4, min_ok = 3, max_error = 0 }",
+            *(range(20), (12, 13, 14), "VVVVVVVVVVVVVVXXXXVV"),  # the third error of six; then four without one
+        ),
+        (
+            "init = { window = 4, min_ok = 3, max_error = 1 }\nvalid = { window = 4, min_ok = 4, max_error = 0 }",
+            *(range(0, 20, 2), (2,), "IIIVXVVVVV"),
+        ),
+        ("valid = { window = 5, min_ok = 1, max_error = 2 }", [0] * 6, (), "VVVVVX"),
+    ],
+    ids=["errors", "lost frames are no errors, nor a few at first", "repeated frames are not intact"],
+)
+def test_state_of_a_message_follows_its_last_frames(
+    kind: str, protect: Callable[..., Protection], windows: str, sent: Sequence[int], spoilt: Sequence[int], states: str
+) -> None:
+    """Initial, valid, or invalid (X) after each frame that was sent, by its place in a stream."""
     protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
-    receiver, invalid = Receiver(protection), []
-    for number, frame in enumerate(stream(protection, 20)):
-        receiver.check(damaged(frame) if number in {12, 13, 14} else frame)
-        invalid += [number] * (receiver.state is E2EState.INVALID)
-    assert invalid == [14, 15, 16, 17], "the third error of six; four frames without one make it valid again"
-
-
-def test_lost_frames_are_no_errors(kind: str, protect: Callable[..., Protection]) -> None:
-    windows = "init = { window = 4, min_ok = 3, max_error = 1 }\nvalid = { window = 4, min_ok = 4, max_error = 0 }"
-    protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
-    receiver, found = Receiver(protection), []
-    for number, frame in enumerate(stream(protection, 20)[::2]):
-        receiver.check(damaged(frame) if number == 1 else frame)
-        found.append(receiver.state)
-    assert found == [E2EState.INIT] * 3 + [E2EState.VALID, E2EState.INVALID] + [E2EState.VALID] * 5
-
-
-def test_repeated_frames_are_no_intact_ones(kind: str, protect: Callable[..., Protection]) -> None:
-    protection = protect(ENTRIES[kind] + "\nvalid = { window = 5, min_ok = 1, max_error = 2 }")
-    receiver, (frame,) = Receiver(protection), stream(protection, 1)
-    states = [receiver.check(frame) and receiver.state for _ in range(6)]
-    assert states[1:] == [E2EState.VALID] * 4 + [E2EState.INVALID]
+    receiver, frames, found = Receiver(protection), stream(protection, 20), ""
+    for place in sent:
+        receiver.check(damaged(frames[place]) if place in spoilt else frames[place])
+        found += {E2EState.INIT: "I", E2EState.VALID: "V", E2EState.INVALID: "X"}[receiver.state]
+    assert found == states
 
 
 # ---- mistakes
@@ -250,10 +244,7 @@ HEADS = [("[e2e]", "[e2e]"), ('[[e2e]]\nprofile = "P01"\nmessages = ["Net"]\n[[e
         (OEM.replace('crc = "Sum"', 'crc = "Count"'), ": message Room: signal Count must be one whole byte"),
         (OEM + "\ncounter_modulus = 17", ": message Room: signal Count cannot count from 0 to 16"),
         (OEM + '\nalgorithm = "md5"', ": message Room: algorithm 'md5' is not known; known are autosar, bluetooth,"),
-        (
-            COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 256 }",
-            "data_id 256 does not fit into data_id_bytes = 1",
-        ),
+        (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 256 }", "256 does not fit into data_id_bytes = 1"),
     ],
 )
 @pytest.mark.parametrize(("head", "place"), HEADS)
@@ -268,21 +259,16 @@ def test_wrong_entry_is_named_by_its_place(
 @pytest.mark.parametrize(
     ("entry", "old", "new", "words"),
     [
-        (
-            ENTRIES["P01"],
-            "Room: 24",
-            "Room: 10",
-            "Room has 10 bytes in the DBC; CAN FD pads it, .* 12, 16, 20, 24, 32,",
-        ),
-        (OEM, "56|8@1+", "57|8@1+", "message Room: signal Sum must be one whole byte to be a CRC-8$"),
-        (OEM, "36|4@1+", "38|4@1+", "message Room: signal Count must be within one byte to be a counter$"),
-        (OEM, "36|4@1+", "36|4@1-", "message Room: signal Count cannot count from 0 to 7$"),
+        (ENTRIES["P01"], "Room: 24", "Room: 10", "10 bytes in the DBC; CAN FD pads it, .* 12, 16, 20, 24, 32,"),
+        (OEM, "56|8@1+", "57|8@1+", "signal Sum must be one whole byte to be a CRC-8$"),
+        (OEM, "36|4@1+", "38|4@1+", "signal Count must be within one byte to be a counter$"),
+        (OEM, "36|4@1+", "36|4@1-", "signal Count cannot count from 0 to 7$"),
     ],
 )
 def test_unfit_message_is_refused(
     protect: Callable[..., Protection], entry: str, old: str, new: str, words: str
 ) -> None:
-    with pytest.raises(LayoutError, match=words):
+    with pytest.raises(LayoutError, match=f"message Room.* {words}"):
         protect(entry, room=ROOM.replace(old, new))
 
 

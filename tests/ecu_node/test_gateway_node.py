@@ -19,8 +19,9 @@ from ecu_node.bus.wiring import Mode
 from ecu_node.core.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from tests.ecu_node.test_node import LONGEST_WAIT_S, at_work, wait_until
-from tests.ecu_node.vehicles import corrector_for, decoded, protected
+from tests.ecu_node.test_node import LONGEST_WAIT_S, at_work, battery_frame, wait_until
+from tests.ecu_node.test_socketcan import fields, random_frame
+from tests.ecu_node.vehicles import corrector_for, decoded
 
 Ends = tuple[can.BusABC, can.BusABC]
 
@@ -59,36 +60,12 @@ def received(bus: can.BusABC, count: int, *, status: bool | None = False) -> lis
     return found
 
 
-def random_frames(database: VehicleDatabase, count: int) -> list[can.Message]:
-    """Branch frames among frames of others: standard, extended, remote, FD, of any length."""
-    chance, counter, frames = random.Random(1), 0, []
-    for _ in range(count):
-        kind = chance.choice(("branch", "standard", "extended", "remote", "fd"))
-        data = chance.randbytes(chance.randrange(9))
-        if kind == "branch":
-            data, counter = protected(database, "HV_Battery", counter % 15, BatteryCurrent=100.0), counter + 1
-        frames.append(
-            can.Message(
-                arbitration_id=0x110 if kind == "branch" else chance.randrange(0x150, 0x4FF),
-                is_extended_id=kind == "extended",
-                is_remote_frame=kind == "remote",
-                is_fd=kind == "fd",
-                bitrate_switch=kind == "fd",
-                dlc=4 if kind == "remote" else None,
-                data=None if kind == "remote" else data if kind != "fd" else chance.randbytes(64),
-            )
-        )
-    return frames
-
-
-def as_sent(message: can.Message) -> tuple[object, ...]:
-    kinds = message.is_extended_id, message.is_remote_frame, message.is_fd, message.bitrate_switch
-    return message.arbitration_id, kinds, message.dlc, bytes(message.data)
-
-
 def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, vehicle = ends
-    sent = random_frames(database, 2000)
+    chance = random.Random(1)
+    sent = [random_frame(chance) for _ in range(1000)]
+    sent = [frame for frame in sent if frame.is_extended_id or not 0x100 <= frame.arbitration_id < 0x600]
+    sent[::3] = [battery_frame(database, number, current_a=100.0) for number in range(len(sent[::3]))]
     with gateway(database, channel) as (corrector, _):
         for message in sent:
             sensors.send(message)
@@ -98,19 +75,16 @@ def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, end
         if before.arbitration_id == 0x110:
             assert decoded(database, "HV_Battery", bytes(after.data))["BatteryCurrent"] == pytest.approx(76.0)
         else:
-            assert as_sent(after) == as_sent(before)
+            assert fields(after) == fields(before)
     assert sensors.recv(0.0) is None, "nothing comes back"
 
 
 def test_branch_frame_that_waited_too_long_is_held_back(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     with gateway(database, channel) as (corrector, _), VirtualBus(f"{channel} a", preserve_timestamps=True) as bus:
         for counter, age_s in enumerate((0.0, 5.0, 0.0)):
-            data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
-            bus.send(can.Message(time.time() - age_s, arbitration_id=0x110, is_extended_id=False, data=data))
-        counters = [
-            decoded(database, "HV_Battery", bytes(frame.data))["AliveCounter"] for frame in received(ends[1], 2)
-        ]
-        assert (counters, corrector.counters.late) == ([0, 2], 1)
+            bus.send(battery_frame(database, counter, time.time() - age_s))
+        frames = [decoded(database, "HV_Battery", bytes(frame.data)) for frame in received(ends[1], 2)]
+        assert ([frame["AliveCounter"] for frame in frames], corrector.counters.late) == ([0, 2], 1)
 
 
 class BlockingBus(VirtualBus):
@@ -167,13 +141,12 @@ def test_frames_from_before_the_start_are_not_passed_on(database: VehicleDatabas
 
 def test_a_remote_frame_passes_whatever_its_identifier(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, vehicle = ends
-    asked = [
-        can.Message(arbitration_id=key, is_extended_id=False, is_remote_frame=True, dlc=8) for key in (0x110, 0x5F0)
-    ]
+    remote = partial(can.Message, is_extended_id=False, is_remote_frame=True, dlc=8)
+    asked = [remote(arbitration_id=key) for key in (0x110, 0x5F0)]
     with gateway(database, channel):
         for message in asked:
             vehicle.send(message)
-        assert list(map(as_sent, received(sensors, 2, status=None))) == list(map(as_sent, asked))
+        assert list(map(fields, received(sensors, 2, status=None))) == list(map(fields, asked))
 
 
 WORDS = "another node sends frames 0x(110|5F0), which only this one may send there; two nodes on one bus, or two buses"
@@ -190,8 +163,7 @@ def test_foreign_frames_are_dropped_and_counted(
         for counter in range(100):
             sender.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=[counter, *bytes(7)]))
         for counter in range(10):
-            data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
-            sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+            sensors.send(battery_frame(database, counter))
         found = received(vehicle, 10)
         wait_until(lambda: corrector.counters.foreign == 100)
         assert not running.done()
@@ -203,8 +175,7 @@ def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, chan
     sensors, _ = ends
     with gateway(database, channel, f"{channel} a") as (_, running):
         for counter in range(100):
-            data = protected(database, "HV_Battery", counter % 15, BatteryCurrent=float(counter))
-            sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+            sensors.send(battery_frame(database, counter))
             time.sleep(0.005)
         with pytest.raises(BusError, match=WORDS):
             running.result(LONGEST_WAIT_S)

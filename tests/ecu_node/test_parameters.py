@@ -113,30 +113,24 @@ def test_schema_and_reader_agree_on_any_change_of_a_document(database: VehicleDa
     assert is_readable(document) == VALIDATOR.is_valid(document)
 
 
+SHA = "0" * 64
+
+
 @pytest.mark.parametrize(
-    ("faults", "change", "vehicle", "reason", "words"),
+    ("branch", "change", "reason", "words"),
     [
-        ({"battery": (0.1, 1.0)}, {}, "v2", Reason.WRONG_VEHICLE, "are for vehicle 'v1', this is 'v2'"),
-        ({"battery": (0.1, 1.0)}, {"layout": "0" * 64}, None, Reason.WRONG_LAYOUT, "000000000000.*calibrate.*template"),
-        ({"battery": (0.1, 1.0)}, {"dbc": "0" * 64}, None, Reason.WRONG_DBC, "DBC .*000000000000.*template"),
-        ({"fridge": (0.1, 1.0)}, {}, None, Reason.WRONG_LAYOUT, "branch 'fridge', which .* does not have"),
+        ("battery", {"vehicle": "v3"}, Reason.WRONG_VEHICLE, "are for vehicle 'v3', this is 'v1'"),
+        ("battery", {"layout": {"name": "l", "sha256": SHA}}, Reason.WRONG_LAYOUT, "0000000.*calibrate.*template"),
+        ("battery", {"dbc": {"name": "d", "sha256": SHA}}, Reason.WRONG_DBC, "DBC .*000000000000.*template"),
+        ("fridge", {}, Reason.WRONG_LAYOUT, "branch 'fridge', which .* does not have"),
     ],
 )
 def test_parameters_that_do_not_belong_here_are_unfit(
-    database: VehicleDatabase,
-    tmp_path: Path,
-    faults: dict[str, tuple[float, float]],
-    change: dict[str, str],
-    vehicle: str | None,
-    reason: Reason,
-    words: str,
+    database: VehicleDatabase, branch: str, change: dict[str, Any], reason: Reason, words: str
 ) -> None:
-    document = as_document(parameters_for(database, **faults))
-    for key, digest in change.items():
-        document[key]["sha256"] = digest
-    (tmp_path / "p.json").write_text(json.dumps(document))
+    document = as_document(parameters_for(database, **{branch: (0.1, 1.0)})) | change
     with pytest.raises(UnfitError, match=words) as caught:
-        check_fit(read_parameters(tmp_path / "p.json"), database, vehicle)
+        check_fit(decode_parameters(json.dumps(document).encode(), "p"), database, "v1")
     assert caught.value.reason is reason
     for own in ("v1", None):
         check_fit(parameters_for(database, battery=(0.4, -150.0)), database, own)
@@ -177,14 +171,8 @@ def test_a_file_of_version_1_0_is_read_unless_it_has_a_sensor_model(database: Ve
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (
-            {"expected_a": 150.5},
-            r"an expected Kirchhoff sum of \+150\.5 A is beyond .* limit of offsets, 150 A$",
-        ),
-        (
-            {"expected_a": -150.5},
-            r"an expected Kirchhoff sum of -150\.5 A is beyond",
-        ),
+        ({"expected_a": 150.5}, r"an expected Kirchhoff sum of \+150\.5 A is beyond .* limit of offsets, 150 A$"),
+        ({"expected_a": -150.5}, r"an expected Kirchhoff sum of -150\.5 A is beyond"),
         ({"delay_s": 5.5, "apply": False}, r"branch battery: delay \+5\.5 s is beyond 5 s"),
         ({"delay_s": -5.5}, r"branch battery: delay -5\.5 s is beyond 5 s"),
         ({"drift": -0.5}, r"branch battery: drift -0\.5 is beyond the layout's limit of 0\.4"),

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,17 @@ import pytest
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Telemetry
 from ecu_node.bus.wiring import Mode
-from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters, Latency
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.test_adapters import running
 from tests.ecu_node.test_node import wait_until
-from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, MakeDatabase, answers, corrector_for
+from tests.ecu_node.vehicles import LAYOUT, PAIR, SMALL_LAYOUT, Frame, MakeDatabase, answers, corrector_for
 
 ROOT = Path(__file__).parents[2]
 VSS = "Vehicle.Powertrain.TractionBattery.CurrentCurrent"
 NAMED = SMALL_LAYOUT.replace('name = "battery", ', f'name = "battery", vss = "{VSS}", ')
+CURRENTS = bytes.fromhex("0320f9c000000000")
+"""80 A from battery to motor."""
 
 
 class Outlet:
@@ -48,25 +50,23 @@ class Outlet:
         wait_until(lambda: self.corrector.counters.telemetry_lost >= count)
 
     def second(self) -> None:
-        """A frame of the pair, of 80 A from battery to motor, and what is done once per second."""
+        """A frame of the pair, and what is done once per second."""
         self.now_s += 1.0
-        data = bytes((*(800).to_bytes(2, "big"), *(-1600).to_bytes(2, "big", signed=True), 0, 0, 0, 0))
-        answers(self.corrector, Frame(FrameKey(256, False), data), self.now_s)
+        answers(self.corrector, Frame(PAIR, CURRENTS), self.now_s)
         self.corrector.look(self.now_s)
         self.telemetry.look(self.now_s)
 
 
 @pytest.fixture
 def make_outlet(make_database: MakeDatabase) -> Iterator[Callable[..., Outlet]]:
-    made: list[Outlet] = []
+    with ExitStack() as opened:
 
-    def make(target: Path | tuple[str, int]) -> Outlet:
-        made.append(Outlet(make_database(NAMED), target))
-        return made[-1]
+        def make(target: Path | tuple[str, int]) -> Outlet:
+            outlet = Outlet(make_database(NAMED), target)
+            opened.callback(outlet.bus.close)
+            return outlet
 
-    yield make
-    for outlet in made:
-        outlet.bus.close()
+        yield make
 
 
 def lines_of(path: Path, count: int) -> list[dict[str, Any]]:
@@ -98,8 +98,8 @@ def test_spoilt_frame_has_no_value_as_on_the_bus(make_outlet: Any, tmp_path: Pat
     outlet = make_outlet(tmp_path / "node.jsonl")
     outlet.second()
     lines_of(tmp_path / "node.jsonl", 1)
-    for data in (bytes.fromhex("0320f9c000000000"), bytes(1)):
-        answers(outlet.corrector, Frame(FrameKey(256, False), data), outlet.now_s + 0.9)
+    for data in (CURRENTS, bytes(1)):
+        answers(outlet.corrector, Frame(PAIR, data), outlet.now_s + 0.9)
     outlet.telemetry.look(outlet.now_s + 1.0)
     _, line = lines_of(tmp_path / "node.jsonl", 2)
     assert line["branches"][VSS] == {"measured_a": None, "corrected_a": None, "quality": "INVALID"}
