@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -67,12 +67,7 @@ def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("interfaces", "config", "settings", "words"),
     [
-        (
-            "pcan kvaser vector slcan gs_usb ixxat cantact",
-            {},
-            {},
-            "no bitrate: .* give ecu-node --bitrate BIT_PER_S, or",
-        ),
+        ("pcan kvaser vector slcan gs_usb ixxat cantact", {}, {}, "no bitrate: .* ecu-node --bitrate BIT_PER_S, or"),
         ("kvaser vector ixxat", {}, {"fd": True, "bitrate": 500_000}, "no data_bitrate: .* --data-bitrate BIT_PER_S"),
         ("pcan slcan nixnet", {}, FD_RATES, r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"),
         ("socketcan virtual udp_multicast serial", {}, {"bitrate": 250_000}, "the bit rate of .* is not set from here"),
@@ -82,12 +77,7 @@ def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
         ("pcan", {"f_clock": 8_000_000, "bitrate": 250_000}, {}, "incomplete, .* classic CAN .* brp, tseg1"),
         ("pcan", FD_TIMING, {}, "not one of classic CAN"),
         ("pcan", CLASSIC_TIMING, {"fd": True}, "not one of CAN FD, which has f_clock, nom_brp"),
-        (
-            "pcan",
-            {**CLASSIC_TIMING, "bitrate": 500_000},
-            {},
-            "bitrate = 500000 contradicts the bit timing .BR: 250_000",
-        ),
+        ("pcan", {**CLASSIC_TIMING, "bitrate": 500_000}, {}, "500000 contradicts the bit timing .BR: 250_000"),
         ("pcan", {**FD_TIMING, "data_bitrate": 4_000_000}, {"fd": True}, "data_bitrate = 4000000 contradicts"),
         ("ixxat", CLASSIC_TIMING, {}, "python-can cannot set a bit timing there; take f_clock out"),
     ],
@@ -134,35 +124,44 @@ def test_whether_an_interface_carries_can_fd_is_known_from_its_mtu(interface: st
 # ---- a dry run
 
 
-def test_dry_run_prints_what_it_would_open(node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    adapter = ["--interface", "pcan", "--channel", "PCAN_USBBUS1"]  # its library is not here: opening it would fail
-    assert run_ecu_node([*node, *adapter, "--bitrate", "250000", "--dry-run"]) == 0
-    captured = capsys.readouterr()
-    assert captured.out.splitlines() == [
-        "would open pcan PCAN_USBBUS1: bitrate 250000",
-        "  reads Pair (0x100), Heater (0x200), Net (0x102)",
-        "  sends PairOut (0x200)",
-    ]
-    assert run_ecu_node([*node, *adapter, "--bitrate", "250000", "--dry-run", "--params", "none.json"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1].startswith("would correct nothing: none.json: no such parameter")
-    assert captured.err == ""
-    assert run_ecu_node([*node, *adapter, "--dry-run"]) == 1
+PCAN = ("--interface", "pcan", "--channel", "PCAN_USBBUS1")
+"""Its library is not here: opening it would fail."""
+
+
+@pytest.fixture
+def dry_run(node: list[str], capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
+    """Lines that the node with these options prints of what it would do."""
+
+    def run(*options: str) -> list[str]:
+        assert run_ecu_node([*node, *options, "--dry-run"]) == 0
+        out, err = capsys.readouterr()
+        assert err == ""
+        return out.splitlines()
+
+    return run
+
+
+def test_dry_run_prints_what_it_would_open(
+    node: list[str], dry_run: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    rate = ("--bitrate", "250000")
+    reads, sends = "  reads Pair (0x100), Heater (0x200), Net (0x102)", "  sends PairOut (0x200)"
+    assert dry_run(*PCAN, *rate) == ["would open pcan PCAN_USBBUS1: bitrate 250000", reads, sends]
+    last = dry_run(*PCAN, *rate, "--params", "none.json")[-1]
+    assert last.startswith("would correct nothing: none.json: no such parameter")
+    assert run_ecu_node([*node, *PCAN, "--dry-run"]) == 1
     assert "no bitrate" in capsys.readouterr().err
 
 
-def test_dry_run_prints_bit_timing(
-    node: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dry_run_prints_bit_timing(dry_run: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
-    assert run_ecu_node([*node, "--interface", "pcan", "--channel", "PCAN_USBBUS1", "--dry-run"]) == 0
-    (opened, *_) = capsys.readouterr().out.splitlines()
+    opened = dry_run(*PCAN)[0]
     assert opened.startswith("would open pcan PCAN_USBBUS1: timing BR: 250_000 bit/s, SP: 87.50%, BRP: 2, ")
     assert "f_clock" not in opened
 
 
-def test_dry_run_of_a_gateway_prints_both_ways(node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_ecu_node([*node, "--interface", "virtual", "--channel", "a", "--gateway", "b", "--dry-run"]) == 0
-    assert capsys.readouterr().out.splitlines() == [
+def test_dry_run_of_a_gateway_prints_both_ways(dry_run: Callable[..., list[str]]) -> None:
+    assert dry_run("--interface", "virtual", "--channel", "a", "--gateway", "b") == [
         "would open virtual a: no settings",
         "  reads all frames; corrects Pair (0x100), Heater (0x200)",
         "  sends all other frames of the other bus, as they are",
@@ -184,10 +183,11 @@ def test_dry_run_of_a_gateway_prints_both_ways(node: list[str], capsys: pytest.C
         ("virtual", "nothing is sent$"),
     ],
 )
-def test_listen_only_names_ack(interface: str, words: str, node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_listen_only_says_whether_the_adapter_acknowledges(
+    interface: str, words: str, dry_run: Callable[..., list[str]]
+) -> None:
     rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
-    assert run_ecu_node([*node, "--interface", interface, "--channel", "c0", *rate, "--listen-only", "--dry-run"]) == 0
-    *_, sends, last = capsys.readouterr().out.splitlines()
+    *_, sends, last = dry_run("--interface", interface, "--channel", "c0", *rate, "--listen-only")
     assert sends == "  sends nothing"
     assert re.search(words, last)
 
@@ -246,6 +246,7 @@ def line() -> Iterator[SerialLine]:
 
 
 MEASURED = PAIR.encode({"Battery": BATTERY_A, "Motor": CORRECTED_A})
+SLCAN_FRAME = b"t1008" + MEASURED.hex().upper().encode() + b"\r"
 RIGHT = {"Battery": pytest.approx(CORRECTED_A, abs=0.05 + 1e-9), "Motor": pytest.approx(CORRECTED_A)}
 
 
@@ -261,7 +262,7 @@ def test_slcan_answers_at_its_bit_rate(
     bus = ("--interface", "slcan", "--channel", line.path, "--bitrate", "250000")
     with running(*node, *bus, *options) as log:
         for _ in range(10):
-            line.put(b"t1008" + MEASURED.hex().upper().encode() + b"\r")
+            line.put(SLCAN_FRAME)
             line.take(0.02)
     line.take(0.1)
     head, answers, last = line.taken.split(b"\r")[:5], line.taken.split(b"\r")[5:-2], line.taken[-2:]
@@ -285,7 +286,7 @@ def test_unpublished_and_silent_branches_are_reported(
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(60.0)
         with running(*node, "--interface", "slcan", "--channel", line.path, "--bitrate", "250000") as log:
-            line.put(b"t1008" + MEASURED.hex().upper().encode() + b"\r")
+            line.put(SLCAN_FRAME)
             while manager.recv(4096) != b"STATUS=no branch sends":
                 pass
     assert any("branch heater is not published: the parameters apply a fault to it" in text for text in log)
