@@ -429,6 +429,32 @@ def test_a_power_is_divided_by_the_voltage_of_its_own_instant(make_database: Mak
     assert corrector.branches[2].currents_at(0.1) == pytest.approx((-10.0, -10.0))
 
 
+def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_database: MakeDatabase) -> None:
+    """And is written again, as long as it is not stale, into each answer to the other branches of its message."""
+    layout = SMALL_LAYOUT.replace('"Net.Voltage"', '"Net.Voltage", corrected = "PairOut.Heater"')
+    signal = ' SG_ Heater : 40|16@1+ (1,0) [0|60000] "W" Node\n SG_ Quality'
+    database = make_database(layout, SMALL_DBC.replace(" SG_ Quality", signal) + 'VAL_ 512 Heater 65535 "SNA";\n')
+    corrector = corrector_for(database, heater=(0.25, -2.0))
+    pair = Frame(PAIR, database.message("Pair").encode({"Battery": 0.0, "Motor": 0.0}))
+    heater = Frame(HEATER, database.message("Heater").encode({"Power": 4000}))
+
+    def heater_w(frame: Frame, now_s: float) -> float:
+        return published(database, corrector, frame, now_s, "heater")[0]
+
+    def volts(volts: float, now_s: float) -> None:
+        answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": volts})), now_s)
+
+    assert heater_w(heater, 0.0) == 65535, "no voltage yet"
+    volts(400.0, 0.1)
+    assert heater_w(pair, 0.15) == 65535, "nor one at the time of the last power"
+    assert heater_w(heater, 0.2) == (4000.0 - 2.0 * 400.0) / 1.25
+    volts(500.0, 0.3)
+    assert heater_w(pair, 0.4) == (4000.0 - 2.0 * 400.0) / 1.25
+    assert heater_w(heater, 0.5) == (4000.0 - 2.0 * 500.0) / 1.25
+    assert heater_w(pair, 1.1) == 65535, "stale"
+    assert corrector.counters.saturated == 0
+
+
 def test_a_signal_beyond_the_end_of_its_frame_is_invalid(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = corrector_for(database, battery=(0.1, 0.0))

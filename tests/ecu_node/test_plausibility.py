@@ -104,6 +104,22 @@ def test_a_sensor_that_stays_where_it_is_while_the_others_move_is_stuck(junction
     assert junction.corrector.latched_branches == ("battery",)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_stuck_branch_is_named_where_the_sum_may_vary_much(tmp_path: Path, name: str) -> None:
+    """Neither a jump nor a gain error or an offset shows; that one code never changes does, after a while."""
+
+    def swinging(time_s: float) -> dict[str, float]:
+        motor_a, heater_a = 60.0 + 30.0 * math.sin(0.7 * time_s), 60.0 + 30.0 * math.sin(3.1 * time_s)
+        return {"battery": motor_a + heater_a, "motor": motor_a, "heater": heater_a}
+
+    junction = Junction(three_branches(tmp_path), sd_a=15.0)
+    junction.wrong = {name: lambda _: 120.0 if name == "battery" else 60.0}
+    junction.run(8.5, swinging)
+    assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
+    junction.run(1.0, swinging)
+    assert (junction.corrector.latched, junction.corrector.latched_branches) == (Reason.BRANCH_STUCK, (name,))
+
+
 def test_a_steady_load_beside_a_gain_error_that_is_corrected_is_not_stuck(junction: Junction) -> None:
     def swinging(time_s: float) -> dict[str, float]:
         motor_a = 350.0 * math.sin(0.7 * time_s)
