@@ -44,7 +44,6 @@ class Vehicle:
         self.corrector.latch(reason, branches)
         self.memory.look(self.now_s)
 
-    @property
     def latched(self) -> Reason:
         return self.corrector.latched
 
@@ -84,9 +83,9 @@ def test_latched_fault_survives_a_restart_until_it_is_cleared(vehicle: Vehicle, 
     vehicle.file.write_text(vehicle.file.read_text().replace('"parameter_set": 44', f'"parameter_set": {number}'))
     vehicle.start()
     vehicle.later(3.0)
-    assert vehicle.latched is latched
+    assert vehicle.latched() is latched
     vehicle.clear()
-    assert vehicle.latched is Reason.NONE
+    assert vehicle.latched() is Reason.NONE
     assert vehicle.faults() == []
 
 
@@ -96,13 +95,13 @@ def test_a_short_gap_on_the_bus_releases_nothing_and_sleep_does(vehicle: Vehicle
         vehicle.latch(Reason.BRANCH_STALE, "motor")
         for seconds, latched in ((2.0, Reason.BRANCH_STALE), (7.0, Reason.NONE)):
             vehicle.later(seconds)
-            assert vehicle.latched is latched
+            assert vehicle.latched() is latched
         assert [(fault["active"], fault["count"]) for fault in vehicle.faults()] == [(False, count)]
         vehicle.junction.run(0.1, driving)
         vehicle.later(1.0)
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.later(60.0)
-    assert vehicle.latched is Reason.SUM_IMPLAUSIBLE
+    assert vehicle.latched() is Reason.SUM_IMPLAUSIBLE
     assert [fault["active"] for fault in vehicle.faults()] == [True, False], "the last one first"
 
 
@@ -110,21 +109,21 @@ def test_fault_that_cannot_be_kept_is_reported_and_kept_later(vehicle: Vehicle) 
     vehicle.state.rmdir()
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.later(3.0)
-    assert vehicle.latched is Reason.SUM_IMPLAUSIBLE
+    assert vehicle.latched() is Reason.SUM_IMPLAUSIBLE
     assert len([text for text in vehicle.said if "cannot keep the fault" in text]) == 1
     vehicle.state.mkdir()
     vehicle.later(62.0)
     (fault,) = vehicle.faults()
     assert (fault["reason"], fault["active"]) == ("SUM_IMPLAUSIBLE", True)
     vehicle.clear()
-    assert vehicle.latched is Reason.NONE
+    assert vehicle.latched() is Reason.NONE
 
 
 def test_a_state_folder_that_vanishes_clears_nothing(vehicle: Vehicle) -> None:
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.state.rename(vehicle.state.with_name("away"))
     vehicle.later(3.0)
-    assert vehicle.latched is Reason.SUM_IMPLAUSIBLE
+    assert vehicle.latched() is Reason.SUM_IMPLAUSIBLE
 
 
 def test_faults_that_are_over_are_cleared_for_good(vehicle: Vehicle) -> None:

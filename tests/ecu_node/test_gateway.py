@@ -68,15 +68,6 @@ def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_datab
         gateway_for(make_database(layout.replace("32000", "32768")))
 
 
-def test_bad_frames_are_held_back(database: VehicleDatabase) -> None:
-    corrector = gateway_for(database, battery=(0.25, 5.0))
-    good = battery(database, 3)
-    found = [passed_on(corrector, frame, 0.0) is None for frame in (good, damaged(good), good, battery(database, 13))]
-    assert found == [False, True, True, True]
-    counters = corrector.counters
-    assert (counters.corrupt, counters.repeated, counters.jumped, counters.held_back) == (1, 1, 1, 3)
-
-
 def test_bad_frames_are_passed_on_so_that_they_are_seen_to_be_bad(make_database: MakeDatabase) -> None:
     own = whole_vehicle(make_database, "", INVALID)
     corrector = gateway_for(own, battery=(0.25, 5.0))

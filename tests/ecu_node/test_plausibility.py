@@ -100,8 +100,9 @@ def test_a_sensor_that_stays_where_it_is_while_the_others_move_is_stuck(junction
     junction.run(15.0, accelerating)
     junction.wrong = {"battery": lambda _: 54.5}
     junction.run(10.0, accelerating)
-    assert junction.corrector.latched is Reason.BRANCH_STUCK
-    assert junction.corrector.latched_branches == ("battery",)
+    assert (junction.corrector.latched, junction.corrector.latched_branches) == (Reason.BRANCH_STUCK, ("battery",))
+    assert junction.fell_back_s is not None
+    assert junction.fell_back_s - 15.0 <= 5.0
 
 
 @pytest.mark.parametrize("name", NAMES)
