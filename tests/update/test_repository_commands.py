@@ -1,6 +1,7 @@
 """``calibrator repository``: keys, thresholds, signers one after the other, and mistakes in one line."""
 
 import os
+import re
 import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
@@ -16,6 +17,7 @@ from calibrator.files.storage import open_storage
 from ecu_node.parameters import VehicleParameters, write_parameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE, public_key_of
 from tests.disk import full_disk
+from tests.ecu_node.test_node import wait_until
 from tests.ecu_node.vehicles import LAYOUT
 from tests.update.repo import ALL, Repo, expired
 
@@ -249,6 +251,6 @@ def test_commands_that_write_wait_for_each_other(repo: Repo) -> None:
     command = [sys.executable, "-m", "calibrator", "repository", "unstage", str(repo.path)]
     with open_storage(repo.path).locked():
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.communicate(timeout=3)
+        waiting = re.compile(rf"-> FLOCK .* {process.pid} ")
+        wait_until(lambda: waiting.search(Path("/proc/locks").read_text()) is not None)
     assert "0 staged roles dropped" in process.communicate(timeout=60)[0]

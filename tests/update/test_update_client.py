@@ -1,5 +1,6 @@
 """What a vehicle makes of an honest repository: our own checks, revocation, time, and damaged files."""
 
+import lzma
 import math
 import os
 import subprocess
@@ -266,11 +267,12 @@ def test_no_bit_of_the_state_can_be_another_one(state: Path) -> None:
 
 
 def test_every_byte_of_a_bundle_counts(repo: Repo, new: Path) -> None:
-    content = repo.bundle().read_bytes()
-    places = range(len(content))
+    """Of head and tail each is changed or the last, of those between every seventh."""
+    content, path = repo.bundle().read_bytes(), repo.folder / "changed"
+    places = sorted({*range(64), *range(0, len(content), 7), *range(len(content) - 64, len(content))})
+    weak = lzma.compress(lzma.decompress(content))  # whole, but checked by CRC-64 alone
     changed = [content[:k] + bytes([content[k] ^ 1 << k % 8]) + content[k + 1 :] for k in places]
-    path = repo.folder / "changed"
-    for item in (*changed, *(content[:length] for length in places), content + b"\0", content + content):
+    for item in (*changed, *(content[:length] for length in places), content + b"\0", content + content, weak):
         path.write_bytes(item)
         with pytest.raises(TrustError, match="not a whole bundle") as caught:
             open_source(str(path))
