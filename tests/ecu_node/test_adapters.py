@@ -252,9 +252,7 @@ def answer(data: bytes) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("options", "opened"), [((), b"O"), (("--listen-only",), b"L")])
-def test_slcan_answers_at_its_bit_rate(
-    node: list[str], line: SerialLine, options: tuple[str, ...], opened: bytes
-) -> None:
+def test_slcan_answers_corrected(node: list[str], line: SerialLine, options: tuple[str, ...], opened: bytes) -> None:
     bus = ("--interface", "slcan", "--channel", line.path, "--bitrate", "250000")
     with running(*node, *bus, *options) as log:
         for _ in range(10):

@@ -182,9 +182,7 @@ def test_silent_branch_ends_the_correction_until_sleep(
 
 
 @pytest.mark.parametrize(("fault", "state"), [((0.0, 0.0), State.PASSING_THROUGH), ((0.25, 5.0), State.CORRECTING)])
-def test_unnamed_branches_are_not_waited_for(
-    database: VehicleDatabase, fault: tuple[float, float], state: State
-) -> None:
+def test_no_unnamed_branch_is_awaited(database: VehicleDatabase, fault: tuple[float, float], state: State) -> None:
     corrector = corrector_for(database, battery=fault)
     answers(corrector, battery(database, 0), 0.0)
     assert state_at(corrector, 0.05) == (state, Reason.NONE)
@@ -522,9 +520,7 @@ WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1-
         ),
     ],
 )
-def test_layout_that_disturbs_the_bus_is_refused(
-    make_database: MakeDatabase, layout: str, dbc: str, words: str
-) -> None:
+def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layout: str, dbc: str, words: str) -> None:
     with pytest.raises((LayoutError, DatabaseError), match=words):
         corrector_for(make_database(layout, dbc))
 

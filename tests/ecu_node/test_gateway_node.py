@@ -19,7 +19,7 @@ from ecu_node.bus.wiring import Mode
 from ecu_node.core.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from tests.ecu_node.test_node import LONGEST_WAIT_S, at_work, battery_frame, wait_until
+from tests.ecu_node.test_node import LONGEST_WAIT_S, at_work, battery_frame, receive, wait_until
 from tests.ecu_node.test_socketcan import fields, random_frame
 from tests.ecu_node.vehicles import corrector_for, decoded
 
@@ -48,16 +48,12 @@ def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> I
         yield corrector, running
 
 
-def received(bus: can.BusABC, count: int, *, status: bool | None = False) -> list[can.Message]:
-    """The next frames; those of the status only if asked for, else all others, or with None all."""
-    found: list[can.Message] = []
-    give_up = time.monotonic() + LONGEST_WAIT_S
-    while len(found) < count:
-        message = bus.recv(0.5)
-        assert time.monotonic() < give_up, f"{len(found)} of {count} frames came"
-        if message is not None and status in {None, message.arbitration_id == 0x5F0}:
-            found.append(message)
-    return found
+STATUS = 0x5F0
+
+
+def received(bus: can.BusABC, count: int) -> list[can.Message]:
+    """The next frames but for those of the status."""
+    return receive(bus, STATUS, count, int.__ne__)
 
 
 def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, ends: Ends, channel: str) -> None:
@@ -146,7 +142,7 @@ def test_a_remote_frame_passes_whatever_its_identifier(database: VehicleDatabase
     with gateway(database, channel):
         for message in asked:
             vehicle.send(message)
-        assert list(map(fields, received(sensors, 2, status=None))) == list(map(fields, asked))
+        assert list(map(fields, receive(sensors, 0, 2, int.__ge__))) == list(map(fields, asked))
 
 
 WORDS = "another node sends frames 0x(110|5F0), which only this one may send there; two nodes on one bus, or two buses"
@@ -158,7 +154,7 @@ def test_foreign_frames_are_dropped_and_counted(
 ) -> None:
     sensors, vehicle = ends
     with gateway(database, channel) as (corrector, running):
-        received(vehicle, 1, status=True)
+        receive(vehicle, STATUS, 1)
         sender = vehicle if origin == "vehicle" else sensors
         for counter in range(100):
             sender.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=[counter, *bytes(7)]))
@@ -184,8 +180,8 @@ def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, chan
 def test_a_second_gateway_between_the_same_buses_refuses(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     _, vehicle = ends
     with gateway(database, channel) as (_, first):
-        received(vehicle, 1, status=True)
+        receive(vehicle, STATUS, 1)
         with gateway(database, channel) as (_, second), pytest.raises(BusError, match=WORDS):
             second.result(LONGEST_WAIT_S)
-        received(vehicle, 3, status=True)
+        receive(vehicle, STATUS, 3)
         assert not first.done()

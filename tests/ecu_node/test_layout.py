@@ -85,15 +85,10 @@ def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: st
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("content", "words"), [(None, "cannot read the layout: No such file"), (b"\xff", "the file is not UTF-8")]
-)
-def test_a_layout_file_that_cannot_be_read_is_named(tmp_path: Path, content: bytes | None, words: str) -> None:
-    path = tmp_path / "x.toml"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(LayoutError, match=rf"x\.toml: .*{words}"):
-        read_layout(path)
+def test_a_layout_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.toml").write_bytes(b"\xff")
+    with pytest.raises(LayoutError, match=r"x\.toml: not a layout: the file is not UTF-8 text; see the page 'Layout'"):
+        read_layout(tmp_path / "x.toml")
 
 
 @pytest.mark.parametrize(
@@ -122,9 +117,7 @@ def test_a_diagnostics_database_is_refused(make_database: MakeDatabase, tmp_path
 
 @pytest.mark.parametrize("mark", [1 << 31, 0])
 @pytest.mark.parametrize("more", ["", 'VAL_ 258 Gone 1 "On";\n'])
-def test_unmarked_29_bit_identifiers_and_stray_names_are_read(
-    make_database: MakeDatabase, mark: int, more: str
-) -> None:
+def test_unmarked_29_bit_ids_and_stray_names_are_read(make_database: MakeDatabase, mark: int, more: str) -> None:
     """As they stand in many public DBCs."""
     number = mark | 0x18FF0200
     texts = f'CM_ SG_ {number} Power "Taken up";\nVAL_ {number} Power 65535 "SNA";\n'

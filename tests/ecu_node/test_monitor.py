@@ -182,9 +182,7 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("handlers")
-def test_once_prints_what_was_seen_and_sends_nothing(
-    database: VehicleDatabase, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_once_prints_view_and_sends_nothing(database: VehicleDatabase, capsys: pytest.CaptureFixture[str]) -> None:
     counters = cycle(range(15))
 
     def count_on(message: can.Message) -> None:

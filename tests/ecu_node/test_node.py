@@ -57,14 +57,16 @@ def at_work(node: Node, *, may_end: bool = False) -> Iterator[Future[None]]:
         running.result()
 
 
-def receive(bus: can.BusABC, identifier: int, count: int) -> list[can.Message]:
-    """The first frames of one identifier."""
+def receive(
+    bus: can.BusABC, identifier: int, count: int, is_wanted: Callable[[int, int], bool] = int.__eq__
+) -> list[can.Message]:
+    """The first frames of one identifier, or of those that compare with it as wanted."""
     found: list[can.Message] = []
     give_up = time.monotonic() + LONGEST_WAIT_S
     while len(found) < count:
         message = bus.recv(1.0)
         assert time.monotonic() < give_up, f"{len(found)} of {count} frames came"
-        if message is not None and message.arbitration_id == identifier:
+        if message is not None and is_wanted(message.arbitration_id, identifier):
             found.append(message)
     return found
 

@@ -182,9 +182,7 @@ def test_a_file_of_version_1_0_is_read_unless_it_has_a_sensor_model(database: Ve
         ({"expected_a": -150.0, "delay_s": None}, None),
     ],
 )
-def test_parameters_beyond_limits_do_not_fit(
-    database: VehicleDatabase, change: dict[str, Any], words: str | None
-) -> None:
+def test_values_beyond_limits_are_unfit(database: VehicleDatabase, change: dict[str, Any], words: str | None) -> None:
     expected = {key: value for key, value in change.items() if key == "expected_a"}
     residual = JunctionResidual(measured_a=1.0, corrected_a=0.1, **expected)
     branches = {"battery": replace(SOUND, **{key: change[key] for key in change.keys() - expected})}

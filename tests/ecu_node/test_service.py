@@ -91,9 +91,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     return at
 
 
-def test_repeated_line_is_limited_to_one_in_10_s(
-    clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_repeated_line_comes_once_in_10_s(clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]) -> None:
     log = Log()
     for tenth in range(201):
         clock(0.1 * tenth)

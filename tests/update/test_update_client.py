@@ -46,9 +46,7 @@ def numbers(state: Path) -> list[int | None]:
     return [item.parameters.number if item else None for item in (found.in_force, found.on_trial, found.before)]
 
 
-def test_set_is_on_trial_then_in_force_and_previous_set_is_kept(
-    repo: Repo, new: Path, other: VehicleParameters
-) -> None:
+def test_set_is_on_trial_then_in_force_and_the_last_is_kept(repo: Repo, new: Path, other: VehicleParameters) -> None:
     repo.updated(new)
     assert numbers(new)[:2] == [None, 300]
     pass_trial(new)
@@ -348,9 +346,7 @@ def test_inspect_and_report_say_what_the_vehicle_holds(repo: Repo, state: Path, 
     assert msgspec.json.decode(repo.node("report", "--state", state)[1])["on_trial"] == facts["on_trial"]
 
 
-def test_inspect_fails_if_the_set_in_force_has_expired(
-    state: Path, repo: Repo, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_inspect_fails_if_the_set_in_force_expired(state: Path, repo: Repo, monkeypatch: pytest.MonkeyPatch) -> None:
     late = replace(read_state(state), latest=held_set(state).expires)
     monkeypatch.setattr("ecu_node.update.state.read_state", lambda _: late)
     code, _, err = repo.node("inspect", "--state", state)

@@ -158,7 +158,7 @@ def test_rules_that_vanish_are_set_again(params: Path, start_node: StartNode) ->
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin")
 
 
-def test_node_carries_all_frames_without_rights(
+def test_node_carries_frames_without_rights(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY, by=WITHOUT_RIGHTS) as node:
@@ -174,9 +174,7 @@ def test_node_carries_all_frames_without_rights(
     ) in node.messages
 
 
-def test_node_carries_all_frames_without_module(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
+def test_node_carries_frames_without_module(params: Path, start_node: StartNode, other_recording: Recording) -> None:
     run_tool("rmmod", "can-gw")
     try:
         with start_node(params, *GATEWAY) as node:
