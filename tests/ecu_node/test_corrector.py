@@ -32,6 +32,7 @@ from tests.ecu_node.vehicles import (
     corrector_for,
     damaged,
     decoded,
+    frame_of,
     parameters_for,
     passed_on,
     protected,
@@ -201,8 +202,8 @@ def test_a_value_from_before_the_sleep_is_never_published(make_database: MakeDat
     database = make_database(*TWO_SOURCES)
     faults = {"battery": (0.5, 3.0), "motor": (0.25, 0.0)}
     corrector = corrector_for(database, **faults)
-    pair = Frame(PAIR, database.message("Pair").encode({"Battery": 153.0}))
-    answers(corrector, Frame(FrameKey(257, False), database.message("Other").encode({"Motor": 50.0})), 0.0)
+    pair = frame_of(database, "Pair", Battery=153.0)
+    answers(corrector, frame_of(database, "Other", Motor=50.0), 0.0)
     no_value = pytest.approx(0.05 * 32768)
     assert published(database, corrector, pair, 0.1, "motor")[0] == 40.0
     for now_s in (0.2, 3600.0, 3600.1):
@@ -396,17 +397,19 @@ def test_dbc_names_all_status_codes(database: VehicleDatabase, signal: str, code
 def test_a_power_counts_in_the_sum_as_power_over_voltage(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0), heater=(0.25, 0.0))
-    answers(corrector, Frame(PAIR, database.message("Pair").encode({"Battery": 50.0, "Motor": 40.0})), 0.0)
-    heater = Frame(HEATER, database.message("Heater").encode({"Power": 4000}))
+    answers(corrector, frame_of(database, "Pair", Battery=50.0, Motor=40.0), 0.0)
+    heater = frame_of(database, "Heater", Power=4000)
     answers(corrector, heater, 0.0)
     assert sums_at(corrector, 0.0) == (None, None)
-    answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": 400.0})), 0.0)
+    answers(corrector, frame_of(database, "Net", Voltage=400.0), 0.0)
     assert answers(corrector, heater, 0.1) == []
     assert sums_at(corrector, 0.1) == pytest.approx((50.0 - 40.0 - 10.0, 50.0 - 40.0 - 8.0))
-    answers(corrector, heater, 0.7)
-    assert corrector.branches[2].currents_at(0.7) is None, "a voltage 0.7 s old is not divided by"
-    answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": 0.5})), 0.7)
-    assert corrector.branches[2].currents_at(0.7) is None, "nor one near zero"
+    answers(corrector, frame_of(database, "Net", Voltage=500.0), 0.2)
+    assert corrector.branches[2].currents_at(0.1) == pytest.approx((-10.0, -8.0)), "each at its own voltage"
+    answers(corrector, heater, 0.9)
+    assert corrector.branches[2].currents_at(0.9) is None, "a voltage 0.7 s old is not divided by"
+    answers(corrector, frame_of(database, "Net", Voltage=0.5), 0.9)
+    assert corrector.branches[2].currents_at(0.9) is None, "nor one near zero"
 
 
 @pytest.mark.parametrize(("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")])
@@ -418,29 +421,20 @@ def test_unit_per_bit_counts_once_beside_the_scale(make_database: MakeDatabase, 
     assert corrector.branches[2].currents_at(0.0) == pytest.approx((-10.0, -10.0))
 
 
-def test_a_power_is_divided_by_the_voltage_of_its_own_instant(make_database: MakeDatabase) -> None:
-    database = make_database()
-    corrector = corrector_for(database, heater=(0.0, 0.0))
-    answers(corrector, Frame(HEATER, database.message("Heater").encode({"Power": 4000})), 0.0)
-    for now_s, volts in ((0.0, 400.0), (0.2, 500.0)):
-        answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": volts})), now_s)
-    assert corrector.branches[2].currents_at(0.1) == pytest.approx((-10.0, -10.0))
-
-
 def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_database: MakeDatabase) -> None:
     """And is written again, as long as it is not stale, into each answer to the other branches of its message."""
     layout = SMALL_LAYOUT.replace('"Net.Voltage"', '"Net.Voltage", corrected = "PairOut.Heater"')
     signal = ' SG_ Heater : 40|16@1+ (1,0) [0|60000] "W" Node\n SG_ Quality'
     database = make_database(layout, SMALL_DBC.replace(" SG_ Quality", signal) + 'VAL_ 512 Heater 65535 "SNA";\n')
     corrector = corrector_for(database, heater=(0.25, -2.0))
-    pair = Frame(PAIR, database.message("Pair").encode({"Battery": 0.0, "Motor": 0.0}))
-    heater = Frame(HEATER, database.message("Heater").encode({"Power": 4000}))
+    pair = frame_of(database, "Pair", Battery=0.0, Motor=0.0)
+    heater = frame_of(database, "Heater", Power=4000)
 
     def heater_w(frame: Frame, now_s: float) -> float:
         return published(database, corrector, frame, now_s, "heater")[0]
 
     def volts(volts: float, now_s: float) -> None:
-        answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": volts})), now_s)
+        answers(corrector, frame_of(database, "Net", Voltage=volts), now_s)
 
     assert heater_w(heater, 0.0) == 65535, "no voltage yet"
     volts(400.0, 0.1)
@@ -463,9 +457,7 @@ def test_a_signal_beyond_the_end_of_its_frame_is_invalid(make_database: MakeData
     assert corrector.counters.short == 2
 
 
-def test_bad_frame_is_published_as_invalid_if_the_layout_says_so(
-    make_database: MakeDatabase,
-) -> None:
+def test_bad_frame_is_published_as_invalid_if_the_layout_says_so(make_database: MakeDatabase) -> None:
     own = whole_vehicle(make_database, "", ("full_scale_a", 'on_bad_frame = "invalid"\nfull_scale_a'))
     corrector = corrector_for(own, battery=(0.25, 5.0))
     found = [published(own, corrector, frame, 0.0) for frame in (battery(own, 3), damaged(battery(own, 4)))]
@@ -525,18 +517,15 @@ def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layou
         corrector_for(make_database(layout, dbc))
 
 
-def test_frame_without_the_current_repeats_its_last_value_until_stale(
-    make_database: MakeDatabase,
-) -> None:
+def test_frame_without_the_current_repeats_its_last_value_until_stale(make_database: MakeDatabase) -> None:
     multiplexed = SMALL_DBC.replace(
         " SG_ Battery : 7|16@0-", ' SG_ Page M : 48|8@1+ (1,0) [0|255] "" Node\n SG_ Battery m0 : 7|16@0-', 1
     )
     database = make_database(dbc=multiplexed)
     corrector = corrector_for(database, battery=(0.5, 0.0))
-    with_it = database.message("Pair").encode({"Page": 0, "Battery": 150.0, "Motor": 0.0})
-    without = bytes((0, 0, 0, 0, 0, 0, 1, 0))
+    with_it, without = frame_of(database, "Pair", Page=0, Battery=150.0, Motor=0.0), Frame(PAIR, b"\0\0\0\0\0\0\1\0")
     frames = ((0.0, with_it), (0.1, without), (0.4, without), (0.6, without))
-    found = [published(database, corrector, Frame(PAIR, data), time_s) for time_s, data in frames]
+    found = [published(database, corrector, frame, time_s) for time_s, frame in frames]
     current = (100.0, Quality.CORRECTED)
     assert found == [current, current, current, (-3276.8, Quality.NOT_AVAILABLE)]
 

@@ -8,7 +8,6 @@ from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError
 from tests.ecu_node.vehicles import (
-    HEATER,
     NET,
     PAIR,
     SMALL_DBC,
@@ -19,6 +18,7 @@ from tests.ecu_node.vehicles import (
     corrector_for,
     damaged,
     decoded,
+    frame_of,
     passed_on,
     whole_vehicle,
 )
@@ -84,12 +84,12 @@ def test_bad_frames_are_passed_on_so_that_they_are_seen_to_be_bad(make_database:
 def test_a_power_is_written_back_as_a_power(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = gateway_for(database, heater=(0.25, -2.0))
-    heater = Frame(HEATER, database.message("Heater").encode({"Power": 4000}))
+    heater = frame_of(database, "Heater", Power=4000)
     assert passed_on(corrector, heater, 0.0) == heater.data, "without a voltage it is passed through"
     missing = State.PARTLY_CORRECTING, Reason.INPUT_MISSING
     corrector.look(0.0)
     assert corrector.state() == missing
-    passed_on(corrector, Frame(NET, database.message("Net").encode({"Voltage": 400.0})), 0.0)
+    passed_on(corrector, frame_of(database, "Net", Voltage=400.0), 0.0)
     out = passed_on(corrector, heater, 0.1)
     assert out is not None
     current_a = (-4000 / 400 + 2.0) / 1.25
