@@ -465,6 +465,9 @@ def test_bad_frame_is_published_as_invalid_if_the_layout_says_so(make_database: 
 
 
 MOTOR_SNA = '512 Motor -32768 "SNA"'
+INIT = (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"')
+PAGE = (" SG_ Quality", ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1')
+OWN_E2E = '\n[e2e]\nprofile = "P01"\nmessages = ["PairOut"]\n'
 LOOP = ("PairOut.Motor", "Pair.Spare")
 SPARE = (" SG_ Battery", ' SG_ Spare : 48|16@1- (1,0) [0|0] "A" Node\n SG_ Battery')
 OWN_STATUS = '\n[status]\nmessage = "Own"\nstate = "State"\nreason = "Reason"\n'
@@ -490,26 +493,18 @@ WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1-
         (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
         (
             SMALL_LAYOUT,
-            SMALL_DBC.replace(" SG_ Quality", ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1'),
-            "signal PairOut.Quality is multiplexed; what the node sends in its own name must be in every frame",
+            SMALL_DBC.replace(*PAGE),
+            "PairOut.Quality is multiplexed; what the node sends .* in every frame",
         ),
         (SMALL_LAYOUT, SMALL_DBC.replace(MOTOR_SNA, '512 Motor 32767 "Max"'), "Motor needs a code named SNA"),
         (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
         (
             SMALL_LAYOUT + OWN_SUM,
             WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n',
-            "status: code 3 of signal Sum means 'SNA', so that no result beyond 0.2 could be written",
+            "code 3 of signal Sum means 'SNA', .* beyond 0.2",
         ),
-        (
-            SMALL_LAYOUT,
-            SMALL_DBC.replace(MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"'),
-            "branch motor: code -1 of signal Motor means 'Init', .* beyond 0 could be",
-        ),
-        (
-            SMALL_LAYOUT + '\n[e2e]\nprofile = "P01"\nmessages = ["PairOut"]\n',
-            SMALL_DBC,
-            "PairOut.Battery is written twice, or overlaps another signal that is written, or the E2E header",
-        ),
+        (SMALL_LAYOUT, SMALL_DBC.replace(*INIT), "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
+        (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery is written twice, or overlaps .*, or the E2E header"),
     ],
 )
 def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layout: str, dbc: str, words: str) -> None:
@@ -518,10 +513,8 @@ def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layou
 
 
 def test_frame_without_the_current_repeats_its_last_value_until_stale(make_database: MakeDatabase) -> None:
-    multiplexed = SMALL_DBC.replace(
-        " SG_ Battery : 7|16@0-", ' SG_ Page M : 48|8@1+ (1,0) [0|255] "" Node\n SG_ Battery m0 : 7|16@0-', 1
-    )
-    database = make_database(dbc=multiplexed)
+    page = ' SG_ Page M : 48|8@1+ (1,0) [0|255] "" Node\n'
+    database = make_database(dbc=SMALL_DBC.replace(" SG_ Battery : 7", f"{page} SG_ Battery m0 : 7", 1))
     corrector = corrector_for(database, battery=(0.5, 0.0))
     with_it, without = frame_of(database, "Pair", Page=0, Battery=150.0, Motor=0.0), Frame(PAIR, b"\0\0\0\0\0\0\1\0")
     frames = ((0.0, with_it), (0.1, without), (0.4, without), (0.6, without))

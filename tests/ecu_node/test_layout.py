@@ -25,6 +25,7 @@ def test_a_byte_order_mark_is_left_out_and_line_ends_do_not_change_the_digest(tm
     assert read_layout(tmp_path / "x.toml").digest == layout.digest == file_digest(tmp_path / "x.toml")
 
 
+E2E = '\n]\n[e2e]\nmessages = ["Net"]\nprofile ='
 BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
 
 
@@ -49,31 +50,19 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ("full_scale_a", "watch.valid = [nan]\nfull_scale_a", r"\[watch\], valid, entry number 1: .* found NaN"),
         (
             "\n]\n",
-            '\n]\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\nvalid = { window = 3, min_ok = 5, max_error = 0 }\n',
-            r"\[e2e\], valid: min_ok = 5 of 3 frames; at most all of them can be",
+            f'{E2E} "P01"\nvalid = {{ window = 3, min_ok = 5, max_error = 0 }}\n',
+            "valid: min_ok = 5 of 3 frames;",
         ),
         ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
-        (
-            "\n]\n",
-            '\n]\n[e2e]\nprofile = ["P01"]\nmessages = ["Net"]\n',
-            r"profile: expected one of P01.*found \[\"P01\"\]",
-        ),
-        (
-            "sign = ",
-            'vss = "Vehicle.A", sign = ',
-            "vss 'Vehicle.A' stands at two branches; each needs a name of its own",
-        ),
+        ("\n]\n", f'{E2E} ["P01"]\n', r"profile: expected one of P01.*found \[\"P01\"\]"),
+        ("sign = ", 'vss = "Vehicle.A", sign = ', "vss 'Vehicle.A' stands at two branches; each needs a name of"),
         ("sign = ", 'vss = "vehicle.A", sign = ', "'battery', vss: expected a name of the Vehicle Signal Spec"),
         ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: 'speed' is no"),
         ('"Pair.Motor"', '"Pair.Battery"', "branches battery and motor: both read Pair.Battery"),
         ('"PairOut.Motor"', '"PairOut.Battery"', "PairOut.Battery is written twice"),
         ('"PairOut.Motor"', '"Pair.Motor"', "Pair.Motor is both read and written"),
         ("sign = ", "balance = true, sign = ", "more than one branch has 'balance = true'"),
-        (
-            "full_scale_a",
-            'input = [{ name = "x", signal = "PairOut.Quality" }]\nfull_scale_a',
-            "is both read and written",
-        ),
+        ("\n]\n", '\n]\ninput = [{ name = "x", signal = "PairOut.Quality" }]\n', "Quality is both read and written"),
     ],
 )
 def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: str, new: str, words: str) -> None:

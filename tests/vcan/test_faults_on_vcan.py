@@ -25,19 +25,12 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.small_drive import BRANCHES, passed_on, protected, true_parameters, write_drive
+from tests.vcan.small_drive import BRANCHES, passed_on, protected, true_parameters
 
 INSTANTS = 45
 """A multiple of the counter's period, so that a drive may follow itself."""
 STATUS, BATTERY, AUXILIARY, BATTERY_CORRECTED, MARKER = 0x5F0, 0x110, 0x130, 0x510, 0x7F0
 GATEWAY = ("--gateway", OTHER_CHANNEL)
-
-
-@pytest.fixture
-def drive(database: VehicleDatabase, tmp_path: Path) -> Path:
-    path = tmp_path / "drive.log"
-    write_drive(path, database, INSTANTS)
-    return path
 
 
 def expected_battery(database: VehicleDatabase, drive: Path) -> list[bytes]:

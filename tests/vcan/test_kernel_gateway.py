@@ -34,13 +34,13 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.small_drive import write_drive
 from tests.vcan.test_faults_on_vcan import AUXILIARY, BATTERY, GATEWAY, STATUS, state_of
 
 NOISE, BACK = 0x345, 0x346
 """Identifiers of others, sent towards the vehicle and towards the sensors."""
 RULES = 2 * (34 + 1)
 """Both ways, all standard identifiers but those of the five branches and the status, and all extended ones."""
+INSTANTS = 150
 FOREIGN = "FFFFFFFFFFFFFFFF"
 """What another node sends under the battery's identifier."""
 
@@ -57,13 +57,6 @@ def rules() -> list[tuple[str, ...]]:
     """Source, identifier and mask of the kernel's rules; ``cangw -L`` fails where there are as many as of a gateway."""
     lines = [line.split() for line in Path("/proc/net/can/rcvlist_fil").read_text().splitlines()]
     return sorted(tuple(words[:3]) for words in lines if words[-1:] == ["gw"])
-
-
-@pytest.fixture
-def drive(database: VehicleDatabase, tmp_path: Path) -> Path:
-    path = tmp_path / "drive.log"
-    write_drive(path, database, 150)
-    return path
 
 
 @contextmanager
@@ -227,14 +220,14 @@ def test_foreign_branch_frames_are_reported(
                 wait_for_state(other_recording, State.CORRECTING, Reason.FOREIGN_FRAMES)
                 assert player.wait(LONGEST_WAIT_S) == 0
             foreigner.terminate()
-        sent = len(recording.wait_for(BATTERY, 150))
-        other_recording.wait_for(AUXILIARY, 150)
+        sent = len(recording.wait_for(BATTERY, INSTANTS))
+        other_recording.wait_for(AUXILIARY, INSTANTS)
         print(f"{len(other_recording.data_of(BATTERY)) - sent} foreign frames among {sent}")
         assert node.stop() == 0
     foreign = bytes.fromhex(FOREIGN)
     assert foreign not in recording.data_of(BATTERY), "none reaches the sensors' bus"
     passed = [data for data in other_recording.data_of(BATTERY) if data != foreign]
-    assert [data[1] & 15 for data in passed] == [k % 15 for k in range(150)], "each frame of the branch arrives"
+    assert [data[1] & 15 for data in passed] == [k % 15 for k in range(INSTANTS)], "each frame of the branch arrives"
     assert passed != recording.data_of(BATTERY), "corrected"
     assert "vcan1': another node sends frames 0x110, which only this one may send there; they are dropped" in (
         node.messages
@@ -258,7 +251,7 @@ def test_a_gateway_whose_log_nobody_reads_goes_on_both_ways_and_ends(
             with noise(100), playing(drive) as player:
                 generate(OTHER_CHANNEL, 20, "-I", f"{BATTERY:X}")  # each is worth a line
                 assert player.wait(LONGEST_WAIT_S) == 0
-            other_recording.wait_for(AUXILIARY, 150)
+            other_recording.wait_for(AUXILIARY, INSTANTS)
             other_recording.wait_for(NOISE, 100)
             recording.wait_for(BACK, 100)
             process.terminate()
