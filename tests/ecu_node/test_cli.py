@@ -93,7 +93,7 @@ def test_layout_without_own_signals_needs_a_gateway(
     assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
 
 
-def test_check_reports_fault_not_applied(
+def test_check_says_which_fault_is_not_applied(
     database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parameters = msgspec.structs.replace(parameters_for(database, battery=(0.25, 5.0)), vehicle="v\x1b[2J")
@@ -112,7 +112,7 @@ def test_check_warns_of_can_fd(make_database: MakeDatabase, tmp_path: Path, caps
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
 
 
-def test_unfit_parameters_end_in_1(
+def test_check_of_unfit_parameters_ends_in_1_and_says_why(
     params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run_ecu_node(check(params, "--vehicle", "v2", "--json")) == 1

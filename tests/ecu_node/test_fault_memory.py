@@ -142,7 +142,7 @@ def test_faults_that_are_over_are_cleared_for_good(vehicle: Vehicle) -> None:
         ("", None, "cannot read the fault memory: it is a folder"),
     ],
 )
-def test_damaged_memory(
+def test_damaged_memory_is_one_line(
     vehicle: Vehicle, old: str, new: str | None, why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicle.latch(Reason.BRANCH_STALE, "motor")

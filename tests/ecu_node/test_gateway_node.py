@@ -93,7 +93,7 @@ class BlockingBus(VirtualBus):
         super().send(msg, timeout)
 
 
-def test_watchdog_starves_if_way_back_is_stuck(
+def test_watchdog_is_not_fed_while_the_way_back_is_stuck(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)

@@ -83,7 +83,7 @@ def test_a_file_that_is_gone_or_of_another_vehicle_changes_nothing(path: Path, d
         (b'"v1"', b'"v2"', Reason.WRONG_VEHICLE, "parameters are for vehicle 'v2', this is 'v1'"),
     ],
 )
-def test_later_file_is_used(
+def test_file_that_comes_later_is_used(
     path: Path, database: VehicleDatabase, old: bytes, new: bytes, reason: Reason, words: str
 ) -> None:
     """What stood there at the start is not used, and why is published."""

@@ -30,7 +30,7 @@ def test_jump_of_a_sensor_ends_the_correction_within_100_ms(junction: Junction, 
     ("name", "gain", "growth_per_s", "within_s"),
     [("motor", 1.2, 0, 5), ("battery", 0.8, 0, 5), ("battery", 3, 0, 5), ("battery", 1, 0.01, 30)],
 )
-def test_gain_change_ends_correction(
+def test_gain_that_changes_ends_the_correction(
     junction: Junction, name: str, gain: float, growth_per_s: float, within_s: float
 ) -> None:
     junction.break_sensors(

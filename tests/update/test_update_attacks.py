@@ -230,7 +230,7 @@ def test_web_server(repo: Repo, new: Path, server: Any, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("vehicle", ["V 1", "Ü#1", "a/b", "50%"])
-def test_vehicle_of_any_name(
+def test_vehicle_may_have_any_name(
     vehicle: str, repo: Repo, server: Any, parameters: VehicleParameters, tmp_path: Path
 ) -> None:
     path = tmp_path / "parameters.json"

@@ -126,7 +126,7 @@ def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, dat
     ("drift", "offset_a"), [(-DRIFT, -OFFSET_A), (0.0, -OFFSET_A), (3.0 * DRIFT, OFFSET_A), (DRIFT, 10.0)]
 )
 @pytest.mark.parametrize("left_a", [0.5, 20.0], ids=["little", "much"])
-def test_wrong_set_fails(
+def test_wrong_set_fails_its_trial(
     vehicle: Path, database: VehicleDatabase, drift: float, offset_a: float, left_a: float
 ) -> None:
     """Also where the calibrator saw that much is left of the sum."""
