@@ -251,6 +251,6 @@ def test_commands_that_write_wait_for_each_other(repo: Repo) -> None:
     command = [sys.executable, "-m", "calibrator", "repository", "unstage", str(repo.path)]
     with open_storage(repo.path).locked():
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        waiting = re.compile(rf"-> FLOCK .* {process.pid} ")
+        waiting = re.compile(rf"-> \w+ .* {process.pid} ")
         wait_until(lambda: waiting.search(Path("/proc/locks").read_text()) is not None)
     assert "0 staged roles dropped" in process.communicate(timeout=60)[0]

@@ -65,15 +65,11 @@ def ended(
     return running
 
 
-def mend(path: Path, content: bytes) -> None:
-    shutil.rmtree(path, ignore_errors=True)
-    path.write_bytes(content)
-
-
 @pytest.mark.parametrize("damage", [without, cut, a_folder])
-def test_damaged_state_keeps_what_is_in_force(
+def test_damaged_state_changes_nothing_until_it_is_mended(
     damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
 ) -> None:
+    """In a running node what was in force stays; one that starts with it passes through."""
     running, path = Running(correcting, database), correcting / "state.json"
     whole = path.read_bytes()
     damage(path)
@@ -84,25 +80,16 @@ def test_damaged_state_keeps_what_is_in_force(
     running.now = NOW + timedelta(days=400)
     assert running.look(8.0) == [True], "it expires all the same"
     assert running.corrector.reason is Reason.NOT_VALID_NOW
-    mend(path, whole)
+    started = Running(correcting, database)
+    assert started.corrector.reason in (Reason.MALFORMED_PARAMETERS, Reason.NO_PARAMETERS)
+    assert not any(started.look(1.0))
+    shutil.rmtree(path, ignore_errors=True)
+    path.write_bytes(whole)
+    assert started.look(3.0) == [True]
+    assert (started.drift, started.corrector.reason) == (DRIFT, Reason.NONE)
     running.now = NOW
     running.look(10.0)
     assert running.drift == DRIFT
-
-
-@pytest.mark.parametrize("damage", [without, cut, a_folder])
-def test_node_passes_through_until_damaged_state_is_mended(
-    damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
-) -> None:
-    path = correcting / "state.json"
-    whole = path.read_bytes()
-    damage(path)
-    running = Running(correcting, database)
-    assert running.corrector.reason in (Reason.MALFORMED_PARAMETERS, Reason.NO_PARAMETERS)
-    assert not any(running.look(1.0))
-    mend(path, whole)
-    assert running.look(3.0) == [True]
-    assert (running.drift, running.corrector.reason) == (DRIFT, Reason.NONE)
 
 
 def test_state_of_another_vehicle_is_not_used(correcting: Path, database: VehicleDatabase) -> None:
