@@ -139,10 +139,11 @@ def test_a_remote_frame_passes_whatever_its_identifier(database: VehicleDatabase
     sensors, vehicle = ends
     remote = partial(can.Message, is_extended_id=False, is_remote_frame=True, dlc=8)
     asked = [remote(arbitration_id=key) for key in (0x110, 0x5F0)]
-    with gateway(database, channel):
+    with gateway(database, channel) as (corrector, _):
         for message in asked:
             vehicle.send(message)
         assert list(map(fields, receive(sensors, 0, 2, int.__ge__))) == list(map(fields, asked))
+        wait_until(lambda: corrector.counters.returned == 2)
 
 
 WORDS = "another node sends frames 0x(110|5F0), which only this one may send there; two nodes on one bus, or two buses"
