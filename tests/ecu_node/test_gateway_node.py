@@ -1,5 +1,6 @@
 """A gateway on two of python-can's virtual buses: real bus objects, the node in threads of its own."""
 
+import operator
 import random
 import threading
 import time
@@ -53,7 +54,7 @@ STATUS = 0x5F0
 
 def received(bus: can.BusABC, count: int) -> list[can.Message]:
     """The next frames but for those of the status."""
-    return receive(bus, STATUS, count, int.__ne__)
+    return receive(bus, STATUS, count, operator.ne)
 
 
 def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, ends: Ends, channel: str) -> None:
@@ -142,7 +143,7 @@ def test_a_remote_frame_passes_whatever_its_identifier(database: VehicleDatabase
     with gateway(database, channel) as (corrector, _):
         for message in asked:
             vehicle.send(message)
-        assert list(map(fields, receive(sensors, 0, 2, int.__ge__))) == list(map(fields, asked))
+        assert list(map(fields, receive(sensors, 0, 2, operator.ge))) == list(map(fields, asked))
         wait_until(lambda: corrector.counters.returned == 2)
 
 

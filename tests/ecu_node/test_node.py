@@ -2,6 +2,7 @@
 
 import errno
 import gc
+import operator
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -58,7 +59,7 @@ def at_work(node: Node, *, may_end: bool = False) -> Iterator[Future[None]]:
 
 
 def receive(
-    bus: can.BusABC, identifier: int, count: int, is_wanted: Callable[[int, int], bool] = int.__eq__
+    bus: can.BusABC, identifier: int, count: int, is_wanted: Callable[[int, int], bool] = operator.eq
 ) -> list[can.Message]:
     """The first frames of one identifier, or of those that compare with it as wanted."""
     found: list[can.Message] = []
