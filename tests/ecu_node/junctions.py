@@ -9,7 +9,7 @@ import numpy as np
 
 from ecu_node.bus.wiring import InForce, wire
 from ecu_node.core.signals import FrameKey
-from ecu_node.core.status import Quality
+from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from tests.ecu_node.vehicles import parameters_for
@@ -40,6 +40,8 @@ _CURRENT = ' SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" X\n'
 KEYS = {name: FrameKey(16 + number, False) for number, name in enumerate(NAMES)}
 PHASE_S = {"battery": 0.0, "motor": 0.003, "heater": 0.007}
 """Control units send one after the other. [s]"""
+BREAK_S = 15.0
+"""When sensors break. [s]"""
 
 
 def three_branches(folder: Path, quality_bits: int = 3, reason_bits: int = 8) -> VehicleDatabase:
@@ -117,6 +119,23 @@ class Junction:
                 if self.fell_back_s is None and self.corrector.latched:
                     self.fell_back_s = self.now_s
         self.step += 1
+
+    def break_sensors(
+        self,
+        seconds: float,
+        true_a: Callable[[float], Mapping[str, float]],
+        **wrong: Callable[[float], float],
+    ) -> None:
+        """Run for 15 s with the sensors as they are, and so many seconds with some that are broken."""
+        self.run(BREAK_S, true_a)
+        assert self.corrector.state() == (State.CORRECTING, Reason.NONE)
+        self.wrong = wrong
+        self.run(seconds, true_a)
+
+    @property
+    def corrected_for_s(self) -> float:
+        """How long the node went on to correct after the sensors broke. [s]"""
+        return float("inf") if self.fell_back_s is None else self.fell_back_s - BREAK_S
 
     def _send(self, name: str, shown_a: float, now_s: float) -> None:
         code = min(max(round(10.0 * shown_a), -30000), 30000)

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -32,10 +32,10 @@ from ecu_node.parameters import write_parameters
 from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
 
 _FD_VALUES = (80_000_000, 2, 63, 16, 16, 2, 15, 4, 4)
-FD_TIMING = dict(zip(BitTimingFdDict.__annotations__, _FD_VALUES, strict=True))
+FD_TIMING: dict[str, Any] = dict(zip(BitTimingFdDict.__annotations__, _FD_VALUES, strict=True))
 """500 kbit/s and 2 Mbit/s, both sampled at 80 %."""
 FD_RATES = {"fd": True, "bitrate": 500_000, "data_bitrate": 2_000_000}
-CLASSIC_TIMING = {"f_clock": 8_000_000, "brp": 2, "tseg1": 13, "tseg2": 2, "sjw": 1, "nof_samples": 1}
+CLASSIC_TIMING: dict[str, Any] = {"f_clock": 8_000_000, "brp": 2, "tseg1": 13, "tseg2": 2, "sjw": 1, "nof_samples": 1}
 """250 kbit/s, sampled at 87.5 %."""
 DATABASE = cantools.database.can.Database()
 DATABASE.add_dbc_string(SMALL_DBC)
@@ -82,17 +82,12 @@ def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
         ("pcan", {"f_clock": 8_000_000, "bitrate": 250_000}, {}, "incomplete, .* classic CAN .* brp, tseg1"),
         ("pcan", FD_TIMING, {}, "not one of classic CAN"),
         ("pcan", CLASSIC_TIMING, {"fd": True}, "not one of CAN FD, which has f_clock, nom_brp"),
-        (
-            "pcan",
-            {**CLASSIC_TIMING, "bitrate": 500_000},
-            {},
-            "bitrate = 500000 contradicts the bit timing .BR: 250_000",
-        ),
+        ("pcan", {**CLASSIC_TIMING, "bitrate": 500_000}, {}, "500000 contradicts the bit timing .BR: 250_000"),
         ("pcan", {**FD_TIMING, "data_bitrate": 4_000_000}, {"fd": True}, "data_bitrate = 4000000 contradicts"),
         ("ixxat", CLASSIC_TIMING, {}, "python-can cannot set a bit timing there; take f_clock out"),
     ],
 )
-def test_speed_that_would_be_another_one_is_refused(
+def test_wrong_speed_is_refused(
     interfaces: str, config: dict[str, object], settings: Any, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAN_CONFIG", json.dumps(config))
@@ -111,9 +106,7 @@ def test_driver_that_is_missing_is_said(interface: str) -> None:
 # ---- python-can's configuration
 
 
-def test_each_channel_has_its_section_and_the_command_line_goes_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_line_overrides_the_section_of_a_channel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "can.conf").write_text("[default]\nbitrate = 125000\n[1]\nbitrate = 250000\nserial = 1234\n")
     assert bus_config("vector", "1") == {"interface": "vector", "channel": 1, "bitrate": 250_000, "serial": 1234}
     assert bus_config("vector", "2")["bitrate"] == 125_000
@@ -122,15 +115,6 @@ def test_each_channel_has_its_section_and_the_command_line_goes_first(
     assert bus_config("vector", "1", bitrate=500_000, data_bitrate=None)["bitrate"] == 500_000
     monkeypatch.setenv("CAN_BITRATE", "100000")
     assert bus_config("vector", "1")["bitrate"] == 100_000
-
-
-@pytest.mark.parametrize(("timing", "fd"), [(FD_TIMING, True), (CLASSIC_TIMING, False)])
-def test_bit_timing_of_can_conf_reaches_the_driver(timing: dict[str, int], fd: bool, tmp_path: Path) -> None:
-    lines = [f"{name} = {value}" for name, value in timing.items()]
-    (tmp_path / "can.conf").write_text("\n".join(["[PCAN_USBBUS1]", *lines]))
-    found = bus_config("pcan", "PCAN_USBBUS1", fd=fd)["timing"]
-    assert isinstance(found, can.BitTimingFd if fd else can.BitTiming)
-    assert dict(found) == timing
 
 
 @pytest.mark.parametrize(
@@ -143,37 +127,49 @@ def test_whether_an_interface_carries_can_fd_is_known_from_its_mtu(interface: st
 # ---- a dry run
 
 
-def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
-    node: list[str], capsys: pytest.CaptureFixture[str]
+PCAN = ("--interface", "pcan", "--channel", "PCAN_USBBUS1")
+"""Its library is not here: opening it would fail."""
+
+
+@pytest.fixture
+def dry_run(node: list[str], capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
+    """Lines that the node with these options prints of what it would do."""
+
+    def run(*options: str) -> list[str]:
+        assert run_ecu_node([*node, *options, "--dry-run"]) == 0
+        out, err = capsys.readouterr()
+        assert err == ""
+        return out.splitlines()
+
+    return run
+
+
+def test_dry_run_prints_what_it_would_open(
+    node: list[str], dry_run: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    adapter = ["--interface", "pcan", "--channel", "PCAN_USBBUS1"]  # its library is not here: opening it would fail
-    assert run_ecu_node([*node, *adapter, "--bitrate", "250000", "--dry-run"]) == 0
-    captured = capsys.readouterr()
-    assert captured.out.splitlines() == [
-        "would open pcan PCAN_USBBUS1: bitrate 250000",
-        "  reads Pair (0x100), Heater (0x200), Net (0x102)",
-        "  sends PairOut (0x200)",
-    ]
-    assert run_ecu_node([*node, *adapter, "--bitrate", "250000", "--dry-run", "--params", "none.json"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1].startswith("would correct nothing: none.json: no such parameter")
-    assert captured.err == ""
-    assert run_ecu_node([*node, *adapter, "--dry-run"]) == 1
+    rate = ("--bitrate", "250000")
+    reads, sends = "  reads Pair (0x100), Heater (0x200), Net (0x102)", "  sends PairOut (0x200)"
+    assert dry_run(*PCAN, *rate) == ["would open pcan PCAN_USBBUS1: bitrate 250000", reads, sends]
+    last = dry_run(*PCAN, *rate, "--params", "none.json")[-1]
+    assert last.startswith("would correct nothing: none.json: no such parameter")
+    assert run_ecu_node([*node, *PCAN, "--dry-run"]) == 1
     assert "no bitrate" in capsys.readouterr().err
 
 
-def test_dry_run_prints_a_bit_timing_once(
-    node: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("timing", [can.BitTiming(**CLASSIC_TIMING), can.BitTimingFd(**FD_TIMING)])
+def test_bit_timing_of_can_conf_is_opened_and_printed_once(
+    timing: can.BitTiming | can.BitTimingFd, tmp_path: Path, dry_run: Callable[..., list[str]]
 ) -> None:
-    monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
-    assert run_ecu_node([*node, "--interface", "pcan", "--channel", "PCAN_USBBUS1", "--dry-run"]) == 0
-    (opened, *_) = capsys.readouterr().out.splitlines()
-    assert opened.startswith("would open pcan PCAN_USBBUS1: timing BR: 250_000 bit/s, SP: 87.50%, BRP: 2, ")
+    lines = [f"{name} = {value}" for name, value in timing.items()]
+    (tmp_path / "can.conf").write_text("\n".join(["[PCAN_USBBUS1]", *lines]))
+    opened = dry_run(*PCAN, *(("--fd",) if isinstance(timing, can.BitTimingFd) else ()))[0]
+    assert opened.startswith("would open pcan PCAN_USBBUS1: ")
+    assert f"timing {timing}" in opened
     assert "f_clock" not in opened
 
 
-def test_dry_run_of_a_gateway_prints_both_ways(node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_ecu_node([*node, "--interface", "virtual", "--channel", "a", "--gateway", "b", "--dry-run"]) == 0
-    assert capsys.readouterr().out.splitlines() == [
+def test_dry_run_of_a_gateway_prints_both_ways(dry_run: Callable[..., list[str]]) -> None:
+    assert dry_run("--interface", "virtual", "--channel", "a", "--gateway", "b") == [
         "would open virtual a: no settings",
         "  reads all frames; corrects Pair (0x100), Heater (0x200)",
         "  sends all other frames of the other bus, as they are",
@@ -196,11 +192,10 @@ def test_dry_run_of_a_gateway_prints_both_ways(node: list[str], capsys: pytest.C
     ],
 )
 def test_listen_only_says_whether_the_adapter_acknowledges(
-    interface: str, words: str, node: list[str], capsys: pytest.CaptureFixture[str]
+    interface: str, words: str, dry_run: Callable[..., list[str]]
 ) -> None:
     rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
-    assert run_ecu_node([*node, "--interface", interface, "--channel", "c0", *rate, "--listen-only", "--dry-run"]) == 0
-    *_, sends, last = capsys.readouterr().out.splitlines()
+    *_, sends, last = dry_run("--interface", interface, "--channel", "c0", *rate, "--listen-only")
     assert sends == "  sends nothing"
     assert re.search(words, last)
 
@@ -259,6 +254,7 @@ def line() -> Iterator[SerialLine]:
 
 
 MEASURED = PAIR.encode({"Battery": BATTERY_A, "Motor": CORRECTED_A})
+SLCAN_FRAME = b"t1008" + MEASURED.hex().upper().encode() + b"\r"
 RIGHT = {"Battery": pytest.approx(CORRECTED_A, abs=0.05 + 1e-9), "Motor": pytest.approx(CORRECTED_A)}
 
 
@@ -268,13 +264,11 @@ def answer(data: bytes) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("options", "opened"), [((), b"O"), (("--listen-only",), b"L")])
-def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected_unless_it_only_listens(
-    node: list[str], line: SerialLine, options: tuple[str, ...], opened: bytes
-) -> None:
+def test_slcan_answers_corrected(node: list[str], line: SerialLine, options: tuple[str, ...], opened: bytes) -> None:
     bus = ("--interface", "slcan", "--channel", line.path, "--bitrate", "250000")
     with running(*node, *bus, *options) as log:
         for _ in range(10):
-            line.put(b"t1008" + MEASURED.hex().upper().encode() + b"\r")
+            line.put(SLCAN_FRAME)
             line.take(0.02)
     line.take(0.1)
     head, answers, last = line.taken.split(b"\r")[:5], line.taken.split(b"\r")[5:-2], line.taken[-2:]
@@ -288,7 +282,7 @@ def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected_unless_it_only_li
     assert any("listen-only: nothing is sent, and no frame acknowledged" in text for text in log) == bool(options)
 
 
-def test_node_tells_which_branch_it_does_not_publish_and_that_no_branch_sends(
+def test_unpublished_and_silent_branches_are_reported(
     node: list[str], line: SerialLine, make_database: MakeDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In its log, and the second one also to the service manager."""
@@ -298,7 +292,7 @@ def test_node_tells_which_branch_it_does_not_publish_and_that_no_branch_sends(
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(60.0)
         with running(*node, "--interface", "slcan", "--channel", line.path, "--bitrate", "250000") as log:
-            line.put(b"t1008" + MEASURED.hex().upper().encode() + b"\r")
+            line.put(SLCAN_FRAME)
             while manager.recv(4096) != b"STATUS=no branch sends":
                 pass
     assert any("branch heater is not published: the parameters apply a fault to it" in text for text in log)

@@ -32,9 +32,7 @@ def placed_signals(draw: st.DrawFn) -> tuple[Message, Signal]:
 
 
 @given(placed_signals(), st.data())
-def test_put_writes_what_cantools_encodes_and_keeps_all_other_bits(
-    case: tuple[Message, Signal], data: st.DataObject
-) -> None:
+def test_put_writes_what_cantools_encodes_and_no_other_bit(case: tuple[Message, Signal], data: st.DataObject) -> None:
     message, signal = case
     place = bit_place(signal)
     before = data.draw(st.binary(min_size=message.length, max_size=message.length))

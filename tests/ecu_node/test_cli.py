@@ -23,8 +23,8 @@ def params(database: VehicleDatabase, tmp_path: Path) -> Path:
     return path
 
 
-def check(params: Path, *more: str) -> list[str]:
-    return ["check", "--params", str(params), "--layout", str(LAYOUT), *more]
+def check(params: Path, *more: str, layout: Path = LAYOUT) -> list[str]:
+    return ["check", "--params", str(params), "--layout", str(layout), *more]
 
 
 def test_fit_parameters_are_shown_with_their_integer_plan(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,23 +48,20 @@ def test_fit_parameters_are_shown_with_their_integer_plan(params: Path, capsys: 
     assert max(map(len, lines)) <= 80
 
 
+RUN = "run --unsigned --params p --layout l --channel c0"
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("run --unsigned --params p --layout l --channel c0 --gateway c0", "c0 is the bus of the sensors itself; two"),
-        (
-            "run --unsigned --params p --layout l --channel c0 --gateway c1 --listen-only",
-            "a gateway must pass frames on",
-        ),
+        (f"{RUN} --gateway c0", "c0 is the bus of the sensors itself; two"),
+        (f"{RUN} --gateway c1 --listen-only", "a gateway must pass frames on"),
         ("run --unsigned --state s --layout l --channel c0", "--state holds signed parameters; leave --unsigned out"),
         ("run --params p --layout l --channel c0", "--params names a file that nobody signed: give --state"),
-        ("run --unsigned --params p --layout l --channel c0 --telemetry udp://h", "is expected, found 'udp://h'"),
-        (
-            "run --unsigned --params p --layout l --channel c0 --telemetry udp://:5000",
-            "is expected, found 'udp://:5000",
-        ),
-        ("run --unsigned --params p --layout l --channel c0 --telemetry mqtt://h:1", "is expected, found 'mqtt://h:1'"),
-        ("run --unsigned --params p --layout l --channel c0 --telemetry=", "is expected, found none"),
+        (f"{RUN} --telemetry udp://h", "is expected, found 'udp://h'"),
+        (f"{RUN} --telemetry udp://:5000", "is expected, found 'udp://:5000"),
+        (f"{RUN} --telemetry mqtt://h:1", "is expected, found 'mqtt://h:1'"),
+        (f"{RUN} --telemetry=", "is expected, found none"),
         ("monitor --layout l --channel c --json", "--json needs --once SECONDS"),
         ("monitor --layout l --channel c --once 0", "'0': expected a number of seconds above 0, at most 86400"),
         (f"template --layout l --vehicle {'v' * 65}", "of at most 64 characters, found 65 characters"),
@@ -80,14 +77,14 @@ def test_wrong_use_is_one_line_and_2(arguments: str, words: str, capsys: pytest.
     assert words in line
 
 
-def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gateway_is_one(
+def test_layout_without_own_signals_needs_a_gateway(
     make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The options of run are those of check."""
     bare = re.sub(r', (corrected|quality) = "[\w.]+"', "", SMALL_LAYOUT)
     database = make_database(bare)
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
-    options = ["check", "--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
+    options = check(tmp_path / "v1.json", layout=database.layout.path)
     assert run_ecu_node(options) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "page 'Layout'" in line
@@ -96,7 +93,7 @@ def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gate
     assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
 
 
-def test_fault_that_is_not_applied_is_said(
+def test_check_says_which_fault_is_not_applied(
     database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parameters = msgspec.structs.replace(parameters_for(database, battery=(0.25, 5.0)), vehicle="v\x1b[2J")
@@ -108,17 +105,14 @@ def test_fault_that_is_not_applied_is_said(
     assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
 
 
-def test_can_fd_that_run_would_need_is_said(
-    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_warns_of_can_fd(make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
-    files = ["--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
-    assert run_ecu_node(["check", *files]) == 0
+    assert run_ecu_node(check(tmp_path / "v1.json", layout=database.layout.path)) == 0
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
 
 
-def test_unfit_parameters_end_in_1_and_say_why_also_for_a_vehicle_of_the_environment(
+def test_check_of_unfit_parameters_ends_in_1_and_says_why(
     params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run_ecu_node(check(params, "--vehicle", "v2", "--json")) == 1

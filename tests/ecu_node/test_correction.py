@@ -77,9 +77,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("source", "target", "sign", "drift", "offset"), CASES)
-def test_every_code_of_16_bits_is_rounded_half_up_and_clamped(
-    source: Codes, target: Codes, sign: int, drift: str, offset: str
-) -> None:
+def test_every_code_of_16_bits_is_exact(source: Codes, target: Codes, sign: int, drift: str, offset: str) -> None:
     plan = integer_plan(source, target, sign=sign, drift=float(drift), offset_a=float(offset))
     gain, bias, common = exact_line(source, target, sign=sign, drift=drift, offset_a=offset)
     low, high = writable_range(target, "test")
@@ -95,7 +93,7 @@ def test_every_code_of_16_bits_is_rounded_half_up_and_clamped(
     offset=st.floats(-150.0, 150.0),
     data=st.data(),
 )
-def test_signals_of_any_width_keep_the_error_bound(
+def test_any_width_keeps_error_bound(
     length: int, signed: bool, drift: float, offset: float, data: st.DataObject
 ) -> None:
     source = current(0.02, -7.0, length=length, signed=signed)
@@ -114,9 +112,7 @@ def test_signals_of_any_width_keep_the_error_bound(
     offset=st.floats(-150, 150),
     sign=st.sampled_from([1, -1]),
 )
-def test_a_power_is_corrected_as_a_current_and_written_back_as_a_power(
-    code: int, volts: int, drift: float, offset: float, sign: int
-) -> None:
+def test_power_is_corrected_as_a_current(code: int, volts: int, drift: float, offset: float, sign: int) -> None:
     power, voltage = current(2.0, limits=(-60000, 60000)), current(0.02, signed=False, limits=(0, 1000))
     signals = Signals(source=power, target=power, sign=sign, voltage=voltage)
     plan = correction_plan(signals, SensorFault(drift=drift, offset_a=offset))

@@ -50,6 +50,11 @@ class Drive:
             self.take(256, False, pair)
             self.stamp_s += 0.1
 
+    def ended(self) -> list[SummaryFile]:
+        """Records after the end of the node."""
+        self.summary.close()
+        return self.records()
+
     def take(self, identifier: int, extended: bool, payload: bytes) -> None:
         self.summary.take(FrameKey(identifier, extended), bytearray(payload), self.stamp_s)
 
@@ -67,8 +72,7 @@ def test_means_are_currents_and_open_contactors_show_the_offset(drive: Drive) ->
     for battery in (3000, 500):  # of two samples at one instant the last one counts
         drive.take(256, False, battery.to_bytes(2, "big") + bytes(6))
     drive.take(999, False, bytes(8))
-    drive.summary.close()
-    (record,) = drive.records()
+    (record,) = drive.ended()
     assert record.branches == ["battery", "motor", "heater"]
     assert record.zero_offset_a == [pytest.approx(OFFSET_A), pytest.approx(0.0), None]
     battery_a, motor_a, heater_a = unpacked(record.mean)
@@ -81,8 +85,7 @@ def test_step_of_the_time_of_day_begins_another_drive(drive: Drive) -> None:
     drive.go_on(60.0)
     drive.stamp_s += 3600.0
     drive.go_on(60.0)
-    drive.summary.close()
-    (record,) = drive.records()
+    (record,) = drive.ended()
     assert record.starts == [True, True]
 
 
@@ -96,31 +99,27 @@ def test_silence_of_a_minute_ends_a_drive(drive: Drive) -> None:
 
 def test_one_branch_alone_makes_no_record(drive: Drive) -> None:
     drive.go_on(400.0, battery_only=True)
-    drive.summary.close()
-    assert drive.records() == []
+    assert drive.ended() == []
 
 
 @pytest.mark.parametrize(("flows_s", "records"), [(2.0, 0), (5.5, 0), (6.5, 1)])
 def test_drive_counts_from_a_fifth_of_a_block_on(drive: Drive, flows_s: float, records: int) -> None:
     drive.go_on(flows_s, open_s=0.0)
-    drive.summary.close()
-    assert len(drive.records()) == records
+    assert len(drive.ended()) == records
 
 
 def test_noise_is_zero_where_no_four_samples_follow_each_other(drive: Drive) -> None:
     for _ in range(60):
         drive.go_on(0.3, open_s=0.0)
         drive.stamp_s += 0.7
-    drive.summary.close()
-    (record,) = drive.records()
+    (record,) = drive.ended()
     assert [*unpacked(record.noise_a2)] == [0.0, 0.0, 0.0]
 
 
 def test_full_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "MOST_BATCHES", 1)
     drive.go_on(400.0)
-    drive.summary.close()
-    records = drive.records()
+    records = drive.ended()
     assert len(records) == 3
     assert [record.starts for record in records] == [[True], [False], [False]]
     assert [record.zero_offset_a[0] for record in records] == [pytest.approx(OFFSET_A), None, None]
@@ -128,10 +127,9 @@ def test_full_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.Monk
 
 def test_failure_to_write_is_said_once_and_its_end(drive: Drive) -> None:
     shutil.rmtree(drive.folder)
-    drive.go_on(60.0)
-    drive.summary.end_drive()
-    drive.go_on(60.0)
-    drive.summary.end_drive()
+    for _ in range(2):
+        drive.go_on(60.0)
+        drive.summary.end_drive()
     drive.folder.mkdir()
     drive.go_on(60.0)
     drive.summary.close()
@@ -145,8 +143,7 @@ def test_failure_to_write_is_said_once_and_its_end(drive: Drive) -> None:
 
 def test_record_of_another_version_is_refused(drive: Drive) -> None:
     drive.go_on(60.0)
-    drive.summary.close()
-    (record,) = drive.records()
+    (record,) = drive.ended()
     other = msgspec.structs.replace(record, schema_version=1)
     with pytest.raises(ValueError, match=f"schema version 1, expected {rule.SCHEMA_VERSION}"):
         decode_summary(encode_summary(other))

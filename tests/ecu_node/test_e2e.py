@@ -1,7 +1,7 @@
 """End-to-end protection: what is accepted, what is counted out; the libraries find the frames sound."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pytest
@@ -104,16 +104,6 @@ def test_the_header_is_crc_and_counter_and_no_other_bit_is_written(kind: str, pr
     assert {Receiver(protection).check(bytearray(size)) for size in range(len(header))} == {Check.CORRUPT}
 
 
-def test_sealing_keeps_the_counter(protection: Protection) -> None:
-    for frame in stream(protection, 20):
-        before = protection.counter_of(frame)
-        frame[-1] ^= 0xFF
-        assert not protection.is_sound(frame)
-        protection.seal(frame)
-        assert protection.is_sound(frame)
-        assert protection.counter_of(frame) == before
-
-
 def test_a_corrupt_frame_changes_neither_counter_nor_a_state_that_nothing_has_set(protection: Protection) -> None:
     (first, second), receiver = stream(protection, 2), Receiver(protection)
     found = [(receiver.check(frame), receiver.state) for frame in (damaged(first), first, damaged(second), second)]
@@ -121,11 +111,15 @@ def test_a_corrupt_frame_changes_neither_counter_nor_a_state_that_nothing_has_se
     assert found == [(Check.CORRUPT, E2EState.INIT), ok, corrupt, ok]
 
 
-def test_any_flipped_bit_is_noticed(protection: Protection) -> None:
+def test_any_flipped_bit_is_noticed_and_sealing_keeps_the_counter(protection: Protection) -> None:
     (frame,) = stream(protection, 1)
     for bit in range(8 * SIZE):
         flipped = bytearray((int.from_bytes(frame, "little") ^ 1 << bit).to_bytes(SIZE, "little"))
         assert Receiver(protection).check(flipped) is Check.CORRUPT
+        counter = protection.counter_of(flipped)
+        protection.seal(flipped)
+        assert protection.is_sound(flipped)
+        assert protection.counter_of(flipped) == counter
 
 
 @pytest.mark.parametrize(
@@ -139,9 +133,7 @@ def test_any_flipped_bit_is_noticed(protection: Protection) -> None:
         (ENTRIES["P11"] + '\ndata_id_mode = "nibble"', "2a10000000000000"),
     ],
 )
-def test_first_frame_is_that_of_the_examples_of_autosar(
-    protect: Callable[..., Protection], entry: str, expected: str
-) -> None:
+def test_first_frame_equals_autosar_example(protect: Callable[..., Protection], entry: str, expected: str) -> None:
     payload = bytearray(len(bytes.fromhex(expected)))
     protection = protect(entry)
     protection.before_first(payload)
@@ -150,9 +142,7 @@ def test_first_frame_is_that_of_the_examples_of_autosar(
 
 
 @pytest.mark.parametrize(("profile", "identity"), [("P04", 0x12345678), ("P05", 0x5678), ("P07", 0x12345678)])
-def test_data_identifier_is_the_identifier_of_the_message_where_none_is_given(
-    protect: Callable[..., Protection], profile: str, identity: int
-) -> None:
+def test_default_data_id_is_the_message_id(protect: Callable[..., Protection], profile: str, identity: int) -> None:
     long = ROOM.replace("BO_ 700", f"BO_ {0x80000000 | 0x12345678}")
     protection = protect(autosar(profile, "offset = 3"), room=long)
     assert protection.identity == identity
@@ -178,7 +168,7 @@ def crc8(data: bytes, polynomial: int) -> int:
         (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 255 }", b"\xff", b"", 0x1D),
     ],
 )
-def test_the_crc_of_a_control_unit_is_what_its_words_say(
+def test_crc_of_a_control_unit_is_as_described(
     protect: Callable[..., Protection], entry: str, before: bytes, after: bytes, polynomial: int
 ) -> None:
     protection = protect(entry)
@@ -211,35 +201,31 @@ def test_every_byte_of_a_long_counter_is_compared_with_the_next_one(protection: 
 # ---- the message as a whole
 
 
-def test_more_corrupt_frames_than_allowed_make_a_message_invalid_until_enough_are_intact(
-    kind: str, protect: Callable[..., Protection]
+@pytest.mark.parametrize(
+    ("windows", "sent", "spoilt", "states"),
+    [
+        (
+            "valid = { window = 6, min_ok = 1, max_error = 2 }\ninvalid = { window = 4, min_ok = 3, max_error = 0 }",
+            *(range(20), (12, 13, 14), "VVVVVVVVVVVVVVXXXXVV"),  # the third error of six; then four without one
+        ),
+        (
+            "init = { window = 4, min_ok = 3, max_error = 1 }\nvalid = { window = 4, min_ok = 4, max_error = 0 }",
+            *(range(0, 20, 2), (2,), "IIIVXVVVVV"),
+        ),
+        ("valid = { window = 5, min_ok = 1, max_error = 2 }", [0] * 6, (), "VVVVVX"),
+    ],
+    ids=["errors", "lost frames are no errors, nor a few at first", "repeated frames are not intact"],
+)
+def test_state_of_a_message_follows_its_last_frames(
+    kind: str, protect: Callable[..., Protection], windows: str, sent: Sequence[int], spoilt: Sequence[int], states: str
 ) -> None:
-    windows = "valid = { window = 6, min_ok = 1, max_error = 2 }\ninvalid = { window = 4, min_ok = 3, max_error = 0 }"
+    """Initial, valid, or invalid (X) after each frame that was sent, by its place in a stream."""
     protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
-    receiver, invalid = Receiver(protection), []
-    for number, frame in enumerate(stream(protection, 20)):
-        receiver.check(damaged(frame) if number in {12, 13, 14} else frame)
-        invalid += [number] * (receiver.state is E2EState.INVALID)
-    assert invalid == [14, 15, 16, 17], "the third error of six; four frames without one make it valid again"
-
-
-def test_lost_frames_are_no_errors_and_a_few_errors_at_first_say_nothing(
-    kind: str, protect: Callable[..., Protection]
-) -> None:
-    windows = "init = { window = 4, min_ok = 3, max_error = 1 }\nvalid = { window = 4, min_ok = 4, max_error = 0 }"
-    protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
-    receiver, found = Receiver(protection), []
-    for number, frame in enumerate(stream(protection, 20)[::2]):
-        receiver.check(damaged(frame) if number == 1 else frame)
-        found.append(receiver.state)
-    assert found == [E2EState.INIT] * 3 + [E2EState.VALID, E2EState.INVALID] + [E2EState.VALID] * 5
-
-
-def test_repeated_frames_are_no_intact_ones(kind: str, protect: Callable[..., Protection]) -> None:
-    protection = protect(ENTRIES[kind] + "\nvalid = { window = 5, min_ok = 1, max_error = 2 }")
-    receiver, (frame,) = Receiver(protection), stream(protection, 1)
-    states = [receiver.check(frame) and receiver.state for _ in range(6)]
-    assert states[1:] == [E2EState.VALID] * 4 + [E2EState.INVALID]
+    receiver, frames, found = Receiver(protection), stream(protection, 20), ""
+    for place in sent:
+        receiver.check(damaged(frames[place]) if place in spoilt else frames[place])
+        found += {E2EState.INIT: "I", E2EState.VALID: "V", E2EState.INVALID: "X"}[receiver.state]
+    assert found == states
 
 
 WINDOW = st.builds(E2EWindow, window=st.integers(1, 12), min_ok=st.integers(0, 6), max_error=st.integers(0, 6))
@@ -301,14 +287,11 @@ HEADS = [("[e2e]", "[e2e]"), ('[[e2e]]\nprofile = "P01"\nmessages = ["Net"]\n[[e
         (OEM.replace('crc = "Sum"', 'crc = "Count"'), ": message Room: signal Count must be one whole byte"),
         (OEM + "\ncounter_modulus = 17", ": message Room: signal Count cannot count from 0 to 16"),
         (OEM + '\nalgorithm = "md5"', ": message Room: algorithm 'md5' is not known; known are autosar, bluetooth,"),
-        (
-            COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 256 }",
-            "data_id 256 does not fit into data_id_bytes = 1",
-        ),
+        (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 256 }", "256 does not fit into data_id_bytes = 1"),
     ],
 )
 @pytest.mark.parametrize(("head", "place"), HEADS)
-def test_a_wrong_entry_is_named_by_its_place_as_it_was_written(
+def test_wrong_entry_is_named_by_its_place(
     protect: Callable[..., Protection], head: str, place: str, entry: str, words: str
 ) -> None:
     with pytest.raises(LayoutError, match=rf"small\.toml: {re.escape(place)}.*{re.escape(words)}") as caught:
@@ -319,21 +302,16 @@ def test_a_wrong_entry_is_named_by_its_place_as_it_was_written(
 @pytest.mark.parametrize(
     ("entry", "old", "new", "words"),
     [
-        (
-            ENTRIES["P01"],
-            "Room: 24",
-            "Room: 10",
-            "Room has 10 bytes in the DBC; CAN FD pads it, .* 12, 16, 20, 24, 32,",
-        ),
-        (OEM, "56|8@1+", "57|8@1+", "message Room: signal Sum must be one whole byte to be a CRC-8$"),
-        (OEM, "36|4@1+", "38|4@1+", "message Room: signal Count must be within one byte to be a counter$"),
-        (OEM, "36|4@1+", "36|4@1-", "message Room: signal Count cannot count from 0 to 7$"),
+        (ENTRIES["P01"], "Room: 24", "Room: 10", "10 bytes in the DBC; CAN FD pads it, .* 12, 16, 20, 24, 32,"),
+        (OEM, "56|8@1+", "57|8@1+", "signal Sum must be one whole byte to be a CRC-8$"),
+        (OEM, "36|4@1+", "38|4@1+", "signal Count must be within one byte to be a counter$"),
+        (OEM, "36|4@1+", "36|4@1-", "signal Count cannot count from 0 to 7$"),
     ],
 )
-def test_a_message_that_cannot_be_protected_so_is_refused(
+def test_unfit_message_is_refused(
     protect: Callable[..., Protection], entry: str, old: str, new: str, words: str
 ) -> None:
-    with pytest.raises(LayoutError, match=words):
+    with pytest.raises(LayoutError, match=f"message Room.* {words}"):
         protect(entry, room=ROOM.replace(old, new))
 
 

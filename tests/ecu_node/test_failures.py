@@ -38,9 +38,7 @@ def test_debug_is_taken_from_anywhere_before_two_dashes() -> None:
     assert split_debug(["run", "--", "--debug"]) == (["run", "--", "--debug"], False)
 
 
-def test_a_fault_of_the_node_names_its_place_and_ends_with_70(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_internal_error_names_its_place(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("nobody thought of that")
 

@@ -77,9 +77,7 @@ def test_a_fault_is_kept_with_its_currents(vehicle: Vehicle, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(("number", "latched"), [(44, Reason.SUM_IMPLAUSIBLE), (43, Reason.NONE)])
-def test_what_was_latched_stays_so_over_a_restart_until_it_is_cleared(
-    vehicle: Vehicle, number: int, latched: Reason
-) -> None:
+def test_latched_fault_survives_a_restart_until_it_is_cleared(vehicle: Vehicle, number: int, latched: Reason) -> None:
     """It was the same set of parameters; another one is tried."""
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.file.write_text(vehicle.file.read_text().replace('"parameter_set": 44', f'"parameter_set": {number}'))
@@ -95,12 +93,10 @@ def test_a_short_gap_on_the_bus_releases_nothing_and_sleep_does(vehicle: Vehicle
     """Sleep does not release what the sums said."""
     for count in (1, 2):
         vehicle.latch(Reason.BRANCH_STALE, "motor")
-        vehicle.later(2.0)
-        assert vehicle.latched() is Reason.BRANCH_STALE
-        vehicle.later(7.0)
-        assert vehicle.latched() is Reason.NONE
-        (fault,) = vehicle.faults()
-        assert (fault["active"], fault["count"]) == (False, count)
+        for seconds, latched in ((2.0, Reason.BRANCH_STALE), (7.0, Reason.NONE)):
+            vehicle.later(seconds)
+            assert vehicle.latched() is latched
+        assert [(fault["active"], fault["count"]) for fault in vehicle.faults()] == [(False, count)]
         vehicle.junction.run(0.1, driving)
         vehicle.later(1.0)
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
@@ -109,7 +105,7 @@ def test_a_short_gap_on_the_bus_releases_nothing_and_sleep_does(vehicle: Vehicle
     assert [fault["active"] for fault in vehicle.faults()] == [True, False], "the last one first"
 
 
-def test_a_fault_that_could_not_be_kept_is_told_ends_nothing_and_is_kept_later(vehicle: Vehicle) -> None:
+def test_fault_that_cannot_be_kept_is_reported_and_kept_later(vehicle: Vehicle) -> None:
     vehicle.state.rmdir()
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.later(3.0)
@@ -146,7 +142,7 @@ def test_faults_that_are_over_are_cleared_for_good(vehicle: Vehicle) -> None:
         ("", None, "cannot read the fault memory: it is a folder"),
     ],
 )
-def test_a_damaged_memory_is_one_line(
+def test_damaged_memory_is_one_line(
     vehicle: Vehicle, old: str, new: str | None, why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicle.latch(Reason.BRANCH_STALE, "motor")
@@ -163,11 +159,9 @@ def test_a_damaged_memory_is_one_line(
 
 
 @pytest.mark.parametrize("command", ["faults", "clear"])
-def test_a_folder_that_is_not_there_is_one_line(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_state_folder_is_one_line(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_ecu_node([command, "--state", str(tmp_path / "none")]) == 1
-    assert "no such state folder" in capsys.readouterr().err
+    assert "no such state folder; name the one of 'ecu-node run --state'" in capsys.readouterr().err
 
 
 def test_a_node_without_the_state_of_a_vehicle_says_so_and_passes_values_through(tmp_path: Path) -> None:

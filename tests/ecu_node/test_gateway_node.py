@@ -1,5 +1,6 @@
 """A gateway on two of python-can's virtual buses: real bus objects, the node in threads of its own."""
 
+import operator
 import random
 import threading
 import time
@@ -19,8 +20,9 @@ from ecu_node.bus.wiring import Mode
 from ecu_node.core.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from tests.ecu_node.test_node import LONGEST_WAIT_S, at_work, wait_until
-from tests.ecu_node.vehicles import corrector_for, decoded, protected
+from tests.ecu_node.test_node import LONGEST_WAIT_S, at_work, battery_frame, receive, wait_until
+from tests.ecu_node.test_socketcan import fields, random_frame
+from tests.ecu_node.vehicles import corrector_for, decoded
 
 Ends = tuple[can.BusABC, can.BusABC]
 
@@ -47,50 +49,20 @@ def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> I
         yield corrector, running
 
 
-def received(bus: can.BusABC, count: int, *, status: bool | None = False) -> list[can.Message]:
-    """The next frames; those of the status only if asked for, else all others, or with None all."""
-    found: list[can.Message] = []
-    give_up = time.monotonic() + LONGEST_WAIT_S
-    while len(found) < count:
-        message = bus.recv(0.5)
-        assert time.monotonic() < give_up, f"{len(found)} of {count} frames came"
-        if message is not None and status in {None, message.arbitration_id == 0x5F0}:
-            found.append(message)
-    return found
+STATUS = 0x5F0
 
 
-def random_frames(database: VehicleDatabase, count: int) -> list[can.Message]:
-    """Branch frames among frames of others: standard, extended, remote, FD, of any length."""
-    chance, counter, frames = random.Random(1), 0, []
-    for _ in range(count):
-        kind = chance.choice(("branch", "standard", "extended", "remote", "fd"))
-        data = chance.randbytes(chance.randrange(9))
-        if kind == "branch":
-            data, counter = protected(database, "HV_Battery", counter % 15, BatteryCurrent=100.0), counter + 1
-        frames.append(
-            can.Message(
-                arbitration_id=0x110 if kind == "branch" else chance.randrange(0x150, 0x4FF),
-                is_extended_id=kind == "extended",
-                is_remote_frame=kind == "remote",
-                is_fd=kind == "fd",
-                bitrate_switch=kind == "fd",
-                dlc=4 if kind == "remote" else None,
-                data=None if kind == "remote" else data if kind != "fd" else chance.randbytes(64),
-            )
-        )
-    return frames
+def received(bus: can.BusABC, count: int) -> list[can.Message]:
+    """The next frames but for those of the status."""
+    return receive(bus, STATUS, count, operator.ne)
 
 
-def as_sent(message: can.Message) -> tuple[object, ...]:
-    kinds = message.is_extended_id, message.is_remote_frame, message.is_fd, message.bitrate_switch
-    return message.arbitration_id, kinds, message.dlc, bytes(message.data)
-
-
-def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
-    database: VehicleDatabase, ends: Ends, channel: str
-) -> None:
+def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, vehicle = ends
-    sent = random_frames(database, 2000)
+    chance = random.Random(1)
+    sent = [random_frame(chance) for _ in range(1000)]
+    sent = [frame for frame in sent if frame.is_extended_id or not 0x100 <= frame.arbitration_id < 0x600]
+    sent[::3] = [battery_frame(database, number, current_a=100.0) for number in range(len(sent[::3]))]
     with gateway(database, channel) as (corrector, _):
         for message in sent:
             sensors.send(message)
@@ -100,21 +72,16 @@ def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
         if before.arbitration_id == 0x110:
             assert decoded(database, "HV_Battery", bytes(after.data))["BatteryCurrent"] == pytest.approx(76.0)
         else:
-            assert as_sent(after) == as_sent(before)
+            assert fields(after) == fields(before)
     assert sensors.recv(0.0) is None, "nothing comes back"
 
 
-def test_branch_frame_that_waited_too_long_is_not_passed_on(
-    database: VehicleDatabase, ends: Ends, channel: str
-) -> None:
+def test_branch_frame_that_waited_too_long_is_held_back(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     with gateway(database, channel) as (corrector, _), VirtualBus(f"{channel} a", preserve_timestamps=True) as bus:
         for counter, age_s in enumerate((0.0, 5.0, 0.0)):
-            data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
-            bus.send(can.Message(time.time() - age_s, arbitration_id=0x110, is_extended_id=False, data=data))
-        counters = [
-            decoded(database, "HV_Battery", bytes(frame.data))["AliveCounter"] for frame in received(ends[1], 2)
-        ]
-        assert (counters, corrector.counters.late) == ([0, 2], 1)
+            bus.send(battery_frame(database, counter, time.time() - age_s))
+        frames = [decoded(database, "HV_Battery", bytes(frame.data)) for frame in received(ends[1], 2)]
+        assert ([frame["AliveCounter"] for frame in frames], corrector.counters.late) == ([0, 2], 1)
 
 
 class BlockingBus(VirtualBus):
@@ -127,7 +94,7 @@ class BlockingBus(VirtualBus):
         super().send(msg, timeout)
 
 
-def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
+def test_watchdog_is_not_fed_while_the_way_back_is_stuck(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)
@@ -147,9 +114,7 @@ def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
         wait_until(lambda: True in works)
 
 
-def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
-    database: VehicleDatabase, ends: Ends, channel: str
-) -> None:
+def test_frames_from_before_the_start_are_not_passed_on(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     ended = threading.Event()
 
     def send_early() -> None:
@@ -173,31 +138,30 @@ def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
 
 def test_a_remote_frame_passes_whatever_its_identifier(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, vehicle = ends
-    asked = [
-        can.Message(arbitration_id=key, is_extended_id=False, is_remote_frame=True, dlc=8) for key in (0x110, 0x5F0)
-    ]
-    with gateway(database, channel):
+    remote = partial(can.Message, is_extended_id=False, is_remote_frame=True, dlc=8)
+    asked = [remote(arbitration_id=key) for key in (0x110, 0x5F0)]
+    with gateway(database, channel) as (corrector, _):
         for message in asked:
             vehicle.send(message)
-        assert list(map(as_sent, received(sensors, 2, status=None))) == list(map(as_sent, asked))
+        assert list(map(fields, receive(sensors, 0, 2, operator.ge))) == list(map(fields, asked))
+        wait_until(lambda: corrector.counters.returned == 2)
 
 
 WORDS = "another node sends frames 0x(110|5F0), which only this one may send there; two nodes on one bus, or two buses"
 
 
 @pytest.mark.parametrize(("origin", "identifier"), [("vehicle", 0x110), ("vehicle", 0x5F0), ("sensors", 0x5F0)])
-def test_frames_that_only_it_may_send_are_dropped_and_counted_and_end_nothing(
+def test_foreign_frames_are_dropped_and_counted(
     database: VehicleDatabase, ends: Ends, channel: str, origin: str, identifier: int
 ) -> None:
     sensors, vehicle = ends
     with gateway(database, channel) as (corrector, running):
-        received(vehicle, 1, status=True)
+        receive(vehicle, STATUS, 1)
         sender = vehicle if origin == "vehicle" else sensors
         for counter in range(100):
             sender.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=[counter, *bytes(7)]))
         for counter in range(10):
-            data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
-            sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+            sensors.send(battery_frame(database, counter))
         found = received(vehicle, 10)
         wait_until(lambda: corrector.counters.foreign == 100)
         assert not running.done()
@@ -209,9 +173,9 @@ def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, chan
     sensors, _ = ends
     with gateway(database, channel, f"{channel} a") as (_, running):
         for counter in range(100):
-            data = protected(database, "HV_Battery", counter % 15, BatteryCurrent=float(counter))
-            sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
-            time.sleep(0.005)
+            if not running.done():
+                sensors.send(battery_frame(database, counter))
+                time.sleep(0.005)
         with pytest.raises(BusError, match=WORDS):
             running.result(LONGEST_WAIT_S)
 
@@ -219,8 +183,8 @@ def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, chan
 def test_a_second_gateway_between_the_same_buses_refuses(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     _, vehicle = ends
     with gateway(database, channel) as (_, first):
-        received(vehicle, 1, status=True)
+        receive(vehicle, STATUS, 1)
         with gateway(database, channel) as (_, second), pytest.raises(BusError, match=WORDS):
             second.result(LONGEST_WAIT_S)
-        received(vehicle, 3, status=True)
+        receive(vehicle, STATUS, 3)
         assert not first.done()

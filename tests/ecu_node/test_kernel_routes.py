@@ -24,7 +24,7 @@ def test_all_other_identifiers_of_29_bits_are_covered_once() -> None:
         assert covered == int(identifier not in taken), hex(identifier)
 
 
-def test_an_interface_that_is_not_there_is_told_by_opening_the_bus_alone() -> None:
+def test_missing_interface_is_left_to_the_opening_of_the_bus() -> None:
     said: list[str] = []
     assert kernel_routes(("lo", "no_such_bus"), {(0x110, False)}, fd=False, say=said.append) is None
     assert said == []

@@ -25,6 +25,7 @@ def test_a_byte_order_mark_is_left_out_and_line_ends_do_not_change_the_digest(tm
     assert read_layout(tmp_path / "x.toml").digest == layout.digest == file_digest(tmp_path / "x.toml")
 
 
+E2E = '\n]\n[e2e]\nmessages = ["Net"]\nprofile ='
 BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
 
 
@@ -49,31 +50,19 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ("full_scale_a", "watch.valid = [nan]\nfull_scale_a", r"\[watch\], valid, entry number 1: .* found NaN"),
         (
             "\n]\n",
-            '\n]\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\nvalid = { window = 3, min_ok = 5, max_error = 0 }\n',
-            r"\[e2e\], valid: min_ok = 5 of 3 frames; at most all of them can be",
+            f'{E2E} "P01"\nvalid = {{ window = 3, min_ok = 5, max_error = 0 }}\n',
+            "valid: min_ok = 5 of 3 frames;",
         ),
         ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
-        (
-            "\n]\n",
-            '\n]\n[e2e]\nprofile = ["P01"]\nmessages = ["Net"]\n',
-            r"profile: expected one of P01.*found \[\"P01\"\]",
-        ),
-        (
-            "sign = ",
-            'vss = "Vehicle.A", sign = ',
-            "vss 'Vehicle.A' stands at two branches; each needs a name of its own",
-        ),
+        ("\n]\n", f'{E2E} ["P01"]\n', r"profile: expected one of P01.*found \[\"P01\"\]"),
+        ("sign = ", 'vss = "Vehicle.A", sign = ', "vss 'Vehicle.A' stands at two branches; each needs a name of"),
         ("sign = ", 'vss = "vehicle.A", sign = ', "'battery', vss: expected a name of the Vehicle Signal Spec"),
         ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: 'speed' is no"),
         ('"Pair.Motor"', '"Pair.Battery"', "branches battery and motor: both read Pair.Battery"),
         ('"PairOut.Motor"', '"PairOut.Battery"', "PairOut.Battery is written twice"),
         ('"PairOut.Motor"', '"Pair.Motor"', "Pair.Motor is both read and written"),
         ("sign = ", "balance = true, sign = ", "more than one branch has 'balance = true'"),
-        (
-            "full_scale_a",
-            'input = [{ name = "x", signal = "PairOut.Quality" }]\nfull_scale_a',
-            "is both read and written",
-        ),
+        ("\n]\n", '\n]\ninput = [{ name = "x", signal = "PairOut.Quality" }]\n', "Quality is both read and written"),
     ],
 )
 def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: str, new: str, words: str) -> None:
@@ -85,15 +74,10 @@ def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: st
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("content", "words"), [(None, "cannot read the layout: No such file"), (b"\xff", "the file is not UTF-8")]
-)
-def test_a_layout_file_that_cannot_be_read_is_named(tmp_path: Path, content: bytes | None, words: str) -> None:
-    path = tmp_path / "x.toml"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(LayoutError, match=rf"x\.toml: .*{words}"):
-        read_layout(path)
+def test_a_layout_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.toml").write_bytes(b"\xff")
+    with pytest.raises(LayoutError, match=r"x\.toml: not a layout: the file is not UTF-8 text; see the page 'Layout'"):
+        read_layout(tmp_path / "x.toml")
 
 
 @pytest.mark.parametrize(
@@ -122,9 +106,7 @@ def test_a_diagnostics_database_is_refused(make_database: MakeDatabase, tmp_path
 
 @pytest.mark.parametrize("mark", [1 << 31, 0])
 @pytest.mark.parametrize("more", ["", 'VAL_ 258 Gone 1 "On";\n'])
-def test_29_bit_identifiers_that_are_not_marked_and_names_for_values_of_no_signal_are_put_right(
-    make_database: MakeDatabase, mark: int, more: str
-) -> None:
+def test_unmarked_29_bit_ids_and_stray_names_are_read(make_database: MakeDatabase, mark: int, more: str) -> None:
     """As they stand in many public DBCs."""
     number = mark | 0x18FF0200
     texts = f'CM_ SG_ {number} Power "Taken up";\nVAL_ {number} Power 65535 "SNA";\n'

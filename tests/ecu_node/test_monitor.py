@@ -156,7 +156,7 @@ def test_status_is_read_as_the_node_wrote_it(bus: Bus) -> None:
     assert bus.lines(4.0)[0] == "can0: node: state 14, which this version does not know; status 0.0 s ago"
 
 
-def test_what_else_a_reader_should_know_is_said(make_database: MakeDatabase) -> None:
+def test_view_reports_silence_errors_and_lost_frames(make_database: MakeDatabase) -> None:
     """A small vehicle without a status message, whose heater is a power."""
     bus = Bus(make_database())
     lines = bus.lines(0.1, Counters(bus_errors=2, dropped=3))
@@ -182,9 +182,7 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("handlers")
-def test_once_prints_what_was_seen_sends_nothing_and_ends_in_1_without_any_branch(
-    database: VehicleDatabase, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_once_prints_view_and_sends_nothing(database: VehicleDatabase, capsys: pytest.CaptureFixture[str]) -> None:
     counters = cycle(range(15))
 
     def count_on(message: can.Message) -> None:

@@ -1,6 +1,7 @@
 """Parameters of a running node: replaced by what fits, kept otherwise."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -48,55 +49,43 @@ def test_a_changed_file_is_put_in_force_within_a_second(path: Path, database: Ve
     assert running.said == ["parameter set 300 of vehicle v1 is in force"]
 
 
-@pytest.mark.parametrize("cut", [0, 1, 300])
-def test_a_file_that_is_half_written_changes_nothing_and_counts_once_it_is_whole(
-    path: Path, database: VehicleDatabase, tmp_path: Path, cut: int
+@pytest.mark.parametrize(
+    ("spoil", "reason", "words"),
+    [
+        *(
+            (lambda whole, cut=cut: whole[:cut], Reason.MALFORMED_PARAMETERS, "not a parameter file")
+            for cut in (0, 1, 300)
+        ),
+        (
+            lambda whole: whole.replace(b'"v1"', b'"v2"'),
+            Reason.WRONG_VEHICLE,
+            "parameters are for vehicle 'v2', this is",
+        ),
+        (lambda _: None, Reason.NO_PARAMETERS, "no such parameter file; name one that is there"),
+    ],
+    ids=["empty", "one byte", "half written", "of another vehicle", "gone"],
+)
+def test_unfit_file_changes_nothing_until_a_fit_one_comes(
+    path: Path, database: VehicleDatabase, spoil: Callable[[bytes], bytes | None], reason: Reason, words: str
 ) -> None:
-    running = Running(path, database)
-    write_parameters(parameters_for(database, battery=(0.125, 5.0)), tmp_path / "new.json")
-    whole = (tmp_path / "new.json").read_bytes()
-    path.write_bytes(whole[:cut])
-    assert not running.file.look(running.corrector, 2.0)
+    """In a running node what was in force stays; one that starts with it passes through, and publishes why."""
+    whole, running = path.read_bytes(), Running(path, database)
+    if (content := spoil(whole)) is None:
+        path.unlink()
+    else:
+        path.write_bytes(content)
+    assert [running.file.look(running.corrector, now_s) for now_s in (2.0, 4.0)] == [False, False]
     assert (running.drift, running.corrector.reason) == (0.25, Reason.NONE)
     (line,) = running.said
-    assert line.startswith(f"new parameters are not used, those before stay in force: {path}: not a parameter file")
-    assert not running.file.look(running.corrector, 4.0)
-    path.write_bytes(whole)
-    assert running.file.look(running.corrector, 6.0)
-    assert running.drift == 0.125
+    assert line.startswith(f"new parameters are not used, those before stay in force: {path}: {words}")
+    started = Running(path, database)
+    assert (started.drift, started.corrector.reason) == (0.0, reason)
+    assert (started.file.in_force.why_not or "").startswith(f"{path}: {words}")
+    path.write_bytes(whole.replace(b"0.25", b"0.15"))
+    for node in (running, started):
+        assert node.file.look(node.corrector, 6.0)
+        assert (node.drift, node.corrector.reason) == (0.15, Reason.NONE)
     assert running.corrector.counters.reload_failures == 1
-
-
-def test_a_file_that_is_gone_or_of_another_vehicle_changes_nothing(path: Path, database: VehicleDatabase) -> None:
-    running = Running(path, database)
-    path.write_bytes(path.read_bytes().replace(b'"v1"', b'"v2"'))
-    assert not running.file.look(running.corrector, 2.0)
-    path.unlink()
-    assert not running.file.look(running.corrector, 4.0)
-    assert running.drift == 0.25
-    assert "parameters are for vehicle 'v2', this is 'v1'" in running.said[0]
-    assert running.said[1].endswith("no such parameter file; name one that is there")
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "reason", "words"),
-    [
-        (b"{", b"", Reason.MALFORMED_PARAMETERS, "not a parameter file"),
-        (b'"v1"', b'"v2"', Reason.WRONG_VEHICLE, "parameters are for vehicle 'v2', this is 'v1'"),
-    ],
-)
-def test_a_file_that_comes_later_is_put_in_force(
-    path: Path, database: VehicleDatabase, old: bytes, new: bytes, reason: Reason, words: str
-) -> None:
-    """What stood there at the start is not used, and why is published."""
-    content = path.read_bytes()
-    path.write_bytes(content.replace(old, new, 1))
-    running = Running(path, database)
-    assert (running.drift, running.corrector.reason) == (0.0, reason)
-    assert (running.file.in_force.why_not or "").startswith(f"{path}: {words}")
-    path.write_bytes(content)
-    assert running.file.look(running.corrector, 2.0)
-    assert (running.corrector.reason, running.drift) == (Reason.NONE, 0.25)
 
 
 @pytest.mark.parametrize("mode", [Mode.OVERLAY, Mode.GATEWAY])

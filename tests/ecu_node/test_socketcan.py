@@ -59,7 +59,7 @@ def received(link: SocketCanLink, count: int) -> list[can.Message]:
     return found
 
 
-def test_all_kinds_of_frames_are_read_as_they_were_written(ends: Ends) -> None:
+def test_frames_of_all_kinds_are_read_and_written_as_python_can_does(ends: Ends) -> None:
     link, far = ends
     rng = random.Random(0)
     for _ in range(50):
@@ -67,26 +67,18 @@ def test_all_kinds_of_frames_are_read_as_they_were_written(ends: Ends) -> None:
         for frame in frames:
             far.send(build_can_frame(frame))
         assert [fields(message) for message in received(link, 20)] == [fields(frame) for frame in frames]
-
-
-def test_written_frames_match_python_can_for_every_kind(ends: Ends) -> None:
-    link, far = ends
-    rng = random.Random(1)
-    for _ in range(50):
-        frames = [random_frame(rng) for _ in range(20)]
         done = 0
         while done < len(frames):
             done += link.send(frames, done)
         for frame in frames:
             raw = far.recv(128)
             assert len(raw) == (FD_BYTES if frame.is_fd else CLASSIC_BYTES)
-            identifier, length, flags, data = dissect_can_frame(raw)
-            told = dissect_can_frame(build_can_frame(frame))
-            assert (identifier, length, flags) == told[:3]
+            *head, data = dissect_can_frame(raw)
+            assert head == [*dissect_can_frame(build_can_frame(frame))[:3]]
             assert frame.is_remote_frame or data == bytes(frame.data)
 
 
-def test_an_error_frame_is_told_as_one(ends: Ends) -> None:
+def test_error_frame_is_read_as_one(ends: Ends) -> None:
     link, far = ends
     far.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))
     (message,) = received(link, 1)

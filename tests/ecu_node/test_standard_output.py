@@ -17,7 +17,7 @@ LINE = ": standard output: cannot write the result: No space left on device; giv
     ("arguments", "unbuffered"),
     [(["check", "--params", "p", "--layout", str(LAYOUT)], ""), (["--help"], ""), (["--version"], "1"), (MONITOR, "1")],
 )
-def test_a_result_that_cannot_be_written_is_one_line_and_1(arguments: list[str], unbuffered: str) -> None:
+def test_unwritable_result_is_one_line_and_1(arguments: list[str], unbuffered: str) -> None:
     command = [sys.executable, "-m", "ecu_node", *arguments]
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with Path("/dev/full").open("w") as full:

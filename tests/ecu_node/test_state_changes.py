@@ -41,7 +41,7 @@ class Node:
 
 @pytest.mark.parametrize("before", [Reason.NONE, Reason.BRANCH_STALE])
 @pytest.mark.parametrize("revoked", [False, True])
-def test_every_silence_and_its_end_is_said(database: VehicleDatabase, before: Reason, revoked: bool) -> None:
+def test_every_silence_and_its_end_is_reported(database: VehicleDatabase, before: Reason, revoked: bool) -> None:
     """After a fall-back, or without parameters, in the same way."""
     node = Node(database)
     assert node.drive() is None

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,17 @@ import pytest
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Telemetry
 from ecu_node.bus.wiring import Mode
-from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters, Latency
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.test_adapters import running
 from tests.ecu_node.test_node import wait_until
-from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, MakeDatabase, answers, corrector_for
+from tests.ecu_node.vehicles import LAYOUT, PAIR, SMALL_LAYOUT, Frame, MakeDatabase, answers, corrector_for
 
 ROOT = Path(__file__).parents[2]
 VSS = "Vehicle.Powertrain.TractionBattery.CurrentCurrent"
 NAMED = SMALL_LAYOUT.replace('name = "battery", ', f'name = "battery", vss = "{VSS}", ')
+CURRENTS = bytes.fromhex("0320f9c000000000")
+"""80 A from battery to motor."""
 
 
 class Outlet:
@@ -48,25 +50,23 @@ class Outlet:
         wait_until(lambda: self.corrector.counters.telemetry_lost >= count)
 
     def second(self) -> None:
-        """A frame of the pair, of 80 A from battery to motor, and what is done once per second."""
+        """A frame of the pair, and what is done once per second."""
         self.now_s += 1.0
-        data = bytes((*(800).to_bytes(2, "big"), *(-1600).to_bytes(2, "big", signed=True), 0, 0, 0, 0))
-        answers(self.corrector, Frame(FrameKey(256, False), data), self.now_s)
+        answers(self.corrector, Frame(PAIR, CURRENTS), self.now_s)
         self.corrector.look(self.now_s)
         self.telemetry.look(self.now_s)
 
 
 @pytest.fixture
 def make_outlet(make_database: MakeDatabase) -> Iterator[Callable[..., Outlet]]:
-    made: list[Outlet] = []
+    with ExitStack() as opened:
 
-    def make(target: Path | tuple[str, int]) -> Outlet:
-        made.append(Outlet(make_database(NAMED), target))
-        return made[-1]
+        def make(target: Path | tuple[str, int]) -> Outlet:
+            outlet = Outlet(make_database(NAMED), target)
+            opened.callback(outlet.bus.close)
+            return outlet
 
-    yield make
-    for outlet in made:
-        outlet.bus.close()
+        yield make
 
 
 def lines_of(path: Path, count: int) -> list[dict[str, Any]]:
@@ -98,8 +98,8 @@ def test_spoilt_frame_has_no_value_as_on_the_bus(make_outlet: Any, tmp_path: Pat
     outlet = make_outlet(tmp_path / "node.jsonl")
     outlet.second()
     lines_of(tmp_path / "node.jsonl", 1)
-    for data in (bytes.fromhex("0320f9c000000000"), bytes(1)):
-        answers(outlet.corrector, Frame(FrameKey(256, False), data), outlet.now_s + 0.9)
+    for data in (CURRENTS, bytes(1)):
+        answers(outlet.corrector, Frame(PAIR, data), outlet.now_s + 0.9)
     outlet.telemetry.look(outlet.now_s + 1.0)
     _, line = lines_of(tmp_path / "node.jsonl", 2)
     assert line["branches"][VSS] == {"measured_a": None, "corrected_a": None, "quality": "INVALID"}
@@ -129,9 +129,7 @@ def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tm
 
 
 @pytest.mark.parametrize("target", [".", "pipe", ("no-such-host.invalid", 5000), ("a" * 64, 5000)])
-def test_target_that_takes_nothing_never_blocks_and_is_said(
-    target: str | tuple[str, int], make_outlet: Any, tmp_path: Path
-) -> None:
+def test_unusable_target_is_reported(target: str | tuple[str, int], make_outlet: Any, tmp_path: Path) -> None:
     """A folder, a pipe without a reader, a host without an address, and one that no name server could know."""
     os.mkfifo(tmp_path / "pipe")
     outlet = make_outlet(tmp_path / target if isinstance(target, str) else target)
@@ -166,9 +164,7 @@ def test_example_takes_the_currents_out_of_a_line(make_outlet: Any, tmp_path: Pa
     assert currents((tmp_path / "node.jsonl").read_text()) == {VSS: -60.0, "motor": -80.0}
 
 
-def test_line_that_fits_in_part_is_taken_back(
-    make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_line_written_in_part_is_removed(make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, write = tmp_path / "node.jsonl", os.write
     outlet = make_outlet(path)
     monkeypatch.setattr(os, "write", lambda file, line: write(file, line[:7] if line.startswith(b'{"time"') else line))
@@ -204,7 +200,7 @@ def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: 
         assert fault in log[-1]
 
 
-def test_missing_real_time_permissions_are_reported_not_fatal() -> None:
+def test_missing_real_time_permissions_are_reported() -> None:
     code = (
         "import os; from contextlib import suppress; from ecu_node.bus.service import be_real_time\n"
         "user = os.geteuid()\n"

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, cast
 import msgspec
 from e2e.p01 import e2e_p01_protect
 
-from ecu_node.bus.wiring import InForce, Mode, wire
+from ecu_node.bus.wiring import InForce, Mode, key_of, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason
@@ -31,6 +31,14 @@ PAIR, HEATER, NET = FrameKey(256, False), FrameKey(512, True), FrameKey(258, Fal
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 MakeDatabase = Callable[..., VehicleDatabase]
 """Makes a database from the texts of layout and DBC; without them, those of the small vehicle."""
+
+
+class Frame(NamedTuple):
+    """One data frame."""
+
+    key: FrameKey
+    data: bytes
+
 
 SMALL_LAYOUT = """
 schema = 1
@@ -110,6 +118,12 @@ def protected(database: VehicleDatabase, message: str, counter: int, **values: f
     return bytes(data)
 
 
+def frame_of(database: VehicleDatabase, message: str, **values: float) -> Frame:
+    """A frame by cantools, without protection."""
+    definition = database.message(message)
+    return Frame(key_of(definition), definition.encode(values))
+
+
 def decoded(database: VehicleDatabase, message: str, data: bytes) -> dict[str, Any]:
     """The signals of a frame by cantools; named codes as numbers."""
     return cast("dict[str, Any]", database.message(message).decode(data, decode_choices=False))
@@ -125,13 +139,6 @@ class AtOnce(Executor):
         except UserError as error:
             done.set_exception(error)
         return done
-
-
-class Frame(NamedTuple):
-    """One data frame."""
-
-    key: FrameKey
-    data: bytes
 
 
 def answers(corrector: Corrector, frame: Frame, now_s: float) -> list[Frame]:

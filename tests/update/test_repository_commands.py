@@ -1,6 +1,7 @@
 """``calibrator repository``: keys, thresholds, signers one after the other, and mistakes in one line."""
 
 import os
+import re
 import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
@@ -16,6 +17,7 @@ from calibrator.files.storage import open_storage
 from ecu_node.parameters import VehicleParameters, write_parameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE, public_key_of
 from tests.disk import full_disk
+from tests.ecu_node.test_node import wait_until
 from tests.ecu_node.vehicles import LAYOUT
 from tests.update.repo import ALL, Repo, expired
 
@@ -54,9 +56,7 @@ def test_change_after_a_signature_needs_all_signatures_anew(repo: Repo, other: V
     assert f"what is staged is not published: {repo.bin} has 1 of 2 signatures" in out
 
 
-def test_what_waits_for_a_signer_does_not_keep_the_timestamp_from_being_renewed(
-    repo: Repo, state: Path, other: VehicleParameters
-) -> None:
+def test_staged_roles_do_not_block_a_new_timestamp(repo: Repo, state: Path, other: VehicleParameters) -> None:
     """Else a signer who is away for 30 days would end the updates of the whole fleet."""
     repo.updated(state)
     repo.add(other)
@@ -90,7 +90,7 @@ def test_revoked_file_that_is_added_again_is_no_longer_revoked_and_add_says_so(r
     assert repo.updated(state).startswith("on trial: ")
 
 
-def test_publication_that_was_cut_goes_on(
+def test_interrupted_publication_goes_on(
     repo: Repo, new: Path, other: VehicleParameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Up to the new timestamp vehicles see what was there before."""
@@ -220,7 +220,7 @@ def test_full_disk_leaves_what_vehicles_see(repo: Repo, new: Path, other: Vehicl
     assert repo.updated(new).startswith("nothing new: ")
 
 
-def test_root_that_expires_before_the_timestamp_is_told(repo: Repo) -> None:
+def test_root_that_expires_before_the_timestamp_is_reported(repo: Repo) -> None:
     def expire_soon(root: Root) -> None:
         root.expires = datetime.now(UTC).replace(microsecond=0) + timedelta(days=3)
 
@@ -251,6 +251,6 @@ def test_commands_that_write_wait_for_each_other(repo: Repo) -> None:
     command = [sys.executable, "-m", "calibrator", "repository", "unstage", str(repo.path)]
     with open_storage(repo.path).locked():
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.communicate(timeout=3)
+        waiting = re.compile(rf"-> \w+ .* {process.pid} ")
+        wait_until(lambda: waiting.search(Path("/proc/locks").read_text()) is not None)
     assert "0 staged roles dropped" in process.communicate(timeout=60)[0]

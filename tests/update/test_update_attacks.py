@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import msgspec
 import pytest
 from msgspec.structs import replace
-from tuf.api.metadata import Key, Snapshot, SuccinctRoles, TargetFile, Targets
+from tuf.api.metadata import Key, MetaFile, Snapshot, SuccinctRoles, TargetFile, Targets
 
 from ecu_node.parameters import VehicleParameters, encode_parameters
 from ecu_node.update.signers import public_key_of
@@ -154,8 +154,14 @@ def test_one_stolen_key_brings_no_parameters(keys: tuple[str, ...], repo: Repo, 
     repo.refused(new, "was signed by ")
 
 
-@pytest.mark.parametrize("name", ["bins/../../..", "../../../secret"])
-def test_no_name_in_metadata_leads_out_of_the_repository(name: str, repo: Repo, new: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("bins/../../..", "metadata/1.bins%2F..%2F..%2F..-1.json is not in the folder"),
+        ("../../../secret", "leads out of the repository"),
+    ],
+)
+def test_no_name_in_metadata_leads_out_of_the_repository(name: str, words: str, repo: Repo, new: Path) -> None:
     """By somebody who has the keys of targets."""
     (repo.folder / "secret").write_bytes(EVIL)
 
@@ -171,7 +177,9 @@ def test_no_name_in_metadata_leads_out_of_the_repository(name: str, repo: Repo, 
     role, change = (repo.bin, lead_out) if name.startswith("..") else ("targets", lead_out_of_bins)
     repo.forge(role, change, "t1", "t2")
     repo.relist(role, "snapshot", "timestamp")
-    repo.refused(new, "")
+    repo.forge("snapshot", lambda snapshot: snapshot.meta.update({f"{name}-1.json": MetaFile(1)}), "snapshot")
+    repo.point("timestamp")
+    repo.refused(new, words)
 
 
 class _Server(BaseHTTPRequestHandler):
@@ -222,7 +230,7 @@ def test_web_server(repo: Repo, new: Path, server: Any, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("vehicle", ["V 1", "Ü#1", "a/b", "50%"])
-def test_web_server_has_files_of_vehicles_with_any_name(
+def test_vehicle_may_have_any_name(
     vehicle: str, repo: Repo, server: Any, parameters: VehicleParameters, tmp_path: Path
 ) -> None:
     path = tmp_path / "parameters.json"

@@ -77,9 +77,7 @@ def cuts(folder: Path, files: list[Path], place: Path) -> Iterator[Path]:
     ["conclude", *(pytest.param(name, marks=pytest.mark.long) for name in ("update", "revoke"))],
     indirect=True,
 )
-def test_power_cut_at_any_moment_leaves_the_state_of_before_or_of_after(
-    command: Callable[[Path], list[str]], state: Path, tmp_path: Path
-) -> None:
+def test_power_cut_leaves_old_or_new_state(command: Callable[[Path], list[str]], state: Path, tmp_path: Path) -> None:
     work, log = tmp_path / "work", tmp_path / "log"
     calls = calls_of(command(started(state, work)), work, FILES, log)
     before, after = timeless(state), timeless(work)
@@ -105,9 +103,7 @@ ERRORS = {"openat": "ENOSPC", "write": "ENOSPC", "fsync": "EIO", "rename": "EIO"
 
 
 @pytest.mark.parametrize("command", ["update"], indirect=True)
-def test_full_or_broken_disk_is_one_line_and_keeps_the_state_or_says_so(
-    command: Callable[[Path], list[str]], state: Path, tmp_path: Path
-) -> None:
+def test_broken_disk_keeps_state_or_says_so(command: Callable[[Path], list[str]], state: Path, tmp_path: Path) -> None:
     work, log = tmp_path / "work", tmp_path / "log"
     calls = calls_of(command(started(state, work)), work, FILES, log)
     before, after = timeless(state), timeless(work)

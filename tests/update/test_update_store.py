@@ -65,15 +65,11 @@ def ended(
     return running
 
 
-def mend(path: Path, content: bytes) -> None:
-    shutil.rmtree(path, ignore_errors=True)
-    path.write_bytes(content)
-
-
 @pytest.mark.parametrize("damage", [without, cut, a_folder])
-def test_state_that_is_damaged_under_a_running_node_leaves_what_was_in_force(
+def test_damaged_state_changes_nothing_until_it_is_mended(
     damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
 ) -> None:
+    """In a running node what was in force stays; one that starts with it passes through."""
     running, path = Running(correcting, database), correcting / "state.json"
     whole = path.read_bytes()
     damage(path)
@@ -84,25 +80,16 @@ def test_state_that_is_damaged_under_a_running_node_leaves_what_was_in_force(
     running.now = NOW + timedelta(days=400)
     assert running.look(8.0) == [True], "it expires all the same"
     assert running.corrector.reason is Reason.NOT_VALID_NOW
-    mend(path, whole)
+    started = Running(correcting, database)
+    assert started.corrector.reason in (Reason.MALFORMED_PARAMETERS, Reason.NO_PARAMETERS)
+    assert not any(started.look(1.0))
+    shutil.rmtree(path, ignore_errors=True)
+    path.write_bytes(whole)
+    assert started.look(3.0) == [True]
+    assert (started.drift, started.corrector.reason) == (DRIFT, Reason.NONE)
     running.now = NOW
     running.look(10.0)
     assert running.drift == DRIFT
-
-
-@pytest.mark.parametrize("damage", [without, cut, a_folder])
-def test_node_that_starts_with_a_damaged_state_passes_through_until_it_is_mended(
-    damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
-) -> None:
-    path = correcting / "state.json"
-    whole = path.read_bytes()
-    damage(path)
-    running = Running(correcting, database)
-    assert running.corrector.reason in (Reason.MALFORMED_PARAMETERS, Reason.NO_PARAMETERS)
-    assert not any(running.look(1.0))
-    mend(path, whole)
-    assert running.look(3.0) == [True]
-    assert (running.drift, running.corrector.reason) == (DRIFT, Reason.NONE)
 
 
 def test_state_of_another_vehicle_is_not_used(correcting: Path, database: VehicleDatabase) -> None:
@@ -144,9 +131,7 @@ def test_trial_in_a_damaged_state_does_not_end_the_node(correcting: Path, ended:
     assert all(line.isprintable() for line in ended.said)
 
 
-def test_state_that_could_not_be_read_for_a_moment_is_read_again(
-    correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_state_is_read_again(correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a revocation would not be heeded before the next start."""
 
     def broken_disk(folder: Path) -> VehicleState:
@@ -161,7 +146,7 @@ def test_state_that_could_not_be_read_for_a_moment_is_read_again(
     assert running.corrector.reason is Reason.REVOKED
 
 
-def test_slow_disk_does_not_hold_the_node_up_at_the_end_of_a_trial(
+def test_slow_disk_does_not_hold_the_node_up(
     correcting: Path, ended: Running, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writing, may_go_on = threading.Event(), threading.Event()
@@ -185,9 +170,7 @@ def test_slow_disk_does_not_hold_the_node_up_at_the_end_of_a_trial(
     assert any("has passed its trial: seen" in line for line in running.said)
 
 
-def test_set_that_expires_during_its_trial_leaves_what_was_in_force(
-    correcting: Path, ended: Running, other: VehicleParameters
-) -> None:
+def test_set_expiring_on_trial_changes_nothing(correcting: Path, ended: Running, other: VehicleParameters) -> None:
     put_on_trial(correcting, other, days=1)
     ended.look(2.0, 2.1)
     ended.now = NOW + timedelta(days=2)
@@ -197,9 +180,7 @@ def test_set_that_expires_during_its_trial_leaves_what_was_in_force(
     assert ended.said[-1].split(" is ")[1].startswith("not in force, though its trial went well")
 
 
-def test_trial_begins_only_with_a_set_that_fits_and_holds(
-    correcting: Path, other: VehicleParameters, database: VehicleDatabase
-) -> None:
+def test_trial_needs_a_valid_set(correcting: Path, other: VehicleParameters, database: VehicleDatabase) -> None:
     put_on_trial(correcting, other, days=-1)
     running = Running(correcting, database)
     running.look(*range(0, 110, 2))

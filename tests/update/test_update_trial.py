@@ -126,7 +126,7 @@ def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, dat
     ("drift", "offset_a"), [(-DRIFT, -OFFSET_A), (0.0, -OFFSET_A), (3.0 * DRIFT, OFFSET_A), (DRIFT, 10.0)]
 )
 @pytest.mark.parametrize("left_a", [0.5, 20.0], ids=["little", "much"])
-def test_wrong_set_never_comes_in_force(
+def test_wrong_set_fails_its_trial(
     vehicle: Path, database: VehicleDatabase, drift: float, offset_a: float, left_a: float
 ) -> None:
     """Also where the calibrator saw that much is left of the sum."""
@@ -204,9 +204,7 @@ def test_revocation_holds_at_once_in_a_running_node(vehicle: Path, database: Veh
     assert drive.said[-1].startswith("passing measured values through: ")
 
 
-def test_set_that_expires_is_not_used_and_does_not_come_back_with_the_clock(
-    vehicle: Path, database: VehicleDatabase
-) -> None:
+def test_expired_set_does_not_return_when_the_clock_goes_back(vehicle: Path, database: VehicleDatabase) -> None:
     drive = tried(vehicle, right(database), database)
     drive.time = NOW + timedelta(days=366)
     drive.go_on(2.0)

@@ -15,7 +15,7 @@ from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
 from tests.vcan.patient_layout import write_patient_layout
 from tests.vcan.processes import CHANNEL, OTHER_CHANNEL, NodeProcess, Recording, running_node, running_recording
-from tests.vcan.small_drive import true_parameters
+from tests.vcan.small_drive import true_parameters, write_drive
 
 
 class StartNode(Protocol):
@@ -61,6 +61,13 @@ def params(database: VehicleDatabase, tmp_path: Path) -> Path:
     path = tmp_path / "params.json"
     write_parameters(true_parameters(database), path)
     return path
+
+
+@pytest.fixture
+def drive(database: VehicleDatabase, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """Log of the small drive, with as many instants as the module of the test says."""
+    write_drive(tmp_path / "drive.log", database, request.module.INSTANTS)
+    return tmp_path / "drive.log"
 
 
 @pytest.fixture

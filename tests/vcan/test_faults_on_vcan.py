@@ -25,19 +25,12 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.small_drive import BRANCHES, passed_on, protected, true_parameters, write_drive
+from tests.vcan.small_drive import BRANCHES, passed_on, protected, true_parameters
 
 INSTANTS = 45
 """A multiple of the counter's period, so that a drive may follow itself."""
 STATUS, BATTERY, AUXILIARY, BATTERY_CORRECTED, MARKER = 0x5F0, 0x110, 0x130, 0x510, 0x7F0
 GATEWAY = ("--gateway", OTHER_CHANNEL)
-
-
-@pytest.fixture
-def drive(database: VehicleDatabase, tmp_path: Path) -> Path:
-    path = tmp_path / "drive.log"
-    write_drive(path, database, INSTANTS)
-    return path
 
 
 def expected_battery(database: VehicleDatabase, drive: Path) -> list[bytes]:
@@ -80,7 +73,7 @@ def bus_is_back() -> Iterator[None]:
 
 @pytest.mark.parametrize("how", ["down", "deleted"])
 @pytest.mark.usefixtures("bus_is_back")
-def test_a_bus_that_was_away_is_used_again(
+def test_bus_that_was_away_is_used_again(
     params: Path, tmp_path: Path, drive: Path, start_node: StartNode, how: str
 ) -> None:
     with start_node(params) as node:
@@ -108,7 +101,7 @@ def test_a_bus_that_was_away_is_used_again(
     assert "reopened 1" in lines[-1]
 
 
-def test_a_full_send_queue_costs_the_frames_that_it_does_not_take(
+def test_full_send_queue_loses_only_what_it_refuses(
     database: VehicleDatabase, params: Path, drive: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     expected = expected_battery(database, drive)
@@ -128,7 +121,7 @@ def test_a_full_send_queue_costs_the_frames_that_it_does_not_take(
     assert "bus failed" not in node.messages
 
 
-def test_error_frames_are_counted_and_not_passed_on(
+def test_error_frames_are_not_passed_on(
     database: VehicleDatabase, params: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY) as node:
@@ -142,7 +135,7 @@ def test_error_frames_are_counted_and_not_passed_on(
     assert {item.identifier for item in other_recording.frames} == {"110", "120", "130", "5F0"}
 
 
-def test_changed_file_is_read_and_sighup_ends_nothing(
+def test_changed_file_is_read(
     database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
 ) -> None:
     with start_node(params) as node:
@@ -160,7 +153,7 @@ def test_changed_file_is_read_and_sighup_ends_nothing(
     assert "reloads 1, reload failures" in node.messages.splitlines()[-1]
 
 
-def test_a_second_node_refuses_and_the_first_one_goes_on(
+def test_second_gateway_refuses_and_the_first_goes_on(
     params: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY) as first:
@@ -185,7 +178,7 @@ def test_a_gateway_on_joined_buses_ends(params: Path, drive: Path, start_node: S
     assert "which only this one may send there; two nodes on one bus, or two buses that are joined?" in node.messages
 
 
-def test_a_clock_that_is_set_makes_no_branch_stale(
+def test_clock_step_is_no_fault(
     database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
 ) -> None:
     k = 0
@@ -207,9 +200,7 @@ def test_a_clock_that_is_set_makes_no_branch_stale(
     assert {state_of(data)[0] for data in recording.data_of(STATUS)} <= {State.STARTING, State.CORRECTING}
 
 
-def test_a_node_that_was_killed_goes_on_after_a_restart(
-    params: Path, drive: Path, start_node: StartNode, recording: Recording
-) -> None:
+def test_killed_node_corrects_again(params: Path, drive: Path, start_node: StartNode, recording: Recording) -> None:
     with playing(drive, endlessly=True):
         with start_node(params) as node:
             recording.wait_for(BATTERY_CORRECTED, 5)

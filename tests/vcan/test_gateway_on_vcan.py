@@ -15,7 +15,7 @@ from tests.vcan.processes import (
     playing,
     wait_until,
 )
-from tests.vcan.small_drive import VEHICLE, passed_on, write_drive
+from tests.vcan.small_drive import VEHICLE, passed_on
 
 INSTANTS = 150
 STATUS = "5F0"
@@ -57,13 +57,11 @@ def rewritten(database: VehicleDatabase, frames: Iterable[LoggedFrame]) -> list[
 def test_a_gateway_changes_currents_and_crcs_and_nothing_else(
     database: VehicleDatabase,
     params: Path,
-    tmp_path: Path,
+    drive: Path,
     start_node: StartNode,
     recording: Recording,
     other_recording: Recording,
 ) -> None:
-    drive = tmp_path / "drive.log"
-    write_drive(drive, database, INSTANTS)
     with start_node(params, "--vehicle", VEHICLE, "--gateway", OTHER_CHANNEL, "--fd") as node:
         other_recording.wait_for(int(STATUS, 16), 1)
         with playing(drive) as player:
@@ -92,7 +90,7 @@ def test_a_gateway_changes_currents_and_crcs_and_nothing_else(
     assert node.messages.endswith(f"{counted}\n")
 
 
-def test_frames_of_the_vehicle_arrive_at_the_sensors_once(
+def test_way_back_passes_all_frames_once(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, "--gateway", OTHER_CHANNEL) as node:

@@ -34,13 +34,13 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.small_drive import write_drive
 from tests.vcan.test_faults_on_vcan import AUXILIARY, BATTERY, GATEWAY, STATUS, state_of
 
 NOISE, BACK = 0x345, 0x346
 """Identifiers of others, sent towards the vehicle and towards the sensors."""
 RULES = 2 * (34 + 1)
 """Both ways, all standard identifiers but those of the five branches and the status, and all extended ones."""
+INSTANTS = 150
 FOREIGN = "FFFFFFFFFFFFFFFF"
 """What another node sends under the battery's identifier."""
 
@@ -57,13 +57,6 @@ def rules() -> list[tuple[str, ...]]:
     """Source, identifier and mask of the kernel's rules; ``cangw -L`` fails where there are as many as of a gateway."""
     lines = [line.split() for line in Path("/proc/net/can/rcvlist_fil").read_text().splitlines()]
     return sorted(tuple(words[:3]) for words in lines if words[-1:] == ["gw"])
-
-
-@pytest.fixture
-def drive(database: VehicleDatabase, tmp_path: Path) -> Path:
-    path = tmp_path / "drive.log"
-    write_drive(path, database, 150)
-    return path
 
 
 @contextmanager
@@ -96,7 +89,7 @@ def wait_for_state(recording: Recording, state: State, reason: Reason) -> None:
     wait_until(lambda: state_of(recording.data_of(STATUS)[-1]) == (state, reason), f"the state {state.name}")
 
 
-def test_other_frames_go_on_while_the_gateway_is_killed_and_started_again(
+def test_frames_pass_while_the_gateway_is_killed(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY) as node:
@@ -123,9 +116,7 @@ def test_other_frames_go_on_while_the_gateway_is_killed_and_started_again(
     assert again.process.returncode is not None
 
 
-def test_the_rules_go_with_the_gateway_both_ways(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
+def test_rules_end_with_the_gateway(params: Path, start_node: StartNode, other_recording: Recording) -> None:
     with start_node(params, *GATEWAY, "--fd") as node:
         other_recording.wait_for(STATUS, 1)
         assert len(rules()) == 2 * RULES, "both ways, classic and FD"
@@ -160,7 +151,7 @@ def test_rules_that_vanish_are_set_again(params: Path, start_node: StartNode) ->
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin")
 
 
-def test_without_rights_the_node_carries_all_frames_and_says_so(
+def test_node_carries_frames_without_rights(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY, by=WITHOUT_RIGHTS) as node:
@@ -176,9 +167,7 @@ def test_without_rights_the_node_carries_all_frames_and_says_so(
     ) in node.messages
 
 
-def test_without_the_module_the_node_carries_all_frames_and_says_so(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
+def test_node_carries_frames_without_module(params: Path, start_node: StartNode, other_recording: Recording) -> None:
     run_tool("rmmod", "can-gw")
     try:
         with start_node(params, *GATEWAY) as node:
@@ -192,7 +181,7 @@ def test_without_the_module_the_node_carries_all_frames_and_says_so(
     assert "the kernel carries no frames (its module can-gw is needed)" in node.messages
 
 
-def test_rules_that_nobody_here_may_change_are_told(
+def test_rules_left_by_a_privileged_gateway_refuse_start(
     params: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY) as node:
@@ -220,7 +209,7 @@ def test_rules_for_an_interface_that_has_just_gone_are_refused_in_one_line() -> 
             routes.set()
 
 
-def test_foreign_branch_frames_are_dropped_and_reported(
+def test_foreign_branch_frames_are_reported(
     params: Path, drive: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     command = ["cangen", OTHER_CHANNEL, "-I", f"{BATTERY:X}", "-D", FOREIGN, "-L", "8", "-g", "1"]
@@ -231,14 +220,14 @@ def test_foreign_branch_frames_are_dropped_and_reported(
                 wait_for_state(other_recording, State.CORRECTING, Reason.FOREIGN_FRAMES)
                 assert player.wait(LONGEST_WAIT_S) == 0
             foreigner.terminate()
-        sent = len(recording.wait_for(BATTERY, 150))
-        other_recording.wait_for(AUXILIARY, 150)
+        sent = len(recording.wait_for(BATTERY, INSTANTS))
+        other_recording.wait_for(AUXILIARY, INSTANTS)
         print(f"{len(other_recording.data_of(BATTERY)) - sent} foreign frames among {sent}")
         assert node.stop() == 0
     foreign = bytes.fromhex(FOREIGN)
     assert foreign not in recording.data_of(BATTERY), "none reaches the sensors' bus"
     passed = [data for data in other_recording.data_of(BATTERY) if data != foreign]
-    assert [data[1] & 15 for data in passed] == [k % 15 for k in range(150)], "each frame of the branch arrives"
+    assert [data[1] & 15 for data in passed] == [k % 15 for k in range(INSTANTS)], "each frame of the branch arrives"
     assert passed != recording.data_of(BATTERY), "corrected"
     assert "vcan1': another node sends frames 0x110, which only this one may send there; they are dropped" in (
         node.messages
@@ -262,7 +251,7 @@ def test_a_gateway_whose_log_nobody_reads_goes_on_both_ways_and_ends(
             with noise(100), playing(drive) as player:
                 generate(OTHER_CHANNEL, 20, "-I", f"{BATTERY:X}")  # each is worth a line
                 assert player.wait(LONGEST_WAIT_S) == 0
-            other_recording.wait_for(AUXILIARY, 150)
+            other_recording.wait_for(AUXILIARY, INSTANTS)
             other_recording.wait_for(NOISE, 100)
             recording.wait_for(BACK, 100)
             process.terminate()
@@ -302,7 +291,7 @@ def joined() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("killed", [False, True], ids=["at work", "killed before"])
-def test_buses_that_are_joined_end_the_gateway_and_its_rules_so_that_no_storm_stays(
+def test_joined_buses_end_the_gateway_without_a_storm(
     params: Path, drive: Path, tmp_path: Path, start_node: StartNode, other_recording: Recording, killed: bool
 ) -> None:
     words = "which only this one may send there; two nodes on one bus, or two buses that are joined? Stop one"

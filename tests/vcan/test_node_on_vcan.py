@@ -3,13 +3,13 @@
 import math
 import signal
 from pathlib import Path
-from typing import Any, cast
 
 import pytest
 from e2e.p01 import e2e_p01_check
 
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
+from tests.ecu_node.vehicles import decoded
 from tests.vcan.conftest import StartNode
 from tests.vcan.processes import Recording, frames_of, play
 from tests.vcan.small_drive import BRANCHES, VEHICLE, protected, write_drive
@@ -27,10 +27,6 @@ def expected_frame(database: VehicleDatabase, name: str, k: int, code: int, qual
         k,
         **{f"{signal_name}Corrected": code, f"{signal_name}Quality": int(quality)},
     )
-
-
-def decoded(database: VehicleDatabase, message: str, data: bytes) -> dict[str, Any]:
-    return cast("dict[str, Any]", database.message(message).decode(data, decode_choices=False))
 
 
 def state_and_reason(database: VehicleDatabase, data: bytes) -> tuple[int, int]:

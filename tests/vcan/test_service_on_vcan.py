@@ -18,7 +18,7 @@ from tests.vcan.processes import CHANNEL, ECU_NODE, LONGEST_WAIT_S, Recording, p
 from tests.vcan.small_drive import BRANCHES, true_parameters, write_drive
 
 UNPRIVILEGED = ["setpriv", "--bounding-set=-all", "--inh-caps=-all", "--ambient-caps=-all", "--no-new-privs"]
-CORRECTED_BATTERY, STATUS = 0x510, 0x5F0
+INSTANTS, CORRECTED_BATTERY, STATUS = 20, 0x510, 0x5F0
 
 
 def filters() -> int:
@@ -55,23 +55,18 @@ def test_the_monitor_shows_branches_sums_and_node(patient: VehicleDatabase, tmp_
     assert abs(view["sums"]["corrected_a"]) < 3.0
 
 
-def test_the_node_needs_no_capability(
-    start_node: StartNode, database: VehicleDatabase, params: Path, tmp_path: Path, recording: Recording
-) -> None:
+def test_node_needs_no_capability(start_node: StartNode, params: Path, drive: Path, recording: Recording) -> None:
     """As in deploy/ecu-node@.service: an empty bounding set, no ambient capabilities, no new privileges."""
-    write_drive(tmp_path / "drive.log", database, 20)
     with start_node(params, by=UNPRIVILEGED) as node:
         capabilities = Path(f"/proc/{node.process.pid}/status").read_text().partition("CapPrm:")[2].split()
         assert int(capabilities[0], 16) == 0
-        play(tmp_path / "drive.log")
-        assert len(recording.wait_for(CORRECTED_BATTERY, 20)) == 20
+        play(drive)
+        assert len(recording.wait_for(CORRECTED_BATTERY, INSTANTS)) == INSTANTS
         assert recording.wait_for(STATUS, 1)
         assert node.stop() == 0
 
 
-def test_real_time_is_first_in_first_out_on_one_processor_with_locked_memory(
-    start_node: StartNode, params: Path
-) -> None:
+def test_real_time_is_fifo_on_one_processor_with_locked_memory(start_node: StartNode, params: Path) -> None:
     with start_node(params, "--realtime") as node:
         number = node.process.pid
         status = Path(f"/proc/{number}/status").read_text()
@@ -83,7 +78,7 @@ def test_real_time_is_first_in_first_out_on_one_processor_with_locked_memory(
     assert locked_kb > 1000
 
 
-def test_a_memory_lock_that_a_filter_of_system_calls_forbids_is_told() -> None:
+def test_forbidden_memory_lock_is_reported() -> None:
     strace = shutil.which("strace")
     if strace is None:
         pytest.skip("no strace here (apt-get install strace)")

@@ -130,8 +130,8 @@ def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path
 
 def test_full_disk_ends_an_import(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     """All further drives would be lost one by one, with exit code 0."""
-    command = [sys.executable, "-m", "calibrator", "import", fleet / "logs", "--layout", LAYOUT, "--out", tmp_path]
-    limited = ["prlimit", "--fsize=1000", *command]
+    command = [sys.executable, "-m", "calibrator", "import", str(fleet / "logs"), "--layout", str(LAYOUT)]
+    limited = ["prlimit", "--fsize=1000", *command, "--out", str(tmp_path)]
     found = subprocess.run(limited, capture_output=True, text=True, check=False)
     assert found.returncode == 1
     assert "drive.parquet: cannot write it: File too large; " in found.stderr.splitlines()[-1]
