@@ -51,10 +51,7 @@ def test_error_from_moments_equals_the_error_of_corrected_currents() -> None:
     drift, offset_a = np.array([[0.15, -0.3]]), np.array([[2.0, 11.0]])
     i_m = measured_currents(I_A, truth.take(0))
     expected = np.sqrt(np.mean(((i_m - offset_a) / (1.0 + drift) - I_A) ** 2, axis=0))
-    for unseen in (
-        UnseenDrive.of_linear_sensors(MEAN_A, MEAN_SQUARE_A2, truth),
-        UnseenDrive.of_samples([(I_A, i_m)]),
-    ):
+    for unseen in (UnseenDrive.of_linear_sensors(MEAN_A, MEAN_SQUARE_A2, truth), UnseenDrive.of_samples([(I_A, i_m)])):
         np.testing.assert_allclose(unseen.rms_a(drift, offset_a)[0], expected)
 
 

@@ -291,11 +291,7 @@ def test_standard_deviations_are_right() -> None:
     [
         (lambda frame: frame.assign(motor=-frame["motor"]), {}, "check sign and unit of branch"),
         (lambda frame: frame.drop(columns="motor"), {}, "no column motor"),
-        (
-            lambda frame: frame.assign(motor=2.4 * frame["motor"]),
-            {"trusted": ["battery"]},
-            "motor reads 2.5 times",
-        ),
+        (lambda frame: frame.assign(motor=2.4 * frame["motor"]), {"trusted": ["battery"]}, "motor reads 2.5 times"),
         (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
         (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
         (lambda frame: frame, {"load": (-3.0, 0.1)}, "a value from 0 with its standard deviation"),

@@ -103,8 +103,7 @@ def test_zero_current_and_bench_readings_combine_or_both_drop_out_if_contradicto
         "list[VehicleSummary]",
         [
             SimpleNamespace(
-                vehicle=name,
-                zero_current=ZeroCurrent(offset_a=np.array([offset_a, NAN]), sd_a=np.array([sd_a, NAN])),
+                vehicle=name, zero_current=ZeroCurrent(offset_a=np.array([offset_a, NAN]), sd_a=np.array([sd_a, NAN]))
             )
             for name, (offset_a, sd_a) in shown.items()
         ],

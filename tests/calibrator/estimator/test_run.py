@@ -320,11 +320,7 @@ def test_vehicle_of_the_earlier_result_that_is_in_the_store_no_more_is_named(
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        (
-            "method",
-            "published",
-            "its method is published, that of this run posterior; calibrate without --since",
-        ),
+        ("method", "published", "its method is published, that of this run posterior; calibrate without --since"),
         ("branches", ["battery"], "its list of branches is battery, that of this run battery, motor"),
         ("layout_sha256", "0", "its version of "),
         ("buckets", 32, "its number of buckets is 32, that of this run 16"),

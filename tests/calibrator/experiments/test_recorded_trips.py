@@ -7,13 +7,7 @@ from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.errors import FleetError
 from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import PERFECT, POSTERIOR
-from calibrator.experiments.recorded_trips import (
-    NOISE,
-    RecordedCase,
-    RecordedFleet,
-    record_vehicles,
-    recorded_trial,
-)
+from calibrator.experiments.recorded_trips import NOISE, RecordedCase, RecordedFleet, record_vehicles, recorded_trial
 from calibrator.experiments.trial import drawn_distribution
 from calibrator.faults import true_currents
 from tests.calibrator.experiments.small_trials import small_fleet

@@ -134,10 +134,10 @@ def test_csv_has_a_row_for_each_branch_of_each_vehicle(checked: Checked) -> None
     battery, motor, *others = csv.DictReader(text.splitlines(keepends=True))
     assert text.count("\r\n") == 7
     assert [battery[name] for name in ("branch", "signal", "signal_unit", "drift", "offset_a", "applied")] == [
-        *("battery", "HV_Battery.BatteryCurrent", "A", "0.05", "-1.23456789012345", "true"),
+        *("battery", "HV_Battery.BatteryCurrent", "A", "0.05", "-1.23456789012345", "true")
     ]
     assert [motor[name] for name in ("drift", "drift_sd", "offset_sd_a", "applied", "held_back")] == [
-        *("0.2", "0.01", "", "false", "harm limit"),
+        *("0.2", "0.01", "", "false", "harm limit")
     ]
     assert [row["vehicle"] for row in others] == ['b, "c"\nd', 'b, "c"\nd', "-12", "-12"]
     assert {name: battery[name] for name in checked.provenance} == checked.provenance

@@ -305,10 +305,7 @@ def test_i3_at_its_chargers(recording: str, shared_data: Path, tmp_path: Path) -
     """Real ones, of 9 to 40 s; in two of them the current does not change, and only its mean tells the signs."""
     log = shared_data / "bmw_i3_charging" / f"2019_{recording}.csv.gz"
     layout = found(database_file(tmp_path, I3), "--log", log)
-    assert signed(layout) == {
-        "battery": ("Battery112.Battery_Current", -1),
-        "charger": ("Charger2B2.CHG_Amps", 1),
-    }
+    assert signed(layout) == {"battery": ("Battery112.Battery_Current", -1), "charger": ("Charger2B2.CHG_Amps", 1)}
 
 
 # ---- tables and names

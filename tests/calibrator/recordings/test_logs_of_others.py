@@ -279,10 +279,7 @@ def test_prefix_of_the_bus_is_needed_only_where_two_buses_have_the_message(tmp_p
     require_currents(before(log, layout))
 
 
-@pytest.mark.parametrize(
-    ("formula", "sum_a"),
-    [("2 * m", 20.0 - 2 * 17.8), ("m - one", 3.2), ("p / u * 1000", 2.2)],
-)
+@pytest.mark.parametrize(("formula", "sum_a"), [("2 * m", 20.0 - 2 * 17.8), ("m - one", 3.2), ("p / u * 1000", 2.2)])
 def test_branch_computed_by_a_formula(tmp_path: Path, layout: Path, formula: str, sum_a: float) -> None:
     (tmp_path / "car.dbc").write_text(
         DBC + ' SG_ One : 16|8@1+ (1,1) [0|0] "" Car\n SG_ Power : 0|16@1- (0.04,0) [-1000|1000] "kW" Car\n'

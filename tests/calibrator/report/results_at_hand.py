@@ -19,13 +19,7 @@ from calibrator.estimator.results import (
     write_run,
 )
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import (
-    BranchParameters,
-    Explanation,
-    HardwareFault,
-    JunctionResidual,
-    VehicleParameters,
-)
+from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, JunctionResidual, VehicleParameters
 from tests.ecu_node.vehicles import parameters_for
 
 BRANCHES = ("battery", "motor")

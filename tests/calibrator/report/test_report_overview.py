@@ -75,10 +75,7 @@ def test_steps_join_vehicles_with_the_same_question(tmp_path: Path, database: Ve
     window = "a zero-current window (contactors open) would decide: the motor sensor then shows +{} A or +0 A"
     needs = {"V1": window.format(7), "V2": window.format(3), "V3": window.format(7)}
     items = [vehicle(database, name, held, sensor(), decides=need) for name, need in needs.items()]
-    assert steps(write_result(tmp_path / "few", items)) == [
-        f"V1, V3: {needs['V1']}.",
-        f"V2: {needs['V2']}.",
-    ]
+    assert steps(write_result(tmp_path / "few", items)) == [f"V1, V3: {needs['V1']}.", f"V2: {needs['V2']}."]
     items += [vehicle(database, f"W{n}", held, sensor(), decides=window.format(n)) for n in (4, 5)]
     assert steps(write_result(tmp_path / "many", items)) == [
         "V1, V3, V2, W4, W5, not corrected because the correction might do harm: what would decide stands with each. "

@@ -30,10 +30,7 @@ def store(database: VehicleDatabase, tmp_path: Path) -> Path:
     ("branches", "beside"),
     [
         (None, []),
-        (
-            ["battery", "motor"],
-            ["branches recorded but not asked for, missing from the junction sum: auxiliary"],
-        ),
+        (["battery", "motor"], ["branches recorded but not asked for, missing from the junction sum: auxiliary"]),
     ],
 )
 def test_branches_that_were_not_recorded_or_not_asked_for_are_named(

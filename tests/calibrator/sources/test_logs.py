@@ -27,12 +27,7 @@ def make(*paths: Path) -> None:
         (["V1/DRIVE1.LOG.GZ"], ["."], ["V1/DRIVE1"], []),
         (["V1/a.log"], ["V1", "V1/a.log", "."], ["V1/a"], []),  # named twice, read once
         (["V1/a.log", "V1/old/b.log"], ["V1", "V1/a.log"], ["V1/a", "old/b"], []),
-        (
-            ["V1/a.log", "V1/old/b.log"],
-            ["V1"],
-            ["old/b"],
-            ["V1/a.log: lies beside folders with logs; move it"],
-        ),
+        (["V1/a.log", "V1/old/b.log"], ["V1"], ["old/b"], ["V1/a.log: lies beside folders with logs; move it"]),
         (["V1/a.log", "V2/a.log", "b.log"], ["."], ["V1/a", "V2/a"], ["b.log: lies beside folders with logs"]),
         (
             ["x/V1/a.log", "y/V1/b.log", "y/V2/a.log"],

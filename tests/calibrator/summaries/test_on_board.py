@@ -64,10 +64,7 @@ def recorded_drive(seed: int = 1) -> Drive:
         "voltage": beside_battery(350.0 - 0.05 * current(battery.time_s)),
     }
     return Drive(
-        vehicle="V1",
-        name="drive",
-        branches={"battery": battery, "motor": motor, "auxiliary": auxiliary},
-        inputs=inputs,
+        vehicle="V1", name="drive", branches={"battery": battery, "motor": motor, "auxiliary": auxiliary}, inputs=inputs
     )
 
 

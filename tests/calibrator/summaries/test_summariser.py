@@ -11,14 +11,7 @@ from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank, low_passes
 from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, FitSums
 from calibrator.summaries.summariser import find_spikes, summarise_samples
-from tests.calibrator.estimator.simulated_drives import (
-    PERIOD_S,
-    Conditions,
-    coloured,
-    drive_of,
-    no_faults,
-    samples_of,
-)
+from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, coloured, drive_of, no_faults, samples_of
 
 SAMPLES = 1800
 
