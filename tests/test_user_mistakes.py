@@ -109,6 +109,10 @@ MISTAKES = [
     # one junction
     ("calibrator calibrate drive.csv CAR --out x --trusted gearbox", 1, "--trusted gearbox: no such branch"),
     ("calibrator calibrate drive.csv CAR --out x --load=-3:0.1", 2, "expected what flows out of the junction"),
+    ("calibrator calibrate drive.csv CAR --out x --load much", 2, "expected a number and its standard deviation"),
+    ("calibrator calibrate drive.csv CAR --out x --charge battery", 2, "expected a branch with its charge"),
+    ("calibrator calibrate drive.csv CAR --out x --trusted battery --hold-out car", 2, "--hold-out is for a fleet"),
+    ("calibrator calibrate drive.csv CAR --out x --trusted battery --expected-faults 0.2", 2, "is for a fleet"),
     ("calibrator calibrate drive.csv CAR --out x --charge battery=3", 2, "give its standard deviation"),
     ("calibrator calibrate drive.csv CAR --out x --meter battery", 1, "--meter battery: one folder of recordings"),
     ("calibrator calibrate drive.csv CAR --out x --readings none.csv", 1, "none.csv"),

@@ -6,12 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from calibrator.processes.interrupts import ENDED, TERMINATED, interrupted_message
+from calibrator.processes.interrupts import ENDED, TERMINATED, importing, interrupted_message
 from ecu_node.program import INTERRUPTED
 
 ROOT = Path(__file__).parents[2]
@@ -89,3 +90,44 @@ def test_closed_pipe_gives_no_traceback(arguments: list[str]) -> None:
     run = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
     os.close(writer)
     assert (run.returncode, run.stderr) == (1, "")
+
+
+def test_base_install_says_which_extra_the_calibrator_needs() -> None:
+    code = "import sys; sys.modules['typer'] = None; from calibrator.__main__ import calibrator_program as run; run()"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert run.stderr == "calibrator: typer is not installed; pip install 'hv-current-correction[calibrator]'\n"
+
+
+def handler() -> "Callable[..., object] | int | None":
+    return signal.getsignal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("before", [signal.default_int_handler, signal.SIG_IGN])
+def test_ctrl_c_is_handled_as_before_afterwards_and_stays_ignored(before: "Callable[..., object] | int") -> None:
+    of_pytest = signal.signal(signal.SIGINT, before)
+    try:
+        with importing():
+            assert (handler() is before) == (before is signal.SIG_IGN)
+        assert handler() is before
+    finally:
+        signal.signal(signal.SIGINT, of_pytest)
+
+
+def test_message_says_whether_a_command_goes_on_where_it_was() -> None:
+    goes_on = "; it goes on with what it had read"
+    for arguments, kept in ((["--debug", "import", "x"], goes_on), (["simulate", "--out", "import"], ""), ([], "")):
+        assert interrupted_message(arguments) == f"calibrator: interrupted; run the same command again{kept}"
+    assert interrupted_message([], ENDED) == "calibrator: ended by SIGTERM; run the same command again"
+
+
+def test_ctrl_c_while_libraries_are_imported_ends_the_program_with_one_line() -> None:
+    code = (
+        "import os, signal, sys\n"
+        "from calibrator.processes.interrupts import importing\n"
+        "sys.argv = ['calibrator', 'summarise']\n"
+        "with importing(): os.kill(os.getpid(), signal.SIGINT)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    line = "calibrator: interrupted; run the same command again; it goes on with what it had read\n"
+    assert (run.returncode, run.stderr) == (130, line)

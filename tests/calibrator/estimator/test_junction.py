@@ -314,15 +314,6 @@ def test_mistake_is_one_line(motor_off: pd.DataFrame, change: Any, known: dict[s
     assert "\n" not in str(raised.value)
 
 
-@pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory, motor_off: pd.DataFrame) -> Path:
-    """A car in a folder of its own: a table, and the layout of its columns."""
-    folder = tmp_path_factory.mktemp("car")
-    motor_off.rename_axis("time_s").to_csv(folder / "drive.csv")
-    write_layout(folder, motor_off)
-    return folder
-
-
 def write_layout(folder: Path, frame: pd.DataFrame) -> Path:
     branches = "".join(f'[[branch]]\nname = "{name}"\nsignal = "{name}"\nsign = 1\n' for name in frame)
     (folder / "layout.toml").write_text(f'schema = 1\nname = "car"\nfull_scale_a = 400.0\n{branches}')
@@ -339,26 +330,6 @@ def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:
     (parameters,) = (tmp_path / "result" / "params").iterdir()
     sums = command("kirchhoff", drive, "--layout", layout, "--parameters", parameters)
     assert re.search(r"RMSE of the sum about the 2 A expected: 2.\d+ A measured, 0.4\d A corrected", sums.stdout)
-
-
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        (["--load", "much"], "expected a number and its standard deviation"),
-        (["--load=-3:0.1"], "expected what flows out of the junction"),
-        (["--charge", "battery"], "expected a branch with its charge"),
-        (["--charge", "battery=3"], "give its standard deviation"),
-        (["--trusted", "battery", "--hold-out", "car"], "--hold-out is for a fleet"),
-        (["--trusted", "battery", "--expected-faults", "0.2"], "--expected-faults is for a fleet"),
-    ],
-)
-def test_wrong_option_is_one_line(table: Path, tmp_path: Path, options: list[str], match: str) -> None:
-    arguments = ["calibrate", table / "drive.csv", "--layout", table / "layout.toml", "--out", tmp_path / "r", *options]
-    done = command(*arguments)
-    assert done.returncode != 0
-    assert match in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "r").exists()
 
 
 def test_gain_ratios_are_named_in_the_order_of_the_layout(motor_off: pd.DataFrame) -> None:

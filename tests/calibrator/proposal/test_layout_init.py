@@ -1,7 +1,6 @@
 """``calibrator layout init``: databases with the units, names and ranges of real ones, logs, tables, the dialogue."""
 
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from calibrator.words import word_set
+from calibrator.words import is_battery, places_of, word_set, words_of
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import Layout, read_layout
 from tests.calibrator.command_here import calibrator
@@ -279,18 +278,6 @@ def test_artificial_vehicle_passes_the_doctor(tmp_path: Path, database: VehicleD
     assert calibrator("doctor", "--layout", layout.path, "--log", log).returncode == 0
 
 
-def test_tesla_gives_its_three_branches(shared_data: Path, tmp_path: Path) -> None:
-    (tmp_path / "Model3CAN.dbc").symlink_to(shared_data / "tesla_model3" / "Model3CAN.dbc")
-    started = time.process_time()
-    layout = found(tmp_path / "Model3CAN.dbc", "--log", shared_data / "tesla_model3" / "drive.log.gz")
-    assert time.process_time() - started < 10.0
-    assert signed(layout) == {
-        "battery": ("ID132HVBattAmpVolt.SmoothBattCurrent132", 1),
-        "motor_rear": ("ID266RearInverterPower.RearPower266", -1),
-        "motor_front": ("ID2E5FrontInverterPower.FrontPower2E5", -1),
-    }
-
-
 I3 = """BO_ 274 Battery112: 8 BMS
  SG_ Battery_Current : 0|16@1+ (0.1,-819.2) [0|819] "Amps" INV
  SG_ Battery_Volts : 16|16@1+ (0.1,0) [0|500] "Volts" INV
@@ -456,3 +443,37 @@ def test_dialogue_writes_what_does_not_close_only_when_asked_again(tmp_path: Pat
     shown.press("\r")
     assert shown.ended()[0] == 0
     assert (tmp_path / "car.toml").exists()
+
+
+# Words
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("SmoothBattCurrent132", "smooth batt current 132"),
+        ("ID266RearInverterPower", "id 266 rear inverter power"),
+        ("HV_BatteryVoltage", "hv battery voltage"),
+        ("PTC_leftCurrentHV", "ptc left current hv"),
+        ("DcDc_LowVoltagePower", "dcdc lv power"),
+        ("AirConPowerDemand", "aircon power demand"),
+    ],
+)
+def test_names_are_split_into_words(text: str, words: str) -> None:
+    assert " ".join(words_of(text)) == words
+
+
+def test_places_are_known_by_the_words_of_several_houses() -> None:
+    assert places_of(words_of("BMS_PackCurrent")) == {"battery"}
+    assert places_of(words_of("INV_DcPower")) == {"motor"}
+    assert places_of(words_of("Odometer")) == set()
+    assert places_of(words_of("PWR_LeistDC", "DC-Leistung Pulswechselrichter")) == {"motor"}
+    assert places_of(words_of("LadegStrom", "HV-Ladegerät")) == {"charger"}
+    assert words_of("Längsbeschleunigung") == ("laengsbeschleunigung",)
+    assert places_of(words_of("BAT_StromIst", "HV-Batteriestrom am Shunt")) == {"battery"}
+
+
+def test_a_battery_is_known_by_the_branch_or_else_by_its_signal() -> None:
+    assert is_battery("battery", "X.Y")
+    assert is_battery("source", "BMS_1.PackCurrent")
+    assert not is_battery("motor", "BMS_1.InverterCurrent")

@@ -7,6 +7,7 @@ import logging
 import re
 import zlib
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -138,12 +139,7 @@ ERROR_FRAME = "(1.200000) can0 20000080#0000000000000000"
     ],
 )
 def test_line_without_data_frame_is_left_out_and_counted(
-    tmp_path: Path,
-    suffix: str,
-    line: str,
-    counts: tuple[int, int, int],
-    capfd: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path, suffix: str, line: str, counts: tuple[int, int, int], capfd: Any, caplog: Any
 ) -> None:
     path = write_log(tmp_path / f"drive{suffix}", some_messages(20))
     path.write_text(f"{path.read_text()}{line}\n")
