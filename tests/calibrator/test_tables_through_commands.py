@@ -19,24 +19,12 @@ schema = 1
 name = "car"
 full_scale_a = 400.0
 model_inputs = ["demand", "heater_demand"]
-[[branch]]
-name = "battery"
-signal = "Ibat [A]"
-sign = 1
-[[branch]]
-name = "motor"
-signal = "Imot [A]"
-sign = -1
-[[branch]]
-name = "heater"
-signal = "Iheat [A]"
-sign = -1
-[[input]]
-name = "demand"
-signal = "demand"
-[[input]]
-name = "heater_demand"
-signal = "heater_demand"
+branch = [
+    { name = "battery", signal = "Ibat [A]", sign = 1 },
+    { name = "motor", signal = "Imot [A]", sign = -1 },
+    { name = "heater", signal = "Iheat [A]", sign = -1 },
+]
+input = [{ name = "demand", signal = "demand" }, { name = "heater_demand", signal = "heater_demand" }]
 """
 
 
@@ -142,10 +130,3 @@ def test_two_currents_that_close_the_sum_together_are_branches(tmp_path: Path) -
     taken = {each["signal"]: (each["branch"], each["sign"]) for each in found["candidates"]}
     wanted = {"Ibat": ("battery", 1), "Iinv": ("motor", -1), "I1": ("auxiliary", 1), "I2": ("auxiliary_3", 1)}
     assert taken == wanted
-
-
-def test_table_has_no_frames_to_replay(place: Path) -> None:
-    done = calibrator("replay", place / "logs" / "V1" / "drive.csv", "--interface", "virtual", "--channel", "c")
-    assert done.returncode == 1
-    assert "table" in done.stderr
-    assert "Traceback" not in done.stderr

@@ -171,10 +171,7 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
     shutil.copytree(store.url, tmp_path / "both")
     (tmp_path / "both" / "drives").mkdir()
     shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
-    (tmp_path / "file").touch()
     for place, code, message in (
-        (tmp_path / "nothing", 1, "nothing: no such folder, store of drives or store of summaries"),
-        (tmp_path / "file", 1, "file: not a known log format; expected .log"),
         (tmp_path / "both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them"),
         (tmp_path / "empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
         ("", 2, "an empty name; give the path"),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from calibrator.errors import ContradictionError, ExportError
+from calibrator.errors import ExportError
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError
 from ecu_node.parameters import write_parameters
@@ -45,29 +45,12 @@ def test_several_vehicles_are_one_table(database: VehicleDatabase, params: Path,
         assert [(row["vehicle"], row["branch"]) for row in csv.DictReader(file)] == [("v1", "battery"), ("v2", "motor")]
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("v1.json", "--format", "dcm"), "2 parameter files: dcm holds one vehicle; .* --format csv"),
-        (("--format", "hex"), "--format hex needs --elf PROGRAM"),
-        (("--format", "csv", "--elf", "v1.json"), "--format csv takes no --elf PROGRAM"),
-    ],
-)
-def test_contradictions_of_the_command_line_are_refused(words: tuple[str, ...], message: str, params: Path) -> None:
-    words = tuple(str(params) if word == "v1.json" else word for word in words)
-    with pytest.raises(ContradictionError, match=message):
-        raise refused(params, *words, "--output", params.with_name("out"))
-    assert [*params.parent.iterdir()] == [params]
-
-
 def test_parameters_that_do_not_fit_are_refused(params: Path, tmp_path: Path, make_database: MakeDatabase) -> None:
     more = ("--format", "c", "--output", tmp_path / "out")
     with pytest.raises(ParameterError, match=r"v1\.json: parameters are for vehicle 'v1', this is 'v7'"):
         raise refused(params, *more, "--vehicle", "v7")
     with pytest.raises(ParameterError, match=r"made with layout hv_powertrain\.toml .*, this is .*small"):
         raise refused(params, *more, layout=make_database().layout.path)
-    with pytest.raises(ParameterError, match=r"none\.json: no such parameter file"):
-        raise refused(tmp_path / "none.json", *more)
     assert not (tmp_path / "out").exists()
 
 

@@ -117,11 +117,3 @@ def test_ctrl_c_ends_the_line_of_progress_first_and_says_how_much_was_sent(
     *_, progress, last = capsys.readouterr().err.splitlines()
     assert progress.startswith(f"replay: 3 of {len(FRAMES)} frames, ")
     assert last == f"calibrator replay: 3 of {len(FRAMES)} frames were sent"
-
-
-@pytest.mark.parametrize("speed", ["-1", "nan", "inf", "fast"])
-def test_speed_that_is_none_is_named_with_what_is_expected(
-    log: Path, speed: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command(log, "--channel=c", f"--speed={speed}") == 2
-    assert f"'--speed': {speed}: expected a number from 0 to 1" in capsys.readouterr().err

@@ -25,41 +25,22 @@ def make(*paths: Path) -> None:
         path.touch()
 
 
-@pytest.mark.parametrize(
-    ("files", "arguments", "found", "problems"),
-    [
-        (["logs/V1/monday.log.gz", "logs/V2/a.b.blf", "truth.json"], ["."], ["V1/monday", "V2/a.b"], []),
-        (["V1/DRIVE1.LOG.GZ"], ["."], ["V1/DRIVE1"], []),
-        (["V1/a.log"], ["V1", "V1/a.log", "."], ["V1/a"], []),  # named twice, read once
-        (["V1/a.log", "V1/old/b.log"], ["V1", "V1/a.log"], ["V1/a", "old/b"], []),
-        (["V1/a.log", "V1/old/b.log"], ["V1"], ["old/b"], ["V1/a.log: lies beside folders with logs; move it"]),
-        (["V1/a.log", "V2/a.log", "b.log"], ["."], ["V1/a", "V2/a"], ["b.log: lies beside folders with logs"]),
-        (
-            ["x/V1/a.log", "y/V1/b.log", "y/V2/a.log"],
-            ["."],
-            ["V2/a"],
-            ["two vehicles with one name: V1 is in {}/x/V1 and in {}/y/V1; rename one folder"],
-        ),
-        (
-            ["V1/a.log", "V1/a.blf", "V1/b.log"],
-            ["."],
-            ["V1/b"],
-            ["vehicle V1: drive a is in {}/V1/a.blf and {}/V1/a.log; remove or rename one"],
-        ),
-        (
-            ["V1/größe.log", "V2/a.log", "V2/a.blf", "V3/a.log"],
-            ["."],
-            ["V3/a"],
-            ["größe.log: the file's name, which names the drive, 'größe' cannot be used", "vehicle V2: drive a is in"],
-        ),
-        (
-            ["V1/a.log", "empty/notes.md"],
-            ["nothing", "empty", "V1"],
-            ["V1/a"],
-            ["nothing: no such file or folder", "empty: no logs in it; expected .log, .asc"],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("files", "arguments", "found", "problems"), [
+    (["logs/V1/monday.log.gz", "logs/V2/a.b.blf", "truth.json"], ["."], ["V1/monday", "V2/a.b"], []),
+    (["V1/DRIVE1.LOG.GZ"], ["."], ["V1/DRIVE1"], []),
+    (["V1/a.log"], ["V1", "V1/a.log", "."], ["V1/a"], []),  # named twice, read once
+    (["V1/a.log", "V1/old/b.log"], ["V1", "V1/a.log"], ["V1/a", "old/b"], []),
+    (["V1/a.log", "V1/old/b.log"], ["V1"], ["old/b"], ["V1/a.log: lies beside folders with logs; move it"]),
+    (["V1/a.log", "V2/a.log", "b.log"], ["."], ["V1/a", "V2/a"], ["b.log: lies beside folders with logs"]),
+    (["x/V1/a.log", "y/V1/b.log", "y/V2/a.log"], ["."], ["V2/a"],
+     ["two vehicles with one name: V1 is in {}/x/V1 and in {}/y/V1; rename one folder"]),
+    (["V1/a.log", "V1/a.blf", "V1/b.log"], ["."], ["V1/b"],
+     ["vehicle V1: drive a is in {}/V1/a.blf and {}/V1/a.log; remove or rename one"]),
+    (["V1/größe.log", "V2/a.log", "V2/a.blf", "V3/a.log"], ["."], ["V3/a"],
+     ["größe.log: the file's name, which names the drive, 'größe' cannot be used", "vehicle V2: drive a is in"]),
+    (["V1/a.log", "empty/notes.md"], ["nothing", "empty", "V1"], ["V1/a"],
+     ["nothing: no such file or folder", "empty: no logs in it; expected .log, .asc"]),
+])  # fmt: skip
 def test_which_log_is_of_which_vehicle_and_what_is_left_out(
     tmp_path: Path, files: list[str], arguments: list[str], found: list[str], problems: list[str]
 ) -> None:
