@@ -144,7 +144,7 @@ def test_rows_that_nothing_explains_and_rows_that_say_nothing_are_fitted_without
         assert np.isfinite(fits.root[j, :n]).all()
     assert () in supports(fits, 2)
     np.testing.assert_allclose(fits.theta[2], 0.0, atol=0.05)
-    np.testing.assert_allclose(np.einsum("qpp->p", fits.root[2, : fits.number[2]] ** 2).max() > 0.1, True)
+    assert np.einsum("qpp->p", fits.root[2, : fits.number[2]] ** 2).max() > 0.1
 
 
 # Weights of the draws

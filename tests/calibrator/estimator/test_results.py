@@ -10,7 +10,6 @@ from calibrator.errors import FleetError
 from calibrator.estimator.results import (
     MOST_FILES,
     PARTS,
-    RunRecord,
     encode_chunk,
     join_rows,
     left_out_of,
@@ -28,25 +27,12 @@ from calibrator.summaries.identity import bucket_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, decode_parameters, read_parameters
 from tests.calibrator.conftest import run_command
+from tests.calibrator.report.results_at_hand import RUN as AT_HAND
 from tests.calibrator.report.results_at_hand import six_vehicle_result
 from tests.ecu_node.vehicles import parameters_for
 
 BUCKETS = 16
-RUN = RunRecord(
-    tool="test",
-    method="posterior",
-    fleet="f",
-    layout="hv_powertrain",
-    branches=["battery", "motor"],
-    model_inputs=[],
-    settings={},
-    created="2026-01-01T00:00:00Z",
-    details={},
-    vehicles=2,
-    buckets=BUCKETS,
-    left_out={},
-    notices=[],
-)
+RUN = replace(AT_HAND, buckets=BUCKETS)
 
 
 def vehicle(database: VehicleDatabase, name: str) -> VehicleParameters:
