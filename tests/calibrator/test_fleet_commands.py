@@ -156,13 +156,10 @@ def test_one_car_alone_and_copies_of_one_are_no_fleet(fleet: Path, tmp_path: Pat
     assert "vehicle other to trust; other: same recording as one; it cannot be told whose it is" in run.stderr
 
 
-@pytest.mark.parametrize(
-    ("key", "change", "message"),
-    [
-        ("vehicles", lambda found: {f"X{name}": each for name, each in found.items()}, "truth of another fleet"),
-        ("branches", lambda _: ["battery", "dcdc"], "with branches battery, motor, the truth of layout hv_powertrain"),
-    ],
-)
+@pytest.mark.parametrize(("key", "change", "message"), [
+    ("vehicles", lambda found: {f"X{name}": each for name, each in found.items()}, "truth of another fleet"),
+    ("branches", lambda _: ["battery", "dcdc"], "with branches battery, motor, the truth of layout hv_powertrain"),
+])  # fmt: skip
 def test_score_refuses_the_truth_of_other_vehicles_or_branches(
     fleet: Path, result: Path, tmp_path: Path, key: str, change: Callable[[Any], Any], message: str
 ) -> None:

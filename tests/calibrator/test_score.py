@@ -17,17 +17,14 @@ def sensor_faults(drift: list[list[float]] | Array, offset: list[list[float]] | 
     return Faults(hardware_drift=np.zeros(len(d)), hardware_offset_a=np.zeros_like(d), drift=d, offset_a=o)
 
 
-@pytest.mark.parametrize(
-    ("true", "found", "within_10", "within_25"),
-    [
-        ((0.1, 0.2), (0.109, 0.2), True, True),
-        ((0.1, 0.2), (0.111, 0.2), False, True),
-        ((0.1, 0.2), (0.1, 0.221), False, True),
-        ((0.0, 0.0), (0.0049, 0.0), True, True),  # a vanishing truth counts as the smallest fault, 0.05
-        ((0.0, 0.0), (0.0051, 0.0), False, True),
-        ((0.1, 0.0), (float("nan"), 0.0), False, False),
-    ],
-)
+@pytest.mark.parametrize(("true", "found", "within_10", "within_25"), [
+    ((0.1, 0.2), (0.109, 0.2), True, True),
+    ((0.1, 0.2), (0.111, 0.2), False, True),
+    ((0.1, 0.2), (0.1, 0.221), False, True),
+    ((0.0, 0.0), (0.0049, 0.0), True, True),  # a vanishing truth counts as the smallest fault, 0.05
+    ((0.0, 0.0), (0.0051, 0.0), False, True),
+    ((0.1, 0.0), (float("nan"), 0.0), False, False),
+])  # fmt: skip
 def test_vehicle_is_recovered_if_drift_and_offset_are_close(
     true: tuple[float, float], found: tuple[float, float], within_10: bool, within_25: bool
 ) -> None:

@@ -186,15 +186,12 @@ def test_sizes_lie_in_their_range_and_sign_bias_is_the_excess_of_positive_faults
     assert (sizes.min(), sizes.mean(), sizes.max()) == pytest.approx((0.05, 0.15, 0.25), abs=0.002)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"sign_bias": 0.6}, "expected 0 to 0.5"),
-        ({"sign_bias": float("nan")}, "expected 0 to 0.5"),
-        ({"sign_bias": 0.2, "symmetric": True}, "and 0 for a symmetric fleet"),
-        ({"vehicles": 6, "symmetric": True}, "needs a multiple of 4 vehicles, not 6"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"sign_bias": 0.6}, "expected 0 to 0.5"),
+    ({"sign_bias": float("nan")}, "expected 0 to 0.5"),
+    ({"sign_bias": 0.2, "symmetric": True}, "and 0 for a symmetric fleet"),
+    ({"vehicles": 6, "symmetric": True}, "needs a multiple of 4 vehicles, not 6"),
+])  # fmt: skip
 def test_fleet_that_cannot_be_drawn_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(FleetError, match=message):
         draw(**{"vehicles": 4} | changes)

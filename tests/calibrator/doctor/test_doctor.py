@@ -144,15 +144,12 @@ def test_all_signs_inverted_are_told_by_the_voltage(log: Path, tmp_path: Path) -
     assert [(item.subject, item.severity) for item in told.findings("sign")] == [("all branches", "warning")]
 
 
-@pytest.mark.parametrize(
-    ("branch", "signal", "unit", "factor"),
-    [
-        ("battery", "BatteryCurrent", "mA", 1000.0),
-        ("motor", "MotorCurrent", "kA", 0.001),
-        ("auxiliary", "AuxiliaryCurrent", "mA", 1000.0),
-        ("auxiliary", "AuxiliaryCurrent", "kA", 0.001),
-    ],
-)
+@pytest.mark.parametrize(("branch", "signal", "unit", "factor"), [
+    ("battery", "BatteryCurrent", "mA", 1000.0),
+    ("motor", "MotorCurrent", "kA", 0.001),
+    ("auxiliary", "AuxiliaryCurrent", "mA", 1000.0),
+    ("auxiliary", "AuxiliaryCurrent", "kA", 0.001),
+])  # fmt: skip
 def test_unit_slip_gives_factor(branch: str, signal: str, unit: str, factor: float, log: Path, tmp_path: Path) -> None:
     told = examined(write_layout(tmp_path, units={signal: unit}), log)
     assert told.errors == [("unit", branch)]

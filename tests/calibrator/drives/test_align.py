@@ -109,13 +109,10 @@ def test_a_missing_channel_is_named_with_those_there_are(layout: Layout) -> None
         align(drive_of({"battery": ramp(0.0, 1.0, 0.1)}), layout, ["battery", "motor"], inputs=["voltage"])
 
 
-@pytest.mark.parametrize(
-    ("dcdc", "words"),
-    [
-        (channel(np.array([0.0]), np.array([1.0]), bad=[0]), "drive d: no good sample of dcdc"),
-        (ramp(2.0, 3.0, 0.1), "no instant in common"),
-    ],
-)
+@pytest.mark.parametrize(("dcdc", "words"), [
+    (channel(np.array([0.0]), np.array([1.0]), bad=[0]), "drive d: no good sample of dcdc"),
+    (ramp(2.0, 3.0, 0.1), "no instant in common"),
+])  # fmt: skip
 def test_channels_that_cannot_be_aligned_are_refused(layout: Layout, dcdc: Channel, words: str) -> None:
     with pytest.raises(DriveError, match=words):
         aligned(layout, {"battery": ramp(0.0, 1.0, 0.1), "dcdc": dcdc})

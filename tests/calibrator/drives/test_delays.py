@@ -132,16 +132,13 @@ def without_some(channel: Channel) -> Channel:
     return replace(channel, value=np.where(good, channel.value, np.nan), good=good)
 
 
-@pytest.mark.parametrize(
-    ("drive", "within_s"),
-    [
-        (with_value("motor", lambda a: np.where(np.arange(len(a)) % 2500 < 5, 650.0, a)), 5e-3),  # wild samples
-        (changed("motor", lambda c: kept(c, np.floor(c.time_s / 20.0) % 3 != 0)), 1e-3),  # gaps
-        (changed("motor", without_some), 1e-3),
-        (changed("battery", lambda c: replace(c, value=c.value + 4.0 * (np.floor(c.time_s / 17.0) % 2))), 2e-3),
-        (with_value("motor", lambda a: np.where(a > 60.0, 1.15, 0.95) * (a - 60.0)), 3e-3),  # a gain for each sign
-    ],
-)
+@pytest.mark.parametrize(("drive", "within_s"), [
+    (with_value("motor", lambda a: np.where(np.arange(len(a)) % 2500 < 5, 650.0, a)), 5e-3),  # wild samples
+    (changed("motor", lambda c: kept(c, np.floor(c.time_s / 20.0) % 3 != 0)), 1e-3),  # gaps
+    (changed("motor", without_some), 1e-3),
+    (changed("battery", lambda c: replace(c, value=c.value + 4.0 * (np.floor(c.time_s / 17.0) % 2))), 2e-3),
+    (with_value("motor", lambda a: np.where(a > 60.0, 1.15, 0.95) * (a - 60.0)), 3e-3),  # a gain for each sign
+])  # fmt: skip
 def test_what_a_recording_lacks_or_has_besides_moves_the_delay_little(drive: Drive, within_s: float) -> None:
     found = estimate_delays([drive], TWO, max_sd_s=0.02)
     assert found.known.all()
@@ -152,18 +149,15 @@ NO_SAMPLES = changed("motor", lambda c: replace(c, good=np.zeros(len(c.good), np
 SHORT = made_up_drive(1, replace(PAIR, duration_s=30.0))
 
 
-@pytest.mark.parametrize(
-    "drive",
-    [
-        *(with_value(branch, lambda a: np.full(len(a), 12.0)) for branch in TWO),
-        *(with_value(branch, lambda a: 12.0 + 0.4 * NOISE[: len(a)]) for branch in TWO),
-        with_value("motor", lambda a: -a),  # a wrong sign
-        made_up_drive(1, replace(PAIR, size_a={"motor": 0.0})),
-        made_up_drive(1, replace(PAIR, delay_s={"motor": 0.8})),  # beyond the longest
-        NO_SAMPLES,
-        SHORT,
-    ],
-)
+@pytest.mark.parametrize("drive", [
+    *(with_value(branch, lambda a: np.full(len(a), 12.0)) for branch in TWO),
+    *(with_value(branch, lambda a: 12.0 + 0.4 * NOISE[: len(a)]) for branch in TWO),
+    with_value("motor", lambda a: -a),  # a wrong sign
+    made_up_drive(1, replace(PAIR, size_a={"motor": 0.0})),
+    made_up_drive(1, replace(PAIR, delay_s={"motor": 0.8})),  # beyond the longest
+    NO_SAMPLES,
+    SHORT,
+])  # fmt: skip
 def test_drive_that_tells_no_delay_is_flagged(drive: Drive) -> None:
     found = estimate_delays([drive], TWO)
     assert found.known.tolist() == [True, False]

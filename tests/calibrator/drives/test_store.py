@@ -58,13 +58,10 @@ def test_a_name_that_is_no_file_name_is_refused(tmp_path: Path, layout: Layout, 
     assert not (tmp_path / "store").exists()
 
 
-@pytest.mark.parametrize(
-    ("digest", "words"),
-    [
-        ("digest", r"monday\.parquet: made with layout hv_powertrain .*000000.*import the logs again with this layout"),
-        ("dbc_digest", r"made with another DBC than .*hv_powertrain\.dbc; import the logs again with this DBC"),
-    ],
-)
+@pytest.mark.parametrize(("digest", "words"), [
+    ("digest", r"monday\.parquet: made with layout hv_powertrain .*000000.*import the logs again with this layout"),
+    ("dbc_digest", r"made with another DBC than .*hv_powertrain\.dbc; import the logs again with this DBC"),
+])  # fmt: skip
 def test_a_store_made_with_another_layout_or_dbc_is_refused(
     tmp_path: Path, layout: Layout, monkeypatch: pytest.MonkeyPatch, digest: str, words: str
 ) -> None:

@@ -239,16 +239,13 @@ def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitud
     assert abs(right.sum() - found.confidence.sum()) < 3.0 * spread + 1.0
 
 
-@pytest.mark.parametrize(
-    ("shared", "size", "share"),
-    [
-        ("offset", 0.05, 0.6),
-        ("load", 0.025, 0.15),
-        ("gain", 0.04, 1.0),
-        pytest.param("offset", 0.0125, 1.0, marks=pytest.mark.long),
-        pytest.param("load", 0.0125, 1.0, marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize(("shared", "size", "share"), [
+    ("offset", 0.05, 0.6),
+    ("load", 0.025, 0.15),
+    ("gain", 0.04, 1.0),
+    pytest.param("offset", 0.0125, 1.0, marks=pytest.mark.long),
+    pytest.param("load", 0.0125, 1.0, marks=pytest.mark.long),
+])  # fmt: skip
 def test_what_a_batch_of_sensors_or_a_load_makes_alike_makes_no_vehicle_worse(
     shared: str, size: float, share: float
 ) -> None:

@@ -276,43 +276,31 @@ def of_all(change: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     return lambda: {name: change(each) for name, each in frames().items()}
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (dict, r"dict without vehicles: expected data frames by vehicle"),
-        (lambda: frames(1), r"a single vehicle, V1: a fleet that is compared with itself needs 5 or more"),
-        (lambda: {1: frame(1), "1": frame(2)}, r"vehicle 1 is there twice; give all of its frames as one list"),
-        (lambda: {"a/b": frame(1), "V2": frame(2)}, r"vehicle 'a/b' cannot be used"),
-        (changed(V2=lambda _: []), r"vehicle V2: no frame in its list"),
-        (changed(V2=lambda each: each["motor"]), r"vehicle V2: Series given; expected a DataFrame or a list of them"),
-        (changed(V2=lambda _: frame(1)), r"vehicle V2, frame 1: the same as vehicle V1, frame 1"),
-        (changed(V2=lambda each: each.drop(columns="motor")), r"vehicle V2, frame 1: no column motor; it has battery"),
-        (changed(V3=lambda each: each.drop(columns="heat")), r"vehicle V3, frame 1: no column heat; it has battery"),
-        (changed(V3=lambda each: each.assign(wind=1.0)), r"V3, frame 1: column wind, which vehicle V1, frame 1 has n"),
-        (changed(V2=lambda each: each.astype({"motor": str})), r"V2, frame 1: column motor is of .*expected numbers"),
-        (changed(V2=lambda each: each.assign(motor=np.nan)), r"V2, frame 1: column motor has no number at all"),
-        (changed(V2=lambda each: each.assign(motor=3.0)), r"vehicle V2: branch motor is 3 A throughout: stuck"),
-        (changed(V2=lambda each: each.iloc[::-1]), r"V2, frame 1: time runs back at row 1 \(299.0 -> 298.0\)"),
-        (retimed(lambda time: time.where(time != 7.0, 6.0)), r"V2, frame 1: time twice at row 7 \(6.0 -> 6.0\)"),
-        (changed(V2=lambda each: each.reset_index(drop=True)), r"V2, frame 1: its index counts rows; expected the tim"),
-        (retimed(lambda time: time.astype(str)), r"V2, frame 1: its index is of .*; expected"),
-        (retimed(lambda time: time.where(time != 7.0)), r"V2, frame 1: 1 rows without a time"),
-        (changed(V2=lambda each: each.iloc[:1]), r"V2, frame 1: 1 rows; leave the frame out"),
-        (
-            changed(V2=lambda each: each.assign(motor=1e-3 * each["motor"])),
-            r"V2: the largest motor .*perhaps it is in kA",
-        ),
-        (
-            of_all(lambda each: each.set_index(60.0 * each.index)),
-            r"V1, frame 1: rows are 60 s apart, expected 5 s at mo",
-        ),
-        (
-            retimed(lambda time: 1e-3 * time),
-            r"V2, frame 1: rows are 0.001 s apart, .* fleet 1 s; if the index is not in",
-        ),
-        (of_all(lambda each: each[["battery", "motor"]]), r"inputs none: expected one or more"),
-    ],
-)
+@pytest.mark.parametrize(("given", "message"), [
+    (dict, r"dict without vehicles: expected data frames by vehicle"),
+    (lambda: frames(1), r"a single vehicle, V1: a fleet that is compared with itself needs 5 or more"),
+    (lambda: {1: frame(1), "1": frame(2)}, r"vehicle 1 is there twice; give all of its frames as one list"),
+    (lambda: {"a/b": frame(1), "V2": frame(2)}, r"vehicle 'a/b' cannot be used"),
+    (changed(V2=lambda _: []), r"vehicle V2: no frame in its list"),
+    (changed(V2=lambda each: each["motor"]), r"vehicle V2: Series given; expected a DataFrame or a list of them"),
+    (changed(V2=lambda _: frame(1)), r"vehicle V2, frame 1: the same as vehicle V1, frame 1"),
+    (changed(V2=lambda each: each.drop(columns="motor")), r"vehicle V2, frame 1: no column motor; it has battery"),
+    (changed(V3=lambda each: each.drop(columns="heat")), r"vehicle V3, frame 1: no column heat; it has battery"),
+    (changed(V3=lambda each: each.assign(wind=1.0)), r"V3, frame 1: column wind, which vehicle V1, frame 1 has n"),
+    (changed(V2=lambda each: each.astype({"motor": str})), r"V2, frame 1: column motor is of .*expected numbers"),
+    (changed(V2=lambda each: each.assign(motor=np.nan)), r"V2, frame 1: column motor has no number at all"),
+    (changed(V2=lambda each: each.assign(motor=3.0)), r"vehicle V2: branch motor is 3 A throughout: stuck"),
+    (changed(V2=lambda each: each.iloc[::-1]), r"V2, frame 1: time runs back at row 1 \(299.0 -> 298.0\)"),
+    (retimed(lambda time: time.where(time != 7.0, 6.0)), r"V2, frame 1: time twice at row 7 \(6.0 -> 6.0\)"),
+    (changed(V2=lambda each: each.reset_index(drop=True)), r"V2, frame 1: its index counts rows; expected the tim"),
+    (retimed(lambda time: time.astype(str)), r"V2, frame 1: its index is of .*; expected"),
+    (retimed(lambda time: time.where(time != 7.0)), r"V2, frame 1: 1 rows without a time"),
+    (changed(V2=lambda each: each.iloc[:1]), r"V2, frame 1: 1 rows; leave the frame out"),
+    (changed(V2=lambda each: each.assign(motor=1e-3 * each["motor"])), r"V2: the largest motor .*perhaps it is in kA"),
+    (of_all(lambda each: each.set_index(60.0 * each.index)), r"V1, frame 1: rows are 60 s apart, expected 5 s at mo"),
+    (retimed(lambda time: 1e-3 * time), r"V2, frame 1: rows are 0.001 s apart, .* fleet 1 s; if the index is not in"),
+    (of_all(lambda each: each[["battery", "motor"]]), r"inputs none: expected one or more"),
+])  # fmt: skip
 def test_frames_that_are_no_recordings_of_a_fleet_are_refused_in_one_line(
     given: Callable[[], Frames], message: str
 ) -> None:
@@ -322,16 +310,13 @@ def test_frames_that_are_no_recordings_of_a_fleet_are_refused_in_one_line(
     assert type(caught.value).__module__ == "calibrator.errors"
 
 
-@pytest.mark.parametrize(
-    ("branches", "full_scale_a", "message"),
-    [
-        (["battery"], 400.0, r"branches \['battery'\]: a junction has 2 to 16 branches"),
-        ("battery", 400.0, r"branches 'battery': expected a list of names"),
-        (["battery", "battery"], 400.0, r"branches \['battery', 'battery'\]: expected different names"),
-        (["battery", "motor"], 0.0, r"full_scale_a 0.0: expected the nominal maximum current in A"),
-        (["battery", "motor"], "400 A", r"full_scale_a '400 A': expected the nominal maximum current in A"),
-    ],
-)
+@pytest.mark.parametrize(("branches", "full_scale_a", "message"), [
+    (["battery"], 400.0, r"branches \['battery'\]: a junction has 2 to 16 branches"),
+    ("battery", 400.0, r"branches 'battery': expected a list of names"),
+    (["battery", "battery"], 400.0, r"branches \['battery', 'battery'\]: expected different names"),
+    (["battery", "motor"], 0.0, r"full_scale_a 0.0: expected the nominal maximum current in A"),
+    (["battery", "motor"], "400 A", r"full_scale_a '400 A': expected the nominal maximum current in A"),
+])  # fmt: skip
 def test_junction_of_one_branch_or_without_full_scale_is_refused(
     branches: Any, full_scale_a: Any, message: str
 ) -> None:

@@ -179,14 +179,11 @@ def errors_of(rows: EvidenceRows, faults: Faults) -> Array:
     return np.concatenate([plain_residual(rows.take(one), theta[one]) for one in vehicles])
 
 
-@pytest.mark.parametrize(
-    "conditions",
-    [
-        Conditions(noise_a=1.0, memory=0.8),
-        pytest.param(Conditions(), marks=pytest.mark.long),
-        pytest.param(Conditions(model_error_a=1.0), marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize("conditions", [
+    Conditions(noise_a=1.0, memory=0.8),
+    pytest.param(Conditions(), marks=pytest.mark.long),
+    pytest.param(Conditions(model_error_a=1.0), marks=pytest.mark.long),
+])  # fmt: skip
 def test_standardised_errors_of_the_rows_are_standard_normal(
     conditions: Conditions, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,26 +46,15 @@ def motor_off() -> pd.DataFrame:
 MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
 
 
-@pytest.mark.parametrize(
-    ("fault", "known", "corrected"),
-    [
-        ({"gain": (0.0, 0.05, 0.0)}, {"trusted": ["battery"]}, {"motor"}),
-        ({"gain": (0.03, 0.05, 0.0)}, {"readings": MOTOR_READ}, {"battery", "motor"}),
-        ({"offset_a": (0.0, 4.0, 0.0)}, {"trusted": ["battery"]}, set()),
-        # of two branches the declared load leaves one offset; of three the gain alone is corrected
-        (
-            {"offset_a": (0.0, 4.0, 0.0), "load_a": 3.0},
-            {"trusted": ["battery", "heater"], "load": (3.0, 0.2)},
-            {"motor"},
-        ),
-        (
-            {"gain": (0.0, 0.1, 0.0), "offset_a": (0.0, 0.0, 6.0)},
-            {"trusted": ["battery"], "load": (0.0, 0.1)},
-            {"motor"},
-        ),
-        ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
-    ],
-)
+@pytest.mark.parametrize(("fault", "known", "corrected"), [
+    ({"gain": (0.0, 0.05, 0.0)}, {"trusted": ["battery"]}, {"motor"}),
+    ({"gain": (0.03, 0.05, 0.0)}, {"readings": MOTOR_READ}, {"battery", "motor"}),
+    ({"offset_a": (0.0, 4.0, 0.0)}, {"trusted": ["battery"]}, set()),
+    # of two branches the declared load leaves one offset; of three the gain alone is corrected
+    ({"offset_a": (0.0, 4.0, 0.0), "load_a": 3.0}, {"trusted": ["battery", "heater"], "load": (3.0, 0.2)}, {"motor"}),
+    ({"gain": (0.0, 0.1, 0.0), "offset_a": (0.0, 0.0, 6.0)}, {"trusted": ["battery"], "load": (0.0, 0.1)}, {"motor"}),
+    ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
+])  # fmt: skip
 def test_faults_are_within_their_deviations_and_what_is_known_well_is_corrected(
     fault: dict[str, Any], known: dict[str, Any], corrected: set[str]
 ) -> None:
@@ -210,15 +199,12 @@ def test_contradicting_knowledge_corrects_nothing() -> None:
     assert not calibrator.parameters_.corrected.any()
 
 
-@pytest.mark.parametrize(
-    ("change", "cause"),
-    [
-        (lambda motor: motor.clip(-50.0, 50.0), "clipped"),
-        (lambda motor: motor.where(motor.index < 120.0, 1.1 * motor), "step"),
-        (lambda motor: motor.where(motor > 0.0, 1.1 * motor), "sign"),
-        (lambda motor: motor * (1.0 + 0.0005 * motor.abs()), "saturating"),
-    ],
-)
+@pytest.mark.parametrize(("change", "cause"), [
+    (lambda motor: motor.clip(-50.0, 50.0), "clipped"),
+    (lambda motor: motor.where(motor.index < 120.0, 1.1 * motor), "step"),
+    (lambda motor: motor.where(motor > 0.0, 1.1 * motor), "sign"),
+    (lambda motor: motor * (1.0 + 0.0005 * motor.abs()), "saturating"),
+])  # fmt: skip
 def test_sensor_that_is_not_linear_is_found_and_not_corrected(change: Any, cause: str) -> None:
     frame = recording()
     calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame.assign(motor=change(frame["motor"])), JUNCTION)
@@ -254,17 +240,14 @@ def second_motor(rng: np.random.Generator, frame: pd.DataFrame) -> None:
     frame["battery"] += 30.0 * np.convolve(rng.normal(size=len(frame) + 19), np.full(20, 0.22), "valid")
 
 
-@pytest.mark.parametrize(
-    ("spoil", "causes"),
-    [
-        (noisy("motor", 0.0), set()),
-        (noisy("motor", 10.0), set()),
-        (noisy("battery", 10.0), set()),
-        (steady_heater, set()),
-        (switched_heater, set()),
-        (second_motor, {"switching"}),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "causes"), [
+    (noisy("motor", 0.0), set()),
+    (noisy("motor", 10.0), set()),
+    (noisy("battery", 10.0), set()),
+    (steady_heater, set()),
+    (switched_heater, set()),
+    (second_motor, {"switching"}),
+])  # fmt: skip
 def test_no_sensor_is_blamed_for_noise_or_for_a_branch_that_is_switched_or_not_measured(
     spoil: Any, causes: set[str]
 ) -> None:
@@ -286,28 +269,25 @@ def test_standard_deviations_are_right() -> None:
     assert np.abs(errors).max() < 4.0
 
 
-@pytest.mark.parametrize(
-    ("change", "known", "match"),
-    [
-        (lambda frame: frame.assign(motor=-frame["motor"]), {}, "check sign and unit of branch"),
-        (lambda frame: frame.drop(columns="motor"), {}, "no column motor"),
-        (lambda frame: frame.assign(motor=2.4 * frame["motor"]), {"trusted": ["battery"]}, "motor reads 2.5 times"),
-        (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
-        (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
-        (lambda frame: frame, {"load": (-3.0, 0.1)}, "a value from 0 with its standard deviation"),
-        (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
-        (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
-        (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
-        *(
-            (
-                lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
-                {"charge_ah": {"battery": (1.0, 0.1)}},
-                "have no samples of it",
-            )
-            for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
-        ),
-    ],
-)
+@pytest.mark.parametrize(("change", "known", "match"), [
+    (lambda frame: frame.assign(motor=-frame["motor"]), {}, "check sign and unit of branch"),
+    (lambda frame: frame.drop(columns="motor"), {}, "no column motor"),
+    (lambda frame: frame.assign(motor=2.4 * frame["motor"]), {"trusted": ["battery"]}, "motor reads 2.5 times"),
+    (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
+    (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
+    (lambda frame: frame, {"load": (-3.0, 0.1)}, "a value from 0 with its standard deviation"),
+    (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
+    (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
+    (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
+    *(
+        (
+            lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
+            {"charge_ah": {"battery": (1.0, 0.1)}},
+            "have no samples of it",
+        )
+        for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
+    ),
+])  # fmt: skip
 def test_mistake_is_one_line(motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str) -> None:
     with pytest.raises((FleetError, DriveError, ContradictionError), match=match) as raised:
         JunctionCalibrator(**known).fit(change(motor_off), JUNCTION)

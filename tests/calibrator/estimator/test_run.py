@@ -140,22 +140,19 @@ def test_few_vehicles_are_calibrated_by_this_process_alone(
 # What is refused
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "message"),
-    [
-        (("--method", "published"), 1, "a store of summaries, and --method published needs the drives"),
-        (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
-        (("--charge", "battery=3:0.1"), 1, "a store of summaries, and --charge needs the drives"),
-        (("--meter", "motor"), 1, "a store of summaries, and --meter needs the drives"),
-        (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
-        (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
-        (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
-        (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
-        (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
-        (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
-        (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
-    ],
-)
+@pytest.mark.parametrize(("options", "code", "message"), [
+    (("--method", "published"), 1, "a store of summaries, and --method published needs the drives"),
+    (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
+    (("--charge", "battery=3:0.1"), 1, "a store of summaries, and --charge needs the drives"),
+    (("--meter", "motor"), 1, "a store of summaries, and --meter needs the drives"),
+    (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
+    (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
+    (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
+    (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
+    (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
+    (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
+    (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
+])  # fmt: skip
 def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
     store: SummaryStore, tmp_path: Path, options: tuple[str, ...], code: int, message: str, monkeypatch: Any
 ) -> None:
@@ -240,13 +237,10 @@ def failing_for(bad: str, error: Exception, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(FleetTask, "estimate", refusing)
 
 
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (FleetError("evidence is not finite"), "its evidence cannot be used: evidence is not finite; look at its rec"),
-        (KeyError("x"), "internal error: KeyError: 'x' (test_run.py:"),
-    ],
-)
+@pytest.mark.parametrize(("error", "reason"), [
+    (FleetError("evidence is not finite"), "its evidence cannot be used: evidence is not finite; look at its rec"),
+    (KeyError("x"), "internal error: KeyError: 'x' (test_run.py:"),
+])  # fmt: skip
 def test_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
     store: SummaryStore, task: FleetTask, monkeypatch: pytest.MonkeyPatch, error: Exception, reason: str
 ) -> None:
@@ -314,15 +308,12 @@ def test_vehicle_of_the_earlier_result_that_is_in_the_store_no_more_is_named(
     assert left_out_of(tmp_path / "out") == dict.fromkeys(gone, why)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("method", "published", "its method is published, that of this run posterior; calibrate without --since"),
-        ("branches", ["battery"], "its list of branches is battery, that of this run battery, motor"),
-        ("layout_sha256", "0", "its version of "),
-        ("buckets", 32, "its number of buckets is 32, that of this run 16"),
-    ],
-)
+@pytest.mark.parametrize(("key", "value", "message"), [
+    ("method", "published", "its method is published, that of this run posterior; calibrate without --since"),
+    ("branches", ["battery"], "its list of branches is battery, that of this run battery, motor"),
+    ("layout_sha256", "0", "its version of "),
+    ("buckets", 32, "its number of buckets is 32, that of this run 16"),
+])  # fmt: skip
 def test_since_a_result_of_something_else_is_refused(
     store: SummaryStore, result: Path, tmp_path: Path, key: str, value: object, message: str
 ) -> None:

@@ -171,18 +171,15 @@ TWICE = (Setting(x=1.0, case=CommonCase()),) * 2
 NO_TABLE = "^snr: expected a method, and settings that differ in x or series$"
 
 
-@pytest.mark.parametrize(
-    ("change", "repetitions", "message"),
-    [
-        ({"settings": (Setting(x=1.0, case=RecordedCase()),)}, 1, "RecordedCase cannot be run on a CommonDrive"),
-        ({}, 0, "at least 1 repetition, not 0"),
-        ({"settings": (Setting(x=1.0, case=CommonCase(branches=4)),)}, 1, "4 branches: drive smooth has 2 to 2"),
-        ({"settings": ()}, 1, NO_TABLE),
-        ({"settings": TWICE}, 1, NO_TABLE),
-        ({"methods": ()}, 1, NO_TABLE),
-        ({"methods": (PERFECT, POSTERIOR, PERFECT)}, 1, "^2 methods are called 'published/perfect'; give each method"),
-    ],
-)
+@pytest.mark.parametrize(("change", "repetitions", "message"), [
+    ({"settings": (Setting(x=1.0, case=RecordedCase()),)}, 1, "RecordedCase cannot be run on a CommonDrive"),
+    ({}, 0, "at least 1 repetition, not 0"),
+    ({"settings": (Setting(x=1.0, case=CommonCase(branches=4)),)}, 1, "4 branches: drive smooth has 2 to 2"),
+    ({"settings": ()}, 1, NO_TABLE),
+    ({"settings": TWICE}, 1, NO_TABLE),
+    ({"methods": ()}, 1, NO_TABLE),
+    ({"methods": (PERFECT, POSTERIOR, PERFECT)}, 1, "^2 methods are called 'published/perfect'; give each method"),
+])  # fmt: skip
 def test_what_makes_no_table_is_refused(change: dict[str, Any], repetitions: int, message: str) -> None:
     with pytest.raises(FleetError, match=message):
         run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive(), repetitions=repetitions)
@@ -256,20 +253,17 @@ def test_own_methods_stand_beside_the_paper_and_confidence_is_of_the_first_that_
     assert headline(both)["confidence"].iloc[0] == f"{default:.3f}"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda _: MANY, r"what estimate\(\) returned is float64 of shape \(20, 2\), expected an Estimate; see"),
-        (lambda e: replace(e, faults=None), "faults is NoneType, expected Faults of calibrator.faults"),
-        (with_faults(drift=None), r"faults.drift is NoneType, expected finite numbers of shape \(20, 2\)"),
-        (with_faults(hardware_drift=np.zeros(3)), r"faults.hardware_drift is .*\(3,\), expected .*\(20,\)"),
-        (with_faults(drift=MANY * np.nan), "faults.drift .* expected finite numbers .*, 0 where no fault is found"),
-        (lambda e: replace(e, hardware=np.zeros(N)), "hardware is float64 .* expected bool"),
-        (lambda e: replace(e, confidence=np.full(N, 1.5)), "confidence is .* probabilities from 0 to 1"),
-        (lambda e: replace(e, drift_sd=MANY[:3], offset_sd_a=MANY), r"drift_sd is .* \(3, 2\), expected .*\(20, 2\)"),
-        (lambda e: replace(e, findings=[["load"]]), "findings of 1 vehicles is list, expected those of 20, or none"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda _: MANY, r"what estimate\(\) returned is float64 of shape \(20, 2\), expected an Estimate; see"),
+    (lambda e: replace(e, faults=None), "faults is NoneType, expected Faults of calibrator.faults"),
+    (with_faults(drift=None), r"faults.drift is NoneType, expected finite numbers of shape \(20, 2\)"),
+    (with_faults(hardware_drift=np.zeros(3)), r"faults.hardware_drift is .*\(3,\), expected .*\(20,\)"),
+    (with_faults(drift=MANY * np.nan), "faults.drift .* expected finite numbers .*, 0 where no fault is found"),
+    (lambda e: replace(e, hardware=np.zeros(N)), "hardware is float64 .* expected bool"),
+    (lambda e: replace(e, confidence=np.full(N, 1.5)), "confidence is .* probabilities from 0 to 1"),
+    (lambda e: replace(e, drift_sd=MANY[:3], offset_sd_a=MANY), r"drift_sd is .* \(3, 2\), expected .*\(20, 2\)"),
+    (lambda e: replace(e, findings=[["load"]]), "findings of 1 vehicles is list, expected those of 20, or none"),
+])  # fmt: skip
 def test_what_is_no_estimate_is_refused_with_the_name_of_the_method(change: Change, message: str) -> None:
     with pytest.raises(FleetError, match=f"^method 'mine': {message}"):
         run(Own("mine", change))

@@ -127,29 +127,23 @@ def test_the_newer_fd_object_is_read_with_what_it_leaves_out_as_zeros(length: in
     assert frames.data[0, : frames.length[0]].tobytes() == expected
 
 
-@pytest.mark.parametrize(
-    "spoilt",
-    [
-        SOUND[:6] + struct.pack("<H", 7) + SOUND[8:],  # a header of unknown version
-        an_object(CLASSIC, classic(0x11, b"x"), time=2**64 - 1),
-    ],
-)
+@pytest.mark.parametrize("spoilt", [
+    SOUND[:6] + struct.pack("<H", 7) + SOUND[8:],  # a header of unknown version
+    an_object(CLASSIC, classic(0x11, b"x"), time=2**64 - 1),
+])  # fmt: skip
 def test_an_object_that_cannot_be_a_frame_is_counted_as_damaged(spoilt: bytes) -> None:
     frames = blf_frames(io.BytesIO(of_objects(spoilt, SOUND)), "x.blf")
     assert (frames.key.tolist(), frames.damaged) == ([0x10], 1)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (of_objects(an_object(CLASSIC, b"1234")), "an object of 36 bytes, which is impossible for its type"),
-        (of_objects(SOUND[:8] + bytes(4) + SOUND[12:]), "a container holds an object of 0 bytes"),  # no endless loop
-        (of_objects(SOUND, b"no object at all"), "something that is no object"),
-        (of_objects(SOUND)[:-2], "the file ends before"),
-        (of_objects(SOUND[:-4]), "the last object is cut"),
-        (b"LOGG", "the header 'LOGG' of 144 bytes is expected"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (of_objects(an_object(CLASSIC, b"1234")), "an object of 36 bytes, which is impossible for its type"),
+    (of_objects(SOUND[:8] + bytes(4) + SOUND[12:]), "a container holds an object of 0 bytes"),  # no endless loop
+    (of_objects(SOUND, b"no object at all"), "something that is no object"),
+    (of_objects(SOUND)[:-2], "the file ends before"),
+    (of_objects(SOUND[:-4]), "the last object is cut"),
+    (b"LOGG", "the header 'LOGG' of 144 bytes is expected"),
+])  # fmt: skip
 def test_damage_is_refused_with_its_place(content: bytes, message: str) -> None:
     with pytest.raises(LogError, match=rf"x\.blf: truncated or damaged BLF: at byte \d+ .*{message}.* before it"):
         blf_frames(io.BytesIO(content), "x.blf")

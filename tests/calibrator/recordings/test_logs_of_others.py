@@ -244,18 +244,12 @@ def on_buses(path: Path, *channels: tuple[str, int]) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("layout_text", "channels", "ignored"),
-    [
-        (LAYOUT, [("can0", 80), ("can1", 3)], ["3 frames of other buses ignored (can1)"]),
-        (of_buses("pt"), [("can0", 80), ("can1", 40)], ["40 frames of other buses ignored (can1)"]),
-        (
-            of_buses("pt", "aux").replace("Pack.", "pt:Pack.").replace("Motor.", "aux:Motor."),
-            [("can0", 80), ("can1", 80), ("can2", 7)],
-            ["7 frames of other buses ignored (can2)"],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("layout_text", "channels", "ignored"), [
+    (LAYOUT, [("can0", 80), ("can1", 3)], ["3 frames of other buses ignored (can1)"]),
+    (of_buses("pt"), [("can0", 80), ("can1", 40)], ["40 frames of other buses ignored (can1)"]),
+    (of_buses("pt", "aux").replace("Pack.", "pt:Pack.").replace("Motor.", "aux:Motor."),
+     [("can0", 80), ("can1", 80), ("can2", 7)], ["7 frames of other buses ignored (can2)"]),
+])  # fmt: skip
 def test_branches_come_from_the_buses_of_the_layout_and_frames_of_others_are_ignored(
     tmp_path: Path, layout: Path, layout_text: str, channels: list[tuple[str, int]], ignored: list[str]
 ) -> None:
@@ -384,18 +378,15 @@ def test_damaged_log_gives_one_error_line_or_is_counted(tmp_path: Path, layout: 
         assert any("damaged lines or frames left out" in notice for notice in said["notices"])
 
 
-@pytest.mark.parametrize(
-    ("program", "old", "new"),
-    [
-        ("candump -ta", b"[8]  14 00 A0 0F 00 00 00 00\n", b"[8]  14 00 A0\n"),
-        ("candump -tA", b"2023-11-14 22:13:20.100", b"2023-11-4 22:13:20.100"),
-        ("candump -td", b"(000.04", b"(0.0.04"),
-        ("SavvyCAN", b",\n265", b",265"),
-        ("SavvyCAN", b"00000100,false", b'"0000100,false'),
-        ("SavvyCAN", b"00000100,false", b"90000000000100,false"),
-        ("PEAK TRC 1.3", b"00000200", b"9000000200"),
-    ],
-)
+@pytest.mark.parametrize(("program", "old", "new"), [
+    ("candump -ta", b"[8]  14 00 A0 0F 00 00 00 00\n", b"[8]  14 00 A0\n"),
+    ("candump -tA", b"2023-11-14 22:13:20.100", b"2023-11-4 22:13:20.100"),
+    ("candump -td", b"(000.04", b"(0.0.04"),
+    ("SavvyCAN", b",\n265", b",265"),
+    ("SavvyCAN", b"00000100,false", b'"0000100,false'),
+    ("SavvyCAN", b"00000100,false", b"90000000000100,false"),
+    ("PEAK TRC 1.3", b"00000200", b"9000000200"),
+])  # fmt: skip
 def test_damaged_line_is_left_out_and_counted(
     tmp_path: Path, layout: Path, program: str, old: bytes, new: bytes
 ) -> None:
@@ -418,14 +409,11 @@ def test_damaged_database_is_one_line(tmp_path: Path, layout: Path, suffix: str,
     require_one_line(calibrator("kirchhoff", tmp_path / "x.blf", "--layout", layout), path.name)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (of_buses("pt", "aux"), "names several buses; the node corrects the signals of one bus"),
-        (of_buses(), "has no 'dbc', so that it fits tables only"),
-        (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    (of_buses("pt", "aux"), "names several buses; the node corrects the signals of one bus"),
+    (of_buses(), "has no 'dbc', so that it fits tables only"),
+    (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
+])  # fmt: skip
 def test_template_refuses_layouts_without_one_dbc(layout: Path, text: str, words: str) -> None:
     layout.write_text(text)
     command = [sys.executable, "-m", "ecu_node", "template", "--layout", str(layout), "--vehicle", "V1"]

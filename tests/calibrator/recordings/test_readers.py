@@ -186,16 +186,14 @@ def test_float_signal_is_not_written_as_whole_number() -> None:
 
 
 @settings(max_examples=60)
-@given(st.integers(-32768, 32767), st.integers(0, 2047), st.integers(-256, 255))
-def test_both_byte_orders_agree_with_cantools(a: int, b: int, c: int) -> None:
-    expected = big_endian_database().message("M").encode({"A": a * 0.5 + 10, "B": b, "C": c * -0.25}, strict=False)
-    series = encode_message(
-        big_endian_database(),
-        "M",
-        np.zeros(1),
-        {"A": np.array([a * 0.5 + 10]), "B": np.array([float(b)]), "C": np.array([c * -0.25])},
-    )
-    assert series.data[0].tobytes() == expected
+@given(st.integers(-32768, 32767), st.integers(0, 2047), st.integers(-256, 255), st.floats(-0.49, 0.49))
+def test_nearest_codes_are_written_in_both_byte_orders_as_cantools_writes_them(
+    a: int, b: int, c: int, e: float
+) -> None:
+    database = big_endian_database()
+    expected = database.message("M").encode({"A": a * 0.5 + 10, "B": b, "C": c * -0.25}, strict=False)
+    values = {"A": np.array([(a + e) * 0.5 + 10]), "B": np.array([b + e]), "C": np.array([(c + e) * -0.25])}
+    assert encode_message(database, "M", np.zeros(1), values).data[0].tobytes() == expected
 
 
 def big_endian_database(dbc: str = BIG_ENDIAN_DBC, **keys: EndToEnd) -> VehicleDatabase:

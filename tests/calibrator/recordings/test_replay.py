@@ -88,13 +88,10 @@ def test_the_command_plays_a_log_and_counts(log: Path, capsys: pytest.CaptureFix
     assert capsys.readouterr().out.startswith("60 frames in ")
 
 
-@pytest.mark.parametrize(
-    ("name", "interface", "words"),
-    [
-        ("missing.log", "virtual", "calibrator: .*no such file"),
-        ("drive.log", "pigeon", "calibrator: pigeon c: cannot open"),
-    ],
-)
+@pytest.mark.parametrize(("name", "interface", "words"), [
+    ("missing.log", "virtual", "calibrator: .*no such file"),
+    ("drive.log", "pigeon", "calibrator: pigeon c: cannot open"),
+])  # fmt: skip
 def test_a_replay_that_fails_ends_in_1(
     log: Path, capsys: pytest.CaptureFixture[str], name: str, interface: str, words: str
 ) -> None:

@@ -119,6 +119,15 @@ def test_table_gives_currents_without_a_layout(tmp_path: Path, kind: str) -> Non
     require_sum(before(tmp_path / name, "--branches", BRANCHES))
 
 
+def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
+    rows = frame().to_csv(index=False).splitlines()
+    rows[20] += ",7"
+    rows[30] = "," + rows[30].partition(",")[2]
+    (tmp_path / "x.csv").write_text("\n".join(rows))
+    found = before(tmp_path / "x.csv", "--branches", BRANCHES)
+    assert "2 damaged lines or frames left out" in found["notices"]
+
+
 def test_row_numbers_that_a_filter_left_as_index_are_not_the_time(tmp_path: Path) -> None:
     rows = frame().rename(columns={"time": "time [s]"})
     rows.drop(index=[3, 7, 8]).to_parquet(tmp_path / "x.parquet")
@@ -280,3 +289,11 @@ def test_damaged_table_is_one_line(tmp_path: Path, suffix: str) -> None:
     assert done.returncode == 1
     assert f"x{suffix}: not a readable" in done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
+
+
+def test_log_of_frames_is_no_table_for_a_layout_without_dbc(tmp_path: Path) -> None:
+    (tmp_path / "x.log").write_text("(1.000000) can0 123#11\n(2.000000) can0 123#11\n")
+    for layout in (LAYOUT, LAYOUT.replace('"Ibat"', '"Ibat", corrected = "A.B"')):
+        (tmp_path / "car.toml").write_text(layout)
+        done = calibrator("kirchhoff", tmp_path / "x.log", "--layout", tmp_path / "car.toml")
+        assert "no 'dbc', so that it fits tables only; give the DBC of the frames" in done.stderr

@@ -101,13 +101,10 @@ def store(database: VehicleDatabase, tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    ("branches", "beside"),
-    [
-        (None, []),
-        (["battery", "motor"], ["branches recorded but not asked for, missing from the junction sum: auxiliary"]),
-    ],
-)
+@pytest.mark.parametrize(("branches", "beside"), [
+    (None, []),
+    (["battery", "motor"], ["branches recorded but not asked for, missing from the junction sum: auxiliary"]),
+])  # fmt: skip
 def test_branches_that_were_not_recorded_or_not_asked_for_are_named(
     store: Path, database: VehicleDatabase, branches: list[str] | None, beside: list[str]
 ) -> None:
@@ -115,13 +112,10 @@ def test_branches_that_were_not_recorded_or_not_asked_for_are_named(
     assert notices == ["branches not recorded, taken as not fitted: dcdc, motor_rear", *beside]
 
 
-@pytest.mark.parametrize(
-    ("branches", "words"),
-    [
-        (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
-        (["pack", "battery"], "no branch 'pack'; known are battery, motor"),
-    ],
-)
+@pytest.mark.parametrize(("branches", "words"), [
+    (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
+    (["pack", "battery"], "no branch 'pack'; known are battery, motor"),
+])  # fmt: skip
 def test_branches_that_cannot_be_asked_for_are_refused(
     store: Path, database: VehicleDatabase, branches: list[str], words: str
 ) -> None:

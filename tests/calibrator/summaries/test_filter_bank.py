@@ -97,18 +97,15 @@ def test_a_bank_file_brings_the_same_bank_back(tmp_path: Path) -> None:
     assert read_bank(tmp_path / "bank.json") == bank_of()
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "No such file or directory; give a file that 'calibrator identify' wrote"),
-        ("{", "no filter bank"),
-        ('{"input_names": ["u"], "period_s": 0.1, "gains": []}', "no filter bank .*gains"),
-        ('{"input_names": ["u"], "period_s": 0.1, "poles": [[1.0, 0.0]]}', "pole 1 .* inside the unit circle"),
-        ('{"input_names": ["u"], "period_s": 0.1, "poles": [[0.5, -0.1]]}', "positive imaginary part"),
-        ('{"input_names": ["u"], "period_s": 0.0}', "period 0.0 s; expected a positive number"),
-        ('{"input_names": ["u", "u"], "period_s": 0.1}', "expected distinct names"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "No such file or directory; give a file that 'calibrator identify' wrote"),
+    ("{", "no filter bank"),
+    ('{"input_names": ["u"], "period_s": 0.1, "gains": []}', "no filter bank .*gains"),
+    ('{"input_names": ["u"], "period_s": 0.1, "poles": [[1.0, 0.0]]}', "pole 1 .* inside the unit circle"),
+    ('{"input_names": ["u"], "period_s": 0.1, "poles": [[0.5, -0.1]]}', "positive imaginary part"),
+    ('{"input_names": ["u"], "period_s": 0.0}', "period 0.0 s; expected a positive number"),
+    ('{"input_names": ["u", "u"], "period_s": 0.1}', "expected distinct names"),
+])  # fmt: skip
 def test_a_file_that_is_no_bank_is_refused_with_its_name(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "bank.json"
     if text:

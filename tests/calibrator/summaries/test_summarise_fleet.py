@@ -186,15 +186,12 @@ def put(name: str, value: float) -> Change:
     return lambda channels: channels[name].put(100, value)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (put("motor", 1e12), "drive d: branch motor shows 1e+12 A, full scale of the junction being 400 A"),
-        (put("motor", np.nan), "drive d: branch motor shows nan A"),
-        (put("battery", -np.inf), "drive d: branch battery shows inf A"),
-        (put("speed", np.nan), "drive d: input speed has values that are no numbers"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (put("motor", 1e12), "drive d: branch motor shows 1e+12 A, full scale of the junction being 400 A"),
+    (put("motor", np.nan), "drive d: branch motor shows nan A"),
+    (put("battery", -np.inf), "drive d: branch battery shows inf A"),
+    (put("speed", np.nan), "drive d: input speed has values that are no numbers"),
+])  # fmt: skip
 def test_impossible_values_are_named(tmp_path: Path, database: VehicleDatabase, change: Change, message: str) -> None:
     write(tmp_path, "V1", "d", database, change=change)
     with pytest.raises(DriveError, match=re.escape(message)):
