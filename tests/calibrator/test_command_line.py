@@ -55,9 +55,7 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(tmp_path:
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.0])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_and_sigterm_while_logs_are_read_end_readers_too_in_one_line(
-    how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path
-) -> None:
+def test_signal_ends_readers_too(how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path) -> None:
     log, temporary = tmp_path / "V1" / "endless.log.gz", short_folder
     log.parent.mkdir()
     log.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)

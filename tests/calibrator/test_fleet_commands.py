@@ -169,9 +169,7 @@ def test_score_refuses_the_truth_of_other_vehicles_or_branches(
     assert (run.returncode, message in run.stderr) == (1, True), run.stderr
 
 
-def test_truth_of_a_fleet_with_the_same_names_is_refused_before_the_work(
-    fleet: Path, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_foreign_truth_is_refused(fleet: Path, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("calibrator.estimator.published_fleet.read_vehicles", None)  # the work
     other, store = tmp_path / "truth.json", tmp_path / "store"
     other.write_text(json.dumps({**json.loads((fleet / "truth.json").read_text()), "fleet_id": "other"}))

@@ -47,9 +47,7 @@ def test_asymmetric_fleet_with_delays_and_an_unmeasured_load_is_recovered_and_no
     assert figures["harmed_rate"] == 0.0
 
 
-def test_delay_of_the_motor_is_found_and_stands_in_the_parameter_file(
-    fleet: Path, parameters: list[VehicleParameters]
-) -> None:
+def test_delay_of_the_motor_is_in_the_parameter_file(fleet: Path, parameters: list[VehicleParameters]) -> None:
     truth = read_truth(fleet / "truth.json").vehicles
     for item in parameters:
         delays = {name: branch.delay_s for name, branch in item.branches.items()}

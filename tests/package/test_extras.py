@@ -33,9 +33,7 @@ def test_an_extra_alone_is_whole(installed: Installed, extra: str, car: Path) ->
     assert venv.run("ecu-node", "schema", folder=car).returncode == 0
 
 
-def test_calibrator_takes_a_fleet_from_logs_to_reports_and_exports(
-    installed: Installed, car: Path, fleet: Path, drive: Path, tmp_path: Path
-) -> None:
+def test_fleet_from_logs_to_exports(installed: Installed, car: Path, fleet: Path, drive: Path, tmp_path: Path) -> None:
     venv, result = installed("calibrator"), tmp_path / "result"
     layout = ("--layout", car / "my_car.toml")
     calibrator(venv, tmp_path, "import", fleet / "logs", *layout, "--out", "store")

@@ -68,9 +68,7 @@ def test_bundle_that_is_accepted_is_reported(vehicle: Vehicle, monkeypatch: pyte
     ("error", "words"),
     [(KeyError("slots"), r"here: KeyError\('slots'\)"), (TrustError(Reason.NONE, "two\nlines"), "here: not one line")],
 )
-def test_crash_and_answer_of_two_lines_are_reported(
-    vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
-) -> None:
+def test_wrong_answer_is_named(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch, error: Exception, words: str) -> None:
     def failing(*_: object, **__: object) -> None:
         raise error
 

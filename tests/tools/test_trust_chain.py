@@ -36,9 +36,7 @@ def test_no_vehicle_of_a_fleet_is_made_worse(
         assert counts[f"of_these_passed_{kind}"] < 0.2 * counts[f"wrong_sets_on_trial_{kind}"]
 
 
-def test_trips_that_end_before_the_trial_does_are_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_short_trips_are_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         chain(monkeypatch, "--unseen-minutes", 5)
     assert f"--unseen-minutes: the trial of {LAYOUT} alone takes 300 s; give more" in capsys.readouterr().err

@@ -117,9 +117,7 @@ def test_car_at_rest_is_called_so_without_an_error_and_taken_by_calibrate(
     assert calibrated(tmp_path, log, layout, "--trusted", "battery")[0] == 0
 
 
-def test_constant_currents_while_driving_are_not_standstill(
-    tmp_path: Path, layout: Path, database: VehicleDatabase
-) -> None:
+def test_constant_current_at_speed_is_no_standstill(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     told = examined(layout, at_rest(database, tmp_path, noise_a=0.02, speed=50.0))
     assert told.findings("stands still") == []
     assert [item.subject for item in told.findings("full scale")] == ["all branches"]

@@ -246,9 +246,7 @@ def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitud
     pytest.param("offset", 0.0125, 1.0, marks=pytest.mark.long),
     pytest.param("load", 0.0125, 1.0, marks=pytest.mark.long),
 ])  # fmt: skip
-def test_what_a_batch_of_sensors_or_a_load_makes_alike_makes_no_vehicle_worse(
-    shared: str, size: float, share: float
-) -> None:
+def test_fault_of_a_whole_batch_or_a_load_harms_no_vehicle(shared: str, size: float, share: float) -> None:
     faults, some = random_faults(2, vehicles=24, branches=2), np.arange(24) < 24 * share
     if shared == "offset":
         faults.offset_a[some, 0] += size

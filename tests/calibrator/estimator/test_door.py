@@ -253,9 +253,7 @@ def test_readings_and_trust_that_the_drives_contradict_are_named_and_the_others_
 @pytest.mark.parametrize(
     ("column", "factor", "said"), [("battery", -1.0, "reads with the wrong sign"), ("motor", 0.0, "does not follow")]
 )
-def test_vehicle_whose_currents_do_not_balance_at_all_is_told_what_is_wrong(
-    column: str, factor: float, said: str
-) -> None:
+def test_currents_that_do_not_balance_are_explained(column: str, factor: float, said: str) -> None:
     given = frames(6)
     given["V6"][column] = factor * given["V6"][column] + np.sin(given["V6"].index)
     found = FleetCalibrator().fit(Fleet.from_frames(given, JUNCTION))
@@ -301,9 +299,7 @@ def of_all(change: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     (retimed(lambda time: 1e-3 * time), r"V2, frame 1: rows are 0.001 s apart, .* fleet 1 s; if the index is not in"),
     (of_all(lambda each: each[["battery", "motor"]]), r"inputs none: expected one or more"),
 ])  # fmt: skip
-def test_frames_that_are_no_recordings_of_a_fleet_are_refused_in_one_line(
-    given: Callable[[], Frames], message: str
-) -> None:
+def test_unusable_frames_are_refused_in_one_line(given: Callable[[], Frames], message: str) -> None:
     with pytest.raises(UserError, match=message) as caught:
         Fleet.from_frames(given(), JUNCTION)
     assert "\n" not in str(caught.value)
@@ -317,9 +313,7 @@ def test_frames_that_are_no_recordings_of_a_fleet_are_refused_in_one_line(
     (["battery", "motor"], 0.0, r"full_scale_a 0.0: expected the nominal maximum current in A"),
     (["battery", "motor"], "400 A", r"full_scale_a '400 A': expected the nominal maximum current in A"),
 ])  # fmt: skip
-def test_junction_of_one_branch_or_without_full_scale_is_refused(
-    branches: Any, full_scale_a: Any, message: str
-) -> None:
+def test_wrong_branches_or_full_scale_are_refused(branches: Any, full_scale_a: Any, message: str) -> None:
     with pytest.raises(FleetError, match=message):
         Junction(branches=branches, full_scale_a=full_scale_a)
 

@@ -184,9 +184,7 @@ def errors_of(rows: EvidenceRows, faults: Faults) -> Array:
     pytest.param(Conditions(), marks=pytest.mark.long),
     pytest.param(Conditions(model_error_a=1.0), marks=pytest.mark.long),
 ])  # fmt: skip
-def test_standardised_errors_of_the_rows_are_standard_normal(
-    conditions: Conditions, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_standardised_errors_of_rows_are_normal(conditions: Conditions, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evidence, "LEAST_SD", np.array([5e-5, 1e-5]))  # these sensors are exact
     faults = random_faults(1, vehicles=150, branches=K, sparsity=70.0, full_scale_a=FULL_SCALE_A)
     fleet = stack_summaries(summaries_of(faults, conditions, seed=1))

@@ -114,9 +114,7 @@ def test_two_variants_of_the_vehicle_are_said_and_named(larger: float) -> None:
     assert not found.corrected.any()
 
 
-def test_pit_of_the_truth_lies_between_zero_and_one(
-    truth: Faults, summaries: Summaries, reference: FleetReference
-) -> None:
+def test_pit_of_the_truth_is_a_probability(truth: Faults, summaries: Summaries, reference: FleetReference) -> None:
     for pit in estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
         assert pit.shape == (VEHICLES, K)
         assert ((pit >= 0.0) & (pit <= 1.0 + 1e-9)).all()

@@ -55,9 +55,7 @@ MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift":
     ({"gain": (0.0, 0.1, 0.0), "offset_a": (0.0, 0.0, 6.0)}, {"trusted": ["battery"], "load": (0.0, 0.1)}, {"motor"}),
     ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
 ])  # fmt: skip
-def test_faults_are_within_their_deviations_and_what_is_known_well_is_corrected(
-    fault: dict[str, Any], known: dict[str, Any], corrected: set[str]
-) -> None:
+def test_well_known_faults_are_corrected(fault: dict[str, Any], known: dict[str, Any], corrected: set[str]) -> None:
     rows = found(recording(**fault), **known).loc["vehicle"]
     gain, offset_a = (np.array(fault.get(name, (0.0, 0.0, 0.0))) for name in ("gain", "offset_a"))
     assert (np.abs(rows.gain_error - gain) < 3.0 * rows.gain_error_sd).all()
@@ -159,9 +157,7 @@ def switched(frame: pd.DataFrame, rms_a: float) -> None:
 
 
 @pytest.mark.parametrize(("spoil", "share"), [(bent, 0.002), (switched, 0.008)])
-def test_what_no_gain_and_offset_explain_is_found_from_the_size_that_the_documents_say(
-    spoil: Any, share: float
-) -> None:
+def test_misfit_is_found_from_the_documented_size(spoil: Any, share: float) -> None:
     """Of full scale, RMS; see docs/junction.md."""
     for seed in (300, 301):
         frame = recording(seed, gain=(0.0, 0.1, 0.0))
@@ -248,9 +244,7 @@ def second_motor(rng: np.random.Generator, frame: pd.DataFrame) -> None:
     (switched_heater, set()),
     (second_motor, {"switching"}),
 ])  # fmt: skip
-def test_no_sensor_is_blamed_for_noise_or_for_a_branch_that_is_switched_or_not_measured(
-    spoil: Any, causes: set[str]
-) -> None:
+def test_noise_and_unmeasured_or_switched_branches_blame_no_sensor(spoil: Any, causes: set[str]) -> None:
     for seed in range(2):
         frame = recording(seed, gain=(0.0, 0.1, -0.2), offset_a=(0.0, 3.0, 0.0))
         spoil(np.random.default_rng(seed + 100), frame)

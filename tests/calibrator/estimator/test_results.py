@@ -66,9 +66,7 @@ def test_unknown_vehicle_is_named(result: Path, name: str) -> None:
         written_of(result, name)
 
 
-def test_parameter_files_are_written_by_the_command(
-    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_parameter_files(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["params", str(result), "v1", "v2", "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.splitlines() == [str(tmp_path / "out" / f"{name}.json") for name in ("v1", "v2")]
     assert read_parameters(tmp_path / "out" / "v2.json").branches["motor"].offset_a == 1.0
@@ -97,9 +95,7 @@ def test_folder_that_is_no_result_is_named(tmp_path: Path) -> None:
         read_run(tmp_path)
 
 
-def test_vehicles_and_branches_are_counted_as_the_report_page_counts_them(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_counts_of_result_and_report_page_are_equal(tmp_path: Path, database: VehicleDatabase) -> None:
     folder = six_vehicle_result(tmp_path / "result", database)
     report = report_of(folder, read_run(folder), parameters="p", shown=folder)
     page = overview_of(read_fleet_table(folder))

@@ -130,9 +130,7 @@ def test_result_is_the_same_for_any_number_of_workers(
     assert contents(tmp_path / "two") == contents(result)
 
 
-def test_few_vehicles_are_calibrated_by_this_process_alone(
-    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_vehicles_start_no_processes(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_many, "_outcomes", None)  # which starts processes
     assert calibrate(store.url, tmp_path / "out", "--workers", 2).returncode == 0
 
@@ -181,7 +179,7 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
 # Second pass
 
 
-def test_vehicle_gets_the_same_parameters_in_any_company(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+def test_same_parameters_in_any_company(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
     bucket = fullest(store)
     records = store.read(bucket)
     together = texts(calibrate_bucket(bucket, store=store, task=task))
@@ -193,9 +191,7 @@ def test_vehicle_gets_the_same_parameters_in_any_company(store: SummaryStore, ta
 
 
 @pytest.mark.parametrize("what", ["moments", "noise_a2"])
-def test_vehicle_with_impossible_numbers_stops_neither_pass(
-    store: SummaryStore, task: FleetTask, tmp_path: Path, what: str
-) -> None:
+def test_impossible_numbers_stop_neither_pass(store: SummaryStore, task: FleetTask, tmp_path: Path, what: str) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
     expected = texts(calibrate_bucket(bucket, store=store, task=task))
@@ -212,9 +208,7 @@ def test_vehicle_with_impossible_numbers_stops_neither_pass(
     assert left_out(chunk)[bad].startswith("its summary holds impossible numbers; look at its recordings")
 
 
-def test_vehicle_without_usable_drives_is_left_out_with_its_reason(
-    store: SummaryStore, task: FleetTask, tmp_path: Path
-) -> None:
+def test_vehicle_without_usable_drives_is_left_out(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
     bad = next(name for name in (f"V9{j:02d}" for j in range(100)) if store.bucket_of(name) == bucket)
@@ -253,9 +247,7 @@ def test_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
     assert left_out(chunk)[bad].startswith(reason)
 
 
-def test_internal_error_is_named_and_ends_the_command_with_70(
-    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_internal_error_ends_with_70(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failing_for("V012", ZeroDivisionError("by nothing"), monkeypatch)
     done = calibrate(store.url, tmp_path / "out", "--workers", 1)
     assert done.returncode == 70
@@ -294,9 +286,7 @@ def test_only_those_who_drove_since_are_calibrated_and_moved_sensors_from_their_
     assert abs(battery["offset_a"] - faults.offset_a[0, 0]) <= 4.0 * battery["offset_sd_a"]
 
 
-def test_vehicle_of_the_earlier_result_that_is_in_the_store_no_more_is_named(
-    store: SummaryStore, result: Path, tmp_path: Path
-) -> None:
+def test_vehicle_that_left_the_store_is_named(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     """Also if it was the only one of its bucket."""
     shutil.copytree(store.url, tmp_path / "store")
     gone = {name for name in (f"V{j:03d}" for j in range(VEHICLES)) if store.bucket_of(name) == fullest(store)}

@@ -123,9 +123,7 @@ def test_figures_depend_on_the_seed_and_not_on_the_number_of_processes(snr: Expe
     assert other.figures["of"].max() == 2 * again.figures["of"].max(), "all trials of a setting count"
 
 
-def test_tables_put_paper_published_method_and_default_side_by_side_and_explain_what_is_there(
-    snr: ExperimentResult,
-) -> None:
+def test_tables_put_paper_and_methods_side_by_side_and_explain_columns(snr: ExperimentResult) -> None:
     table = headline(snr)
     assert list(table.columns[:5]) == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
     assert table[["SNR [dB]", "paper"]].to_numpy().tolist() == [["10", "-"], ["20", "0.91"]]

@@ -46,9 +46,7 @@ def test_default_recovers_recorded_vehicles_that_defeat_the_published_method(fle
 
 
 @pytest.mark.parametrize(("branches", "sparsity", "balanced"), [(2, 20.0, True), (2, 80.0, False), (3, 60.0, True)])
-def test_distribution_is_that_of_drawn_fleets_and_draws_such_fleets(
-    branches: int, sparsity: float, balanced: bool
-) -> None:
+def test_distribution_is_that_of_drawn_fleets(branches: int, sparsity: float, balanced: bool) -> None:
     rng, vehicles = np.random.default_rng(1), 40_000
     settings = FaultSettings(sparsity=sparsity, balanced=balanced)
     known = drawn_distribution(settings, branches)

@@ -103,9 +103,7 @@ def test_new_folder_is_not_made_over_a_mounted_disk(tmp_path: Path, monkeypatch:
         require_new_folder(tmp_path)
 
 
-def test_files_that_belong_together_change_together_or_not_at_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_change_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "old").write_bytes(b"old")
     (tmp_path / "folder").mkdir()
     with pytest.raises(UserError, match=f"^{tmp_path}/folder: cannot be written: it is a folder$"):
@@ -146,9 +144,7 @@ def test_unknown_kind_of_storage_is_refused() -> None:
         open_storage("nokind://x").names()
 
 
-def test_a_file_that_vanishes_while_its_folder_is_listed_hides_no_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_vanishing_file_hides_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "there").touch()
 
     class Vanishing:
@@ -166,9 +162,7 @@ def test_a_file_that_vanishes_while_its_folder_is_listed_hides_no_others(
     assert open_storage(tmp_path).names() == ["there"]
 
 
-def test_an_inner_folder_that_cannot_be_read_is_a_problem_and_the_others_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreadable_inner_folder_is_a_problem_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("V1", "lost+found", "vehicle 2"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.log").touch()

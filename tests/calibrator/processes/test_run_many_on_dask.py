@@ -49,9 +49,7 @@ def test_hostile_items_cost_themselves_only(tmp_path: Path, where: Workers) -> N
         assert outcome.reason.startswith(cause.partition(" by ")[0])  # a worker's process may not know the signal
 
 
-def test_errors_of_function_and_items_are_not_taken_for_a_lost_scheduler(
-    where: Workers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_of_items_are_no_lost_scheduler(where: Workers, monkeypatch: pytest.MonkeyPatch) -> None:
     def items() -> Iterator[int]:
         yield from range(2, 60)
         raise OSError("no more")
@@ -67,9 +65,7 @@ def test_errors_of_function_and_items_are_not_taken_for_a_lost_scheduler(
         list(run_many(abs, range(3), where))
 
 
-def test_scheduler_that_starts_only_now_is_waited_for_and_a_lost_worker_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_late_scheduler_and_lost_worker_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As one that is started again after it was lost."""
     monkeypatch.setattr(module, "CONNECT_S", 60.0)
     with DaskCluster(tmp_path, at_once=False) as cluster:
@@ -220,9 +216,7 @@ def test_drives_in_object_storage_are_those_in_a_folder(logs: Path, tmp_path: Pa
 
 
 @pytest.mark.long
-def test_logs_and_stores_in_object_storage_give_the_same_from_cluster_workers(
-    logs: Path, tmp_path: Path, s3: dict[str, str]
-) -> None:
+def test_cluster_reads_object_storage_as_this_machine_does(logs: Path, tmp_path: Path, s3: dict[str, str]) -> None:
     layout = ("--layout", LAYOUT)
     for processes in (1, 2):
         command("summarise", logs, *layout, "--out", tmp_path / f"s{processes}", "--workers", processes)

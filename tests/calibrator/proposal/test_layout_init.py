@@ -376,9 +376,7 @@ def test_named_branches_are_written_without_a_guess(table: Path) -> None:
     ("other.log --log car.dbc", "the database comes first"),
     ("car.dbc --out there.toml", "exists, and is not overwritten"),
 ])  # fmt: skip
-def test_mistake_with_a_database_is_one_line(
-    line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_database_mistake_is_one_line(line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     database_file(tmp_path, PACK, INVERTER)
     database_file(tmp_path, PACK, PACK.replace("1 PackStatus", "9 Twin"), name="two.dbc")
     (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n")

@@ -105,9 +105,7 @@ messages = st.builds(
 
 
 @given(st.lists(messages, max_size=60), st.sampled_from([200, 1000, 1 << 17]), st.sampled_from([0, 6]))
-def test_any_log_gives_the_frames_that_python_can_reads(
-    log: list[can.Message], container_bytes: int, compression: int
-) -> None:
+def test_any_log_is_read_as_by_python_can(log: list[can.Message], container_bytes: int, compression: int) -> None:
     assert_the_same(written(log, container_bytes=container_bytes, compression=compression))
 
 
@@ -150,9 +148,7 @@ def test_damage_is_refused_with_its_place(content: bytes, message: str) -> None:
 
 
 @pytest.mark.parametrize("batch_bytes", [1, 100, 1 << 21])
-def test_how_many_containers_are_taken_apart_at_a_time_changes_nothing(
-    batch_bytes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_size_of_a_batch_of_containers_changes_nothing(batch_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blf, "BATCH_BYTES", batch_bytes)
     messages = [can.Message(timestamp=START + k, arbitration_id=k, data=bytes([k])) for k in range(100)]
     assert len(assert_the_same(written(messages, container_bytes=150))) == 100

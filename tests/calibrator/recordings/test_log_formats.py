@@ -164,9 +164,7 @@ GOOD = b"(1.000000) can0 123#01\n"
     ("x.asc", b"base hex  timestamps relative\n", "the time stamps are relative to the line before; save it with"),
     ("x.asc", b"base dec\n0.1 1 12 Rx d 1 1\n0.2 1 12Z Rx d 1 1\n", r"damaged at line 3 .*; \d frames before it"),
 ])  # fmt: skip
-def test_log_that_cannot_be_used_is_refused_with_the_reason(
-    tmp_path: Path, name: str, content: bytes, words: str
-) -> None:
+def test_unusable_log_is_refused_with_the_reason(tmp_path: Path, name: str, content: bytes, words: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(LogError, match=rf"{name}: {words}"):
         read_frames(tmp_path / name)
@@ -209,9 +207,7 @@ def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest
     ([5000.0, 5001.0, 100.0, 101.0], [0.0, 1.0, 1.0 + CLOCK_GAP_S, 2.0 + CLOCK_GAP_S], 0, 1),
     ([0.0, 600.0, 1201.0], [0.0, 600.0, 600.0 + CLOCK_GAP_S], 0, 1),
 ])  # fmt: skip
-def test_disorder_is_sorted_and_a_step_of_the_clock_becomes_a_gap(
-    logged_s: list[float], time_s: list[float], disordered: int, clock_steps: int
-) -> None:
+def test_clock_is_repaired(logged_s: list[float], time_s: list[float], disordered: int, clock_steps: int) -> None:
     time = repaired_time(np.rint(1e9 * np.array(logged_s)).astype(np.int64))
     np.testing.assert_allclose(time.time_s, time_s)
     assert (time.disordered, time.clock_steps) == (disordered, clock_steps)

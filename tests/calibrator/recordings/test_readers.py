@@ -59,18 +59,14 @@ def recorded(folder: Path, database: VehicleDatabase, *lines: tuple[float, str])
     return read_recording(folder / "x.log", database, vehicle="v", name="d").drive
 
 
-def test_current_has_the_sign_of_the_layout_and_the_unit_of_the_dbc_is_turned_into_ampere(
-    tmp_path: Path, power_database: VehicleDatabase
-) -> None:
+def test_current_has_sign_of_layout_and_is_in_ampere(tmp_path: Path, power_database: VehicleDatabase) -> None:
     drive = recorded(tmp_path, power_database, (0.0, "00000003#9CFF"))
     np.testing.assert_allclose(drive.branches["battery"].value, [-10.0])
     with pytest.raises(LogError, match="no branch"):  # of 11 bits, not of 29
         recorded(tmp_path, power_database, (0.0, "003#9CFF"))
 
 
-def test_power_is_divided_by_the_latest_voltage_at_or_before_it_until_that_is_too_old(
-    tmp_path: Path, power_database: VehicleDatabase
-) -> None:
+def test_power_is_divided_by_latest_voltage_if_fresh(tmp_path: Path, power_database: VehicleDatabase) -> None:
     lines = [(0.0, "001#1400"), (0.1, "002#A00F"), (0.1, "001#1400"), (0.2, "002#D007"), (0.25, "001#1400")]
     motor = recorded(tmp_path, power_database, *lines, (0.7, "001#1400"), (0.8, "001#1400")).branches["motor"]
     np.testing.assert_allclose(motor.time_s, [0.0, 0.1, 0.25, 0.7, 0.8], atol=1e-9)
@@ -78,9 +74,7 @@ def test_power_is_divided_by_the_latest_voltage_at_or_before_it_until_that_is_to
     np.testing.assert_allclose(motor.value[1:3], [-10_000 / 400.0, -10_000 / 200.0])
 
 
-def test_codes_with_any_name_and_those_of_the_layout_are_no_currents_as_on_the_node(
-    tmp_path: Path, power_database: VehicleDatabase
-) -> None:
+def test_named_codes_and_those_of_the_layout_are_no_currents(tmp_path: Path, power_database: VehicleDatabase) -> None:
     names = 'VAL_ 1 Power -200 "Signal_ungueltig" ;\nVAL_ 2 Voltage 4000 "Ersatzwert" ;\n'
     (tmp_path / "power.dbc").write_text(POWER_DBC + names)
     (tmp_path / "power.toml").write_text(POWER_LAYOUT + "no_value = [-100, 21]\n")
@@ -104,9 +98,7 @@ def test_names_of_an_input_are_values_unless_they_mean_not_available(tmp_path: P
     assert drive.inputs["gear"].good.tolist() == [True, True, False]
 
 
-def test_log_without_any_branch_lists_what_it_has_and_what_is_expected(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_log_without_a_branch_lists_what_is_expected(tmp_path: Path, database: VehicleDatabase) -> None:
     with pytest.raises(LogError, match=r"x\.log: no branch .* 0x7FF, 0x18DAF110; expected HV_Battery \(0x110\)"):
         recorded(tmp_path, database, (0.0, "7FF#00"), (0.1, "18DAF110#00"))
 
@@ -167,9 +159,7 @@ def test_frames_with_a_counter_of_several_bytes_are_written_and_read() -> None:
 
 
 @pytest.mark.parametrize(("value", "expected"), [(np.nan, "SNA"), (1e6, 650.0), (-1e6, -650.0)])
-def test_missing_values_become_the_code_for_not_available_and_others_saturate(
-    database: VehicleDatabase, value: float, expected: object
-) -> None:
+def test_missing_values_become_sna_others_saturate(database: VehicleDatabase, value: float, expected: object) -> None:
     series = encode_message(database, "HV_Motor", np.zeros(1), {"MotorCurrent": np.array([value])})
     decoded = database.message("HV_Motor").decode_simple(series.data[0].tobytes())
     assert decoded["MotorCurrent"] == (pytest.approx(expected) if isinstance(expected, float) else expected)
@@ -187,9 +177,7 @@ def test_float_signal_is_not_written_as_whole_number() -> None:
 
 @settings(max_examples=60)
 @given(st.integers(-32768, 32767), st.integers(0, 2047), st.integers(-256, 255), st.floats(-0.49, 0.49))
-def test_nearest_codes_are_written_in_both_byte_orders_as_cantools_writes_them(
-    a: int, b: int, c: int, e: float
-) -> None:
+def test_nearest_codes_are_written_in_both_byte_orders(a: int, b: int, c: int, e: float) -> None:
     database = big_endian_database()
     expected = database.message("M").encode({"A": a * 0.5 + 10, "B": b, "C": c * -0.25}, strict=False)
     values = {"A": np.array([(a + e) * 0.5 + 10]), "B": np.array([b + e]), "C": np.array([(c + e) * -0.25])}

@@ -101,7 +101,7 @@ def test_a_replay_that_fails_ends_in_1(
     assert re.match(words, captured.err)
 
 
-def test_ctrl_c_ends_the_line_of_progress_first_and_says_how_much_was_sent(
+def test_ctrl_c_says_what_was_sent(
     log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def send(self: VirtualBus, msg: can.Message, timeout: float | None = None) -> None:

@@ -183,9 +183,7 @@ def test_column_of_texts_is_named_beside_the_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("step", "rows", "seconds"), [(1, 100, 99), (10, 100, 990), (10, 7000, 69.99), (500, 9, 4), (10**5, 9, 0.8)]
 )
-def test_whole_numbers_without_a_unit_are_what_makes_a_recording(
-    tmp_path: Path, step: int, rows: int, seconds: float
-) -> None:
+def test_whole_numbers_are_in_the_unit_that_fits(tmp_path: Path, step: int, rows: int, seconds: float) -> None:
     csv(pd.DataFrame({"time": step * np.arange(rows), "a": np.arange(rows) % 7, "b": 1, "note": "ok"}))(
         tmp_path / "x.csv"
     )

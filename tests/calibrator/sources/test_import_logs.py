@@ -21,9 +21,7 @@ def imported(logs: list[Path], store: Path, database: VehicleDatabase) -> Import
     return import_logs(logs, database, store, workers=Workers())
 
 
-def test_what_is_there_is_named_and_what_is_new_is_added(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_only_new_logs_are_added(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     first = imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     both = imported([two_vehicles / "logs"], tmp_path, database)
     assert (len(first.drives), first.already_there) == (1, ())
@@ -36,9 +34,7 @@ def report(two_vehicles: Path, tmp_path_factory: pytest.TempPathFactory, databas
     return imported([two_vehicles / "logs"], tmp_path_factory.mktemp("store"), database)
 
 
-def test_drives_of_the_store_are_those_of_the_logs(
-    two_vehicles: Path, report: ImportReport, database: VehicleDatabase
-) -> None:
+def test_stored_drives_are_the_logs(two_vehicles: Path, report: ImportReport, database: VehicleDatabase) -> None:
     logs, store = find_fleet(two_vehicles).vehicles, find_fleet(report.store).vehicles
     assert list(logs) == list(store) == ["V001", "V002"]
     for vehicle, (log,) in logs.items():
@@ -54,9 +50,7 @@ def test_equal_notices_are_told_once_and_json_keeps_those_of_every_drive(report:
     assert told == [f"  in 2 vehicles: junction_box_temperature: {sum(frames)} of {sum(frames)} frames not usable"]
 
 
-def test_a_damaged_drive_in_the_store_is_not_taken_for_imported(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_damaged_drive_is_not_imported(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     (tmp_path / "drives" / "V001" / "drive.parquet").write_bytes(b"cut")
     report = imported([two_vehicles / "logs" / "V001"], tmp_path, database)
@@ -65,9 +59,7 @@ def test_a_damaged_drive_in_the_store_is_not_taken_for_imported(
     assert "remove it and import it again" in report.left_out["V001/drive"]
 
 
-def test_what_a_killed_import_was_just_writing_is_removed_by_the_next(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_left_over_of_a_killed_import_goes(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     folder = tmp_path / "drives" / "V001"
     folder.mkdir(parents=True)
     left, other = folder / ".drive.parquet.x1y2", folder / ".drive.parquet.new"
@@ -79,16 +71,12 @@ def test_what_a_killed_import_was_just_writing_is_removed_by_the_next(
     assert {path.name for path in folder.iterdir()} == {"drive.parquet", other.name}
 
 
-def test_the_store_knows_which_artificial_fleet_its_drives_are_of(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_store_knows_its_artificial_fleet(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     imported([two_vehicles / "logs" / "V001" / "drive.log.gz"], tmp_path, database)
     assert read_fleet_ids(tmp_path) == read_fleet_ids(two_vehicles / "logs") != frozenset()
 
 
-def test_import_into_a_bucket_that_nobody_may_write_ends_before_it_reads(
-    two_vehicles: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_import_into_a_closed_bucket_reads_nothing(two_vehicles: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def denied(*_: object, **__: object) -> None:
         raise PermissionError("Access Denied")
 
@@ -104,9 +92,7 @@ def write_endless_log(path: Path) -> None:
     path.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
 
 
-def test_a_log_that_takes_too_long_costs_itself_only(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_slow_log_costs_itself_only(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     endless = tmp_path / "logs" / "V000" / "endless.log.gz"
     write_endless_log(endless)
     logs = [endless, two_vehicles / "logs"]

@@ -116,8 +116,6 @@ def test_branches_that_were_not_recorded_or_not_asked_for_are_named(
     (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
     (["pack", "battery"], "no branch 'pack'; known are battery, motor"),
 ])  # fmt: skip
-def test_branches_that_cannot_be_asked_for_are_refused(
-    store: Path, database: VehicleDatabase, branches: list[str], words: str
-) -> None:
+def test_wrong_branches_are_refused(store: Path, database: VehicleDatabase, branches: list[str], words: str) -> None:
     with pytest.raises((FleetError, LayoutError), match=words):
         probe_equipment(find_fleet(store), database, branches)

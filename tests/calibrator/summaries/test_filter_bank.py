@@ -76,9 +76,7 @@ def test_an_error_in_the_start_is_nearly_gone_when_samples_are_used() -> None:
 
 
 @pytest.mark.parametrize("is_long", [False, True])
-def test_inputs_keep_their_last_value_through_a_short_gap_and_filters_start_again_after_a_long_one(
-    is_long: bool,
-) -> None:
+def test_short_gap_keeps_the_last_inputs_and_a_long_one_starts_filters_again(is_long: bool) -> None:
     u, valid = inputs_of(5), np.ones(SAMPLES, bool)
     gap = slice(300, 300 + HOLDING + is_long)
     held = u.copy()

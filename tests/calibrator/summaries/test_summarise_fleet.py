@@ -198,7 +198,7 @@ def test_impossible_values_are_named(tmp_path: Path, database: VehicleDatabase, 
         read_vehicle_summary(find_fleet(tmp_path).vehicles["V1"], EQUIPMENT, database)
 
 
-def test_a_fault_of_the_program_is_not_one_of_the_drives(
+def test_fault_of_program_ends_in_70(
     tmp_path: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path / "drives", "V1", "a", database)

@@ -67,9 +67,7 @@ def test_any_tool_can_read_it(store: SummaryStore) -> None:
     assert seconds == pytest.approx(VEHICLES * 1800.0)
 
 
-def test_added_records_are_files_of_their_own_until_they_are_put_together(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_added_records_are_files_until_compacted(tmp_path: Path, database: VehicleDatabase) -> None:
     store = small_store(tmp_path / "store", database, random_faults(4))
     bucket = store.bucket_of("V001")
     before = {path.name: path.read_bytes() for path in (tmp_path / "store" / "buckets").iterdir()}
@@ -171,9 +169,7 @@ def own_store(store: SummaryStore, tmp_path: Path) -> SummaryStore:
     {"digests": [None]},
     {"digests": ["no digest"]},
 ])  # fmt: skip
-def test_a_vehicle_whose_row_makes_no_sense_is_left_out_and_the_others_stay_as_they_are(
-    store: SummaryStore, own_store: SummaryStore, changes: dict[str, Any]
-) -> None:
+def test_senseless_row_costs_its_vehicle(store: SummaryStore, own_store: SummaryStore, changes: dict[str, Any]) -> None:
     bucket = fullest(store)
     bad = spoil(own_store, bucket, changes)
     before, after = store.read(bucket), own_store.read(bucket)

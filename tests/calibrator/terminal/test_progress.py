@@ -24,9 +24,7 @@ def test_a_log_gets_lines_with_time_left(monkeypatch: pytest.MonkeyPatch, capsys
     ]
 
 
-def test_passes_of_one_command_are_numbered(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_passes_are_numbered(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("calibrator.terminal.progress.WORTH_A_LINE_S", 0.0)
     with numbered_passes(2):
         with progress_bar("learn the fleet", None):
