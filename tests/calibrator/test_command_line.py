@@ -19,22 +19,31 @@ ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 
 
-def test_ctrl_c_during_start_up_ends_it_in_one_line() -> None:
-    # The import of the command line sends SIGINT to itself and swallows what comes of it, as libraries do.
-    code = (
-        "import os, signal, sys, types\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name == 'typer':\n"
-        "            try: os.kill(os.getpid(), signal.SIGINT)\n"
-        "            except BaseException: pass\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "from calibrator.__main__ import calibrator_program\n"
-        "sys.argv = ['calibrator', '--version']\n"
-        "calibrator_program()\n"
-    )
+START = "import os, signal, sys; from calibrator.__main__ import calibrator_program as run; sys.argv[1:] = ['{}']; "
+# The import of the command line sends SIGINT to itself and swallows what comes of it, as libraries do.
+SWALLOWED = """
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == 'typer':
+            try: os.kill(os.getpid(), signal.SIGINT)
+            except BaseException: pass
+sys.meta_path.insert(0, Finder())
+run()
+"""
+IMPORTING = (
+    "from calibrator.processes.interrupts import importing\nwith importing(): os.kill(os.getpid(), signal.SIGINT)"
+)
+
+
+@pytest.mark.parametrize(("code", "exit_code", "said"), [
+    (START.format("--version") + "sys.modules['typer'] = None; run()", 1,
+     "calibrator: typer is not installed; pip install 'hv-current-correction[calibrator]'\n"),
+    (START.format("--version") + SWALLOWED, INTERRUPTED, f"{interrupted_message([])}\n"),
+    (START.format("summarise") + IMPORTING, INTERRUPTED, f"{interrupted_message(['summarise'])}\n"),
+], ids=["base install", "Ctrl-C during start-up", "Ctrl-C during imports"])  # fmt: skip
+def test_program_that_cannot_start_says_why_in_one_line(code: str, exit_code: int, said: str) -> None:
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-    assert (run.returncode, run.stdout, run.stderr) == (INTERRUPTED, "", f"{interrupted_message([])}\n")
+    assert (run.returncode, run.stdout, run.stderr) == (exit_code, "", said)
 
 
 def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(tmp_path: Path) -> None:
@@ -90,13 +99,6 @@ def test_closed_pipe_gives_no_traceback(arguments: list[str]) -> None:
     assert (run.returncode, run.stderr) == (1, "")
 
 
-def test_base_install_says_which_extra_the_calibrator_needs() -> None:
-    code = "import sys; sys.modules['typer'] = None; from calibrator.__main__ import calibrator_program as run; run()"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert run.returncode == 1
-    assert run.stderr == "calibrator: typer is not installed; pip install 'hv-current-correction[calibrator]'\n"
-
-
 def handler() -> "Callable[..., object] | int | None":
     return signal.getsignal(signal.SIGINT)
 
@@ -117,15 +119,3 @@ def test_message_says_whether_a_command_goes_on_where_it_was() -> None:
     for arguments, kept in ((["--debug", "import", "x"], goes_on), (["simulate", "--out", "import"], ""), ([], "")):
         assert interrupted_message(arguments) == f"calibrator: interrupted; run the same command again{kept}"
     assert interrupted_message([], ENDED) == "calibrator: ended by SIGTERM; run the same command again"
-
-
-def test_ctrl_c_while_libraries_are_imported_ends_the_program_with_one_line() -> None:
-    code = (
-        "import os, signal, sys\n"
-        "from calibrator.processes.interrupts import importing\n"
-        "sys.argv = ['calibrator', 'summarise']\n"
-        "with importing(): os.kill(os.getpid(), signal.SIGINT)\n"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-    line = "calibrator: interrupted; run the same command again; it goes on with what it had read\n"
-    assert (run.returncode, run.stderr) == (130, line)

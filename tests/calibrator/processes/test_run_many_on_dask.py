@@ -1,7 +1,6 @@
 """The same on a Dask cluster with two workers: results, lost workers, a scheduler that is restarted, object storage."""
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -20,11 +19,11 @@ from calibrator.artificial.trips import BuiltinTrips
 from calibrator.errors import FleetError
 from calibrator.files.storage import Storage, open_storage, walk
 from calibrator.processes import run_many as module
-from calibrator.processes.run_many import Failed, Workers, run_many, try_many
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.summaries.summary_store import existing_store
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.processes.dask_cluster import DaskCluster, gated, of_no_disk
-from tests.calibrator.processes.test_run_many import CAUSES, LIMIT_S, dying_once, hostile
+from tests.calibrator.processes.test_run_many import dying_once, hostile_items_cost_themselves_only
 
 pytest.importorskip("distributed")
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
@@ -40,13 +39,7 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
 
 
 def test_hostile_items_cost_themselves_only(tmp_path: Path, where: Workers) -> None:
-    os.mkfifo(tmp_path / "endless")
-    read = partial(hostile, endless=tmp_path / "endless")
-    first, *failed, last = (outcome for _, outcome in try_many(read, range(8), where, limit_s=LIMIT_S))
-    assert (first, last) == (0, 7)
-    for outcome, cause in zip(failed, CAUSES, strict=True):
-        assert isinstance(outcome, Failed)
-        assert outcome.reason.startswith(cause.partition(" by ")[0])  # a worker's process may not know the signal
+    hostile_items_cost_themselves_only(where, tmp_path, knows_signals=False)  # the process of a worker may not
 
 
 def test_errors_of_items_are_no_lost_scheduler(where: Workers, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,12 +47,12 @@ def found(path: Path, *arguments: object) -> Layout:
     return layout
 
 
-def sources(layout: Layout) -> dict[str, str]:
-    return {branch.name: branch.source for branch in layout.branch}
-
-
 def signed(layout: Layout) -> dict[str, tuple[str, int]]:
     return {branch.name: (branch.source, branch.sign) for branch in layout.branch}
+
+
+PACK_AND_MOTOR = {"battery": ("PackStatus.PackCurrent", 1), "motor": ("InverterStatus.DcPower", -1)}
+WITH_HEATER = PACK_AND_MOTOR | {"heater": ("ClimaStatus.HeaterCurrent", -1)}
 
 
 # ---- from a database alone
@@ -90,7 +90,7 @@ def test_battery_current_as_databases_call_it(kind: str, tmp_path: Path) -> None
     limits = 'BO_ 7 Limits: 8 BMS\n SG_ MaxPackCurrent : 0|16@1- (0.1,0) [-500|500] "A" INV\n'
     layout = found(database_file(tmp_path, limits, INVERTER, message))
     name = signal.split()[1]
-    assert sources(layout) == {"battery": f"Status1.{name}", "motor": "InverterStatus.DcPower"}
+    assert [b.source for b in layout.branch] == [f"Status1.{name}", PACK_AND_MOTOR["motor"][0]]
 
 
 LEFT_OUT = {
@@ -135,8 +135,8 @@ def test_charger_is_a_branch_only_without_a_motor(tmp_path: Path) -> None:
         'BO_ 5 Chg: 8 OBC\n SG_ CHG_Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS\n'
         ' SG_ CHG_Volts : 16|16@1+ (0.1,0) [0|1] "Volts" BMS\n'
     )
-    assert sources(found(database_file(tmp_path, PACK, charger)))["charger"] == "Chg.CHG_Amps"
-    assert set(sources(found(database_file(tmp_path, PACK, charger, INVERTER)))) == {"battery", "motor"}
+    assert found(database_file(tmp_path, PACK, charger)).find_branch("charger").source == "Chg.CHG_Amps"
+    assert signed(found(database_file(tmp_path, PACK, charger, INVERTER))) == PACK_AND_MOTOR
 
 
 def test_motor_without_a_current_is_computed_of_torque_and_speed(tmp_path: Path) -> None:
@@ -160,10 +160,7 @@ def test_comments_tell_signs(comment: str, sign: int, tmp_path: Path) -> None:
 def test_other_databases_do_as_well(kind: str, tmp_path: Path) -> None:
     database: Any = cantools.database.load_file(database_file(tmp_path, PACK, INVERTER))
     cantools.database.dump_file(database, tmp_path / f"car.{kind}")
-    assert sources(found(tmp_path / f"car.{kind}")) == {
-        "battery": "PackStatus.PackCurrent",
-        "motor": "InverterStatus.DcPower",
-    }
+    assert signed(found(tmp_path / f"car.{kind}")) == PACK_AND_MOTOR
 
 
 # ---- with a log
@@ -225,7 +222,7 @@ def test_with_a_log_signs_are_told_against_convention(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     turned = {**DRIVING, "PackCurrent": lambda t: -battery_a(t), "HeaterCurrent": heater_a}
     layout = found(dbc, "--log", log_file(dbc, turned))
-    assert {branch.name: branch.sign for branch in layout.branch} == {"battery": -1, "motor": -1, "heater": -1}
+    assert signed(layout) == WITH_HEATER | {"battery": ("PackStatus.PackCurrent", -1)}
     assert layout.full_scale_a == 250.0
 
 
@@ -262,11 +259,7 @@ def test_multiplexed_battery_current_is_found(tmp_path: Path) -> None:
 """
     dbc = database_file(tmp_path, pack, INVERTER, HEATER)
     layout = found(dbc, "--log", log_file(dbc, DRIVING))
-    assert sources(layout) == {
-        "battery": "PackStatus.PackCurrent",
-        "motor": "InverterStatus.DcPower",
-        "heater": "ClimaStatus.HeaterCurrent",
-    }
+    assert signed(layout) == WITH_HEATER
     assert layout.find_branch("battery").timeout_s == 0.5  # every 100 ms: every other frame
 
 
@@ -311,12 +304,8 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_columns_of_a_table_are_proposed(table: Path) -> None:
-    layout = found(table)
-    assert signed(layout) == {
-        "battery": ("Batteriestrom [A]", -1),
-        "motor": ("Motorstrom [A]", -1),
-        "heater": ("Heizungsstrom [A]", -1),
-    }
+    layout, columns = found(table), {"battery": "Batterie", "motor": "Motor", "heater": "Heizungs"}
+    assert signed(layout) == {branch: (f"{name}strom [A]", -1) for branch, name in columns.items()}
     assert calibrator("kirchhoff", table, "--layout", layout.path).returncode == 0
 
 
@@ -330,9 +319,9 @@ def columns(path: Path, *names: str, delay_s: float = 0.0, scale: float = 1.0) -
 
 
 def test_current_that_closes_the_sum_is_a_branch_whatever_its_name(tmp_path: Path) -> None:
-    assert sources(found(columns(tmp_path / "x.csv", "Ibat", "Imot", "I_x")))["auxiliary"] == "I_x"
+    assert found(columns(tmp_path / "x.csv", "Ibat", "Imot", "I_x")).find_branch("auxiliary").source == "I_x"
     late = columns(tmp_path / "late.csv", "Ibat", "Imot", "I_x", delay_s=5.0)
-    assert set(sources(found(late))) == {"battery", "motor"}
+    assert set(signed(found(late))) == {"battery", "motor"}
 
 
 def test_current_in_another_unit_than_its_header_says_is_named(tmp_path: Path) -> None:
@@ -350,11 +339,7 @@ def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
     values = TIME_S, 1e3 * battery_a(TIME_S), volts(TIME_S), kilowatts, heater_a(TIME_S)
     pd.DataFrame(dict(zip(names, values, strict=True))).to_csv(tmp_path / "x.csv", index=False)
     layout = found(dbc, "--log", tmp_path / "x.csv")
-    assert signed(layout) == {
-        "battery": ("PackStatus.PackCurrent", 1),
-        "motor": ("InverterStatus.DcPower", -1),
-        "heater": ("ClimaStatus.HeaterCurrent", -1),
-    }
+    assert signed(layout) == WITH_HEATER
     assert layout.full_scale_a == 250.0
     assert calibrator("kirchhoff", tmp_path / "x.csv", "--layout", layout.path).returncode == 0
 
@@ -362,10 +347,7 @@ def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
 def test_named_branches_are_written_without_a_guess(table: Path) -> None:
     layout = found(table, "--branches", "-battery=Batteriestrom,-motor=Motorstrom [A]")
     assert layout.path.read_text().count("# confirm:") == 2  # full scale, voltage
-    assert [(b.name, b.source, b.sign) for b in layout.branch] == [
-        ("battery", "Batteriestrom [A]", -1),
-        ("motor", "Motorstrom [A]", -1),
-    ]
+    assert signed(layout) == {"battery": ("Batteriestrom [A]", -1), "motor": ("Motorstrom [A]", -1)}
 
 
 @pytest.mark.parametrize(("line", "said"), [
@@ -427,7 +409,7 @@ def test_dialogue_takes_and_leaves(tmp_path: Path) -> None:
     code, text = shown.ended()
     assert code == 0
     assert "branches battery, motor;" in text
-    assert {b.name: b.sign for b in read_layout(tmp_path / "car.toml").branch} == {"battery": 1, "motor": -1}
+    assert signed(read_layout(tmp_path / "car.toml")) == PACK_AND_MOTOR
 
 
 def test_dialogue_writes_what_does_not_close_only_when_asked_again(tmp_path: Path) -> None:
