@@ -92,3 +92,12 @@ def test_a_harm_limit_of_zero_corrects_nothing_and_every_fault_says_why(result: 
     unknown = [item for item in parameters if item.verdict == "cannot tell"]
     assert unknown
     assert all(item.explanations and item.deciding_evidence for item in unknown)
+
+
+def test_slip_in_the_bench_readings_ends_the_run_before_the_drives_are_read(fleet: Path, tmp_path: Path) -> None:
+    table, out = tmp_path / "bench.csv", tmp_path / "result"
+    table.write_text("vehicle,branch,offset_a,offset_sd_a\nV001,battery,1 A,0.02\n")
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)
+    assert run.returncode == 1
+    assert "bench.csv: line 2: offset_a is '1 A'; expected a number" in run.stderr
+    assert not out.exists()
