@@ -237,12 +237,8 @@ def second_motor(rng: np.random.Generator, frame: pd.DataFrame) -> None:
 
 
 @pytest.mark.parametrize(("spoil", "causes"), [
-    (noisy("motor", 0.0), set()),
-    (noisy("motor", 10.0), set()),
-    (noisy("battery", 10.0), set()),
-    (steady_heater, set()),
-    (switched_heater, set()),
-    (second_motor, {"switching"}),
+    (noisy("motor", 0.0), set()), (noisy("motor", 10.0), set()), (noisy("battery", 10.0), set()),
+    (steady_heater, set()), (switched_heater, set()), (second_motor, {"switching"}),
 ])  # fmt: skip
 def test_noise_and_unmeasured_or_switched_branches_blame_no_sensor(spoil: Any, causes: set[str]) -> None:
     for seed in range(2):

@@ -74,15 +74,8 @@ def test_ctrl_c_leaves_the_cursor_and_a_new_line() -> None:
 
 
 @pytest.mark.parametrize(("value", "digits", "text"), [
-    (50.0, 1, "50"),
-    (2.4, 3, "2.4"),
-    (0.034567, 2, "0.035"),
-    (4096.4, 2, "4,096"),
-    (-123.456, 3, "-123"),
-    (0.0, 3, "0"),
-    (-1e-12, 3, "0"),
-    (1e7, 3, "10,000,000"),
-    (math.nan, 3, "-"),
+    (50.0, 1, "50"), (2.4, 3, "2.4"), (0.034567, 2, "0.035"), (4096.4, 2, "4,096"), (-123.456, 3, "-123"),
+    (0.0, 3, "0"), (-1e-12, 3, "0"), (1e7, 3, "10,000,000"), (math.nan, 3, "-"),
 ])  # fmt: skip
 def test_figures_are_written_as_people_do(value: float, digits: int, text: str) -> None:
     assert figure(value, digits) == text
