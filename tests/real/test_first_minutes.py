@@ -11,7 +11,6 @@ import pytest
 
 from calibrator.drives.store import iterate_drives
 from calibrator.files.layout_files import vehicle_database
-from ecu_node.layout import read_layout
 from tests.calibrator.command_here import calibrator as calibrator_here
 from tests.calibrator.doctor.artificial_logs import examined
 from tests.calibrator.drive_logs import write_drive_log
@@ -80,17 +79,6 @@ def test_with_one_car_the_template_of_the_guessed_layout_fits_as_the_document_ty
         assert (done.returncode, done.stderr) == (0, ""), command
     assert done.stdout.startswith("vehicle V1, parameter set 1: fit\n")
     assert json.loads((tesla / "V1.json").read_text())["junction_residual"]["expected_a"] == 4.1
-
-
-def test_the_guessed_layout_has_the_branches_and_signs_of_the_one_written_by_hand(tesla: Path) -> None:
-    calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "guessed.toml"])
-    by_hand = read_layout(LAYOUT)
-    guessed = read_layout(tesla / "guessed.toml")
-    for one, other in zip(guessed.branch, by_hand.branch, strict=True):
-        assert (one.name, one.sign, one.source, one.voltage) == (other.name, other.sign, other.source, other.voltage)
-    text = (tesla / "guessed.toml").read_text()
-    assert text.count("\n# confirm:") == len(guessed.branch) * 2 + len(guessed.input) + 1
-    assert len(text.splitlines()) < 160
 
 
 def inverted(name: str) -> Change:
