@@ -240,9 +240,7 @@ def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitud
 
 
 @pytest.mark.parametrize(("shared", "size", "share"), [
-    ("offset", 0.05, 0.6),
-    ("load", 0.025, 0.15),
-    ("gain", 0.04, 1.0),
+    ("offset", 0.05, 0.6), ("load", 0.025, 0.15), ("gain", 0.04, 1.0),
     pytest.param("offset", 0.0125, 1.0, marks=pytest.mark.long),
     pytest.param("load", 0.0125, 1.0, marks=pytest.mark.long),
 ])  # fmt: skip

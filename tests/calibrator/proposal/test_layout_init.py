@@ -437,12 +437,9 @@ def test_dialogue_writes_what_does_not_close_only_when_asked_again(tmp_path: Pat
 
 
 @pytest.mark.parametrize(("text", "words"), [
-    ("SmoothBattCurrent132", "smooth batt current 132"),
-    ("ID266RearInverterPower", "id 266 rear inverter power"),
-    ("HV_BatteryVoltage", "hv battery voltage"),
-    ("PTC_leftCurrentHV", "ptc left current hv"),
-    ("DcDc_LowVoltagePower", "dcdc lv power"),
-    ("AirConPowerDemand", "aircon power demand"),
+    ("SmoothBattCurrent132", "smooth batt current 132"), ("ID266RearInverterPower", "id 266 rear inverter power"),
+    ("HV_BatteryVoltage", "hv battery voltage"), ("PTC_leftCurrentHV", "ptc left current hv"),
+    ("DcDc_LowVoltagePower", "dcdc lv power"), ("AirConPowerDemand", "aircon power demand"),
 ])  # fmt: skip
 def test_names_are_split_into_words(text: str, words: str) -> None:
     assert " ".join(words_of(text)) == words

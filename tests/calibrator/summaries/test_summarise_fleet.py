@@ -17,7 +17,7 @@ from calibrator.files.storage import open_storage
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import find_fleet
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.record import joined_records
+from calibrator.summaries.record import Record, joined_records
 from calibrator.summaries.summarise_fleet import SummariseReport, add_drives, read_vehicle_summary
 from calibrator.summaries.summary_store import SummaryStore, open_store
 from ecu_node.database import VehicleDatabase
@@ -71,12 +71,12 @@ def total(store: SummaryStore, vehicle: str) -> DriveSummary:
     return joined_records(store.read(store.bucket_of(vehicle))[vehicle]).summary
 
 
+def records_in(store: SummaryStore) -> dict[str, list[Record]]:
+    return {name: records for bucket in store.buckets() for name, records in store.read(bucket).items()}
+
+
 def drives_in(store: SummaryStore) -> dict[str, list[tuple[str, ...]]]:
-    return {
-        name: [record.drives for record in records]
-        for bucket in store.buckets()
-        for name, records in store.read(bucket).items()
-    }
+    return {name: [record.drives for record in records] for name, records in records_in(store).items()}
 
 
 def test_each_drive_is_read_once_and_again_when_it_was_changed(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -145,14 +145,8 @@ def test_recording_of_two_vehicles_counts_for_neither(tmp_path: Path, database: 
         added, store = add(drives, out, database)
         reasons = {name: text.partition(";")[0] for name, text in added.left_out.items()}
         assert reasons == {"V1": "same recording as V2", "V2": "same recording as V1"}
-        usable = {
-            (record.vehicle, *record.drives)
-            for bucket in store.buckets()
-            for records in store.read(bucket).values()
-            for record in records
-            if record.found
-        }
-        assert usable == {("V2", "a"), ("V3", "a")}
+        usable = [(name, *each.drives) for name, records in records_in(store).items() for each in records if each.found]
+        assert sorted(usable) == [("V2", "a"), ("V3", "a")]
     (drives / "drives" / "V2" / "b.parquet").unlink()
     added, store = add(drives, tmp_path / "other", database)
     assert (added.left_out, drives_in(store)) == ({}, {name: [("a",)] for name in ("V1", "V2", "V3")})

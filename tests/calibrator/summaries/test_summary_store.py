@@ -150,24 +150,11 @@ def own_store(store: SummaryStore, tmp_path: Path) -> SummaryStore:
 
 
 @pytest.mark.parametrize("changes", [
-    {"moments": None},
-    {"moments": [1.0] * 29},
-    {"moments": [-1.0] * 60 * 21},
-    {"noise_a2": []},
-    {"noise_a2": [None] * 120},
-    {"levels": [1.0]},
-    {"spikes": [-1.0] * 240},
-    {"temperature_c": [math.inf] * 60},
-    {"duration_s": None},
-    {"duration_s": math.inf},
-    {"delay_reference": "bogus"},
-    {"delay_s": [0.1, math.nan]},
-    {"delay_sd_s": [0.1, -0.1]},
-    {"zero_sd_a": None},
-    {"zero_offset_a": [1.0, math.nan], "zero_sd_a": [0.1, 0.1]},
-    {"sources": []},
-    {"digests": [None]},
-    {"digests": ["no digest"]},
+    {"moments": None}, {"moments": [1.0] * 29}, {"moments": [-1.0] * 60 * 21}, {"noise_a2": []},
+    {"noise_a2": [None] * 120}, {"levels": [1.0]}, {"spikes": [-1.0] * 240}, {"temperature_c": [math.inf] * 60},
+    {"duration_s": None}, {"duration_s": math.inf}, {"delay_reference": "bogus"}, {"delay_s": [0.1, math.nan]},
+    {"delay_sd_s": [0.1, -0.1]}, {"zero_sd_a": None}, {"zero_offset_a": [1.0, math.nan], "zero_sd_a": [0.1, 0.1]},
+    {"sources": []}, {"digests": [None]}, {"digests": ["no digest"]},
 ])  # fmt: skip
 def test_senseless_row_costs_its_vehicle(store: SummaryStore, own_store: SummaryStore, changes: dict[str, Any]) -> None:
     bucket = fullest(store)
