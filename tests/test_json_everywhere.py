@@ -60,9 +60,7 @@ def documented() -> set[str]:
     return set(re.findall(r"`([a-z0-9_]+)`", DOCUMENT.read_text()))
 
 
-def test_life_of_parameters_in_json(
-    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_life_of_a_set_in_json(database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each step prints one document whose keys are documented, and which names what the next step needs."""
     params = tmp_path / "v1.json"
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), params)

@@ -98,7 +98,7 @@ def at_rest(
 
 
 @pytest.mark.parametrize(("noise_a", "offset_a"), [(0.0, 0.0), (0.7, 0.0), (0.3, 2.0)])
-def test_car_at_rest_is_called_so_without_an_error_and_taken_by_calibrate(
+def test_car_at_rest_is_no_error(
     noise_a: float, offset_a: float, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
     log = at_rest(database, tmp_path, noise_a=noise_a, offset_a=offset_a)

@@ -344,9 +344,7 @@ def nameless_archive(path: Path) -> None:
         ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
     ],
 )  # fmt: skip
-def test_mistake_with_a_log_is_one_line(
-    tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str
-) -> None:
+def test_mistake_in_a_log(tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str) -> None:
     write(tmp_path / name)
     require_one_line(calibrator("kirchhoff", tmp_path / name, "--layout", layout), words)
 

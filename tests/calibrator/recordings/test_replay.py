@@ -92,7 +92,7 @@ def test_the_command_plays_a_log_and_counts(log: Path, capsys: pytest.CaptureFix
     ("missing.log", "virtual", "calibrator: .*no such file"),
     ("drive.log", "pigeon", "calibrator: pigeon c: cannot open"),
 ])  # fmt: skip
-def test_a_replay_that_fails_ends_in_1(
+def test_failure_ends_in_1(
     log: Path, capsys: pytest.CaptureFixture[str], name: str, interface: str, words: str
 ) -> None:
     assert command(log.parent / name, "--interface", interface, "--channel", "c") == 1
@@ -101,9 +101,7 @@ def test_a_replay_that_fails_ends_in_1(
     assert re.match(words, captured.err)
 
 
-def test_ctrl_c_says_what_was_sent(
-    log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_says_how_far(log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def send(self: VirtualBus, msg: can.Message, timeout: float | None = None) -> None:
         if msg.arbitration_id == FRAMES[3].arbitration_id:
             raise KeyboardInterrupt

@@ -192,9 +192,7 @@ def test_impossible_values_are_named(tmp_path: Path, database: VehicleDatabase, 
         read_vehicle_summary(find_fleet(tmp_path).vehicles["V1"], EQUIPMENT, database)
 
 
-def test_fault_of_program_ends_in_70(
-    tmp_path: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_program_fault_ends_in_70(tmp_path: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "drives", "V1", "a", database)
     path = tmp_path / "sitecustomize.py"  # a bug in a process that reads
     path.write_text("import numpy\nnumpy.ascontiguousarray = lambda *_, **__: 1 // 0\n")

@@ -78,7 +78,7 @@ COMMANDS += [[name] for names in ALL.values() for name in names if [name] not in
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_help_has_an_example_and_words_that_people_use(
+def test_help_is_readable(
     command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
