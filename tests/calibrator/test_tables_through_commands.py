@@ -38,15 +38,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         true = recording(seed)
         frame = recording(seed, gain=(0.0, GAIN.get(name, 0.0), 0.0))
         rng = np.random.default_rng(100 + seed)
-        table = pd.DataFrame(
-            {
-                "Ibat [A]": frame["battery"],
-                "Imot [A]": -frame["motor"],
-                "Iheat [A]": -frame["heater"],
-                "demand": 0.01 * true["motor"] + rng.normal(0.0, 0.002, len(true)),
-                "heater_demand": (true["heater"] < -6.0).astype(int),
-            }
-        )
+        table = pd.DataFrame({"Ibat [A]": frame["battery"], "Imot [A]": -frame["motor"], "Iheat [A]": -frame["heater"]})
+        table["demand"] = 0.01 * true["motor"] + rng.normal(0.0, 0.002, len(true))
+        table["heater_demand"] = (true["heater"] < -6.0).astype(int)
         (place / "logs" / name).mkdir(parents=True)
         table.rename_axis("time_s").to_csv(place / "logs" / name / "drive.csv", sep=";", decimal=",")
     return place

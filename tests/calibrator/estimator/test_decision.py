@@ -74,10 +74,8 @@ def test_of_equally_good_estimates_the_more_probable_explanation_is_taken_whatev
 def test_harm_is_that_of_simulated_currents() -> None:
     """(25) on drawn true currents, against the moments of (M19)."""
     rng = np.random.default_rng(1)
-    found, estimate = (
-        points([(1.0, [0.1, -0.08, 0.03, -0.02])], sd=0.03, draws=400),
-        np.array([0.1, -0.08, 0.03, -0.02]),
-    )
+    estimate = np.array([0.1, -0.08, 0.03, -0.02])
+    found = points([(1.0, estimate.tolist())], sd=0.03, draws=400)
     true = rng.normal([0.1, -0.1], 0.2, size=(2000, K))
     mean, square = true.mean(axis=0)[None], (true**2).mean(axis=0)[None]
     d, o = found.faults[:, None, :K], found.faults[:, None, K:]
@@ -131,10 +129,7 @@ def test_fault_models_are_averaged_by_their_probabilities() -> None:
         explained(truth, first_prior(K))._replace(probability=0.7),
         explained(truth, first_prior(K), shared=shared)._replace(probability=0.3),
     ]
-    both, single = (
-        posterior_points(models)[0],
-        [posterior_points([model._replace(probability=1.0)])[0] for model in models],
-    )
+    both, single = posterior_points(models)[0], [posterior_points([m._replace(probability=1.0)])[0] for m in models]
     mean = 0.7 * single[0].weight @ single[0].faults + 0.3 * single[1].weight @ single[1].faults
     np.testing.assert_allclose(both.weight @ both.faults, mean, atol=1e-12)
     assert np.bincount(both.model, np.bincount(both.explanation, both.weight)) == pytest.approx([0.7, 0.3], abs=1e-4)

@@ -41,15 +41,8 @@ def frame(seed: int, *, gain_error: float = 0.0, minutes: float = 5.0) -> pd.Dat
     heat = np.repeat(rng.integers(0, 2, len(time_s) // 20 + 1), 20)[: len(time_s)].astype(float)
     true_a = 40.0 * power + 15.0 * heat
     noise_a = rng.normal(0.0, 0.3, (2, len(time_s)))
-    return pd.DataFrame(
-        {
-            "battery": (1.0 + gain_error) * true_a + noise_a[0],
-            "motor": -true_a + noise_a[1],
-            "power": power,
-            "heat": heat,
-        },
-        index=time_s,
-    )
+    currents_a = {"battery": (1.0 + gain_error) * true_a + noise_a[0], "motor": -true_a + noise_a[1]}
+    return pd.DataFrame({**currents_a, "power": power, "heat": heat}, index=time_s)
 
 
 def frames(vehicles: int = 3) -> Frames:

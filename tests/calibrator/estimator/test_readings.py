@@ -96,15 +96,9 @@ def test_trusted_vehicle_that_was_read_as_faulty_is_refused(reading: tuple[float
 
 def test_zero_current_and_bench_readings_combine_or_both_drop_out_if_contradictory() -> None:
     shown = {"V1": (4.9, 0.1), "V2": (5.0, 0.1), "V3": (NAN, NAN)}  # by the battery sensor with open contactors
-    vehicles = cast(
-        "list[VehicleSummary]",
-        [
-            SimpleNamespace(
-                vehicle=name, zero_current=ZeroCurrent(offset_a=np.array([offset_a, NAN]), sd_a=np.array([sd_a, NAN]))
-            )
-            for name, (offset_a, sd_a) in shown.items()
-        ],
-    )
+    windows = (ZeroCurrent(offset_a=np.array([o, NAN]), sd_a=np.array([sd, NAN])) for o, sd in shown.values())
+    summaries = [SimpleNamespace(vehicle=name, zero_current=each) for name, each in zip(shown, windows, strict=True)]
+    vehicles = cast("list[VehicleSummary]", summaries)
     bench = {
         **bench_of(NAN, NAN, 5.1, 0.1),
         **bench_of(0.03, 0.001, -5.0, 0.1, "V2", "battery"),

@@ -43,13 +43,8 @@ def write(
     time_s = 0.1 * np.arange(samples)
     speed = 30.0 + 20.0 * np.sin(0.3 * time_s + rng.random())
     battery = 2.0 * speed + rng.normal(size=samples)
-    values = {
-        "battery": battery,
-        "motor": -battery,
-        "speed": speed,
-        "torque": speed,
-        "voltage": np.full(samples, 350.0),
-    }
+    values = {"battery": battery, "motor": -battery, "speed": speed, "torque": speed}
+    values["voltage"] = np.full(samples, 350.0)
     change(values)
     channels = {key: Channel(time_s=time_s, value=value, good=np.ones(samples, bool)) for key, value in values.items()}
     branches = {key: channels.pop(key) for key in EQUIPMENT.branches}
