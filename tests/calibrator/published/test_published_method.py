@@ -14,7 +14,6 @@ from calibrator.published.classify import (
     Classification,
     classify_by_expected_trees,
     classify_by_threshold,
-    classify_by_trees,
     classify_by_truth,
     decision_criterion,
     expected_features,
@@ -112,17 +111,6 @@ def test_threshold_is_a_third_of_the_fleets_spread() -> None:
     found = classify_by_threshold(np.column_stack([eta, np.zeros(4), np.zeros(4)]))
     np.testing.assert_array_equal(found.hardware, eta > eta.std(ddof=1) / 3.0)
     assert found.sensor.all()
-
-
-def test_trees_learn_what_separates_the_classes() -> None:
-    rng = np.random.default_rng(2)
-    hardware, sensor = rng.random(2000) < 0.5, rng.random(2000) < 0.5
-    zero = np.zeros((2000, 2))
-    truth = Faults(hardware_drift=0.1 * hardware, hardware_offset_a=zero, drift=0.2 * sensor[:, None], offset_a=zero)
-    features = np.column_stack([10.0 * hardware, 10.0 * hardware + 5.0 * sensor, 5.0 * sensor]) + rng.random((2000, 3))
-    found = classify_by_trees(features[:1000], truth.take(slice(0, 1000)), features[1000:])
-    np.testing.assert_array_equal(found.hardware, hardware[1000:])
-    np.testing.assert_array_equal(found.sensor, sensor[1000:])
 
 
 def test_expected_features_follow_the_mean_of_a_fleet_that_is_not_symmetric() -> None:

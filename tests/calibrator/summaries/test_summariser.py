@@ -92,15 +92,6 @@ def test_moments_are_those_of_the_samples(time_constants_s: tuple[float, ...]) -
     assert (summary.duration_s, BLOCK_S) == (kept.sum() * PERIOD_S, 30.0 * PERIOD_S)
 
 
-def test_samples_that_are_not_valid_take_no_part() -> None:
-    drive = a_drive(4)
-    valid, currents = drive.valid.copy(), drive.currents_a.copy()
-    valid[5:20], currents[5:20] = False, np.nan
-    summary = summarise_samples([replace(drive, valid=valid, currents_a=currents)], period_s=PERIOD_S)
-    np.testing.assert_allclose(summary.mean_a, drive.currents_a[valid].mean(axis=0))
-    assert np.isfinite(summary.moments).all()
-
-
 @pytest.mark.parametrize("samples", [30, 300])
 def test_white_noise_is_measured_without_bias(samples: int) -> None:
     rng = np.random.default_rng(6)
@@ -133,13 +124,6 @@ def test_levels_are_sums_of_the_samples_at_each_level() -> None:
             there = level == number
             np.testing.assert_allclose(levels[k, number, :-1], columns[there].sum(axis=0), atol=1e-8)
             np.testing.assert_allclose(levels[k, number, -1], np.sum(x[there] ** 2), atol=1e-8)
-
-
-def test_fast_changes_tell_white_noise() -> None:
-    fit = fit_of(coloured_drive())
-    weights = np.ones(3)  # in the sum of the currents nothing but noise is left
-    variance = weights @ fit.fast_a2.sum(axis=0) @ weights / 1.5 / SAMPLES
-    assert variance == pytest.approx(3 * 0.4**2, rel=0.1)
 
 
 def test_spikes_are_labelled_by_branch_and_sign_and_left_out() -> None:
