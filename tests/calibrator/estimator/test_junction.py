@@ -113,6 +113,7 @@ def test_unusable_vehicle_leaves_the_others_calibrated_as_in_python(motor_off: p
     assert "short: " in done.stdout
     assert "at least 5 s are needed" in done.stdout
     assert "next: calibrator report" in done.stderr
+    assert "--hold-out is for a fleet" in command(*arguments[:-1], tmp_path / "x", "--hold-out", "good").stderr
     rows = pd.read_parquet(tmp_path / "r" / "results.parquet").set_index(["vehicle", "branch"]).loc["good"]
     here = found(motor_off, trusted=["battery"]).loc["vehicle"]
     assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
