@@ -15,7 +15,7 @@ import pytest
 from calibrator.processes.interrupts import ENDED, TERMINATED, importing, interrupted_message
 from ecu_node.program import INTERRUPTED
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 
 
