@@ -8,16 +8,8 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
+from calibrator.estimator import results
 from calibrator.estimator.evidence import evidence_names
-from calibrator.estimator.results import (
-    PARTS,
-    RunRecord,
-    encode_chunk,
-    join_rows,
-    part_file,
-    write_parameter_files,
-    write_run,
-)
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, JunctionResidual, VehicleParameters
 from tests.ecu_node.vehicles import parameters_for
@@ -25,7 +17,7 @@ from tests.ecu_node.vehicles import parameters_for
 BRANCHES = ("battery", "motor")
 FULL_SCALE_A = 400.0
 EVIL = "<script>document.title='run'</script>"
-RUN = RunRecord(
+RUN = results.RunRecord(
     tool="calibrator test",
     fleet="at hand",
     method="posterior",
@@ -120,21 +112,21 @@ def write_result(
     evidence: bool = True,
 ) -> Path:
     """A result folder as ``calibrator calibrate`` writes it."""
-    (folder / PARTS).mkdir(parents=True)
+    (folder / results.PARTS).mkdir(parents=True)
     rows = np.ones((3, len(evidence_names(BRANCHES))))
     rows[:2, [3, 4, 8, 9]] = np.nan  # no bench has seen these sensors
     told = {item.vehicle: rows for item in vehicles} if evidence else {}
-    part = encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
-    part_file(folder, 0).write_bytes(part)
-    join_rows(folder, {})
-    write_parameter_files(folder, vehicles=len(vehicles))
+    part = results.encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
+    results.part_file(folder, 0).write_bytes(part)
+    results.join_rows(folder, {})
+    results.write_parameter_files(folder, vehicles=len(vehicles))
     reference = {"agreeing_share": {"battery": 0.8, "motor": 0.75}, "unmeasured_a": 0.3}
     spread = {"model_spread": {"battery": 0.004, "motor": 0.005}}
     own = {"reference": reference, "hyperparameters": spread, "evidence": evidence_names(BRANCHES)}
     lost = dict(left_out or {})
     details, notices = own if evidence else {}, [f"a notice with {EVIL}"]
     more = {"details": details, "left_out": lost, "left_out_count": len(lost), "notices": notices}
-    write_run(folder, replace(RUN, vehicles=len(vehicles), **more))
+    results.write_run(folder, replace(RUN, vehicles=len(vehicles), **more))
     return folder
 
 
