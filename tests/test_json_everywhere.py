@@ -60,9 +60,7 @@ def documented() -> set[str]:
     return set(re.findall(r"`([a-z0-9_]+)`", DOCUMENT.read_text()))
 
 
-def test_a_life_of_signed_parameters_in_json(
-    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_life_of_a_set_in_json(database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each step prints one document whose keys are documented, and which names what the next step needs."""
     params = tmp_path / "v1.json"
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), params)
@@ -77,6 +75,9 @@ def test_a_life_of_signed_parameters_in_json(
         return found
 
     layout, state = ["--layout", LAYOUT], ["--state", tmp_path / "state"]
+    exported = done("calibrator", "export", params, *layout, "--format", "c", "--output", tmp_path / "c" / "car.c")
+    assert (exported["format"], exported["notices"]) == ("c", [])
+    assert all(Path(file).is_file() for file in exported["files"])
     repo = tmp_path / "repo"
     made = done("calibrator", "repository", "key", "anna", "--no-passphrase", "--out", tmp_path / "keys")
     roles = [
@@ -97,21 +98,6 @@ def test_a_life_of_signed_parameters_in_json(
     assert done("ecu-node", "update", repo, *state, *layout)["on_trial"] is None
     after = done("ecu-node", "inspect", *state)
     assert (after["ended"], after["trusted"]["root"], after["problems"]) == ("revoked", 2, [])
-
-
-def test_exports_tell_their_files_and_notices(
-    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    params = tmp_path / "v1.json"
-    write_parameters(parameters_for(database, battery=(0.05, 2.3)), params)
-    out = tmp_path / "hv_calibration.c"
-    words = ["export", str(params), "--layout", str(LAYOUT), "--format", "c", "--output", str(out), "--json"]
-    assert run_app(app, "calibrator", words) == 0
-    printed = capsys.readouterr()
-    found = json.loads(printed.out)
-    assert printed.err == ""
-    assert found.keys() == {"format", "files", "notices"}
-    assert all(Path(file).is_file() for file in found["files"])
 
 
 def test_a_refusal_prints_no_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -106,12 +106,15 @@ MISTAKES = [
     ("calibrator report none", 1, "none"),
     # one junction
     ("calibrator calibrate drive.csv CAR --out x --trusted gearbox", 1, "--trusted gearbox: no such branch"),
-    ("calibrator calibrate drive.csv CAR --out x --load=-3:0.1", 2, "expected what flows out of the junction"),
-    ("calibrator calibrate drive.csv CAR --out x --charge battery=3", 2, "give its standard deviation"),
+    ("calibrator calibrate drive.csv CAR --out x --trusted battery --expected-faults 0.2", 2, "is for a fleet"),
     ("calibrator calibrate drive.csv CAR --out x --meter battery", 1, "--meter battery: one folder of recordings"),
     ("calibrator calibrate drive.csv CAR --out x --readings none.csv", 1, "none.csv"),
     ("calibrator calibrate short.csv CAR --out x", 1, "at least 5 s are needed"),
+    ("calibrator replay drive.csv --interface virtual --channel c", 1, "a table"),
+    ("calibrator replay drive.csv --channel c --speed=-1", 2, "'--speed': -1: expected a number from 0 to 1"),
     # parameter files
+    ("calibrator export v1.json LAYOUT --format hex --out x", 2, "--format hex needs --elf PROGRAM"),
+    ("calibrator export v1.json LAYOUT --format csv --elf v1.json --out x", 2, "--format csv takes no --elf PROGRAM"),
     ("calibrator export none.json LAYOUT --format dcm --out x", 1, "no such parameter file; name one that is there"),
     ("calibrator export empty LAYOUT --format dcm --out x", 1, "empty: not a parameter file: it is empty; correct it"),
     ("calibrator export noise LAYOUT --format dcm --out x", 1, "noise: not a parameter file: "),

@@ -107,15 +107,17 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert run.returncode == 0, run.stderr
     assert "Traceback" not in run.stderr
     left_out = json.loads(run.stdout)["run"]["left_out"]
-    assert "at least 120 s are needed" in left_out["short"]
-    assert "drive.log" in left_out["empty"]
-    assert "0x110" in left_out["no_branch"] or "branch" in left_out["no_branch"]
-    assert "motor" in left_out["no_motor"]
-    assert "drive.blf" in left_out["blf"]
-    assert left_out["other"].startswith("same recording as V002; it cannot be told whose it is")
-    assert left_out["V002"].startswith("same recording as other; it cannot be told whose it is")
-    twins = [reason for reason in left_out.values() if "V001" in reason and "elsewhere" in reason]
-    assert twins, left_out
+    for vehicle, reason in {
+        "short": "at least 120 s are needed",
+        "empty": "drive.log: the log is empty",
+        "no_branch": "expected HV_Battery (0x110)",
+        "no_motor": "no branch motor; it has battery",
+        "blf": "drive.blf: truncated or damaged BLF",
+        "other": "same recording as V002; it cannot be told whose it is",
+        "V002": "same recording as other; it cannot be told whose it is",
+    }.items():
+        assert reason in left_out[vehicle]
+    assert any("V001" in reason and "elsewhere" in reason for reason in left_out.values()), left_out
     assert any("my,drive" in reason for reason in left_out.values()), left_out
     assert sorted(path.stem for path in (out / "params").iterdir()) == ["V003", "V004", "V005", "V006"]
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
@@ -147,7 +149,6 @@ def test_one_car_alone_and_copies_of_one_are_no_fleet(fleet: Path, tmp_path: Pat
     assert run.returncode == 1
     (line,) = [line for line in run.stderr.splitlines() if line.startswith("calibrator:")]
     assert "1 usable vehicle to learn from; a fleet that is compared with itself needs 5 or more" in line
-    assert "pass 1" not in run.stderr
     assert not (tmp_path / "x").exists()
     shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "other")
     run = calibrator("calibrate", tmp_path / "logs", *files, "--trusted", "other")
@@ -155,13 +156,10 @@ def test_one_car_alone_and_copies_of_one_are_no_fleet(fleet: Path, tmp_path: Pat
     assert "vehicle other to trust; other: same recording as one; it cannot be told whose it is" in run.stderr
 
 
-@pytest.mark.parametrize(
-    ("key", "change", "message"),
-    [
-        ("vehicles", lambda found: {f"X{name}": each for name, each in found.items()}, "truth of another fleet"),
-        ("branches", lambda _: ["battery", "dcdc"], "with branches battery, motor, the truth of layout hv_powertrain"),
-    ],
-)
+@pytest.mark.parametrize(("key", "change", "message"), [
+    ("vehicles", lambda found: {f"X{name}": each for name, each in found.items()}, "truth of another fleet"),
+    ("branches", lambda _: ["battery", "dcdc"], "with branches battery, motor, the truth of layout hv_powertrain"),
+])  # fmt: skip
 def test_score_refuses_the_truth_of_other_vehicles_or_branches(
     fleet: Path, result: Path, tmp_path: Path, key: str, change: Callable[[Any], Any], message: str
 ) -> None:
@@ -171,9 +169,8 @@ def test_score_refuses_the_truth_of_other_vehicles_or_branches(
     assert (run.returncode, message in run.stderr) == (1, True), run.stderr
 
 
-def test_truth_of_a_fleet_with_the_same_names_is_refused_before_the_work(
-    fleet: Path, result: Path, tmp_path: Path
-) -> None:
+def test_foreign_truth_is_refused(fleet: Path, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calibrator.estimator.published_fleet.read_vehicles", None)  # the work
     other, store = tmp_path / "truth.json", tmp_path / "store"
     other.write_text(json.dumps({**json.loads((fleet / "truth.json").read_text()), "fleet_id": "other"}))
     run = calibrator("score", result, "--truth", other)
@@ -186,4 +183,3 @@ def test_truth_of_a_fleet_with_the_same_names_is_refused_before_the_work(
         run = calibrator("calibrate", source, "--layout", LAYOUT, "--out", tmp_path / "x", *perfect)
         assert run.returncode == 1
         assert "the truth of fleet other, but" in run.stderr
-        assert "identify" not in run.stderr

@@ -47,9 +47,7 @@ def test_asymmetric_fleet_with_delays_and_an_unmeasured_load_is_recovered_and_no
     assert figures["harmed_rate"] == 0.0
 
 
-def test_delay_of_the_motor_is_found_and_stands_in_the_parameter_file(
-    fleet: Path, parameters: list[VehicleParameters]
-) -> None:
+def test_delay_of_the_motor_is_in_the_parameter_file(fleet: Path, parameters: list[VehicleParameters]) -> None:
     truth = read_truth(fleet / "truth.json").vehicles
     for item in parameters:
         delays = {name: branch.delay_s for name, branch in item.branches.items()}
@@ -96,10 +94,9 @@ def test_a_harm_limit_of_zero_corrects_nothing_and_every_fault_says_why(result: 
     assert all(item.explanations and item.deciding_evidence for item in unknown)
 
 
-def test_a_slip_in_the_bench_readings_ends_the_run_before_any_drive_is_read(fleet: Path, tmp_path: Path) -> None:
-    table = tmp_path / "bench.csv"
+def test_slip_in_the_bench_readings_ends_the_run_before_the_drives_are_read(fleet: Path, tmp_path: Path) -> None:
+    table, out = tmp_path / "bench.csv", tmp_path / "result"
     table.write_text("vehicle,branch,offset_a,offset_sd_a\nV001,battery,1 A,0.02\n")
-    out = tmp_path / "result"
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)
     assert run.returncode == 1
     assert "bench.csv: line 2: offset_a is '1 A'; expected a number" in run.stderr

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.faults import Faults, measured_currents
+from calibrator.faults import Faults, measured_currents, slopes_and_intercepts, true_currents
 from calibrator.score import UnseenDrive, f2_score, harmed, recovered
 
 FULL_SCALE_A = 400.0
@@ -17,17 +17,14 @@ def sensor_faults(drift: list[list[float]] | Array, offset: list[list[float]] | 
     return Faults(hardware_drift=np.zeros(len(d)), hardware_offset_a=np.zeros_like(d), drift=d, offset_a=o)
 
 
-@pytest.mark.parametrize(
-    ("true", "found", "within_10", "within_25"),
-    [
-        ((0.1, 0.2), (0.109, 0.2), True, True),
-        ((0.1, 0.2), (0.111, 0.2), False, True),
-        ((0.1, 0.2), (0.1, 0.221), False, True),
-        ((0.0, 0.0), (0.0049, 0.0), True, True),  # a vanishing truth counts as the smallest fault, 0.05
-        ((0.0, 0.0), (0.0051, 0.0), False, True),
-        ((0.1, 0.0), (float("nan"), 0.0), False, False),
-    ],
-)
+@pytest.mark.parametrize(("true", "found", "within_10", "within_25"), [
+    ((0.1, 0.2), (0.109, 0.2), True, True),
+    ((0.1, 0.2), (0.111, 0.2), False, True),
+    ((0.1, 0.2), (0.1, 0.221), False, True),
+    ((0.0, 0.0), (0.0049, 0.0), True, True),  # a vanishing truth counts as the smallest fault, 0.05
+    ((0.0, 0.0), (0.0051, 0.0), False, True),
+    ((0.1, 0.0), (float("nan"), 0.0), False, False),
+])  # fmt: skip
 def test_vehicle_is_recovered_if_drift_and_offset_are_close(
     true: tuple[float, float], found: tuple[float, float], within_10: bool, within_25: bool
 ) -> None:
@@ -51,10 +48,7 @@ def test_error_from_moments_equals_the_error_of_corrected_currents() -> None:
     drift, offset_a = np.array([[0.15, -0.3]]), np.array([[2.0, 11.0]])
     i_m = measured_currents(I_A, truth.take(0))
     expected = np.sqrt(np.mean(((i_m - offset_a) / (1.0 + drift) - I_A) ** 2, axis=0))
-    for unseen in (
-        UnseenDrive.of_linear_sensors(MEAN_A, MEAN_SQUARE_A2, truth),
-        UnseenDrive.of_samples([(I_A, i_m)]),
-    ):
+    for unseen in (UnseenDrive.of_linear_sensors(MEAN_A, MEAN_SQUARE_A2, truth), UnseenDrive.of_samples([(I_A, i_m)])):
         np.testing.assert_allclose(unseen.rms_a(drift, offset_a)[0], expected)
 
 
@@ -68,3 +62,25 @@ def test_one_worse_branch_is_harm_and_no_or_a_true_correction_is_none() -> None:
         sensor_faults(drift, np.zeros((2, 2))) for drift in ([[0.1, 0.0]] * 2, [[0.1, 0.001], [0.19, 0]])
     )
     assert harmed(estimate, truth, **moments).tolist() == [True, False]
+
+
+FAULTS = Faults(
+    hardware_drift=np.array([0.1, 0.0]),
+    hardware_offset_a=np.array([[5.0, -5.0], [0.0, 0.0]]),
+    drift=np.array([[0.2, 0.0], [0.0, 0.0]]),
+    offset_a=np.array([[-3.0, 0.0], [0.0, 0.0]]),
+)
+
+
+def test_slopes_and_intercepts_reproduce_the_measured_currents() -> None:
+    i_s = np.array([[80.0, -80.0], [-20.0, 20.0], [1.0, -1.0]])
+    a, b = slopes_and_intercepts(FAULTS)
+    for j in range(2):
+        measured = measured_currents(true_currents(i_s, FAULTS.take(j)), FAULTS.take(j))
+        np.testing.assert_allclose(measured, a[j] * i_s + b[j])
+
+
+def test_kinds_of_faults_are_told_apart() -> None:
+    assert FAULTS.has_hardware_fault.tolist() == [True, False]
+    assert FAULTS.has_sensor_fault.tolist() == [True, False]
+    assert len(FAULTS) == 2

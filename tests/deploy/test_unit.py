@@ -2,6 +2,7 @@
 
 import os
 import re
+import runpy
 import shutil
 import subprocess
 from pathlib import Path
@@ -70,3 +71,8 @@ def test_the_command_of_the_unit_is_one_that_the_node_takes(capsys: pytest.Captu
     assert command[:3] == ["run", "--channel", "can0"]
     assert run_ecu_node(command) == 1
     assert capsys.readouterr().err.startswith("ecu-node: /etc/ecu-node/my_car.toml: cannot read the layout: ")
+
+
+def test_the_files_are_in_step_with_the_constraints() -> None:
+    for path, text in runpy.run_path(str(DEPLOY / "requirements.py"))["files"]().items():
+        assert path.read_text() == text, f"{path} is out of date: run deploy/requirements.py"

@@ -49,13 +49,3 @@ def test_links_lead_to_files_and_headings_that_exist(path: Path) -> None:
         if heading and heading not in headings(path.parent / file if file else path)
     ]
     assert wrong == []
-
-
-def test_modules_that_a_document_names_exist() -> None:
-    named = {
-        (path.name, name)
-        for path in DOCUMENTS
-        if path.name != "CHANGELOG.md"  # names files of its time
-        for name in re.findall(r"`([a-z_]+(?:/\w+)+\.py)`", text_of(path))
-    }
-    assert [found for found in named if not any((ROOT / top / found[1]).exists() for top in ("", "calibrator"))] == []

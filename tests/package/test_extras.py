@@ -2,14 +2,16 @@
 
 import json
 import os
+import re
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import can
 import pytest
 
-from tests.package.clean_venv import CleanVenv
+from tests.package.clean_venv import CleanVenv, new_venv
 from tests.package.conftest import VEHICLE, Installed
 
 EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "mf4", "update")
@@ -31,9 +33,7 @@ def test_an_extra_alone_is_whole(installed: Installed, extra: str, car: Path) ->
     assert venv.run("ecu-node", "schema", folder=car).returncode == 0
 
 
-def test_calibrator_takes_a_fleet_from_logs_to_reports_and_exports(
-    installed: Installed, car: Path, fleet: Path, drive: Path, tmp_path: Path
-) -> None:
+def test_fleet_from_logs_to_exports(installed: Installed, car: Path, fleet: Path, drive: Path, tmp_path: Path) -> None:
     venv, result = installed("calibrator"), tmp_path / "result"
     layout = ("--layout", car / "my_car.toml")
     calibrator(venv, tmp_path, "import", fleet / "logs", *layout, "--out", "store")
@@ -126,3 +126,66 @@ def test_docs_are_built_from_the_source(installed: Installed, unpacked: Path) ->
     done = with_tools.run("sphinx-build", *options, ".", "build/docs", folder=unpacked)
     assert done.returncode == 0, done.stderr
     assert (unpacked / "build" / "docs" / "docs" / "index.html").is_file()
+
+
+# What a command says whose extra is missing, and doing what it says helps
+
+
+STEPS: dict[str, tuple[tuple[str, ...], str]] = {
+    "calibrator": (("--version",), "calibrator: typer is not installed; "),
+    "demo": (
+        ("simulate", *LAYOUT, "--vehicles", "2", "--minutes", "1", "--out", "two"),
+        "calibrator: builtin drives need fastsim; install the extra: ",
+    ),
+    "mf4": (("kirchhoff", "drive.mf4", *LAYOUT), "calibrator: drive.mf4: reading MF4 needs asammdf; "),
+    "cluster": (  # what is missing is told before the fleet is read, which takes hours
+        ("calibrate", "none", *LAYOUT, "--scheduler", "tcp://127.0.0.1:9", "--out", "never"),
+        "calibrator: --scheduler needs Dask: ",
+    ),
+}
+"""By extra, from the lightest on: arguments of a command that needs it, and what that says without it."""
+
+
+@pytest.fixture
+def mf4(car: Path, drive: Path) -> None:
+    with can.Logger(car / "drive.mf4") as log:
+        for frame in can.LogReader(drive):
+            log(frame)
+
+
+@pytest.mark.usefixtures("mf4")
+def test_doing_what_a_command_without_its_extra_says_makes_it_work(wheel: Path, car: Path, tmp_path: Path) -> None:
+    venv = new_venv(tmp_path / "growing", wheel)
+    for extra, (arguments, words) in STEPS.items():
+        done = venv.run("calibrator", *arguments, folder=car)
+        assert done.returncode == 1, (extra, done.stderr)
+        assert done.stderr.startswith(words)
+        assert done.stderr.count("\n") == 1
+        (remedy,) = re.findall(r"pip install '(\S+)'", done.stderr)
+        assert remedy == f"hv-current-correction[{extra}]"
+        venv.install(remedy)
+        done = venv.run("calibrator", *arguments, folder=car)
+        assert "pip install" not in done.stderr
+        assert done.returncode != 70
+        assert "Traceback" not in done.stderr
+
+
+INTERPRETERS = os.environ.get("HV_PYTHONS", "").split() or [sys.executable]
+
+
+@pytest.mark.parametrize("interpreter", INTERPRETERS)
+def test_a_fleet_is_calibrated_and_its_parameters_fit(interpreter: str, wheel: Path, car: Path, tmp_path: Path) -> None:
+    venv = new_venv(tmp_path / "environment", wheel, "demo", interpreter=interpreter)
+    layout = ("--layout", car / "my_car.toml")
+    small = ("--vehicles", 6, "--currents", 2, "--minutes", 2)
+    for program, *arguments in (
+        ("calibrator", "simulate", *layout, *small, "--out", "fleet"),
+        ("calibrator", "calibrate", "fleet", *layout, "--out", "result"),
+        ("calibrator", "score", "result", "--truth", "fleet/truth.json"),
+        ("calibrator", "report", "result"),
+        ("ecu-node", "check", "--params", "result/params/V001.json", *layout, "--vehicle", "V001"),
+        ("ecu-node", "schema"),
+    ):
+        done = venv.run(str(program), *arguments, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "Traceback" not in done.stderr

@@ -66,9 +66,7 @@ def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Ben
 
 
 @pytest.mark.parametrize("branches", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_of_vehicles_with_linear_sensors_at_most_one_in_a_hundred_has_a_finding(
-    fleet: RecordedFleet, branches: int
-) -> None:
+def test_of_linear_sensors_at_most_1_percent_have_a_finding(fleet: RecordedFleet, branches: int) -> None:
     found = [mine for seed in range(4) for mine in checked(fleet, branches, seed, {})]
     assert sum(map(bool, found)) <= 0.01 * len(found)
 

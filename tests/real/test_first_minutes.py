@@ -1,6 +1,5 @@
 """The first minutes of somebody with a DBC and a log: a recorded Tesla Model 3, and faults put into the recording."""
 
-import gzip
 import json
 import re
 import subprocess
@@ -12,7 +11,6 @@ import pytest
 
 from calibrator.drives.store import iterate_drives
 from calibrator.files.layout_files import vehicle_database
-from ecu_node.layout import read_layout
 from tests.calibrator.command_here import calibrator as calibrator_here
 from tests.calibrator.doctor.artificial_logs import examined
 from tests.calibrator.drive_logs import write_drive_log
@@ -83,17 +81,6 @@ def test_with_one_car_the_template_of_the_guessed_layout_fits_as_the_document_ty
     assert json.loads((tesla / "V1.json").read_text())["junction_residual"]["expected_a"] == 4.1
 
 
-def test_the_guessed_layout_has_the_branches_and_signs_of_the_one_written_by_hand(tesla: Path) -> None:
-    calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "guessed.toml"])
-    by_hand = read_layout(LAYOUT)
-    guessed = read_layout(tesla / "guessed.toml")
-    for one, other in zip(guessed.branch, by_hand.branch, strict=True):
-        assert (one.name, one.sign, one.source, one.voltage) == (other.name, other.sign, other.source, other.voltage)
-    text = (tesla / "guessed.toml").read_text()
-    assert text.count("\n# confirm:") == len(guessed.branch) * 2 + len(guessed.input) + 1
-    assert len(text.splitlines()) < 160
-
-
 def inverted(name: str) -> Change:
     """A layout with the other sign of one branch."""
     return lambda layout: re.sub(rf'("{name}", sign = )(-?1)', lambda match: match[1] + str(-int(match[2])), layout)
@@ -143,26 +130,6 @@ def test_doctor_names_what_is_wrong_and_nothing_else(
     told = examined(tmp_path / "layout.toml", tesla / "drive.log.gz").findings()
     grave = [item for item in told if item.severity == "error" or item.code == "exchanged"]
     assert sorted((item.severity, item.code, item.subject) for item in grave or told) == findings
-
-
-@pytest.mark.parametrize(("identifier", "late_s"), [("266", 0.2), ("132", -0.2)])
-def test_a_skew_of_200_ms_is_named_and_is_no_error(identifier: str, late_s: float, tesla: Path, tmp_path: Path) -> None:
-    """Time stamps of one message are moved in the log; the battery's the other way round, which is the same skew."""
-    lines = []
-    with gzip.open(tesla / "drive.log.gz", "rt") as file:
-        for line in file:
-            stamp, channel, frame = line.split()
-            time_s = float(stamp.strip("()")) + (late_s if frame.startswith(f"{identifier}#") else 0.0)
-            lines.append((time_s, f"({time_s:.6f}) {channel} {frame}\n"))
-    (tmp_path / "skewed.log").write_text("".join(text for _, text in sorted(lines)))
-    (tmp_path / "Model3CAN.dbc").symlink_to(tesla / "Model3CAN.dbc")
-    (tmp_path / "layout.toml").write_text(LAYOUT.read_text())
-    told = examined(tmp_path / "layout.toml", tmp_path / "skewed.log")
-    assert told.errors == []
-    (delay,) = told.findings("delay")
-    assert (delay.subject, delay.severity) == ("motor_rear", "warning")
-    assert delay.number == pytest.approx(0.2, abs=0.01)
-    assert "late against battery" in delay.text
 
 
 @pytest.mark.parametrize("trip", ["TripA07", "TripA24"])

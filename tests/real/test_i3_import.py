@@ -56,15 +56,12 @@ def test_fleet_with_many_faults_is_not_left_alone(trips: RecordedFleet, balanced
         assert not found["harmed"].any()
 
 
-@pytest.mark.parametrize(
-    ("vehicles", "branches", "least"),
-    [
-        (6, 2, 0.5),
-        pytest.param(12, 2, 0.8, marks=pytest.mark.long),
-        pytest.param(6, 3, 0.5, marks=pytest.mark.long),
-        (12, 3, 0.5),
-    ],
-)
+@pytest.mark.parametrize(("vehicles", "branches", "least"), [
+    (6, 2, 0.5),
+    pytest.param(12, 2, 0.8, marks=pytest.mark.long),
+    pytest.param(6, 3, 0.5, marks=pytest.mark.long),
+    (12, 3, 0.5),
+])  # fmt: skip
 def test_small_fleet_is_corrected(trips: RecordedFleet, vehicles: int, branches: int, least: float) -> None:
     """Of S = 80: of four fleets so many of the faulty vehicles, and no vehicle is made worse."""
     found = []

@@ -24,17 +24,10 @@ I3_LAYOUT = """schema = 1
 name = "i3_charging"
 dbc = "i3.dbc"
 full_scale_a = 200.0
-[[branch]]
-name = "battery"
-signal = "Battery.BatteryCurrent"
-sign = -1
-timeout_s = 0.1
-[[branch]]
-name = "charger"
-signal = "Charger.ChargerCurrent"
-sign = 1
-timeout_s = 0.3
-no_value = [65535]
+branch = [
+    { name = "battery", signal = "Battery.BatteryCurrent", sign = -1, timeout_s = 0.1 },
+    { name = "charger", signal = "Charger.ChargerCurrent", sign = 1, timeout_s = 0.3, no_value = [65535] },
+]
 """
 
 

@@ -98,7 +98,7 @@ def at_rest(
 
 
 @pytest.mark.parametrize(("noise_a", "offset_a"), [(0.0, 0.0), (0.7, 0.0), (0.3, 2.0)])
-def test_car_at_rest_is_called_so_without_an_error_and_taken_by_calibrate(
+def test_car_at_rest_is_no_error(
     noise_a: float, offset_a: float, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
     log = at_rest(database, tmp_path, noise_a=noise_a, offset_a=offset_a)
@@ -117,9 +117,7 @@ def test_car_at_rest_is_called_so_without_an_error_and_taken_by_calibrate(
     assert calibrated(tmp_path, log, layout, "--trusted", "battery")[0] == 0
 
 
-def test_constant_currents_while_driving_are_not_standstill(
-    tmp_path: Path, layout: Path, database: VehicleDatabase
-) -> None:
+def test_constant_current_at_speed_is_no_standstill(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     told = examined(layout, at_rest(database, tmp_path, noise_a=0.02, speed=50.0))
     assert told.findings("stands still") == []
     assert [item.subject for item in told.findings("full scale")] == ["all branches"]
@@ -144,15 +142,12 @@ def test_all_signs_inverted_are_told_by_the_voltage(log: Path, tmp_path: Path) -
     assert [(item.subject, item.severity) for item in told.findings("sign")] == [("all branches", "warning")]
 
 
-@pytest.mark.parametrize(
-    ("branch", "signal", "unit", "factor"),
-    [
-        ("battery", "BatteryCurrent", "mA", 1000.0),
-        ("motor", "MotorCurrent", "kA", 0.001),
-        ("auxiliary", "AuxiliaryCurrent", "mA", 1000.0),
-        ("auxiliary", "AuxiliaryCurrent", "kA", 0.001),
-    ],
-)
+@pytest.mark.parametrize(("branch", "signal", "unit", "factor"), [
+    ("battery", "BatteryCurrent", "mA", 1000.0),
+    ("motor", "MotorCurrent", "kA", 0.001),
+    ("auxiliary", "AuxiliaryCurrent", "mA", 1000.0),
+    ("auxiliary", "AuxiliaryCurrent", "kA", 0.001),
+])  # fmt: skip
 def test_unit_slip_gives_factor(branch: str, signal: str, unit: str, factor: float, log: Path, tmp_path: Path) -> None:
     told = examined(write_layout(tmp_path, units={signal: unit}), log)
     assert told.errors == [("unit", branch)]

@@ -47,9 +47,7 @@ def test_a_line_sampled_at_any_instants_is_found_exactly(layout: Layout) -> None
 
 
 @given(st.lists(st.floats(0.0, 30.0), min_size=2, max_size=60), st.floats(0.05, 3.0))
-def test_no_value_is_extrapolated_and_none_is_valid_across_a_longer_gap_than_the_limit(
-    times: list[float], limit_s: float
-) -> None:
+def test_nothing_is_extrapolated_or_valid_across_a_longer_gap(times: list[float], limit_s: float) -> None:
     known_s = np.array(sorted(times))
     value = np.sin(known_s)
     try:
@@ -70,25 +68,12 @@ def test_no_value_is_extrapolated_and_none_is_valid_across_a_longer_gap_than_the
             assert stale == (gap_s > limit_s)
 
 
-def test_samples_one_time_out_apart_are_valid_and_farther_apart_stale(layout: Layout) -> None:
-    assert layout.find_branch("battery").timeout_s == pytest.approx(0.1)
-    close = aligned(layout, {"battery": ramp(0.05, 3.0, 0.1)})
-    far = aligned(layout, {"battery": ramp(0.05, 3.0, 0.15)})
-    assert close.valid.all()
-    assert not far.valid.all()
-    assert np.isnan(far.currents_a[~far.valid]).all()
-
-
-def test_an_instant_on_a_frame_is_valid_however_far_the_next_one_is(layout: Layout) -> None:
-    samples = aligned(layout, {"battery": channel(np.array([0.0, 10.0]), np.array([1.0, 2.0]))})
-    assert np.flatnonzero(samples.valid).tolist() == [0, 100]
-    np.testing.assert_allclose(samples.currents_a[[0, 100], 0], [1.0, 2.0])
-
-
 def test_bad_samples_are_masked_in_place_with_their_reason(layout: Layout) -> None:
     time_s = np.arange(0.0, 2.0, 0.1)
     bad = channel(time_s, time_s, bad=[5, 6])
-    assert np.flatnonzero(~aligned(layout, {"battery": bad}).valid).tolist() == [5, 6]
+    samples = aligned(layout, {"battery": bad})
+    assert np.flatnonzero(~samples.valid).tolist() == [5, 6]
+    assert np.flatnonzero(np.isnan(samples.currents_a[:, 0])).tolist() == [5, 6]
     reasons = align_channels({"battery": bad}, {"battery": 0.1}, period_s=PERIOD_S, where="test")[2]
     assert {reason: int(mask.sum()) for reason, mask in reasons.items()} == {"stale": 0, "not good": 2}
 
@@ -109,13 +94,10 @@ def test_a_missing_channel_is_named_with_those_there_are(layout: Layout) -> None
         align(drive_of({"battery": ramp(0.0, 1.0, 0.1)}), layout, ["battery", "motor"], inputs=["voltage"])
 
 
-@pytest.mark.parametrize(
-    ("dcdc", "words"),
-    [
-        (channel(np.array([0.0]), np.array([1.0]), bad=[0]), "drive d: no good sample of dcdc"),
-        (ramp(2.0, 3.0, 0.1), "no instant in common"),
-    ],
-)
+@pytest.mark.parametrize(("dcdc", "words"), [
+    (channel(np.array([0.0]), np.array([1.0]), bad=[0]), "drive d: no good sample of dcdc"),
+    (ramp(2.0, 3.0, 0.1), "no instant in common"),
+])  # fmt: skip
 def test_channels_that_cannot_be_aligned_are_refused(layout: Layout, dcdc: Channel, words: str) -> None:
     with pytest.raises(DriveError, match=words):
         aligned(layout, {"battery": ramp(0.0, 1.0, 0.1), "dcdc": dcdc})

@@ -1,11 +1,9 @@
 import numpy as np
-import pytest
 
 from calibrator.drive import Array, Channel, Mask
 from calibrator.drives.charge import Band, ChargeCurve, charge_curve
 
 BAND = Band(short_s=0.2, long_s=2.0)
-DENSE_S = 1e-4
 
 
 def curve_of(time_s: Array, value: Array, *, good: Mask | None = None) -> ChargeCurve:
@@ -19,21 +17,6 @@ def uneven(seed: int, duration_s: float = 20.0) -> tuple[Array, Array]:
     rng = np.random.default_rng(seed)
     time_s = np.sort(rng.uniform(0.0, duration_s, int(20 * duration_s)))
     return time_s, rng.normal(0.0, 30.0, len(time_s))
-
-
-def triangle_mean(time_s: Array, value: Array, centre_s: float, half_s: float) -> float:
-    """The definition, summed finely: mean of the linear interpolation with triangular weight."""
-    around_s = centre_s + np.arange(-half_s, half_s, DENSE_S) + DENSE_S / 2.0
-    weight = 1.0 - np.abs(around_s - centre_s) / half_s
-    return float(np.sum(weight * np.interp(around_s, time_s, value)) / np.sum(weight))
-
-
-def test_the_band_is_the_difference_of_two_triangular_means() -> None:
-    time_s, value = uneven(1)
-    instants_s = np.array([3.0, 7.123, 11.0, time_s[150]])
-    x, _ = curve_of(time_s, value).band(instants_s, BAND)
-    oracle = [triangle_mean(time_s, value, t, 0.2) - triangle_mean(time_s, value, t, 2.0) for t in instants_s]
-    np.testing.assert_allclose(x, oracle, atol=1e-3)
 
 
 def test_the_slope_is_the_derivative_of_the_band() -> None:
@@ -58,12 +41,6 @@ def test_one_or_two_lost_frames_are_bridged_and_bad_samples_make_gaps() -> None:
         good[50 : 50 + lost] = False
         curve = curve_of(time_s, np.where(good, 1.0, np.nan), good=good)
         assert curve.covers(np.array([5.0]), 1.0).tolist() == [bridged]
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_fewer_than_two_good_samples_make_no_curve(count: int) -> None:
-    good = np.arange(5) < count
-    assert charge_curve(Channel(time_s=np.arange(5.0), value=np.zeros(5), good=good)) is None
 
 
 def test_the_band_of_a_straight_line_is_zero_even_after_hours() -> None:

@@ -8,36 +8,14 @@ import pytest
 
 from calibrator.drive import Array
 from calibrator.estimator import evidence
-from calibrator.estimator.evidence import (
-    LEAST_GAIN,
-    EvidenceRows,
-    RowPlaces,
-    VehicleRegressions,
-    collect_rows,
-    densest_clusters,
-    fit_fleet_model,
-    junction_regression,
-    regress_on_fleet,
-    row_design,
-    stack_summaries,
-)
 from calibrator.faults import Faults
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise_samples
-from tests.calibrator.estimator.simulated_drives import (
-    PERIOD_S,
-    Conditions,
-    coloured,
-    drive_of,
-    no_faults,
-    read_out_of,
-    samples_of,
-    summaries_of,
-)
+from tests.calibrator.estimator import simulated_drives
 from tests.calibrator.estimator.simulated_rows import parameters_of, plain_residual, random_faults
 
 K, FULL_SCALE_A = 3, 400.0
-W = read_out_of(K)
+W = simulated_drives.read_out_of(K)
 
 
 @pytest.mark.parametrize(("good", "faulty"), [(20, 80), (300, 700), (12, 8)])
@@ -45,7 +23,7 @@ def test_cluster_is_that_of_agreeing_values_however_many_are_faulty(good: int, f
     """All faults are positive: mean and median are far off."""
     rng = np.random.default_rng(1)
     values = 1.0 + np.concatenate([rng.normal(0.0, 0.002, size=good), rng.uniform(0.05, 0.25, size=faulty)])
-    cluster = densest_clusters(values, np.full(len(values), 0.002))[0]
+    cluster = evidence.densest_clusters(values, np.full(len(values), 0.002))[0]
     assert cluster.centre == pytest.approx(1.0, abs=4.0 * 0.002 / np.sqrt(good) + 2e-4)
 
 
@@ -57,11 +35,11 @@ def one_sided_faults(vehicles: int, share: float) -> Faults:
     rng = np.random.default_rng(vehicles)
     faulty = rng.random((2, vehicles, K)) < share
     size = rng.uniform(0.05, 0.25, size=(2, vehicles, K)) * faulty
-    return replace(no_faults(vehicles, K), drift=size[0], offset_a=FULL_SCALE_A * size[1])
+    return replace(simulated_drives.no_faults(vehicles, K), drift=size[0], offset_a=FULL_SCALE_A * size[1])
 
 
 def model_of(summaries: Sequence[DriveSummary]) -> Array:
-    return fit_fleet_model(stack_summaries(summaries))
+    return evidence.fit_fleet_model(evidence.stack_summaries(summaries))
 
 
 def scaled(summary: DriveSummary, column: int, factor: float) -> DriveSummary:
@@ -77,14 +55,14 @@ def largest_error(read_out: Array) -> float:
 
 
 def test_read_outs_are_those_of_faultless_vehicles_however_lopsided_the_faults() -> None:
-    read_out = model_of(summaries_of(one_sided_faults(40, 0.5)))
+    read_out = model_of(simulated_drives.summaries_of(one_sided_faults(40, 0.5)))
     assert largest_error(read_out) < 0.005
     assert np.abs(read_out[-1]).max() < 0.5
     np.testing.assert_allclose(read_out.sum(axis=1), 0.0, atol=1e-9)
 
 
 def test_order_of_vehicles_units_and_copies_of_inputs_do_not_matter() -> None:
-    summaries = list(summaries_of(one_sided_faults(20, 0.3)))
+    summaries = list(simulated_drives.summaries_of(one_sided_faults(20, 0.3)))
     plain = model_of(summaries)
     np.testing.assert_allclose(model_of(summaries[::-1]), plain, atol=1e-6)
     other = model_of([scaled(summary, 0, 3.6) for summary in summaries])
@@ -92,7 +70,9 @@ def test_order_of_vehicles_units_and_copies_of_inputs_do_not_matter() -> None:
     columns = [0, 0, *range(1, summaries[0].moments.shape[1])]
     twice = [replace(summary, moments=summary.moments[:, columns][:, :, columns]) for summary in summaries]
     slopes = [
-        np.array([fit.estimate for fit in regress_on_fleet(stack_summaries(each), model_of(each))])[..., 0]
+        np.array([fit.estimate for fit in evidence.regress_on_fleet(evidence.stack_summaries(each), model_of(each))])[
+            ..., 0
+        ]
         for each in (summaries, twice)
     ]
     np.testing.assert_allclose(slopes[1], slopes[0], atol=1e-4)
@@ -103,17 +83,17 @@ def test_input_that_stands_still_in_most_vehicles_is_learnt_from_the_others(vary
     """Of the mass of a vehicle, say: where it stands still its variance is rounding, which must not be divided by."""
     rng, summaries, told = np.random.default_rng(8), [], np.array([0.1, -0.1, 0.0])
     for j in range(12):
-        drive = drive_of(rng, no_faults(1, K).take(0), Conditions())
-        change = 50.0 * coloured(rng, len(drive.inputs), 1, 0.9) * (j < varying)
+        drive = simulated_drives.drive_of(rng, simulated_drives.no_faults(1, K).take(0), simulated_drives.Conditions())
+        change = 50.0 * simulated_drives.coloured(rng, len(drive.inputs), 1, 0.9) * (j < varying)
         inputs = np.hstack([drive.inputs, round(rng.uniform(1500.0, 2300.0), 3) + change])
         names = (*drive.input_names, "mass")
         drive = replace(drive, input_names=names, inputs=inputs, currents_a=drive.currents_a + change * told)
-        summaries.append(summarise_samples([drive], period_s=PERIOD_S))
+        summaries.append(summarise_samples([drive], period_s=simulated_drives.PERIOD_S))
     np.testing.assert_allclose(model_of(summaries)[-2], told * bool(varying), atol=2e-4)  # [A] per kg
 
 
 def test_vehicle_with_an_input_in_another_unit_does_not_bend_the_model() -> None:
-    summaries = list(summaries_of(no_faults(20, K), seed=4))
+    summaries = list(simulated_drives.summaries_of(simulated_drives.no_faults(20, K), seed=4))
     plain = largest_error(model_of(summaries))
     summaries[3] = scaled(summaries[3], 0, 1000.0)
     assert largest_error(model_of(summaries)) < 1.5 * plain + 1e-3
@@ -122,10 +102,12 @@ def test_vehicle_with_an_input_in_another_unit_does_not_bend_the_model() -> None
 # Junction law
 
 
-def law_of(*currents_a: Array) -> VehicleRegressions:
+def law_of(*currents_a: Array) -> evidence.VehicleRegressions:
     """Of the currents (T, K) of some vehicles."""
-    samples = [samples_of(np.zeros((len(each), 0)), each) for each in currents_a]
-    return junction_regression(stack_summaries([summarise_samples([each], period_s=PERIOD_S) for each in samples]))
+    samples = [simulated_drives.samples_of(np.zeros((len(each), 0)), each) for each in currents_a]
+    return evidence.junction_regression(
+        evidence.stack_summaries([summarise_samples([each], period_s=simulated_drives.PERIOD_S) for each in samples])
+    )
 
 
 def currents_of(seed: int, size_a: tuple[float, ...], noise_a: tuple[float, ...], samples: int) -> tuple[Array, Array]:
@@ -162,16 +144,16 @@ def test_branch_that_never_moves_keeps_the_prior_and_one_of_noise_gets_no_sensor
     assert still.sd[0, 1] == pytest.approx(0.4, rel=0.1)
     assert still.sd[0, 0] < 0.01
     rng = np.random.default_rng(7)
-    motor = 80.0 * coloured(rng, 3600, 1, 0.98)[:, 0]
+    motor = 80.0 * simulated_drives.coloured(rng, 3600, 1, 0.98)[:, 0]
     noisy = law_of(np.column_stack([-motor, motor, np.zeros(3600)]) + rng.normal(size=(3600, 3)) * (0.3, 0.3, 1.0))
-    assert -noisy.estimate[0, 1] < LEAST_GAIN
+    assert -noisy.estimate[0, 1] < evidence.LEAST_GAIN
     assert noisy.estimate[0, 0] == pytest.approx(-1.0, abs=0.002)
 
 
 # Rows
 
 
-def errors_of(rows: EvidenceRows, faults: Faults) -> Array:
+def errors_of(rows: evidence.EvidenceRows, faults: Faults) -> Array:
     """Rows less what they are without error, as seen in true currents, shape (N, 5K)."""
     offsets = {name: getattr(faults, name) / FULL_SCALE_A for name in ("hardware_offset_a", "offset_a")}
     theta = parameters_of(replace(faults, **offsets))
@@ -179,22 +161,19 @@ def errors_of(rows: EvidenceRows, faults: Faults) -> Array:
     return np.concatenate([plain_residual(rows.take(one), theta[one]) for one in vehicles])
 
 
-@pytest.mark.parametrize(
-    "conditions",
-    [
-        Conditions(noise_a=1.0, memory=0.8),
-        pytest.param(Conditions(), marks=pytest.mark.long),
-        pytest.param(Conditions(model_error_a=1.0), marks=pytest.mark.long),
-    ],
-)
-def test_standardised_errors_of_the_rows_are_standard_normal(
-    conditions: Conditions, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("conditions", [
+    simulated_drives.Conditions(noise_a=1.0, memory=0.8),
+    pytest.param(simulated_drives.Conditions(), marks=pytest.mark.long),
+    pytest.param(simulated_drives.Conditions(model_error_a=1.0), marks=pytest.mark.long),
+])  # fmt: skip
+def test_standardised_errors_of_rows_are_normal(
+    conditions: simulated_drives.Conditions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evidence, "LEAST_SD", np.array([5e-5, 1e-5]))  # these sensors are exact
     faults = random_faults(1, vehicles=150, branches=K, sparsity=70.0, full_scale_a=FULL_SCALE_A)
-    fleet = stack_summaries(summaries_of(faults, conditions, seed=1))
-    rows, _ = collect_rows(fleet, np.vstack([W, np.zeros(K)]), full_scale_a=FULL_SCALE_A)
-    measured = RowPlaces(K).measured
+    fleet = evidence.stack_summaries(simulated_drives.summaries_of(faults, conditions, seed=1))
+    rows, _ = evidence.collect_rows(fleet, np.vstack([W, np.zeros(K)]), full_scale_a=FULL_SCALE_A)
+    measured = evidence.RowPlaces(K).measured
     L = np.linalg.cholesky(rows.covariance[:, measured][:, :, measured])
     z = np.linalg.solve(L, errors_of(rows, faults)[:, measured, None])[..., 0]
     rms = np.sqrt(np.mean(z**2, axis=0))
@@ -216,4 +195,4 @@ def test_design_is_logarithms_and_true_currents_of_what_is_measured(branches: in
     relative = np.log(np.concatenate([slopes, ratios, 1.0 + d]))
     constant = np.concatenate([b / (1.0 + d), [c / (1.0 + d[0])], o / (1.0 + d)])
     theta = np.concatenate([np.log1p([d_h, *d]), o_h[:-1], o / (1.0 + d), [load]])
-    np.testing.assert_allclose(row_design(branches, feed) @ theta, np.append(relative, constant), atol=1e-12)
+    np.testing.assert_allclose(evidence.row_design(branches, feed) @ theta, np.append(relative, constant), atol=1e-12)

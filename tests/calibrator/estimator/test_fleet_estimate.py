@@ -57,13 +57,10 @@ def test_faults_beyond_the_limits_are_found_and_not_corrected(summaries: Summari
     np.testing.assert_array_equal(limited.drift, free.drift)
 
 
-@pytest.mark.parametrize(
-    ("factor", "told"),
-    [
-        (-1.0, "1 A in branch battery goes with +1 A in branch motor"),
-        (0.1, "1 A in branch motor goes with -10 A in branch battery"),
-    ],
-)
+@pytest.mark.parametrize(("factor", "told"), [
+    (-1.0, "1 A in branch battery goes with +1 A in branch motor"),
+    (0.1, "1 A in branch motor goes with -10 A in branch battery"),
+])  # fmt: skip
 def test_a_wrong_sign_or_unit_in_most_vehicles_is_refused(summaries: Summaries, factor: float, told: str) -> None:
     def wrong(summary: DriveSummary) -> DriveSummary:
         moments = summary.moments.copy()
@@ -117,9 +114,7 @@ def test_two_variants_of_the_vehicle_are_said_and_named(larger: float) -> None:
     assert not found.corrected.any()
 
 
-def test_pit_of_the_truth_lies_between_zero_and_one(
-    truth: Faults, summaries: Summaries, reference: FleetReference
-) -> None:
+def test_pit_of_the_truth_is_a_probability(truth: Faults, summaries: Summaries, reference: FleetReference) -> None:
     for pit in estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
         assert pit.shape == (VEHICLES, K)
         assert ((pit >= 0.0) & (pit <= 1.0 + 1e-9)).all()

@@ -46,34 +46,21 @@ def motor_off() -> pd.DataFrame:
 MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
 
 
-@pytest.mark.parametrize(
-    ("fault", "known", "corrected"),
-    [
-        ({"gain": (0.0, 0.05, 0.0)}, {"trusted": ["battery"]}, {"motor"}),
-        ({"gain": (0.03, 0.05, 0.0)}, {"readings": MOTOR_READ}, {"battery", "motor"}),
-        ({"offset_a": (0.0, 4.0, 0.0)}, {"trusted": ["battery"]}, set()),
-        # of two branches the declared load leaves one offset; of three the gain alone is corrected
-        (
-            {"offset_a": (0.0, 4.0, 0.0), "load_a": 3.0},
-            {"trusted": ["battery", "heater"], "load": (3.0, 0.2)},
-            {"motor"},
-        ),
-        (
-            {"gain": (0.0, 0.1, 0.0), "offset_a": (0.0, 0.0, 6.0)},
-            {"trusted": ["battery"], "load": (0.0, 0.1)},
-            {"motor"},
-        ),
-        (
-            {"gain": (0.4, 0.0, 0.0), "offset_a": (3.0, 0.0, 0.0), "load_a": 30.0},
-            {"trusted": ["motor", "heater"], "load": (30.0, 0.1)},
-            {"battery"},
-        ),
-        ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
-    ],
-)
-def test_faults_are_within_their_deviations_and_what_is_known_well_is_corrected(
-    fault: dict[str, Any], known: dict[str, Any], corrected: set[str]
-) -> None:
+@pytest.mark.parametrize(("fault", "known", "corrected"), [
+    ({"gain": (0.0, 0.05, 0.0)}, {"trusted": ["battery"]}, {"motor"}),
+    ({"gain": (0.03, 0.05, 0.0)}, {"readings": MOTOR_READ}, {"battery", "motor"}),
+    ({"offset_a": (0.0, 4.0, 0.0)}, {"trusted": ["battery"]}, set()),
+    # of two branches the declared load leaves one offset; of three the gain alone is corrected
+    ({"offset_a": (0.0, 4.0, 0.0), "load_a": 3.0}, {"trusted": ["battery", "heater"], "load": (3.0, 0.2)}, {"motor"}),
+    ({"gain": (0.0, 0.1, 0.0), "offset_a": (0.0, 0.0, 6.0)}, {"trusted": ["battery"], "load": (0.0, 0.1)}, {"motor"}),
+    (
+        {"gain": (0.4, 0.0, 0.0), "offset_a": (3.0, 0.0, 0.0), "load_a": 30.0},
+        {"trusted": ["motor", "heater"], "load": (30.0, 0.1)},
+        {"battery"},
+    ),
+    ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
+])  # fmt: skip
+def test_well_known_faults_are_corrected(fault: dict[str, Any], known: dict[str, Any], corrected: set[str]) -> None:
     rows = found(recording(**fault), **known).loc["vehicle"]
     gain, offset_a = (np.array(fault.get(name, (0.0, 0.0, 0.0))) for name in ("gain", "offset_a"))
     assert (np.abs(rows.gain_error - gain) < 3.0 * rows.gain_error_sd).all()
@@ -131,6 +118,7 @@ def test_unusable_vehicle_leaves_the_others_calibrated_as_in_python(motor_off: p
     assert "short: " in done.stdout
     assert "at least 5 s are needed" in done.stdout
     assert "next: calibrator report" in done.stderr
+    assert "--hold-out is for a fleet" in command(*arguments[:-1], tmp_path / "x", "--hold-out", "good").stderr
     rows = pd.read_parquet(tmp_path / "r" / "results.parquet").set_index(["vehicle", "branch"]).loc["good"]
     here = found(motor_off, trusted=["battery"]).loc["vehicle"]
     assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
@@ -175,9 +163,7 @@ def switched(frame: pd.DataFrame, rms_a: float) -> None:
 
 
 @pytest.mark.parametrize(("spoil", "share"), [(bent, 0.002), (switched, 0.008)])
-def test_what_no_gain_and_offset_explain_is_found_from_the_size_that_the_documents_say(
-    spoil: Any, share: float
-) -> None:
+def test_misfit_is_found_from_the_documented_size(spoil: Any, share: float) -> None:
     """Of full scale, RMS; see docs/junction.md."""
     for seed in (300, 301):
         frame = recording(seed, gain=(0.0, 0.1, 0.0))
@@ -215,15 +201,12 @@ def test_contradicting_knowledge_corrects_nothing() -> None:
     assert not calibrator.parameters_.corrected.any()
 
 
-@pytest.mark.parametrize(
-    ("change", "cause"),
-    [
-        (lambda motor: motor.clip(-50.0, 50.0), "clipped"),
-        (lambda motor: motor.where(motor.index < 120.0, 1.1 * motor), "step"),
-        (lambda motor: motor.where(motor > 0.0, 1.1 * motor), "sign"),
-        (lambda motor: motor * (1.0 + 0.0005 * motor.abs()), "saturating"),
-    ],
-)
+@pytest.mark.parametrize(("change", "cause"), [
+    (lambda motor: motor.clip(-50.0, 50.0), "clipped"),
+    (lambda motor: motor.where(motor.index < 120.0, 1.1 * motor), "step"),
+    (lambda motor: motor.where(motor > 0.0, 1.1 * motor), "sign"),
+    (lambda motor: motor * (1.0 + 0.0005 * motor.abs()), "saturating"),
+])  # fmt: skip
 def test_sensor_that_is_not_linear_is_found_and_not_corrected(change: Any, cause: str) -> None:
     frame = recording()
     calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame.assign(motor=change(frame["motor"])), JUNCTION)
@@ -259,20 +242,11 @@ def second_motor(rng: np.random.Generator, frame: pd.DataFrame) -> None:
     frame["battery"] += 30.0 * np.convolve(rng.normal(size=len(frame) + 19), np.full(20, 0.22), "valid")
 
 
-@pytest.mark.parametrize(
-    ("spoil", "causes"),
-    [
-        (noisy("motor", 0.0), set()),
-        (noisy("motor", 10.0), set()),
-        (noisy("battery", 10.0), set()),
-        (steady_heater, set()),
-        (switched_heater, set()),
-        (second_motor, {"switching"}),
-    ],
-)
-def test_no_sensor_is_blamed_for_noise_or_for_a_branch_that_is_switched_or_not_measured(
-    spoil: Any, causes: set[str]
-) -> None:
+@pytest.mark.parametrize(("spoil", "causes"), [
+    (noisy("motor", 0.0), set()), (noisy("motor", 10.0), set()), (noisy("battery", 10.0), set()),
+    (steady_heater, set()), (switched_heater, set()), (second_motor, {"switching"}),
+])  # fmt: skip
+def test_noise_and_unmeasured_or_switched_branches_blame_no_sensor(spoil: Any, causes: set[str]) -> None:
     for seed in range(2):
         frame = recording(seed, gain=(0.0, 0.1, -0.2), offset_a=(0.0, 3.0, 0.0))
         spoil(np.random.default_rng(seed + 100), frame)
@@ -291,45 +265,29 @@ def test_standard_deviations_are_right() -> None:
     assert np.abs(errors).max() < 4.0
 
 
-@pytest.mark.parametrize(
-    ("change", "known", "match"),
-    [
-        (lambda frame: frame.assign(motor=-frame["motor"]), {}, "check sign and unit of branch"),
-        (lambda frame: frame.drop(columns="motor"), {}, "no column motor"),
+@pytest.mark.parametrize(("change", "known", "match"), [
+    (lambda frame: frame.assign(motor=-frame["motor"]), {}, "check sign and unit of branch"),
+    (lambda frame: frame.drop(columns="motor"), {}, "no column motor"),
+    (lambda frame: frame.assign(motor=2.4 * frame["motor"]), {"trusted": ["battery"]}, "motor reads 2.5 times"),
+    (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
+    (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
+    (lambda frame: frame, {"load": (-3.0, 0.1)}, "a value from 0 with its standard deviation"),
+    (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
+    (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
+    (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
+    *(
         (
-            lambda frame: frame.assign(motor=2.4 * frame["motor"]),
-            {"trusted": ["battery"]},
-            "motor reads 2.5 times",
-        ),
-        (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
-        (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
-        (lambda frame: frame, {"load": (-3.0, 0.1)}, "a value from 0 with its standard deviation"),
-        (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
-        (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
-        (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
-        *(
-            (
-                lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
-                {"charge_ah": {"battery": (1.0, 0.1)}},
-                "have no samples of it",
-            )
-            for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
-        ),
-    ],
-)
+            lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
+            {"charge_ah": {"battery": (1.0, 0.1)}},
+            "have no samples of it",
+        )
+        for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
+    ),
+])  # fmt: skip
 def test_mistake_is_one_line(motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str) -> None:
     with pytest.raises((FleetError, DriveError, ContradictionError), match=match) as raised:
         JunctionCalibrator(**known).fit(change(motor_off), JUNCTION)
     assert "\n" not in str(raised.value)
-
-
-@pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory, motor_off: pd.DataFrame) -> Path:
-    """A car in a folder of its own: a table, and the layout of its columns."""
-    folder = tmp_path_factory.mktemp("car")
-    motor_off.rename_axis("time_s").to_csv(folder / "drive.csv")
-    write_layout(folder, motor_off)
-    return folder
 
 
 def write_layout(folder: Path, frame: pd.DataFrame) -> Path:
@@ -348,26 +306,6 @@ def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:
     (parameters,) = (tmp_path / "result" / "params").iterdir()
     sums = command("kirchhoff", drive, "--layout", layout, "--parameters", parameters)
     assert re.search(r"RMSE of the sum about the 2 A expected: 2.\d+ A measured, 0.4\d A corrected", sums.stdout)
-
-
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        (["--load", "much"], "expected a number and its standard deviation"),
-        (["--load=-3:0.1"], "expected what flows out of the junction"),
-        (["--charge", "battery"], "expected a branch with its charge"),
-        (["--charge", "battery=3"], "give its standard deviation"),
-        (["--trusted", "battery", "--hold-out", "car"], "--hold-out is for a fleet"),
-        (["--trusted", "battery", "--expected-faults", "0.2"], "--expected-faults is for a fleet"),
-    ],
-)
-def test_wrong_option_is_one_line(table: Path, tmp_path: Path, options: list[str], match: str) -> None:
-    arguments = ["calibrate", table / "drive.csv", "--layout", table / "layout.toml", "--out", tmp_path / "r", *options]
-    done = command(*arguments)
-    assert done.returncode != 0
-    assert match in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "r").exists()
 
 
 def test_gain_ratios_are_named_in_the_order_of_the_layout(motor_off: pd.DataFrame) -> None:

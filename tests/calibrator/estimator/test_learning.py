@@ -210,9 +210,7 @@ def test_batch_of_sensors_whose_gains_differ_is_no_number_of_loads() -> None:
 
 
 @pytest.mark.parametrize(("K", "branch"), [(3, 0), pytest.param(3, 2, marks=pytest.mark.long), (2, 1)])
-def test_gain_that_all_sensors_of_a_branch_share_is_found_and_of_two_branches_either_may_have_it(
-    K: int, branch: int
-) -> None:
+def test_shared_gain_is_found_but_not_which_of_two_branches_has_it(K: int, branch: int) -> None:
     gain, faults = 0.08, random_faults(14, vehicles=16, branches=K)
     faults.drift[:, branch] = (1.0 + gain) * (1.0 + faults.drift[:, branch]) - 1.0
     rows = rows_of(faults, seed=14)

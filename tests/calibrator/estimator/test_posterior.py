@@ -1,26 +1,25 @@
 """Posterior of a vehicle: residuals, fits and weights of its explanations are those of plain mathematics."""
 
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 
 from calibrator.drive import Array
+from calibrator.estimator import posterior
 from calibrator.estimator.evidence import EvidenceRows
-from calibrator.estimator.posterior import (
-    GAIN,
-    OFFSET,
-    Draws,
-    Evidence,
-    Fits,
-    draw_explanations,
-    fit_explanations,
-    row_residuals,
-    size_evidence,
-    weigh,
+from calibrator.estimator.prior import (
+    GRID,
+    LOAD_DENSITY,
+    TAIL_DENSITY,
+    Prior,
+    Slab,
+    first_prior,
+    known_prior,
+    sparse_counts,
 )
-from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, first_prior, known_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import (
@@ -40,12 +39,12 @@ READ = Errors(gain_read=0.01, offset_read=0.001)
 """Every row says something."""
 
 
-def fitted(evidence: Evidence) -> Fits:
+def fitted(evidence: posterior.Evidence) -> posterior.Fits:
     K = evidence.values.shape[1] // 5
-    return fit_explanations(evidence, first_prior(K).log_supports, LOG_LOAD)
+    return posterior.fit_explanations(evidence, first_prior(K).log_supports, LOG_LOAD)
 
 
-def supports(fits: Fits, vehicle: int) -> list[tuple[int, ...]]:
+def supports(fits: posterior.Fits, vehicle: int) -> list[tuple[int, ...]]:
     return [tuple(np.flatnonzero(row).tolist()) for row in fits.support[vehicle, : fits.number[vehicle]]]
 
 
@@ -57,7 +56,7 @@ def random_parameters(seed: int, shape: tuple[int, ...], K: int) -> Array:
 def test_residuals_are_those_of_the_equations_of_the_rows(K: int) -> None:
     rows = rows_of(random_faults(K, vehicles=8, branches=K, sparsity=50.0), seed=K, errors=READ)
     theta = random_parameters(K, (8, 5), K)
-    left = row_residuals(plain_evidence(rows), theta)
+    left = posterior.row_residuals(plain_evidence(rows), theta)
     for j in range(len(rows)):
         np.testing.assert_allclose(left[j], plain_residual(rows.take(slice(j, j + 1)), theta[j]), atol=1e-13)
 
@@ -107,7 +106,7 @@ def test_what_all_sensors_share_leaves_nothing_either(K: int, of_sensor: bool) -
     theta = parameters_of(own, group)
     theta[:, 2 * K : 3 * K] = own.offset_a / (1.0 + both.drift)
     rows = rows_of(both, noise=0.0, load=0.0 if of_sensor else group)
-    left = row_residuals(plain_evidence(rows, centre=centre, shared=shared), theta[:, None])[:, 0]
+    left = posterior.row_residuals(plain_evidence(rows, centre=centre, shared=shared), theta[:, None])[:, 0]
     np.testing.assert_allclose(left[rows.known], 0.0, atol=1e-12)
 
 
@@ -134,7 +133,7 @@ def test_rows_that_nothing_explains_and_rows_that_say_nothing_are_fitted_without
         assert np.isfinite(fits.root[j, :n]).all()
     assert () in supports(fits, 2)
     np.testing.assert_allclose(fits.theta[2], 0.0, atol=0.05)
-    np.testing.assert_allclose(np.einsum("qpp->p", fits.root[2, : fits.number[2]] ** 2).max() > 0.1, True)
+    assert np.einsum("qpp->p", fits.root[2, : fits.number[2]] ** 2).max() > 0.1
 
 
 # Weights of the draws
@@ -155,10 +154,12 @@ def paper_prior(K: int, *totals: int) -> Prior:
     return known_prior(counts, MAGNITUDE)
 
 
-def drawn(rows: EvidenceRows, prior: Prior, shared: Array | None = None) -> Draws:
+def drawn(rows: EvidenceRows, prior: Prior, shared: Array | None = None) -> posterior.Draws:
     evidence = plain_evidence(rows, shared=shared)
     log_load = float(np.log(prior.load_share + prior.group_share.sum()))
-    return draw_explanations(fit_explanations(evidence, prior.log_supports + 1.0, log_load + 2.0), evidence)
+    return posterior.draw_explanations(
+        posterior.fit_explanations(evidence, prior.log_supports + 1.0, log_load + 2.0), evidence
+    )
 
 
 def log_prior(prior: Prior, theta: Array, on: tuple[int, ...]) -> Array:
@@ -196,7 +197,7 @@ def integrated(rows: EvidenceRows, prior: Prior, on: tuple[int, ...], points: in
     return total + float(cell), np.exp(value - total) @ theta
 
 
-def of_supports(draws: Draws, weight: Array, vehicle: int) -> dict[tuple[int, ...], tuple[float, Array]]:
+def of_supports(draws: posterior.Draws, weight: Array, vehicle: int) -> dict[tuple[int, ...], tuple[float, Array]]:
     """Weight of each support of a vehicle and its mean parameters."""
     found = {}
     for q in range(draws.fits.number[vehicle]):
@@ -212,7 +213,7 @@ def test_weights_are_those_of_integration_on_a_grid() -> None:
     truth = random_faults(2, vehicles=6, branches=2, sparsity=100.0 * (1.0 - 1.0 / 6.0))
     rows = rows_of(truth, seed=2, errors=VAGUE)
     draws = drawn(rows, prior)
-    weight, log_evidence = weigh(draws, prior)
+    weight, log_evidence = posterior.weigh(draws, prior)
     for j in range(len(rows)):
         one = rows.take(slice(j, j + 1))
         supports = [on for on in all_supports(2) if len(on) <= 1 and 6 not in on]
@@ -233,18 +234,18 @@ def test_explanation_of_many_faults_is_found_though_no_vehicle_has_fewer() -> No
     truth.hardware_offset_a[0], truth.drift[0, 1], truth.offset_a[0] = [0.16, 0.0, -0.16], 0.24, [-0.12, 0.0, 0.24]
     prior = paper_prior(3, 4)
     draws = drawn(rows_of(truth), prior)
-    assert of_supports(draws, weigh(draws, prior)[0], 0)[2, 4, 6, 8][0] > 0.5
+    assert of_supports(draws, posterior.weigh(draws, prior)[0], 0)[2, 4, 6, 8][0] > 0.5
 
 
-@pytest.mark.parametrize("kind", [GAIN, OFFSET])
+@pytest.mark.parametrize("kind", [posterior.GAIN, posterior.OFFSET])
 @pytest.mark.parametrize("every", [1, 4])
 def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None:
     prior = paper_prior(2, 0, 1, 2)
     draws = drawn(rows_of(random_faults(9, vehicles=20, branches=2, sparsity=70.0), seed=9), prior)
     slabs = [Slab(low=low, high=high, tail=0.02) for low, high in ((0.02, 0.3), (0.05, 0.25), (0.1, 0.5))]
-    found = size_evidence(draws, prior, kind, np.stack([slab.density for slab in slabs]), every=every)
-    of = [replace(prior, gain=slab) if kind == GAIN else replace(prior, offset=slab) for slab in slabs]
-    exact = np.array([weigh(draws, each)[1].sum() for each in of])
+    found = posterior.size_evidence(draws, prior, kind, np.stack([slab.density for slab in slabs]), every=every)
+    of = [replace(prior, gain=slab) if kind == posterior.GAIN else replace(prior, offset=slab) for slab in slabs]
+    exact = np.array([posterior.weigh(draws, each)[1].sum() for each in of])
     np.testing.assert_allclose(found - found[0], exact - exact[0], atol=1e-6 if every == 1 else 3.0)
     assert np.argmax(found) == np.argmax(exact) == 1
 
@@ -256,7 +257,7 @@ def test_an_offset_is_known_though_the_gain_of_its_branch_is_not() -> None:
     blind = Errors(slope=0.4, ratio=0.4, intercept=1e-4, junction=1e-4)
     rows = rows_of(truth, errors=blind, currents=np.array([0.001, -0.001]))
     draws = drawn(rows, prior)
-    found = of_supports(draws, weigh(draws, prior)[0], 0)
+    found = of_supports(draws, posterior.weigh(draws, prior)[0], 0)
     gain, away = np.meshgrid(np.linspace(-0.4, 0.3, 701), np.linspace(-8e-4, 8e-4, 161))
     precision = np.linalg.inv(rows.covariance[0])
     log_evidence = []
@@ -281,7 +282,7 @@ def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
     )
     rows = rows_of(no_faults(3, 2), errors=Errors(intercept=0.003, junction=0.003), load=np.array([0.01, 0.004, -0.02]))
     draws = drawn(rows, prior)
-    weight, _ = weigh(draws, prior)
+    weight, _ = posterior.weigh(draws, prior)
     supports = [on for on in all_supports(2) if len(on) <= 1]
     for j in range(3):
         grid = {on: integrated(rows.take(slice(j, j + 1)), prior, on, 2001)[0] for on in supports}
@@ -290,3 +291,46 @@ def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
     loads = draws.values[..., 6] * draws.fits.support[:, :, None, 6]
     assert weight[loads < 0.0].max() < 1e-30
     assert [of_supports(draws, weight, j)[6,][0] > 0.5 for j in range(3)] == [True, False, False]
+
+
+# Prior of the faults: densities, numbers of faults, and the law that they follow
+
+
+def counted(K: int, sparsity: float, vehicles: int = 4000) -> Array:
+    """Numbers of vehicles with so many hardware and sensor faults, as the paper draws them."""
+    faults, tally = random_faults(1, vehicles=vehicles, branches=K, sparsity=sparsity), np.zeros((K + 1, 2 * K + 1))
+    hardware = (faults.hardware_drift != 0.0) + np.count_nonzero(faults.hardware_offset_a[:, :-1], axis=1)
+    np.add.at(tally, (hardware, np.count_nonzero(np.hstack([faults.drift, faults.offset_a]), axis=1)), 1.0)
+    return tally
+
+
+@BRANCHES
+@pytest.mark.parametrize("sparsity", [80.0, 60.0])
+def test_law_of_sparse_faults_is_that_of_the_fleet(K: int, sparsity: float) -> None:
+    tally = counted(K, sparsity)
+    np.testing.assert_allclose(sparse_counts(tally), tally / tally.sum(), atol=0.02)
+
+
+def mass(density: Array, low: float = 0.0, high: float = np.inf) -> float:
+    return float(np.trapezoid(np.where((low < GRID) & (high > GRID), density, 0.0), GRID))
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.05, 0.25), (0.004, 1.0), (0.1, 0.12)])
+@pytest.mark.parametrize("tail", [0.001, 0.1])
+def test_slab_is_uniform_between_its_bounds_and_has_its_tail_beyond(low: float, high: float, tail: float) -> None:
+    density = Slab(low=low, high=high, tail=tail).density
+    assert mass(density) == pytest.approx(1.0, abs=1e-9)
+    assert mass(density - tail * TAIL_DENSITY, 0.85 * low, 1.15 * high) == pytest.approx(1.0 - tail, abs=0.02)
+    middle = np.interp(np.linspace(1.1 * low, 0.9 * high, 9), GRID, density - tail * TAIL_DENSITY)
+    if low < 0.1:
+        np.testing.assert_allclose(middle, middle.mean(), rtol=0.06)
+    assert (density[(GRID > 0.002) & (GRID < 1.5)] > 0.0).all(), "no size is impossible"
+
+
+@BRANCHES
+def test_supports_of_every_prior_sum_to_one(K: int) -> None:
+    for prior in (first_prior(K), known_prior(counted(K, 70.0) / 4000.0, (0.05, 0.25))):
+        ways = [[comb(K, h) * comb(2 * K, s) for s in range(2 * K + 1)] for h in range(K + 1)]
+        assert prior.counts.sum() == pytest.approx(1.0, abs=1e-6)
+        assert np.sum(ways * np.exp(prior.log_supports)) == pytest.approx(1.0, abs=1e-6)
+        assert prior.branches == K

@@ -66,23 +66,20 @@ def test_table_is_read_in_any_order_and_empty_cells_are_not_read(tmp_path: Path)
     assert other["V1", "motor"][2:4] == (3.0, 0.1)
 
 
-@pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        (["vehicle;branch;drift"], r"line 1: columns vehicle;branch;drift; expected each of vehicle, branch, drift"),
-        (["vehicle,branch,drift,drift_sd,drift,drift_sd"], r"line 1: columns .*; expected each of .* once"),
-        ([HEADER], r"no reading below the header; leave --readings out"),
-        ([HEADER, "V3,motor,0,0.1,,"], r"line 2: no vehicle 'V3' in this fleet; there are, for example, V1, V2"),
-        ([HEADER, "copy,motor,0.2,0.1,,"], r"line 2: vehicle 'copy' is left out: same recording as V1"),
-        ([HEADER, "V1,engine,0,0.1,,"], r"line 2: no branch 'engine' in this fleet; known are battery, motor"),
-        ([HEADER, "V1,motor,2 %,0.1,,"], r"line 2: drift is '2 %'; expected a number"),
-        ([HEADER, "V1,motor,0.02,,,"], r"line 2: drift_sd is ''; expected a number, and drift together with drift_sd"),
-        ([HEADER, "V1,motor,,,1.0,0"], r"line 2: offset_sd_a is 0; expected a number from 0\.004 to 360: in A"),
-        ([HEADER, "V1,motor,2,0.1,,"], r"line 2: drift is 2; expected a magnitude from 0 to 0\.9: .*2 % is 0\.02"),
-        ([HEADER, "V1,motor,0,0.1,,", "V1,motor,0,0.1,,"], r"line 3: the motor sensor of V1 stands there twice"),
-        ([HEADER, "V1,motor,0,0.1,,,,7"], r"line 2: 8 cells, and the header has 6 columns"),
-    ],
-)
+@pytest.mark.parametrize(("lines", "message"), [
+    (["vehicle;branch;drift"], r"line 1: columns vehicle;branch;drift; expected each of vehicle, branch, drift"),
+    (["vehicle,branch,drift,drift_sd,drift,drift_sd"], r"line 1: columns .*; expected each of .* once"),
+    ([HEADER], r"no reading below the header; leave --readings out"),
+    ([HEADER, "V3,motor,0,0.1,,"], r"line 2: no vehicle 'V3' in this fleet; there are, for example, V1, V2"),
+    ([HEADER, "copy,motor,0.2,0.1,,"], r"line 2: vehicle 'copy' is left out: same recording as V1"),
+    ([HEADER, "V1,engine,0,0.1,,"], r"line 2: no branch 'engine' in this fleet; known are battery, motor"),
+    ([HEADER, "V1,motor,2 %,0.1,,"], r"line 2: drift is '2 %'; expected a number"),
+    ([HEADER, "V1,motor,0.02,,,"], r"line 2: drift_sd is ''; expected a number, and drift together with drift_sd"),
+    ([HEADER, "V1,motor,,,1.0,0"], r"line 2: offset_sd_a is 0; expected a number from 0\.004 to 360: in A"),
+    ([HEADER, "V1,motor,2,0.1,,"], r"line 2: drift is 2; expected a magnitude from 0 to 0\.9: .*2 % is 0\.02"),
+    ([HEADER, "V1,motor,0,0.1,,", "V1,motor,0,0.1,,"], r"line 3: the motor sensor of V1 stands there twice"),
+    ([HEADER, "V1,motor,0,0.1,,,,7"], r"line 2: 8 cells, and the header has 6 columns"),
+])  # fmt: skip
 def test_slip_is_named_with_its_line(tmp_path: Path, lines: list[str], message: str) -> None:
     with pytest.raises(FleetError, match=message):
         check(read(tmp_path, *lines))
@@ -99,16 +96,9 @@ def test_trusted_vehicle_that_was_read_as_faulty_is_refused(reading: tuple[float
 
 def test_zero_current_and_bench_readings_combine_or_both_drop_out_if_contradictory() -> None:
     shown = {"V1": (4.9, 0.1), "V2": (5.0, 0.1), "V3": (NAN, NAN)}  # by the battery sensor with open contactors
-    vehicles = cast(
-        "list[VehicleSummary]",
-        [
-            SimpleNamespace(
-                vehicle=name,
-                zero_current=ZeroCurrent(offset_a=np.array([offset_a, NAN]), sd_a=np.array([sd_a, NAN])),
-            )
-            for name, (offset_a, sd_a) in shown.items()
-        ],
-    )
+    windows = (ZeroCurrent(offset_a=np.array([o, NAN]), sd_a=np.array([sd, NAN])) for o, sd in shown.values())
+    summaries = [SimpleNamespace(vehicle=name, zero_current=each) for name, each in zip(shown, windows, strict=True)]
+    vehicles = cast("list[VehicleSummary]", summaries)
     bench = {
         **bench_of(NAN, NAN, 5.1, 0.1),
         **bench_of(0.03, 0.001, -5.0, 0.1, "V2", "battery"),

@@ -7,82 +7,55 @@ import pytest
 from msgspec.structs import replace
 
 from calibrator.errors import FleetError
-from calibrator.estimator.results import (
-    MOST_FILES,
-    PARTS,
-    RunRecord,
-    encode_chunk,
-    join_rows,
-    left_out_of,
-    part_file,
-    read_results,
-    read_run,
-    report_of,
-    write_parameter_files,
-    write_run,
-    written_of,
-)
+from calibrator.estimator import results
 from calibrator.report.fleet_table import read_fleet_table
 from calibrator.report.overview import overview_of
 from calibrator.summaries.identity import bucket_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, decode_parameters, read_parameters
 from tests.calibrator.conftest import run_command
+from tests.calibrator.report.results_at_hand import RUN as AT_HAND
 from tests.calibrator.report.results_at_hand import six_vehicle_result
 from tests.ecu_node.vehicles import parameters_for
 
 BUCKETS = 16
-RUN = RunRecord(
-    tool="test",
-    method="posterior",
-    fleet="f",
-    layout="hv_powertrain",
-    branches=["battery", "motor"],
-    model_inputs=[],
-    settings={},
-    created="2026-01-01T00:00:00Z",
-    details={},
-    vehicles=2,
-    buckets=BUCKETS,
-    left_out={},
-    notices=[],
-)
+RUN = replace(AT_HAND, buckets=BUCKETS)
 
 
 def vehicle(database: VehicleDatabase, name: str) -> VehicleParameters:
     return replace(parameters_for(database, battery=(0.1, 0.0), motor=(0.0, 1.0)), vehicle=name)
 
 
-@pytest.fixture(params=[2, MOST_FILES + 1], ids=["a file each", "in parts"])
+@pytest.fixture(params=[2, results.MOST_FILES + 1], ids=["a file each", "in parts"])
 def result(request: pytest.FixtureRequest, tmp_path: Path, database: VehicleDatabase) -> Path:
     """A result of two vehicles, written as one of few or of many."""
     folder = tmp_path / "result"
-    (folder / PARTS).mkdir(parents=True)
+    (folder / results.PARTS).mkdir(parents=True)
     for name in ("v1", "v2"):
-        part_file(folder, bucket_of(name, BUCKETS)).write_bytes(encode_chunk([vehicle(database, name)], {}))
-    join_rows(folder, {})
-    where = write_parameter_files(folder, vehicles=request.param)
-    assert where == ("params" if request.param == 2 else PARTS)
+        results.part_file(folder, bucket_of(name, BUCKETS)).write_bytes(
+            results.encode_chunk([vehicle(database, name)], {})
+        )
+    results.join_rows(folder, {})
+    where = results.write_parameter_files(folder, vehicles=request.param)
+    assert where == ("params" if request.param == 2 else results.PARTS)
     assert (folder / "params").exists() == (where == "params")
-    write_run(folder, RUN)
+    results.write_run(folder, RUN)
     return folder
 
 
 def test_parameters_of_a_vehicle_are_found_however_many_there_are(result: Path) -> None:
     for name in ("v1", "v2"):
-        assert decode_parameters(written_of(result, name).text, name).vehicle == name
-    assert read_run(result) == RUN
+        assert decode_parameters(results.written_of(result, name).text, name).vehicle == name
+    assert results.read_run(result) == RUN
 
 
 @pytest.mark.parametrize("name", ["v3", "../params/v1", ""])
 def test_unknown_vehicle_is_named(result: Path, name: str) -> None:
     with pytest.raises(FleetError, match=rf"no vehicle '{name}' in it; results\.parquet names all that are"):
-        written_of(result, name)
+        results.written_of(result, name)
 
 
-def test_parameter_files_are_written_by_the_command(
-    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_parameter_files(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["params", str(result), "v1", "v2", "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.splitlines() == [str(tmp_path / "out" / f"{name}.json") for name in ("v1", "v2")]
     assert read_parameters(tmp_path / "out" / "v2.json").branches["motor"].offset_a == 1.0
@@ -94,28 +67,26 @@ def test_parameter_files_are_written_by_the_command(
 def test_parameters_that_cannot_be_written_leave_their_vehicle_out(tmp_path: Path, database: VehicleDatabase) -> None:
     good = vehicle(database, "v1")
     bad = replace(good, vehicle="v2", branches={"battery": replace(good.branches["battery"], offset_a=float("nan"))})
-    (tmp_path / PARTS).mkdir()
-    part_file(tmp_path, 0).write_bytes(encode_chunk([bad, good], {}))
-    assert join_rows(tmp_path, {}) == 1
-    (reason,) = left_out_of(tmp_path).values()
+    (tmp_path / results.PARTS).mkdir()
+    results.part_file(tmp_path, 0).write_bytes(results.encode_chunk([bad, good], {}))
+    assert results.join_rows(tmp_path, {}) == 1
+    (reason,) = results.left_out_of(tmp_path).values()
     assert reason.endswith("; look at its recordings")
 
 
 def test_folder_that_is_no_result_is_named(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match=r"run\.json: not a result of 'calibrator calibrate': No such file"):
-        read_run(tmp_path)
+        results.read_run(tmp_path)
     with pytest.raises(FleetError, match=r"results\.parquet: not a result of 'calibrator calibrate'"):
-        read_results(tmp_path)
+        results.read_results(tmp_path)
     (tmp_path / "run.json").write_text('{"tool": 1}')
     with pytest.raises(FleetError, match=r"run\.json: not a run of 'calibrator calibrate': .*; calibrate again"):
-        read_run(tmp_path)
+        results.read_run(tmp_path)
 
 
-def test_vehicles_and_branches_are_counted_as_the_report_page_counts_them(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_counts_of_result_and_report_page_are_equal(tmp_path: Path, database: VehicleDatabase) -> None:
     folder = six_vehicle_result(tmp_path / "result", database)
-    report = report_of(folder, read_run(folder), parameters="p", shown=folder)
+    report = results.report_of(folder, results.read_run(folder), parameters="p", shown=folder)
     page = overview_of(read_fleet_table(folder))
     assert report.verdicts == {"corrected": 2, "no sensor fault": 2, "cannot tell": 2}
     assert report.held_back == {"harm limit": 1, "beyond the limits": 1}

@@ -130,9 +130,7 @@ def test_result_is_the_same_for_any_number_of_workers(
     assert contents(tmp_path / "two") == contents(result)
 
 
-def test_few_vehicles_are_calibrated_by_this_process_alone(
-    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_vehicles_start_no_processes(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_many, "_outcomes", None)  # which starts processes
     assert calibrate(store.url, tmp_path / "out", "--workers", 2).returncode == 0
 
@@ -140,22 +138,23 @@ def test_few_vehicles_are_calibrated_by_this_process_alone(
 # What is refused
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "message"),
-    [
-        (("--method", "published"), 1, "a store of summaries, and --method published needs the drives"),
-        (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
-        (("--charge", "battery=3:0.1"), 1, "a store of summaries, and --charge needs the drives"),
-        (("--meter", "motor"), 1, "a store of summaries, and --meter needs the drives"),
-        (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
-        (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
-        (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
-        (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
-        (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
-        (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
-        (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
-    ],
-)
+@pytest.mark.parametrize(("options", "code", "message"), [
+    (("--method", "published"), 1, "a store of summaries, and --method published needs the drives"),
+    (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
+    (("--charge", "battery=3:0.1"), 1, "a store of summaries, and --charge needs the drives"),
+    (("--meter", "motor"), 1, "a store of summaries, and --meter needs the drives"),
+    (("--load", "much"), 2, "expected a number and its standard deviation"),
+    (("--load=-3:0.1",), 2, "expected what flows out of the junction"),
+    (("--charge", "battery"), 2, "expected a branch with its charge"),
+    (("--charge", "battery=3"), 2, "give its standard deviation"),
+    (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
+    (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
+    (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
+    (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
+    (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
+    (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
+    (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
+])  # fmt: skip
 def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
     store: SummaryStore, tmp_path: Path, options: tuple[str, ...], code: int, message: str, monkeypatch: Any
 ) -> None:
@@ -171,10 +170,7 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
     shutil.copytree(store.url, tmp_path / "both")
     (tmp_path / "both" / "drives").mkdir()
     shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
-    (tmp_path / "file").touch()
     for place, code, message in (
-        (tmp_path / "nothing", 1, "nothing: no such folder, store of drives or store of summaries"),
-        (tmp_path / "file", 1, "file: not a known log format; expected .log"),
         (tmp_path / "both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them"),
         (tmp_path / "empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
         ("", 2, "an empty name; give the path"),
@@ -187,7 +183,7 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
 # Second pass
 
 
-def test_vehicle_gets_the_same_parameters_in_any_company(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+def test_same_parameters_in_any_company(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
     bucket = fullest(store)
     records = store.read(bucket)
     together = texts(calibrate_bucket(bucket, store=store, task=task))
@@ -199,9 +195,7 @@ def test_vehicle_gets_the_same_parameters_in_any_company(store: SummaryStore, ta
 
 
 @pytest.mark.parametrize("what", ["moments", "noise_a2"])
-def test_vehicle_with_impossible_numbers_stops_neither_pass(
-    store: SummaryStore, task: FleetTask, tmp_path: Path, what: str
-) -> None:
+def test_impossible_numbers_stop_neither_pass(store: SummaryStore, task: FleetTask, tmp_path: Path, what: str) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
     expected = texts(calibrate_bucket(bucket, store=store, task=task))
@@ -218,9 +212,7 @@ def test_vehicle_with_impossible_numbers_stops_neither_pass(
     assert left_out(chunk)[bad].startswith("its summary holds impossible numbers; look at its recordings")
 
 
-def test_vehicle_without_usable_drives_is_left_out_with_its_reason(
-    store: SummaryStore, task: FleetTask, tmp_path: Path
-) -> None:
+def test_vehicle_without_usable_drives_is_left_out(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
     bad = next(name for name in (f"V9{j:02d}" for j in range(100)) if store.bucket_of(name) == bucket)
@@ -243,13 +235,10 @@ def failing_for(bad: str, error: Exception, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(FleetTask, "estimate", refusing)
 
 
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (FleetError("evidence is not finite"), "its evidence cannot be used: evidence is not finite; look at its rec"),
-        (KeyError("x"), "internal error: KeyError: 'x' (test_run.py:"),
-    ],
-)
+@pytest.mark.parametrize(("error", "reason"), [
+    (FleetError("evidence is not finite"), "its evidence cannot be used: evidence is not finite; look at its rec"),
+    (KeyError("x"), "internal error: KeyError: 'x' (test_run.py:"),
+])  # fmt: skip
 def test_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
     store: SummaryStore, task: FleetTask, monkeypatch: pytest.MonkeyPatch, error: Exception, reason: str
 ) -> None:
@@ -262,9 +251,7 @@ def test_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
     assert left_out(chunk)[bad].startswith(reason)
 
 
-def test_internal_error_is_named_and_ends_the_command_with_70(
-    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_internal_error_ends_with_70(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failing_for("V012", ZeroDivisionError("by nothing"), monkeypatch)
     done = calibrate(store.url, tmp_path / "out", "--workers", 1)
     assert done.returncode == 70
@@ -303,9 +290,7 @@ def test_only_those_who_drove_since_are_calibrated_and_moved_sensors_from_their_
     assert abs(battery["offset_a"] - faults.offset_a[0, 0]) <= 4.0 * battery["offset_sd_a"]
 
 
-def test_vehicle_of_the_earlier_result_that_is_in_the_store_no_more_is_named(
-    store: SummaryStore, result: Path, tmp_path: Path
-) -> None:
+def test_vehicle_that_left_the_store_is_named(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     """Also if it was the only one of its bucket."""
     shutil.copytree(store.url, tmp_path / "store")
     gone = {name for name in (f"V{j:03d}" for j in range(VEHICLES)) if store.bucket_of(name) == fullest(store)}
@@ -317,19 +302,12 @@ def test_vehicle_of_the_earlier_result_that_is_in_the_store_no_more_is_named(
     assert left_out_of(tmp_path / "out") == dict.fromkeys(gone, why)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        (
-            "method",
-            "published",
-            "its method is published, that of this run posterior; calibrate without --since",
-        ),
-        ("branches", ["battery"], "its list of branches is battery, that of this run battery, motor"),
-        ("layout_sha256", "0", "its version of "),
-        ("buckets", 32, "its number of buckets is 32, that of this run 16"),
-    ],
-)
+@pytest.mark.parametrize(("key", "value", "message"), [
+    ("method", "published", "its method is published, that of this run posterior; calibrate without --since"),
+    ("branches", ["battery"], "its list of branches is battery, that of this run battery, motor"),
+    ("layout_sha256", "0", "its version of "),
+    ("buckets", 32, "its number of buckets is 32, that of this run 16"),
+])  # fmt: skip
 def test_since_a_result_of_something_else_is_refused(
     store: SummaryStore, result: Path, tmp_path: Path, key: str, value: object, message: str
 ) -> None:

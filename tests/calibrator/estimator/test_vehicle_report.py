@@ -68,50 +68,24 @@ def advice(found: FleetEstimate) -> str:
     return deciding_evidence(found, 0, NAMES, layout="hv.toml")[0]
 
 
-@pytest.mark.parametrize(
-    ("explanations", "held_back", "text"),
-    [
-        (
-            (of(0.6, offset_a=(40, 0)), of(0.4, offset_a=(0, 40))),
-            ("", ""),
-            "a zero-current window (contactors open) would decide: the battery sensor then shows +40.0 A or +0.0 A",
-        ),
-        (
-            (of(0.6, drift=(0.1, 0)), of(0.4, drift=(0, -0.2))),
-            ("", ""),
-            "a check of the motor sensor against a reference would decide: its gain is off by +0.0 % or -20.0 %",
-        ),
-        (
-            (of(0.5, drift=(0.1, 0)), of(0.5, drift=(0.1, 0))),
-            ("", ""),
-            "the explanations differ in the vehicle, not in its sensors: inspect the hardware",
-        ),
-        (  # of a branch that is held back, the explanation in its way counts, not the second one
-            (
-                of(0.958, drift=(0.1, 0), offset_a=(0, 8)),
-                of(0.04, drift=(0.2, 0), offset_a=(0, 8)),
-                of(0.002, drift=(0.1, 0), offset_a=(8, 0)),
-            ),
-            ("", "harm limit"),
-            "a zero-current window (contactors open) would decide: the battery sensor then shows +0.0 A or +8.0 A",
-        ),
-        (
-            (of(0.99, drift=(0.1, 0)), of(0.01, drift=(0, 0.1))),
-            ("harm limit", ""),
-            "a check of the battery sensor against a reference would decide: its gain is off by +10.0 % or +0.0 %",
-        ),
-        (
-            (of(1.0, drift=(0.9, 0)),),
-            ("beyond the limits", ""),
-            "the battery sensor is off by +90.0 % and +0.0 A, beyond the limits of hv.toml: replace the sensor",
-        ),
-        (
-            (of(1.0, drift=(0.9, 0)),),
-            ("reference in doubt", ""),
-            "bench-checked vehicles would decide: the fleet's reference is in doubt for branch battery",
-        ),
-    ],
-)
+WINDOW = "a zero-current window (contactors open) would decide: the battery sensor then shows +{:.1f} A or +{:.1f} A"
+CHECK = "a check of the {} sensor against a reference would decide: its gain is off by {:+.1f} % or {:+.1f} %"
+
+
+@pytest.mark.parametrize(("explanations", "held_back", "text"), [
+    ((of(0.6, offset_a=(40, 0)), of(0.4, offset_a=(0, 40))), ("", ""), WINDOW.format(40, 0)),
+    ((of(0.6, drift=(0.1, 0)), of(0.4, drift=(0, -0.2))), ("", ""), CHECK.format("motor", 0, -20)),
+    ((of(0.5, drift=(0.1, 0)), of(0.5, drift=(0.1, 0))), ("", ""),
+     "the explanations differ in the vehicle, not in its sensors: inspect the hardware"),
+    # of a branch that is held back, the explanation in its way counts, not the second one
+    ((of(0.958, drift=(0.1, 0), offset_a=(0, 8)), of(0.04, drift=(0.2, 0), offset_a=(0, 8)),
+      of(0.002, drift=(0.1, 0), offset_a=(8, 0))), ("", "harm limit"), WINDOW.format(0, 8)),
+    ((of(0.99, drift=(0.1, 0)), of(0.01, drift=(0, 0.1))), ("harm limit", ""), CHECK.format("battery", 10, 0)),
+    ((of(1.0, drift=(0.9, 0)),), ("beyond the limits", ""),
+     "the battery sensor is off by +90.0 % and +0.0 A, beyond the limits of hv.toml: replace the sensor"),
+    ((of(1.0, drift=(0.9, 0)),), ("reference in doubt", ""),
+     "bench-checked vehicles would decide: the fleet's reference is in doubt for branch battery"),
+])  # fmt: skip
 def test_what_would_decide(explanations: tuple[Explanation, ...], held_back: tuple[str, str], text: str) -> None:
     assert advice(estimate(*explanations, held_back=held_back)).startswith(text)
 

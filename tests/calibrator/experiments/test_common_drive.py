@@ -13,10 +13,11 @@ from calibrator.experiments.common_drive import (
     measured_moments,
 )
 from calibrator.experiments.figures import figure_rows, judge
-from calibrator.experiments.methods import CEILING, PERFECT, POSTERIOR, THRESHOLD, TREE
-from calibrator.experiments.trial import ComparedMethod
+from calibrator.experiments.methods import BASELINES, CEILING, PERFECT, POSTERIOR, THRESHOLD, TREE, MethodRow
+from calibrator.experiments.recorded_trips import RecordedCase, recorded_trial
+from calibrator.experiments.trial import ComparedMethod, Trial
 from calibrator.faults import slopes_and_intercepts
-from tests.calibrator.experiments.small_trials import smooth_drive
+from tests.calibrator.experiments.small_trials import small_fleet, smooth_drive
 
 CASE = CommonCase(vehicles=100, training_vehicles=1000)
 
@@ -118,3 +119,32 @@ def test_builtin_drive_has_the_branches_asked_for_and_another_unseen_drive() -> 
     broken = np.ones((10, 2))
     with pytest.raises(DriveError, match="must sum to zero; the worst sum is 2 A"):
         CommonDrive(name="broken", i_s=broken, inputs=np.ones((10, 1)), full_scale_a=400.0, unseen=broken)
+
+
+# Baselines: each finds what it is made for
+
+
+def rate(method: MethodRow, trial: Trial) -> float:
+    return float(judge(method.estimate(trial), trial)["recovery_rate"].mean())
+
+
+def test_best_subset_lasso_and_median_recover_single_faults() -> None:
+    trial = recorded_trial(small_fleet(), RecordedCase(), 0)
+    best, lasso, median, *_ = BASELINES
+    assert rate(best, trial) >= 0.8
+    assert np.mean(best.estimate(trial).hardware == trial.truth.has_hardware_fault) >= 0.8
+    assert rate(lasso, trial) >= 0.6
+    assert rate(median, trial) >= 0.4
+    case = CommonCase(vehicles=60, sparsity=80.0)
+    assert rate(best, common_trial(smooth_drive(), case, 0)) >= 0.9
+
+
+@pytest.mark.parametrize("baseline", BASELINES[3:], ids=lambda baseline: baseline.name)
+def test_methods_on_the_junction_law_alone_know_ratios_of_gains(baseline: MethodRow) -> None:
+    trial = common_trial(smooth_drive(), CommonCase(vehicles=40, sparsity=80.0), 0)
+    found = baseline.estimate(trial)
+    np.testing.assert_array_equal(found.hardware, False)
+    corrected = np.all(found.corrected, axis=1)
+    gains, true = (1.0 + found.faults.drift, 1.0 + trial.truth.drift)
+    ratio, wanted = ((own[:, 0] / own[:, 1])[corrected] for own in (gains, true))
+    np.testing.assert_allclose(ratio, wanted, rtol=1e-3)

@@ -2,7 +2,8 @@
 
 import json
 import re
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR, MethodRo
 from calibrator.experiments.pages import headline, result_markdown, result_table, write_page
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
 from calibrator.experiments.runner import pool_confidences, run_experiment
+from calibrator.experiments.trial import ComparedMethod, Estimate, Trial
+from calibrator.faults import Faults
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
 
 RUN = [name for name in EXPERIMENTS if name != CALIBRATION.name]
@@ -120,9 +123,7 @@ def test_figures_depend_on_the_seed_and_not_on_the_number_of_processes(snr: Expe
     assert other.figures["of"].max() == 2 * again.figures["of"].max(), "all trials of a setting count"
 
 
-def test_tables_put_paper_published_method_and_default_side_by_side_and_explain_what_is_there(
-    snr: ExperimentResult,
-) -> None:
+def test_tables_put_paper_and_methods_side_by_side_and_explain_columns(snr: ExperimentResult) -> None:
     table = headline(snr)
     assert list(table.columns[:5]) == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
     assert table[["SNR [dB]", "paper"]].to_numpy().tolist() == [["10", "-"], ["20", "0.91"]]
@@ -168,18 +169,15 @@ TWICE = (Setting(x=1.0, case=CommonCase()),) * 2
 NO_TABLE = "^snr: expected a method, and settings that differ in x or series$"
 
 
-@pytest.mark.parametrize(
-    ("change", "repetitions", "message"),
-    [
-        ({"settings": (Setting(x=1.0, case=RecordedCase()),)}, 1, "RecordedCase cannot be run on a CommonDrive"),
-        ({}, 0, "at least 1 repetition, not 0"),
-        ({"settings": (Setting(x=1.0, case=CommonCase(branches=4)),)}, 1, "4 branches: drive smooth has 2 to 2"),
-        ({"settings": ()}, 1, NO_TABLE),
-        ({"settings": TWICE}, 1, NO_TABLE),
-        ({"methods": ()}, 1, NO_TABLE),
-        ({"methods": (PERFECT, POSTERIOR, PERFECT)}, 1, "^2 methods are called 'published/perfect'; give each method"),
-    ],
-)
+@pytest.mark.parametrize(("change", "repetitions", "message"), [
+    ({"settings": (Setting(x=1.0, case=RecordedCase()),)}, 1, "RecordedCase cannot be run on a CommonDrive"),
+    ({}, 0, "at least 1 repetition, not 0"),
+    ({"settings": (Setting(x=1.0, case=CommonCase(branches=4)),)}, 1, "4 branches: drive smooth has 2 to 2"),
+    ({"settings": ()}, 1, NO_TABLE),
+    ({"settings": TWICE}, 1, NO_TABLE),
+    ({"methods": ()}, 1, NO_TABLE),
+    ({"methods": (PERFECT, POSTERIOR, PERFECT)}, 1, "^2 methods are called 'published/perfect'; give each method"),
+])  # fmt: skip
 def test_what_makes_no_table_is_refused(change: dict[str, Any], repetitions: int, message: str) -> None:
     with pytest.raises(FleetError, match=message):
         run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive(), repetitions=repetitions)
@@ -204,3 +202,66 @@ def test_command_runs_records_and_pools(tmp_path: Path) -> None:
     assert (tmp_path / "results" / "calibration.png").is_file()
     listed = CliRunner().invoke(app, ["experiment"]).stdout.splitlines()
     assert [line.split()[0] for line in listed] == list(EXPERIMENTS)
+
+
+# Methods of one's own beside the built-in ones, or alone
+
+
+N, K = 20, 2
+MANY = np.ones((N, K))
+Change = Callable[[Estimate], Any]
+
+
+@dataclass(frozen=True)
+class Own:
+    """Finds no faults, and says what it is told to say."""
+
+    name: str = "own"
+    change: Change = lambda estimate: estimate
+
+    def estimate(self, trial: Trial) -> Estimate:
+        assert len(trial.truth) == N
+        zero = np.zeros((N, K))
+        faults = Faults(hardware_drift=np.zeros(N), hardware_offset_a=zero, drift=zero, offset_a=zero)
+        found = Estimate(faults=faults, hardware=np.zeros(N, bool), corrected=zero > 0.0, confidence=None, failed=0)
+        return self.change(found)  # type: ignore[no-any-return]
+
+
+def with_faults(**changed: Any) -> Change:
+    return lambda estimate: replace(estimate, faults=replace(estimate.faults, **changed))
+
+
+def run(*methods: ComparedMethod) -> ExperimentResult:
+    return run_experiment(EXPERIMENTS["classifier"].small(), smooth_drive(), methods=methods, repetitions=1)
+
+
+def test_own_methods_stand_beside_the_paper_and_confidence_is_of_the_first_that_has_one() -> None:
+    sure = Own(change=lambda estimate: replace(estimate, confidence=np.full(N, 0.8)))
+    result = run(PERFECT, Own("silent"), sure)
+    table = headline(result)
+    assert list(table.columns[:6]) == ["reading of S", "sparsity S [%]", "paper", PERFECT.name, "silent", "own"]
+    assert table.iloc[:, :3].to_numpy().tolist() == [["", "60", "0.91"], ["3 of 6", "60", "0.91"]]
+    assert table["confidence"].iloc[0] == "0.800"
+    assert "then figures of own:" in result_markdown(result)
+    silent = run(Own("silent"))
+    assert list(headline(silent).columns[2:]) == ["paper", "silent"]
+    assert "with 95 % intervals:" in result_markdown(silent)
+    both = run(sure, POSTERIOR)
+    default = both.value("confidence", x=60.0, method=POSTERIOR.name)
+    assert headline(both)["confidence"].iloc[0] == f"{default:.3f}"
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda _: MANY, r"what estimate\(\) returned is float64 of shape \(20, 2\), expected an Estimate; see"),
+    (lambda e: replace(e, faults=None), "faults is NoneType, expected Faults of calibrator.faults"),
+    (with_faults(drift=None), r"faults.drift is NoneType, expected finite numbers of shape \(20, 2\)"),
+    (with_faults(hardware_drift=np.zeros(3)), r"faults.hardware_drift is .*\(3,\), expected .*\(20,\)"),
+    (with_faults(drift=MANY * np.nan), "faults.drift .* expected finite numbers .*, 0 where no fault is found"),
+    (lambda e: replace(e, hardware=np.zeros(N)), "hardware is float64 .* expected bool"),
+    (lambda e: replace(e, confidence=np.full(N, 1.5)), "confidence is .* probabilities from 0 to 1"),
+    (lambda e: replace(e, drift_sd=MANY[:3], offset_sd_a=MANY), r"drift_sd is .* \(3, 2\), expected .*\(20, 2\)"),
+    (lambda e: replace(e, findings=[["load"]]), "findings of 1 vehicles is list, expected those of 20, or none"),
+])  # fmt: skip
+def test_what_is_no_estimate_is_refused_with_the_name_of_the_method(change: Change, message: str) -> None:
+    with pytest.raises(FleetError, match=f"^method 'mine': {message}"):
+        run(Own("mine", change))

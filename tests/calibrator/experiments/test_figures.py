@@ -84,9 +84,7 @@ def test_calibration_error_by_chance_is_the_usual_one_of_an_exact_confidence() -
     [(0.1, 0.0, 1.0, 0.0), (0.1, 0.2, 0.5, 0.5), (0.1, -1.0, 0.5, 0.5)],
     ids=["truth", "a sound branch is corrected", "a gain of zero cannot be corrected"],
 )
-def test_correction_that_makes_a_branch_worse_is_harm(
-    drift: float, harm_second: float, recovery_rate: float, harmed: float
-) -> None:
+def test_worse_branch_is_harm(drift: float, harm_second: float, recovery_rate: float, harmed: float) -> None:
     figures = figures_of(judge(*two_vehicles(drift=drift, harm_second=harm_second)))
     assert (figures["recovery_rate"].value, figures["harmed"].value) == (recovery_rate, harmed)
     assert figures["deployed"].value == 1.0

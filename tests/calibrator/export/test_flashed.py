@@ -129,9 +129,7 @@ def test_image_of_big_endian_units_is_mirrored_word_by_word(vehicles: tuple[Path
     assert b"".join(little[at : at + 8][::-1] for at in range(0, len(little), 8)) == big
 
 
-def test_program_that_is_not_the_linked_one_of_this_layout_is_refused(
-    vehicles: tuple[Path, Checked], make_database: MakeDatabase, tmp_path: Path
-) -> None:
+def test_unfit_program_is_refused(vehicles: tuple[Path, Checked], make_database: MakeDatabase, tmp_path: Path) -> None:
     program, checked = vehicles
     (tmp_path / "text").write_text("no ELF")
     cases = [

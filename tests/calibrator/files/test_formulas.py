@@ -14,20 +14,11 @@ from tests.ecu_node.vehicles import SMALL_LAYOUT
 VALUES = {"a": np.array([1.0, -2.0, 4.0]), "b": np.array([2.0, 0.0, -1.0])}
 
 
-@pytest.mark.parametrize(
-    ("formula", "expected"),
-    [
-        ("a * b", [2.0, -0.0, -4.0]),
-        ("a + 2 * b - 1", [4.0, -3.0, 1.0]),
-        ("-(a ** 2)", [-1.0, -4.0, -16.0]),
-        ("+a", [1.0, -2.0, 4.0]),
-        ("positive(a)", [1.0, 0.0, 4.0]),
-        ("negative(a)", [0.0, -2.0, 0.0]),
-        ("abs(a)", [1.0, 2.0, 4.0]),
-        ("sqrt(abs(a))", [1.0, 2**0.5, 2.0]),
-        ("3", [3.0, 3.0, 3.0]),
-    ],
-)
+@pytest.mark.parametrize(("formula", "expected"), [
+    ("a * b", [2.0, -0.0, -4.0]), ("a + 2 * b - 1", [4.0, -3.0, 1.0]), ("-(a ** 2)", [-1.0, -4.0, -16.0]),
+    ("+a", [1.0, -2.0, 4.0]), ("positive(a)", [1.0, 0.0, 4.0]), ("negative(a)", [0.0, -2.0, 0.0]),
+    ("abs(a)", [1.0, 2.0, 4.0]), ("sqrt(abs(a))", [1.0, 2**0.5, 2.0]), ("3", [3.0, 3.0, 3.0]),
+])  # fmt: skip
 def test_a_formula_is_evaluated_at_each_sample(formula: str, expected: list[float]) -> None:
     np.testing.assert_allclose(evaluate_formula(formula, VALUES), expected)
 
@@ -40,15 +31,10 @@ def test_undefined_formula_gives_a_non_finite_value_without_warning(formula: str
     assert np.isnan(formula_value(parse_formula(formula), {name: float(value[1]) for name, value in VALUES.items()}))
 
 
-@pytest.mark.parametrize(
-    ("formula", "words"),
-    [
-        ("speed * 2", r"speed is no \[\[input\]\]"),
-        ("d + 1", r"d is no \[\[input\]\]"),
-        ("open(1)", "not allowed"),
-        ("a b", "not arithmetic"),
-    ],
-)
+@pytest.mark.parametrize(("formula", "words"), [
+    ("speed * 2", r"speed is no \[\[input\]\]"), ("d + 1", r"d is no \[\[input\]\]"), ("open(1)", "not allowed"),
+    ("a b", "not arithmetic"),
+])  # fmt: skip
 def test_layout_with_wrong_formula_is_refused(tmp_path: Path, formula: str, words: str) -> None:
     path = tmp_path / "small.toml"
     derived = f'derived = [{{ name = "d", formula = "{formula}" }}]\nfull_scale_a'

@@ -108,9 +108,7 @@ def test_command_killed_at_any_moment_gives_the_identical_result_when_run_again(
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["import", "summarise"])
-def test_lost_worker_and_restarted_scheduler_change_nothing(
-    tmp_path: Path, database: VehicleDatabase, command: str
-) -> None:
+def test_lost_worker_and_scheduler_change_nothing(tmp_path: Path, database: VehicleDatabase, command: str) -> None:
     logs = fleet_of(24, tmp_path, database)
     with started(command, logs, tmp_path / "here", "--workers", 1) as here:
         here.communicate()

@@ -1,7 +1,6 @@
 """The same on a Dask cluster with two workers: results, lost workers, a scheduler that is restarted, object storage."""
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -20,11 +19,11 @@ from calibrator.artificial.trips import BuiltinTrips
 from calibrator.errors import FleetError
 from calibrator.files.storage import Storage, open_storage, walk
 from calibrator.processes import run_many as module
-from calibrator.processes.run_many import Failed, Workers, run_many, try_many
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.summaries.summary_store import existing_store
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.processes.dask_cluster import DaskCluster, gated, of_no_disk
-from tests.calibrator.processes.test_run_many import CAUSES, LIMIT_S, dying_once, hostile
+from tests.calibrator.processes.test_run_many import dying_once, hostile_items_cost_themselves_only
 
 pytest.importorskip("distributed")
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
@@ -40,18 +39,10 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
 
 
 def test_hostile_items_cost_themselves_only(tmp_path: Path, where: Workers) -> None:
-    os.mkfifo(tmp_path / "endless")
-    read = partial(hostile, endless=tmp_path / "endless")
-    first, *failed, last = (outcome for _, outcome in try_many(read, range(8), where, limit_s=LIMIT_S))
-    assert (first, last) == (0, 7)
-    for outcome, cause in zip(failed, CAUSES, strict=True):
-        assert isinstance(outcome, Failed)
-        assert outcome.reason.startswith(cause.partition(" by ")[0])  # a worker's process may not know the signal
+    hostile_items_cost_themselves_only(where, tmp_path, knows_signals=False)  # the process of a worker may not
 
 
-def test_errors_of_function_and_items_are_not_taken_for_a_lost_scheduler(
-    where: Workers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_of_items_are_no_lost_scheduler(where: Workers, monkeypatch: pytest.MonkeyPatch) -> None:
     def items() -> Iterator[int]:
         yield from range(2, 60)
         raise OSError("no more")
@@ -67,9 +58,7 @@ def test_errors_of_function_and_items_are_not_taken_for_a_lost_scheduler(
         list(run_many(abs, range(3), where))
 
 
-def test_scheduler_that_starts_only_now_is_waited_for_and_a_lost_worker_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_late_scheduler_and_lost_worker_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As one that is started again after it was lost."""
     monkeypatch.setattr(module, "CONNECT_S", 60.0)
     with DaskCluster(tmp_path, at_once=False) as cluster:
@@ -159,13 +148,9 @@ def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
     server.start()
     host, port = server.get_host_and_port()
-    environment = {
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-        "AWS_ACCESS_KEY_ID": "testing",
-        "AWS_SECRET_ACCESS_KEY": "testing",
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "SOURCE_DATE_EPOCH": "1700000000",
-    }
+    environment = dict.fromkeys(("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"), "testing")
+    environment |= {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_DEFAULT_REGION": "us-east-1"}
+    environment["SOURCE_DATE_EPOCH"] = "1700000000"
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment.items():
             patch.setenv(name, value)
@@ -220,9 +205,7 @@ def test_drives_in_object_storage_are_those_in_a_folder(logs: Path, tmp_path: Pa
 
 
 @pytest.mark.long
-def test_logs_and_stores_in_object_storage_give_the_same_from_cluster_workers(
-    logs: Path, tmp_path: Path, s3: dict[str, str]
-) -> None:
+def test_cluster_reads_object_storage_as_this_machine_does(logs: Path, tmp_path: Path, s3: dict[str, str]) -> None:
     layout = ("--layout", LAYOUT)
     for processes in (1, 2):
         command("summarise", logs, *layout, "--out", tmp_path / f"s{processes}", "--workers", processes)

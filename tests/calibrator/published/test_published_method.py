@@ -10,15 +10,7 @@ import pytest
 from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.published.classify import (
-    Classification,
-    classify_by_expected_trees,
-    classify_by_threshold,
-    classify_by_trees,
-    classify_by_truth,
-    decision_criterion,
-    expected_features,
-)
+from calibrator.published import classify
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.published.recovery import recover_fleet
 from calibrator.published.state_space import StateSpaceModel, VehicleModel, evidence_of_models
@@ -104,30 +96,19 @@ def test_criterion_is_the_squared_distance_of_the_projections() -> None:
     features = np.append(np.mean((i_m - i_s) ** 2, axis=0), np.mean(i_m.sum(axis=1) ** 2))
     projected = i_m - i_m.mean(axis=1, keepdims=True)
     expected = np.mean(np.sum((projected - i_s) ** 2, axis=1))
-    assert decision_criterion(features[None])[0] == pytest.approx(expected)
+    assert classify.decision_criterion(features[None])[0] == pytest.approx(expected)
 
 
 def test_threshold_is_a_third_of_the_fleets_spread() -> None:
     eta = np.array([0.0, 1.0, 2.0, 9.0])
-    found = classify_by_threshold(np.column_stack([eta, np.zeros(4), np.zeros(4)]))
+    found = classify.classify_by_threshold(np.column_stack([eta, np.zeros(4), np.zeros(4)]))
     np.testing.assert_array_equal(found.hardware, eta > eta.std(ddof=1) / 3.0)
     assert found.sensor.all()
 
 
-def test_trees_learn_what_separates_the_classes() -> None:
-    rng = np.random.default_rng(2)
-    hardware, sensor = rng.random(2000) < 0.5, rng.random(2000) < 0.5
-    zero = np.zeros((2000, 2))
-    truth = Faults(hardware_drift=0.1 * hardware, hardware_offset_a=zero, drift=0.2 * sensor[:, None], offset_a=zero)
-    features = np.column_stack([10.0 * hardware, 10.0 * hardware + 5.0 * sensor, 5.0 * sensor]) + rng.random((2000, 3))
-    found = classify_by_trees(features[:1000], truth.take(slice(0, 1000)), features[1000:])
-    np.testing.assert_array_equal(found.hardware, hardware[1000:])
-    np.testing.assert_array_equal(found.sensor, sensor[1000:])
-
-
 def test_expected_features_follow_the_mean_of_a_fleet_that_is_not_symmetric() -> None:
     faults = fleet(40, symmetric=False)
-    expected = expected_features(faults, ideal_currents(), np.zeros(3), reference_vehicles=40)
+    expected = classify.expected_features(faults, ideal_currents(), np.zeros(3), reference_vehicles=40)
     np.testing.assert_allclose(evidence_of_noisy(faults, 0.0)[0].features, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -135,7 +116,7 @@ def test_expected_features_follow_the_mean_of_a_fleet_that_is_not_symmetric() ->
 def test_single_faults_are_recovered_exactly_without_noise(branches: int) -> None:
     x = 0.15 * np.eye(3 * branches)
     evidence, truth = evidence_of(x)
-    both = Classification(hardware=np.ones(len(x), bool), sensor=np.ones(len(x), bool))
+    both = classify.Classification(hardware=np.ones(len(x), bool), sensor=np.ones(len(x), bool))
     found = recover_fleet(evidence, both, full_scale_a=FULL_SCALE_A)
     assert not found.failed
     np.testing.assert_allclose(found.faults.drift, truth.drift, atol=1e-6)
@@ -146,7 +127,7 @@ def test_single_faults_are_recovered_exactly_without_noise(branches: int) -> Non
 def test_a_failed_optimisation_is_named_and_the_fleet_goes_on() -> None:
     evidence, truth = evidence_of(np.tile([0.1, 0.0, 0.0, 0.0, 0.1, 0.0], (2, 1)))
     evidence.slopes[0, 0] = np.nan
-    found = recover_fleet(evidence, classify_by_truth(truth), full_scale_a=FULL_SCALE_A)
+    found = recover_fleet(evidence, classify.classify_by_truth(truth), full_scale_a=FULL_SCALE_A)
     assert list(found.failed) == [0]
     assert "basis pursuit" in found.failed[0]
     assert not found.faults.offset_a[0].any()
@@ -157,9 +138,9 @@ def test_a_failed_optimisation_is_named_and_the_fleet_goes_on() -> None:
 def test_symmetric_fleet_is_recovered_through_noise(perfect: bool, least: float) -> None:
     faults = fleet(120)
     evidence, reference = evidence_of_noisy(faults, 0.05)
-    classes = classify_by_truth(faults)
+    classes = classify.classify_by_truth(faults)
     if not perfect:
-        classes = classify_by_expected_trees(
+        classes = classify.classify_by_expected_trees(
             evidence.features,
             reference,
             np.full(3, 0.05),

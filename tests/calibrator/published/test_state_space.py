@@ -6,12 +6,7 @@ from scipy.signal import lfilter
 
 from calibrator.drive import Array
 from calibrator.errors import DriveError
-from calibrator.published.state_space import (
-    StateSpaceModel,
-    choose_order,
-    identify_model,
-    simulation_snr_db,
-)
+from calibrator.published.state_space import StateSpaceModel, choose_order, identify_model, simulation_snr_db
 
 SAMPLES, INPUTS, BRANCHES = 12_000, 5, 4
 TRAIN = 9_600

@@ -105,9 +105,7 @@ messages = st.builds(
 
 
 @given(st.lists(messages, max_size=60), st.sampled_from([200, 1000, 1 << 17]), st.sampled_from([0, 6]))
-def test_any_log_gives_the_frames_that_python_can_reads(
-    log: list[can.Message], container_bytes: int, compression: int
-) -> None:
+def test_any_log_is_read_as_by_python_can(log: list[can.Message], container_bytes: int, compression: int) -> None:
     assert_the_same(written(log, container_bytes=container_bytes, compression=compression))
 
 
@@ -127,38 +125,30 @@ def test_the_newer_fd_object_is_read_with_what_it_leaves_out_as_zeros(length: in
     assert frames.data[0, : frames.length[0]].tobytes() == expected
 
 
-@pytest.mark.parametrize(
-    "spoilt",
-    [
-        SOUND[:6] + struct.pack("<H", 7) + SOUND[8:],  # a header of unknown version
-        an_object(CLASSIC, classic(0x11, b"x"), time=2**64 - 1),
-    ],
-)
+@pytest.mark.parametrize("spoilt", [
+    SOUND[:6] + struct.pack("<H", 7) + SOUND[8:],  # a header of unknown version
+    an_object(CLASSIC, classic(0x11, b"x"), time=2**64 - 1),
+])  # fmt: skip
 def test_an_object_that_cannot_be_a_frame_is_counted_as_damaged(spoilt: bytes) -> None:
     frames = blf_frames(io.BytesIO(of_objects(spoilt, SOUND)), "x.blf")
     assert (frames.key.tolist(), frames.damaged) == ([0x10], 1)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (of_objects(an_object(CLASSIC, b"1234")), "an object of 36 bytes, which is impossible for its type"),
-        (of_objects(SOUND[:8] + bytes(4) + SOUND[12:]), "a container holds an object of 0 bytes"),  # no endless loop
-        (of_objects(SOUND, b"no object at all"), "something that is no object"),
-        (of_objects(SOUND)[:-2], "the file ends before"),
-        (of_objects(SOUND[:-4]), "the last object is cut"),
-        (b"LOGG", "the header 'LOGG' of 144 bytes is expected"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (of_objects(an_object(CLASSIC, b"1234")), "an object of 36 bytes, which is impossible for its type"),
+    (of_objects(SOUND[:8] + bytes(4) + SOUND[12:]), "a container holds an object of 0 bytes"),  # no endless loop
+    (of_objects(SOUND, b"no object at all"), "something that is no object"),
+    (of_objects(SOUND)[:-2], "the file ends before"),
+    (of_objects(SOUND[:-4]), "the last object is cut"),
+    (b"LOGG", "the header 'LOGG' of 144 bytes is expected"),
+])  # fmt: skip
 def test_damage_is_refused_with_its_place(content: bytes, message: str) -> None:
     with pytest.raises(LogError, match=rf"x\.blf: truncated or damaged BLF: at byte \d+ .*{message}.* before it"):
         blf_frames(io.BytesIO(content), "x.blf")
 
 
 @pytest.mark.parametrize("batch_bytes", [1, 100, 1 << 21])
-def test_how_many_containers_are_taken_apart_at_a_time_changes_nothing(
-    batch_bytes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_size_of_a_batch_of_containers_changes_nothing(batch_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blf, "BATCH_BYTES", batch_bytes)
     messages = [can.Message(timestamp=START + k, arbitration_id=k, data=bytes([k])) for k in range(100)]
     assert len(assert_the_same(written(messages, container_bytes=150))) == 100

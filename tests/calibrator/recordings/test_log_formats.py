@@ -7,6 +7,7 @@ import logging
 import re
 import zlib
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -110,40 +111,32 @@ def test_every_line_of_candump_is_counted_and_its_neighbours_are_read(line: str)
 ERROR_FRAME = "(1.200000) can0 20000080#0000000000000000"
 
 
-@pytest.mark.parametrize(
-    ("suffix", "line", "counts"),
-    [
-        (".log", "(1.000000) can0 123#012", (0, 0, 1)),
-        (".log", "(1.000000) can0 123#0G", (0, 0, 1)),
-        (".log", "(1.000000) can0 1234#01", (0, 0, 1)),
-        (".log", "(1.000000) can0 FFF#01", (0, 0, 1)),
-        (".log", "(1.0) can0 123#01", (0, 0, 1)),
-        (".log", "(x.000000) can0 123#01", (0, 0, 1)),
-        (".log", "(1.000000) can0 123#010203040506070809", (0, 0, 1)),
-        (".log", "(1.000000) can0 123##", (0, 0, 1)),
-        (".log", "(1.000000) can0 123##1" + "00" * 65, (0, 0, 1)),
-        (".log", "1.000000 can0 123#01", (0, 0, 1)),
-        (".log", "(1.000000) can0", (0, 0, 1)),
-        (".log", "(1.000000) can0 123#01 X", (0, 0, 1)),
-        (".log", "garbage", (0, 0, 1)),
-        (".log", ERROR_FRAME, (1, 0, 0)),
-        (".log", "(1.000000) can0 123#R8", (0, 1, 0)),
-        (".log", "(1.000000) can0 123#R", (0, 1, 0)),
-        (".asc", "0.05 1 12Z Rx d 2 01 02", (0, 0, 1)),
-        (".asc", "0.05 1 123 Rx d 8 01 02", (0, 0, 1)),
-        (".asc", "9000000000.0 1 1 Rx d 0", (0, 0, 1)),
-        (".asc", "0.05 1 ErrorFrame", (1, 0, 0)),
-        (".asc", "0.05 1 123 Rx r", (0, 1, 0)),
-        (".trc", "     21 ", (0, 0, 1)),
-    ],
-)
+@pytest.mark.parametrize(("suffix", "line", "counts"), [
+    (".log", "(1.000000) can0 123#012", (0, 0, 1)),
+    (".log", "(1.000000) can0 123#0G", (0, 0, 1)),
+    (".log", "(1.000000) can0 1234#01", (0, 0, 1)),
+    (".log", "(1.000000) can0 FFF#01", (0, 0, 1)),
+    (".log", "(1.0) can0 123#01", (0, 0, 1)),
+    (".log", "(x.000000) can0 123#01", (0, 0, 1)),
+    (".log", "(1.000000) can0 123#010203040506070809", (0, 0, 1)),
+    (".log", "(1.000000) can0 123##", (0, 0, 1)),
+    (".log", "(1.000000) can0 123##1" + "00" * 65, (0, 0, 1)),
+    (".log", "1.000000 can0 123#01", (0, 0, 1)),
+    (".log", "(1.000000) can0", (0, 0, 1)),
+    (".log", "(1.000000) can0 123#01 X", (0, 0, 1)),
+    (".log", "garbage", (0, 0, 1)),
+    (".log", ERROR_FRAME, (1, 0, 0)),
+    (".log", "(1.000000) can0 123#R8", (0, 1, 0)),
+    (".log", "(1.000000) can0 123#R", (0, 1, 0)),
+    (".asc", "0.05 1 12Z Rx d 2 01 02", (0, 0, 1)),
+    (".asc", "0.05 1 123 Rx d 8 01 02", (0, 0, 1)),
+    (".asc", "9000000000.0 1 1 Rx d 0", (0, 0, 1)),
+    (".asc", "0.05 1 ErrorFrame", (1, 0, 0)),
+    (".asc", "0.05 1 123 Rx r", (0, 1, 0)),
+    (".trc", "     21 ", (0, 0, 1)),
+])  # fmt: skip
 def test_line_without_data_frame_is_left_out_and_counted(
-    tmp_path: Path,
-    suffix: str,
-    line: str,
-    counts: tuple[int, int, int],
-    capfd: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path, suffix: str, line: str, counts: tuple[int, int, int], capfd: Any, caplog: Any
 ) -> None:
     path = write_log(tmp_path / f"drive{suffix}", some_messages(20))
     path.write_text(f"{path.read_text()}{line}\n")
@@ -160,27 +153,18 @@ NOISE = np.random.default_rng(1).bytes(5000)
 GOOD = b"(1.000000) can0 123#01\n"
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        (
-            "x.log",
-            GOOD * 9 + b"nonsense\n",
-            r"line 10 is damaged, and 1 of 10 lines are; expected .*; 9 frames are rea",
-        ),
-        *((f"x{suffix}", b"", "the log is empty") for suffix in (".log", ".asc", ".trc")),
-        ("x.log", (ERROR_FRAME + "\n").encode(), r"the log is empty: no data frames \(1 error frames"),
-        ("x.log.gz", gzip.compress(b"", mtime=0), "the log is empty"),
-        ("x.asc", NOISE, "not a .asc log but binary data; give the file the suffix of its format"),
-        ("x.trc", NOISE, "not a .trc log but binary data"),
-        ("x.asc.gz", gzip.compress(NOISE, mtime=0), "not a .asc log but binary data"),
-        ("x.asc", b"base hex  timestamps relative\n", "the time stamps are relative to the line before; save it with"),
-        ("x.asc", b"base dec\n0.1 1 12 Rx d 1 1\n0.2 1 12Z Rx d 1 1\n", r"damaged at line 3 .*; \d frames before it"),
-    ],
-)
-def test_log_that_cannot_be_used_is_refused_with_the_reason(
-    tmp_path: Path, name: str, content: bytes, words: str
-) -> None:
+@pytest.mark.parametrize(("name", "content", "words"), [
+    ("x.log", GOOD * 9 + b"nonsense\n", r"line 10 is damaged, and 1 of 10 lines are; expected .*; 9 frames are rea"),
+    *((f"x{suffix}", b"", "the log is empty") for suffix in (".log", ".asc", ".trc")),
+    ("x.log", (ERROR_FRAME + "\n").encode(), r"the log is empty: no data frames \(1 error frames"),
+    ("x.log.gz", gzip.compress(b"", mtime=0), "the log is empty"),
+    ("x.asc", NOISE, "not a .asc log but binary data; give the file the suffix of its format"),
+    ("x.trc", NOISE, "not a .trc log but binary data"),
+    ("x.asc.gz", gzip.compress(NOISE, mtime=0), "not a .asc log but binary data"),
+    ("x.asc", b"base hex  timestamps relative\n", "the time stamps are relative to the line before; save it with"),
+    ("x.asc", b"base dec\n0.1 1 12 Rx d 1 1\n0.2 1 12Z Rx d 1 1\n", r"damaged at line 3 .*; \d frames before it"),
+])  # fmt: skip
+def test_unusable_log_is_refused_with_the_reason(tmp_path: Path, name: str, content: bytes, words: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(LogError, match=rf"{name}: {words}"):
         read_frames(tmp_path / name)
@@ -218,17 +202,12 @@ def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest
         read_frames(path)
 
 
-@pytest.mark.parametrize(
-    ("logged_s", "time_s", "disordered", "clock_steps"),
-    [
-        ([10.0, 10.2, 10.1, 10.3], [0.0, 0.1, 0.2, 0.3], 1, 0),
-        ([5000.0, 5001.0, 100.0, 101.0], [0.0, 1.0, 1.0 + CLOCK_GAP_S, 2.0 + CLOCK_GAP_S], 0, 1),
-        ([0.0, 600.0, 1201.0], [0.0, 600.0, 600.0 + CLOCK_GAP_S], 0, 1),
-    ],
-)
-def test_disorder_is_sorted_and_a_step_of_the_clock_becomes_a_gap(
-    logged_s: list[float], time_s: list[float], disordered: int, clock_steps: int
-) -> None:
+@pytest.mark.parametrize(("logged_s", "time_s", "disordered", "clock_steps"), [
+    ([10.0, 10.2, 10.1, 10.3], [0.0, 0.1, 0.2, 0.3], 1, 0),
+    ([5000.0, 5001.0, 100.0, 101.0], [0.0, 1.0, 1.0 + CLOCK_GAP_S, 2.0 + CLOCK_GAP_S], 0, 1),
+    ([0.0, 600.0, 1201.0], [0.0, 600.0, 600.0 + CLOCK_GAP_S], 0, 1),
+])  # fmt: skip
+def test_clock_is_repaired(logged_s: list[float], time_s: list[float], disordered: int, clock_steps: int) -> None:
     time = repaired_time(np.rint(1e9 * np.array(logged_s)).astype(np.int64))
     np.testing.assert_allclose(time.time_s, time_s)
     assert (time.disordered, time.clock_steps) == (disordered, clock_steps)

@@ -220,16 +220,17 @@ def test_databases_of_other_formats_are_read(tmp_path: Path, layout: Path, suffi
     require_currents(before(tmp_path / "x.blf", layout))
 
 
-BUSES = """
-[[bus]]
-name = "pt"
-channel = "can0"
-dbc = "car.dbc"
-[[bus]]
-name = "aux"
-channel = "can1"
-dbc = "car.dbc"
-"""
+def bus_tables(*names: str) -> str:
+    channels = {"pt": "can0", "aux": "can1"}
+    return "".join(f'[[bus]]\nname = "{name}"\nchannel = "{channels[name]}"\ndbc = "car.dbc"\n' for name in names)
+
+
+BUSES = bus_tables("pt", "aux")
+
+
+def of_buses(*names: str) -> str:
+    """The layout with a database for each of these buses."""
+    return LAYOUT.replace('dbc = "car.dbc"', "") + bus_tables(*names)
 
 
 def on_buses(path: Path, *channels: tuple[str, int]) -> Path:
@@ -243,34 +244,31 @@ def on_buses(path: Path, *channels: tuple[str, int]) -> Path:
     return path
 
 
-def test_stray_frames_of_another_bus_are_ignored_with_one_notice(tmp_path: Path, layout: Path) -> None:
-    found = before(on_buses(tmp_path / "x.log", ("can0", 2 * COUNT), ("can1", 3)), layout)
+@pytest.mark.parametrize(("layout_text", "channels", "ignored"), [
+    (LAYOUT, [("can0", 80), ("can1", 3)], ["3 frames of other buses ignored (can1)"]),
+    (of_buses("pt"), [("can0", 80), ("can1", 40)], ["40 frames of other buses ignored (can1)"]),
+    (of_buses("pt", "aux").replace("Pack.", "pt:Pack.").replace("Motor.", "aux:Motor."),
+     [("can0", 80), ("can1", 80), ("can2", 7)], ["7 frames of other buses ignored (can2)"]),
+])  # fmt: skip
+def test_branches_come_from_the_buses_of_the_layout_and_frames_of_others_are_ignored(
+    tmp_path: Path, layout: Path, layout_text: str, channels: list[tuple[str, int]], ignored: list[str]
+) -> None:
+    layout.write_text(layout_text)
+    found = before(on_buses(tmp_path / "x.log", *channels), layout)
     require_currents(found)
-    assert [notice for notice in found["notices"] if "buses" in notice] == ["3 frames of other buses ignored (can1)"]
+    assert [notice for notice in found["notices"] if "buses" in notice] == ignored
 
 
 def test_two_buses_with_as_many_frames_are_refused_with_the_lines_to_write(tmp_path: Path, layout: Path) -> None:
-    log = on_buses(tmp_path / "x.log", ("can0", 2 * COUNT), ("can1", COUNT))
-    done = calibrator("kirchhoff", log, "--layout", layout)
+    done = calibrator("kirchhoff", on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 40)), "--layout", layout)
     assert done.returncode == 1
     assert "Pack comes on several buses (frames: can0 40, can1 20)" in done.stderr
     assert '[[bus]] with name = "hv", channel = "can0", dbc = "car.dbc"' in done.stderr
-    layout.write_text(LAYOUT.replace('dbc = "car.dbc"', "") + BUSES.partition('[[bus]]\nname = "aux"')[0])
-    found = before(log, layout)
-    require_currents(found)
-    assert "40 frames of other buses ignored (can1)" in found["notices"]
-
-
-def test_branches_come_from_two_buses_with_a_database_each(tmp_path: Path, layout: Path) -> None:
-    layout.write_text(
-        LAYOUT.replace('dbc = "car.dbc"', "").replace("Pack.", "pt:Pack.").replace("Motor.", "aux:Motor.") + BUSES
-    )
-    require_currents(before(on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 80), ("can2", 7)), layout))
 
 
 def test_prefix_of_the_bus_is_needed_only_where_two_buses_have_the_message(tmp_path: Path, layout: Path) -> None:
     (tmp_path / "motor.dbc").write_text(DBC.replace("256 Pack", "257 Other"))
-    text = LAYOUT.replace('dbc = "car.dbc"', "") + BUSES.replace('can1"\ndbc = "car', 'can1"\ndbc = "motor')
+    text = of_buses("pt", "aux").replace('can1"\ndbc = "car', 'can1"\ndbc = "motor')
     log = on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 80))
     layout.write_text(text)
     done = calibrator("kirchhoff", log, "--layout", layout)
@@ -279,10 +277,7 @@ def test_prefix_of_the_bus_is_needed_only_where_two_buses_have_the_message(tmp_p
     require_currents(before(log, layout))
 
 
-@pytest.mark.parametrize(
-    ("formula", "sum_a"),
-    [("2 * m", 20.0 - 2 * 17.8), ("m - one", 3.2), ("p / u * 1000", 2.2)],
-)
+@pytest.mark.parametrize(("formula", "sum_a"), [("2 * m", 20.0 - 2 * 17.8), ("m - one", 3.2), ("p / u * 1000", 2.2)])
 def test_branch_computed_by_a_formula(tmp_path: Path, layout: Path, formula: str, sum_a: float) -> None:
     (tmp_path / "car.dbc").write_text(
         DBC + ' SG_ One : 16|8@1+ (1,1) [0|0] "" Car\n SG_ Power : 0|16@1- (0.04,0) [-1000|1000] "kW" Car\n'
@@ -349,9 +344,7 @@ def nameless_archive(path: Path) -> None:
         ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
     ],
 )  # fmt: skip
-def test_mistake_with_a_log_is_one_line(
-    tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str
-) -> None:
+def test_mistake_in_a_log(tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str) -> None:
     write(tmp_path / name)
     require_one_line(calibrator("kirchhoff", tmp_path / name, "--layout", layout), words)
 
@@ -383,21 +376,16 @@ def test_damaged_log_gives_one_error_line_or_is_counted(tmp_path: Path, layout: 
         assert any("damaged lines or frames left out" in notice for notice in said["notices"])
 
 
-@pytest.mark.parametrize(
-    ("program", "old", "new"),
-    [
-        ("candump -ta", b"[8]  14 00 A0 0F 00 00 00 00\n", b"[8]  14 00 A0\n"),
-        ("candump -tA", b"2023-11-14 22:13:20.100", b"2023-11-4 22:13:20.100"),
-        ("candump -td", b"(000.04", b"(0.0.04"),
-        ("SavvyCAN", b",\n265", b",265"),
-        ("SavvyCAN", b"00000100,false", b'"0000100,false'),
-        ("SavvyCAN", b"00000100,false", b"90000000000100,false"),
-        ("PEAK TRC 1.3", b"00000200", b"9000000200"),
-    ],
-)
-def test_damaged_line_is_left_out_and_counted(
-    tmp_path: Path, layout: Path, program: str, old: bytes, new: bytes
-) -> None:
+@pytest.mark.parametrize(("program", "old", "new"), [
+    ("candump -ta", b"[8]  14 00 A0 0F 00 00 00 00\n", b"[8]  14 00 A0\n"),
+    ("candump -tA", b"2023-11-14 22:13:20.100", b"2023-11-4 22:13:20.100"),
+    ("candump -td", b"(000.04", b"(0.0.04"),
+    ("SavvyCAN", b",\n265", b",265"),
+    ("SavvyCAN", b"00000100,false", b'"0000100,false'),
+    ("SavvyCAN", b"00000100,false", b"90000000000100,false"),
+    ("PEAK TRC 1.3", b"00000200", b"9000000200"),
+])  # fmt: skip
+def test_damaged_line_is_counted(tmp_path: Path, layout: Path, program: str, old: bytes, new: bytes) -> None:
     name, write = LOGS[program]
     write(tmp_path / name)
     above, found, below = (tmp_path / name).read_bytes().rpartition(old)
@@ -417,17 +405,11 @@ def test_damaged_database_is_one_line(tmp_path: Path, layout: Path, suffix: str,
     require_one_line(calibrator("kirchhoff", tmp_path / "x.blf", "--layout", layout), path.name)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (
-            LAYOUT.replace('dbc = "car.dbc"', "") + BUSES,
-            "names several buses; the node corrects the signals of one bus",
-        ),
-        (LAYOUT.replace('dbc = "car.dbc"', ""), "has no 'dbc', so that it fits tables only"),
-        (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    (of_buses("pt", "aux"), "names several buses; the node corrects the signals of one bus"),
+    (of_buses(), "has no 'dbc', so that it fits tables only"),
+    (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
+])  # fmt: skip
 def test_template_refuses_layouts_without_one_dbc(layout: Path, text: str, words: str) -> None:
     layout.write_text(text)
     command = [sys.executable, "-m", "ecu_node", "template", "--layout", str(layout), "--vehicle", "V1"]

@@ -1,14 +1,22 @@
 from pathlib import Path
 
+import can
+import cantools
+import msgspec
 import numpy as np
 import pytest
+from e2e.p07 import e2e_p07_check
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.errors import LogError
+from calibrator.recordings.decode import message_is_sound
 from calibrator.recordings.readers import read_recording
 from calibrator.recordings.write_logs import encode_message, write_candump
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import read_layout
+from ecu_node.errors import DatabaseError
+from ecu_node.layout import EndToEnd, ProfileP07, read_layout
 from tests.calibrator.drive_logs import write_drive_log
 
 POWER_DBC = """VERSION ""
@@ -45,76 +53,38 @@ def power_database(tmp_path: Path) -> VehicleDatabase:
     return read_database(read_layout(tmp_path / "power.toml"))
 
 
-def log_of(path: Path, lines: list[tuple[float, str]]) -> Path:
-    path.write_text("".join(f"({1e9 + time:.6f}) can0 {text}\n" for time, text in lines))
-    return path
+def recorded(folder: Path, database: VehicleDatabase, *lines: tuple[float, str]) -> Drive:
+    """The drive of a log of frames at some times [s]."""
+    (folder / "x.log").write_text("".join(f"({1e9 + time:.6f}) can0 {text}\n" for time, text in lines))
+    return read_recording(folder / "x.log", database, vehicle="v", name="d").drive
 
 
-def steady(values: list[float], period_s: float = 0.1) -> Channel:
-    value = np.array(values)
-    return Channel(time_s=period_s * np.arange(len(value)), value=value, good=np.isfinite(value))
-
-
-def read_motor(path: Path, database: VehicleDatabase) -> Channel:
-    return read_recording(path, database, vehicle="v", name="d").drive.branches["motor"]
-
-
-def test_a_drive_written_as_a_log_is_read_back(tmp_path: Path, database: VehicleDatabase) -> None:
-    written = Drive(
-        vehicle="v",
-        name="d",
-        branches={"battery": steady([10.0, 11.0, np.nan]), "motor": steady([-9.0, -10.0, -11.0])},
-        inputs={"voltage": steady([390.0, 391.0, 392.0]), "speed": steady([0.0, 50.0, np.nan])},
-    )
-    write_drive_log(tmp_path / "d.log.gz", written, database)
-    read = read_recording(tmp_path / "d.log.gz", database, vehicle="v", name="d").drive
-    assert set(read.branches) == {"battery", "motor"}
-    for name, channel in (*written.branches.items(), *written.inputs.items()):
-        found = {**read.branches, **read.inputs}[name]
-        np.testing.assert_allclose(found.time_s, channel.time_s, atol=1e-9)
-        assert np.array_equal(found.good, channel.good)
-        np.testing.assert_allclose(found.value[found.good], channel.value[channel.good], atol=0.01)
-
-
-def test_a_current_has_the_sign_of_the_layout_and_the_unit_of_the_dbc_is_turned_into_ampere(
-    tmp_path: Path, power_database: VehicleDatabase
-) -> None:
-    drive = read_recording(
-        log_of(tmp_path / "x.log", [(0.0, "00000003#9CFF")]), power_database, vehicle="v", name="d"
-    ).drive
+def test_current_has_sign_of_layout_and_is_in_ampere(tmp_path: Path, power_database: VehicleDatabase) -> None:
+    drive = recorded(tmp_path, power_database, (0.0, "00000003#9CFF"))
     np.testing.assert_allclose(drive.branches["battery"].value, [-10.0])
+    with pytest.raises(LogError, match="no branch"):  # of 11 bits, not of 29
+        recorded(tmp_path, power_database, (0.0, "003#9CFF"))
 
 
-def test_an_identifier_of_11_bits_is_not_taken_for_one_of_29(tmp_path: Path, power_database: VehicleDatabase) -> None:
-    with pytest.raises(LogError, match="no branch"):
-        read_motor(log_of(tmp_path / "x.log", [(0.0, "003#9CFF")]), power_database)
-
-
-def test_power_is_divided_by_the_latest_voltage_at_or_before_it_until_that_is_too_old(
-    tmp_path: Path, power_database: VehicleDatabase
-) -> None:
+def test_power_is_divided_by_latest_voltage_if_fresh(tmp_path: Path, power_database: VehicleDatabase) -> None:
     lines = [(0.0, "001#1400"), (0.1, "002#A00F"), (0.1, "001#1400"), (0.2, "002#D007"), (0.25, "001#1400")]
-    lines += [(0.7, "001#1400"), (0.8, "001#1400")]
-    motor = read_motor(log_of(tmp_path / "x.log", lines), power_database)
+    motor = recorded(tmp_path, power_database, *lines, (0.7, "001#1400"), (0.8, "001#1400")).branches["motor"]
     np.testing.assert_allclose(motor.time_s, [0.0, 0.1, 0.25, 0.7, 0.8], atol=1e-9)
     assert motor.good.tolist() == [False, True, True, True, False]
     np.testing.assert_allclose(motor.value[1:3], [-10_000 / 400.0, -10_000 / 200.0])
 
 
-def test_codes_with_any_name_and_those_of_the_layout_are_no_currents_as_on_the_node(
-    tmp_path: Path, power_database: VehicleDatabase
-) -> None:
+def test_named_codes_and_those_of_the_layout_are_no_currents(tmp_path: Path, power_database: VehicleDatabase) -> None:
     names = 'VAL_ 1 Power -200 "Signal_ungueltig" ;\nVAL_ 2 Voltage 4000 "Ersatzwert" ;\n'
     (tmp_path / "power.dbc").write_text(POWER_DBC + names)
     (tmp_path / "power.toml").write_text(POWER_LAYOUT + "no_value = [-100, 21]\n")
     database = read_database(read_layout(tmp_path / "power.toml"))
     texts = ["002#A10F", "001#1400", "001#38FF", "001#9CFF", "001#1500", "002#A00F", "001#1400"]
     lines = list(zip((0.0, 0.1, 0.2, 0.3, 0.4, 0.41, 0.45), texts, strict=True))
-    motor = read_motor(log_of(tmp_path / "x.log", lines), database)
+    motor = recorded(tmp_path, database, *lines).branches["motor"]
     assert motor.good.tolist() == [True, False, False, False, True]
     np.testing.assert_allclose(motor.value[4], -10_000 / 400.1)
-    before = read_motor(log_of(tmp_path / "y.log", lines), power_database)
-    assert before.good.all()
+    assert recorded(tmp_path, power_database, *lines).branches["motor"].good.all()
 
 
 def test_names_of_an_input_are_values_unless_they_mean_not_available(tmp_path: Path) -> None:
@@ -124,20 +94,18 @@ def test_names_of_an_input_are_values_unless_they_mean_not_available(tmp_path: P
     (tmp_path / "power.toml").write_text(POWER_LAYOUT + '[[input]]\nname = "gear"\nsignal = "Volt.Gear"\n')
     database = read_database(read_layout(tmp_path / "power.toml"))
     lines = [(0.0, "001#1400"), (0.1, "002#A00F01"), (0.2, "002#A00F02"), (0.3, "002#A00F03")]
-    drive = read_recording(log_of(tmp_path / "x.log", lines), database, vehicle="v", name="d").drive
+    drive = recorded(tmp_path, database, *lines)
     assert drive.inputs["gear"].good.tolist() == [True, True, False]
 
 
-def test_a_log_without_any_branch_lists_what_it_has_and_what_is_expected(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
-    path = log_of(tmp_path / "x.log", [(0.0, "7FF#00"), (0.1, "18DAF110#00")])
+def test_log_without_a_branch_lists_what_is_expected(tmp_path: Path, database: VehicleDatabase) -> None:
     with pytest.raises(LogError, match=r"x\.log: no branch .* 0x7FF, 0x18DAF110; expected HV_Battery \(0x110\)"):
-        read_recording(path, database, vehicle="v", name="d")
+        recorded(tmp_path, database, (0.0, "7FF#00"), (0.1, "18DAF110#00"))
 
 
 def test_an_input_that_is_never_available_is_left_out_and_reported(tmp_path: Path, database: VehicleDatabase) -> None:
-    drive = Drive(vehicle="v", name="d", branches={"battery": steady([1.0, 2.0])}, inputs={})
+    battery = Channel(time_s=np.array([0.0, 0.1]), value=np.array([1.0, 2.0]), good=np.ones(2, bool))
+    drive = Drive(vehicle="v", name="d", branches={"battery": battery}, inputs={})
     write_drive_log(tmp_path / "d.log", drive, database)
     recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
     assert "voltage" not in recording.drive.inputs
@@ -160,3 +128,77 @@ def test_corrected_frames_are_read_beside_the_measured_ones(tmp_path: Path, data
     recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
     np.testing.assert_allclose(recording.drive.branches["motor"].value, [-10.0, -20.0])
     np.testing.assert_allclose(recording.corrected["motor"].value, [-9.0, -18.0])
+
+
+# Logs that are written
+
+
+BIG_ENDIAN_DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: X
+BO_ 100 M: 8 X
+ SG_ A : 7|16@0- (0.5,10) [0|0] "A" X
+ SG_ B : 26|11@0+ (1,0) [0|0] "A" X
+ SG_ C : 40|9@1- (-0.25,0) [0|0] "A" X
+"""
+
+
+def test_frames_with_a_counter_of_several_bytes_are_written_and_read() -> None:
+    dbc = BIG_ENDIAN_DBC.replace("M: 8", "M: 32")
+    database = big_endian_database(dbc, e2e=ProfileP07(messages=["M"], offset=8))
+    count = 300
+    series = encode_message(database, "M", np.arange(float(count)), {"B": np.arange(float(count))})
+    assert all(e2e_p07_check(row.tobytes(), 100, offset=8) for row in series.data)
+    assert [int.from_bytes(row[20:24].tobytes()) for row in series.data] == list(range(count))
+    length = np.full(count, 32, np.uint8)
+    length[1], length[2] = 27, 31
+    series.data[3, 0] ^= 1
+    sound = message_is_sound(database, database.message("M"), series.data, length)
+    assert np.flatnonzero(~sound).tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(("value", "expected"), [(np.nan, "SNA"), (1e6, 650.0), (-1e6, -650.0)])
+def test_missing_values_become_sna_others_saturate(database: VehicleDatabase, value: float, expected: object) -> None:
+    series = encode_message(database, "HV_Motor", np.zeros(1), {"MotorCurrent": np.array([value])})
+    decoded = database.message("HV_Motor").decode_simple(series.data[0].tobytes())
+    assert decoded["MotorCurrent"] == (pytest.approx(expected) if isinstance(expected, float) else expected)
+    assert decoded["MotorTorque"] == "SNA"
+
+
+def test_float_signal_is_not_written_as_whole_number() -> None:
+    database = big_endian_database(
+        BIG_ENDIAN_DBC.replace("M: 8", "M: 16").replace("40|9@1-", "64|32@1-") + "SIG_VALTYPE_ 100 C : 1;\n"
+    )
+    with pytest.raises(DatabaseError, match=r"^signal C is a float; only whole-numbered signals can be written"):
+        encode_message(database, "M", np.zeros(1), {"C": np.array([1.5])})
+    assert len(encode_message(database, "M", np.zeros(1), {"B": np.array([1.0])}).data) == 1
+
+
+@settings(max_examples=60)
+@given(st.integers(-32768, 32767), st.integers(0, 2047), st.integers(-256, 255), st.floats(-0.49, 0.49))
+def test_nearest_codes_are_written_in_both_byte_orders(a: int, b: int, c: int, e: float) -> None:
+    database = big_endian_database()
+    expected = database.message("M").encode({"A": a * 0.5 + 10, "B": b, "C": c * -0.25}, strict=False)
+    values = {"A": np.array([(a + e) * 0.5 + 10]), "B": np.array([b + e]), "C": np.array([(c + e) * -0.25])}
+    assert encode_message(database, "M", np.zeros(1), values).data[0].tobytes() == expected
+
+
+def big_endian_database(dbc: str = BIG_ENDIAN_DBC, **keys: EndToEnd) -> VehicleDatabase:
+    layout = msgspec.structs.replace(read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"), **keys)
+    database = cantools.database.load_string(dbc)
+    assert isinstance(database, cantools.database.can.Database)
+    return VehicleDatabase(layout=layout, databases={"": database}, digest="0" * 64)
+
+
+@pytest.mark.parametrize("suffix", [".log", ".log.gz"])
+def test_log_reads_back_in_order_of_time(database: VehicleDatabase, tmp_path: Path, suffix: str) -> None:
+    slow = encode_message(database, "HV_Dcdc", np.array([0.05, 0.15]), {"DcdcCurrent": np.ones(2)})
+    fast = encode_message(database, "HV_Motor", np.array([0.0, 0.1, 0.2]), {"MotorCurrent": np.ones(3)})
+    path = tmp_path / f"drive{suffix}"
+    assert write_candump(path, [slow, fast]) == 5
+    with can.LogReader(path) as reader:
+        frames = list(reader)
+    assert [f.arbitration_id for f in frames] == [288, 320, 288, 320, 288]
+    assert [f.timestamp for f in frames] == pytest.approx([0.0, 0.05, 0.1, 0.15, 0.2])
+    assert frames[1].data == slow.data[0].tobytes()

@@ -183,9 +183,7 @@ def test_column_of_texts_is_named_beside_the_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("step", "rows", "seconds"), [(1, 100, 99), (10, 100, 990), (10, 7000, 69.99), (500, 9, 4), (10**5, 9, 0.8)]
 )
-def test_whole_numbers_without_a_unit_are_what_makes_a_recording(
-    tmp_path: Path, step: int, rows: int, seconds: float
-) -> None:
+def test_whole_numbers_are_in_the_unit_that_fits(tmp_path: Path, step: int, rows: int, seconds: float) -> None:
     csv(pd.DataFrame({"time": step * np.arange(rows), "a": np.arange(rows) % 7, "b": 1, "note": "ok"}))(
         tmp_path / "x.csv"
     )
@@ -247,15 +245,12 @@ def test_columns_that_could_be_of_two_messages_are_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("heater", ['power = "Pheat", voltage = "Ubat"', 'formula = "1e3 * Pheat / Ubat"'])
-def test_layout_names_columns_in_place_of_signals(tmp_path: Path, heater: str) -> None:
+def test_layout_names_columns_in_place_of_signals_and_a_branch_may_be_a_quotient(tmp_path: Path, heater: str) -> None:
     (tmp_path / "car.toml").write_text(LAYOUT.replace('power = "Pheat", voltage = "Ubat"', heater))
     csv(powers())(tmp_path / "x.csv")
-    require_sum(before(tmp_path / "x.csv", "--layout", tmp_path / "car.toml"))
-
-
-def test_quotient_of_columns_is_a_branch(tmp_path: Path) -> None:
-    csv(powers())(tmp_path / "x.csv")
-    require_sum(before(tmp_path / "x.csv", "--branches", "battery=Ibat,-motor=Imot,-heater=Pheat*1000/Ubat"))
+    quotient = "battery=Ibat,-motor=Imot,-heater=Pheat*1000/Ubat"
+    for branches in (("--layout", tmp_path / "car.toml"), ("--branches", quotient)):
+        require_sum(before(tmp_path / "x.csv", *branches))
 
 
 @pytest.mark.parametrize(
@@ -295,7 +290,6 @@ def test_damaged_table_is_one_line(tmp_path: Path, suffix: str) -> None:
 
 
 def test_log_of_frames_is_no_table_for_a_layout_without_dbc(tmp_path: Path) -> None:
-    (tmp_path / "car.toml").write_text(LAYOUT)
     (tmp_path / "x.log").write_text("(1.000000) can0 123#11\n(2.000000) can0 123#11\n")
     for layout in (LAYOUT, LAYOUT.replace('"Ibat"', '"Ibat", corrected = "A.B"')):
         (tmp_path / "car.toml").write_text(layout)

@@ -8,29 +8,30 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
+from calibrator.estimator import results
 from calibrator.estimator.evidence import evidence_names
-from calibrator.estimator.results import (
-    PARTS,
-    RunRecord,
-    encode_chunk,
-    join_rows,
-    part_file,
-    write_parameter_files,
-    write_run,
-)
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import (
-    BranchParameters,
-    Explanation,
-    HardwareFault,
-    JunctionResidual,
-    VehicleParameters,
-)
+from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, JunctionResidual, VehicleParameters
 from tests.ecu_node.vehicles import parameters_for
 
 BRANCHES = ("battery", "motor")
 FULL_SCALE_A = 400.0
 EVIL = "<script>document.title='run'</script>"
+RUN = results.RunRecord(
+    tool="calibrator test",
+    fleet="at hand",
+    method="posterior",
+    layout="hv_powertrain",
+    branches=[*BRANCHES],
+    created="2026-01-01T00:00:00+00:00",
+    vehicles=2,
+    full_scale_a=FULL_SCALE_A,
+    settings={},
+    details={},
+    left_out={},
+    model_inputs=[],
+    notices=[],
+)
 
 
 def sensor(
@@ -109,38 +110,23 @@ def write_result(
     left_out: Mapping[str, str] | None = None,
     moved: Mapping[tuple[str, str], str] | None = None,
     evidence: bool = True,
-    created: str = "2026-01-01T00:00:00+00:00",
 ) -> Path:
     """A result folder as ``calibrator calibrate`` writes it."""
-    (folder / PARTS).mkdir(parents=True)
+    (folder / results.PARTS).mkdir(parents=True)
     rows = np.ones((3, len(evidence_names(BRANCHES))))
     rows[:2, [3, 4, 8, 9]] = np.nan  # no bench has seen these sensors
     told = {item.vehicle: rows for item in vehicles} if evidence else {}
-    part = encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
-    part_file(folder, 0).write_bytes(part)
-    join_rows(folder, {})
-    write_parameter_files(folder, vehicles=len(vehicles))
+    part = results.encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
+    results.part_file(folder, 0).write_bytes(part)
+    results.join_rows(folder, {})
+    results.write_parameter_files(folder, vehicles=len(vehicles))
     reference = {"agreeing_share": {"battery": 0.8, "motor": 0.75}, "unmeasured_a": 0.3}
     spread = {"model_spread": {"battery": 0.004, "motor": 0.005}}
     own = {"reference": reference, "hyperparameters": spread, "evidence": evidence_names(BRANCHES)}
-    run = RunRecord(
-        tool="calibrator test",
-        method="posterior",
-        fleet="at hand",
-        layout="hv_powertrain",
-        branches=list(BRANCHES),
-        model_inputs=[],
-        settings={},
-        created=created,
-        details=own if evidence else {},
-        vehicles=len(vehicles),
-        buckets=0,
-        full_scale_a=FULL_SCALE_A,
-        left_out=dict(left_out or {}),
-        left_out_count=len(left_out or {}),
-        notices=[f"a notice with {EVIL}"],
-    )
-    write_run(folder, run)
+    lost = dict(left_out or {})
+    details, notices = own if evidence else {}, [f"a notice with {EVIL}"]
+    more = {"details": details, "left_out": lost, "left_out_count": len(lost), "notices": notices}
+    results.write_run(folder, replace(RUN, vehicles=len(vehicles), **more))
     return folder
 
 

@@ -18,6 +18,7 @@ from calibrator.report.overview import share
 from calibrator.report.page import report_page
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import SensorFinding
+from tests.calibrator.command_here import calibrator
 from tests.calibrator.report.results_at_hand import EVIL, sensor, six_vehicles, write_result
 
 NO_HARDWARE = {"hardware_drift": 0.0, "hardware_offset_a": {}}
@@ -138,3 +139,24 @@ def test_a_vehicle_that_was_left_out_is_told_why(result: Path) -> None:
 )
 def test_share_of_few_vehicles_is_neither_none_nor_all(part: int, whole: int, text: str) -> None:
     assert share(part, whole) == text
+
+
+def test_page_and_numbers_of_the_fleet(result: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "page.html"
+    done = calibrator("report", result, "--out", out)
+    assert (done.returncode, done.stdout) == (0, f"{out}: {out.stat().st_size / 1e6:.2f} MB; open it in a browser\n")
+    found = json.loads(calibrator("report", result, "--out", out, "--json", "--limit", 300).stdout)
+    assert found["bytes"] == out.stat().st_size
+    assert found["overview"]["verdicts"] == {"corrected": 2, "no sensor fault": 2, "cannot tell": 2}
+    assert found["protection"]["limit_a"] == 300.0
+    assert len(found["next_steps"]) == 5
+    assert found["workshop"][0]["cause"] == "hardware"
+
+
+def test_page_is_named_after_its_vehicle_and_stands_in_the_result(result: Path) -> None:
+    found = json.loads(calibrator("report", result, "--vehicle", "V3", "--json").stdout)
+    assert found["page"] == str(result / "V3.html")
+    assert found["parameters"]["hardware_fault"]["drift"] == -0.06
+    assert "Look at the hardware of V3" in (result / "V3.html").read_text()
+    assert calibrator("report", result).returncode == 0
+    assert (result / "report.html").exists()

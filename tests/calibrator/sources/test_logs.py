@@ -3,11 +3,16 @@
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from calibrator.drive import FleetSource
+from calibrator.drive import Channel, Drive, FleetSource
+from calibrator.drives.store import write_drive
+from calibrator.errors import FleetError
 from calibrator.files.storage import open_storage
-from calibrator.sources.fleet_source import find_fleet, find_logs
+from calibrator.sources.fleet_source import find_fleet, find_logs, probe_equipment
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError
 
 
 def drives(found: FleetSource) -> list[str]:
@@ -20,46 +25,22 @@ def make(*paths: Path) -> None:
         path.touch()
 
 
-@pytest.mark.parametrize(
-    ("files", "arguments", "found", "problems"),
-    [
-        (["logs/V1/monday.log.gz", "logs/V2/a.b.blf", "truth.json"], ["."], ["V1/monday", "V2/a.b"], []),
-        (["V1/DRIVE1.LOG.GZ"], ["."], ["V1/DRIVE1"], []),
-        (["V1/a.log"], ["V1", "V1/a.log", "."], ["V1/a"], []),  # named twice, read once
-        (["V1/a.log", "V1/old/b.log"], ["V1", "V1/a.log"], ["V1/a", "old/b"], []),
-        (
-            ["V1/a.log", "V1/old/b.log"],
-            ["V1"],
-            ["old/b"],
-            ["V1/a.log: lies beside folders with logs; move it"],
-        ),
-        (["V1/a.log", "V2/a.log", "b.log"], ["."], ["V1/a", "V2/a"], ["b.log: lies beside folders with logs"]),
-        (
-            ["x/V1/a.log", "y/V1/b.log", "y/V2/a.log"],
-            ["."],
-            ["V2/a"],
-            ["two vehicles with one name: V1 is in {}/x/V1 and in {}/y/V1; rename one folder"],
-        ),
-        (
-            ["V1/a.log", "V1/a.blf", "V1/b.log"],
-            ["."],
-            ["V1/b"],
-            ["vehicle V1: drive a is in {}/V1/a.blf and {}/V1/a.log; remove or rename one"],
-        ),
-        (
-            ["V1/größe.log", "V2/a.log", "V2/a.blf", "V3/a.log"],
-            ["."],
-            ["V3/a"],
-            ["größe.log: the file's name, which names the drive, 'größe' cannot be used", "vehicle V2: drive a is in"],
-        ),
-        (
-            ["V1/a.log", "empty/notes.md"],
-            ["nothing", "empty", "V1"],
-            ["V1/a"],
-            ["nothing: no such file or folder", "empty: no logs in it; expected .log, .asc"],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("files", "arguments", "found", "problems"), [
+    (["logs/V1/monday.log.gz", "logs/V2/a.b.blf", "truth.json"], ["."], ["V1/monday", "V2/a.b"], []),
+    (["V1/DRIVE1.LOG.GZ"], ["."], ["V1/DRIVE1"], []),
+    (["V1/a.log"], ["V1", "V1/a.log", "."], ["V1/a"], []),  # named twice, read once
+    (["V1/a.log", "V1/old/b.log"], ["V1", "V1/a.log"], ["V1/a", "old/b"], []),
+    (["V1/a.log", "V1/old/b.log"], ["V1"], ["old/b"], ["V1/a.log: lies beside folders with logs; move it"]),
+    (["V1/a.log", "V2/a.log", "b.log"], ["."], ["V1/a", "V2/a"], ["b.log: lies beside folders with logs"]),
+    (["x/V1/a.log", "y/V1/b.log", "y/V2/a.log"], ["."], ["V2/a"],
+     ["two vehicles with one name: V1 is in {}/x/V1 and in {}/y/V1; rename one folder"]),
+    (["V1/a.log", "V1/a.blf", "V1/b.log"], ["."], ["V1/b"],
+     ["vehicle V1: drive a is in {}/V1/a.blf and {}/V1/a.log; remove or rename one"]),
+    (["V1/größe.log", "V2/a.log", "V2/a.blf", "V3/a.log"], ["."], ["V3/a"],
+     ["größe.log: the file's name, which names the drive, 'größe' cannot be used", "vehicle V2: drive a is in"]),
+    (["V1/a.log", "empty/notes.md"], ["nothing", "empty", "V1"], ["V1/a"],
+     ["nothing: no such file or folder", "empty: no logs in it; expected .log, .asc"]),
+])  # fmt: skip
 def test_which_log_is_of_which_vehicle_and_what_is_left_out(
     tmp_path: Path, files: list[str], arguments: list[str], found: list[str], problems: list[str]
 ) -> None:
@@ -99,3 +80,42 @@ def test_folder_of_a_vehicle_may_be_a_link(tmp_path: Path) -> None:
     found = find_logs([tmp_path / "fleet"])
     assert drives(found) == ["V1/a"]
     assert not found.left_out
+
+
+# What a fleet is equipped with
+
+
+INPUTS = ("voltage", "torque", "speed")
+
+
+def channel() -> Channel:
+    return Channel(time_s=np.arange(100) * 0.1, value=np.ones(100), good=np.full(100, True))
+
+
+@pytest.fixture
+def store(database: VehicleDatabase, tmp_path: Path) -> Path:
+    """One vehicle with battery, motor and auxiliary."""
+    branches = {name: channel() for name in ("battery", "motor", "auxiliary")}
+    drive = Drive(vehicle="V", name="d", branches=branches, inputs={name: channel() for name in INPUTS})
+    write_drive(tmp_path, drive, database.layout)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("branches", "beside"), [
+    (None, []),
+    (["battery", "motor"], ["branches recorded but not asked for, missing from the junction sum: auxiliary"]),
+])  # fmt: skip
+def test_branches_that_were_not_recorded_or_not_asked_for_are_named(
+    store: Path, database: VehicleDatabase, branches: list[str] | None, beside: list[str]
+) -> None:
+    notices = [n for n in probe_equipment(find_fleet(store), database, branches).notices if n.startswith("branches")]
+    assert notices == ["branches not recorded, taken as not fitted: dcdc, motor_rear", *beside]
+
+
+@pytest.mark.parametrize(("branches", "words"), [
+    (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
+    (["pack", "battery"], "no branch 'pack'; known are battery, motor"),
+])  # fmt: skip
+def test_wrong_branches_are_refused(store: Path, database: VehicleDatabase, branches: list[str], words: str) -> None:
+    with pytest.raises((FleetError, LayoutError), match=words):
+        probe_equipment(find_fleet(store), database, branches)

@@ -7,25 +7,17 @@ from scipy.signal import lfilter
 from calibrator.drive import Array
 from calibrator.errors import DriveError
 from calibrator.published.state_space import StateSpaceModel
-from calibrator.summaries.filter_bank import (
-    LONGEST_HOLD_S,
-    UNSETTLED,
-    FilterBank,
-    Poles,
-    low_passes,
-    plain_bank,
-    read_bank,
-)
+from calibrator.summaries import filter_bank
 
 PERIOD_S = 0.1
 NAMES = ("driving", "heater", "speed")
-POLES: Poles = ((0.9, 0.3), *low_passes(np.array([0.3, 4.0]), period_s=PERIOD_S), (0.5, 0.6))
+POLES: filter_bank.Poles = ((0.9, 0.3), *filter_bank.low_passes(np.array([0.3, 4.0]), period_s=PERIOD_S), (0.5, 0.6))
 SAMPLES = 700
-HOLDING = round(LONGEST_HOLD_S / PERIOD_S)
+HOLDING = round(filter_bank.LONGEST_HOLD_S / PERIOD_S)
 
 
-def bank_of(poles: Poles = POLES) -> FilterBank:
-    return FilterBank(input_names=NAMES, period_s=PERIOD_S, poles=poles)
+def bank_of(poles: filter_bank.Poles = POLES) -> filter_bank.FilterBank:
+    return filter_bank.FilterBank(input_names=NAMES, period_s=PERIOD_S, poles=poles)
 
 
 def inputs_of(seed: int, samples: int = SAMPLES) -> Array:
@@ -57,7 +49,7 @@ def test_columns_are_the_states_of_the_system() -> None:
 
 def test_a_bank_without_poles_is_the_plain_inputs_from_the_first_sample_on() -> None:
     u = inputs_of(2)
-    bank = plain_bank(NAMES, period_s=PERIOD_S)
+    bank = filter_bank.plain_bank(NAMES, period_s=PERIOD_S)
     columns, used = bank.run(u, np.ones(SAMPLES, bool))
     assert used.all()
     np.testing.assert_array_equal(columns, u)
@@ -71,14 +63,12 @@ def test_an_error_in_the_start_is_nearly_gone_when_samples_are_used() -> None:
     error = np.abs(known[SAMPLES, len(NAMES) :] - np.tile(u[SAMPLES], 2))
     left = np.abs(known[SAMPLES:] - started)[first, len(NAMES) :]
     assert first == bank.settling
-    np.testing.assert_array_less(left, UNSETTLED * error)
-    assert left[-1] > 0.9 * UNSETTLED * error[-1]
+    np.testing.assert_array_less(left, filter_bank.UNSETTLED * error)
+    assert left[-1] > 0.9 * filter_bank.UNSETTLED * error[-1]
 
 
 @pytest.mark.parametrize("is_long", [False, True])
-def test_inputs_keep_their_last_value_through_a_short_gap_and_filters_start_again_after_a_long_one(
-    is_long: bool,
-) -> None:
+def test_short_gap_keeps_the_last_inputs_and_a_long_one_starts_filters_again(is_long: bool) -> None:
     u, valid = inputs_of(5), np.ones(SAMPLES, bool)
     gap = slice(300, 300 + HOLDING + is_long)
     held = u.copy()
@@ -94,30 +84,27 @@ def test_inputs_keep_their_last_value_through_a_short_gap_and_filters_start_agai
 
 def test_a_bank_file_brings_the_same_bank_back(tmp_path: Path) -> None:
     (tmp_path / "bank.json").write_bytes(bank_of().to_json())
-    assert read_bank(tmp_path / "bank.json") == bank_of()
+    assert filter_bank.read_bank(tmp_path / "bank.json") == bank_of()
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "No such file or directory; give a file that 'calibrator identify' wrote"),
-        ("{", "no filter bank"),
-        ('{"input_names": ["u"], "period_s": 0.1, "gains": []}', "no filter bank .*gains"),
-        ('{"input_names": ["u"], "period_s": 0.1, "poles": [[1.0, 0.0]]}', "pole 1 .* inside the unit circle"),
-        ('{"input_names": ["u"], "period_s": 0.1, "poles": [[0.5, -0.1]]}', "positive imaginary part"),
-        ('{"input_names": ["u"], "period_s": 0.0}', "period 0.0 s; expected a positive number"),
-        ('{"input_names": ["u", "u"], "period_s": 0.1}', "expected distinct names"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "No such file or directory; give a file that 'calibrator identify' wrote"),
+    ("{", "no filter bank"),
+    ('{"input_names": ["u"], "period_s": 0.1, "gains": []}', "no filter bank .*gains"),
+    ('{"input_names": ["u"], "period_s": 0.1, "poles": [[1.0, 0.0]]}', "pole 1 .* inside the unit circle"),
+    ('{"input_names": ["u"], "period_s": 0.1, "poles": [[0.5, -0.1]]}', "positive imaginary part"),
+    ('{"input_names": ["u"], "period_s": 0.0}', "period 0.0 s; expected a positive number"),
+    ('{"input_names": ["u", "u"], "period_s": 0.1}', "expected distinct names"),
+])  # fmt: skip
 def test_a_file_that_is_no_bank_is_refused_with_its_name(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "bank.json"
     if text:
         path.write_text(text)
     with pytest.raises(DriveError, match=rf"bank\.json: .*{message}"):
-        read_bank(path)
+        filter_bank.read_bank(path)
 
 
 def test_poles_are_described_as_times_and_frequencies() -> None:
-    poles = (*low_passes(np.array([2.0]), period_s=PERIOD_S), (0.9 * np.cos(0.5), 0.9 * np.sin(0.5)))
+    poles = (*filter_bank.low_passes(np.array([2.0]), period_s=PERIOD_S), (0.9 * np.cos(0.5), 0.9 * np.sin(0.5)))
     assert bank_of(poles).described() == "2 s, 0.796 Hz (0.949 s)"
     assert bank_of(()).described() == "the plain inputs"

@@ -64,10 +64,7 @@ def recorded_drive(seed: int = 1) -> Drive:
         "voltage": beside_battery(350.0 - 0.05 * current(battery.time_s)),
     }
     return Drive(
-        vehicle="V1",
-        name="drive",
-        branches={"battery": battery, "motor": motor, "auxiliary": auxiliary},
-        inputs=inputs,
+        vehicle="V1", name="drive", branches={"battery": battery, "motor": motor, "auxiliary": auxiliary}, inputs=inputs
     )
 
 
@@ -151,9 +148,7 @@ def test_summary_made_on_board_is_that_of_the_log(folder: Path, tmp_path: Path) 
         np.testing.assert_allclose(getattr(on_board.zero_current, name), reading, rtol=1e-6)
 
 
-def test_unusable_record_leaves_its_vehicle_out(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unusable_record_is_left_out(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (path,) = (folder / "vehicle" / "V1").iterdir()
     content = path.read_bytes()
     for vehicle, damaged in {"V1": content, "V2": content[:300], "V3": content, "V4": b"summary"}.items():

@@ -17,7 +17,7 @@ from calibrator.files.storage import open_storage
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import find_fleet
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.record import joined_records
+from calibrator.summaries.record import Record, joined_records
 from calibrator.summaries.summarise_fleet import SummariseReport, add_drives, read_vehicle_summary
 from calibrator.summaries.summary_store import SummaryStore, open_store
 from ecu_node.database import VehicleDatabase
@@ -43,13 +43,8 @@ def write(
     time_s = 0.1 * np.arange(samples)
     speed = 30.0 + 20.0 * np.sin(0.3 * time_s + rng.random())
     battery = 2.0 * speed + rng.normal(size=samples)
-    values = {
-        "battery": battery,
-        "motor": -battery,
-        "speed": speed,
-        "torque": speed,
-        "voltage": np.full(samples, 350.0),
-    }
+    values = {"battery": battery, "motor": -battery, "speed": speed, "torque": speed}
+    values["voltage"] = np.full(samples, 350.0)
     change(values)
     channels = {key: Channel(time_s=time_s, value=value, good=np.ones(samples, bool)) for key, value in values.items()}
     branches = {key: channels.pop(key) for key in EQUIPMENT.branches}
@@ -71,12 +66,12 @@ def total(store: SummaryStore, vehicle: str) -> DriveSummary:
     return joined_records(store.read(store.bucket_of(vehicle))[vehicle]).summary
 
 
+def records_in(store: SummaryStore) -> dict[str, list[Record]]:
+    return {name: records for bucket in store.buckets() for name, records in store.read(bucket).items()}
+
+
 def drives_in(store: SummaryStore) -> dict[str, list[tuple[str, ...]]]:
-    return {
-        name: [record.drives for record in records]
-        for bucket in store.buckets()
-        for name, records in store.read(bucket).items()
-    }
+    return {name: [record.drives for record in records] for name, records in records_in(store).items()}
 
 
 def test_each_drive_is_read_once_and_again_when_it_was_changed(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -145,14 +140,8 @@ def test_recording_of_two_vehicles_counts_for_neither(tmp_path: Path, database: 
         added, store = add(drives, out, database)
         reasons = {name: text.partition(";")[0] for name, text in added.left_out.items()}
         assert reasons == {"V1": "same recording as V2", "V2": "same recording as V1"}
-        usable = {
-            (record.vehicle, *record.drives)
-            for bucket in store.buckets()
-            for records in store.read(bucket).values()
-            for record in records
-            if record.found
-        }
-        assert usable == {("V2", "a"), ("V3", "a")}
+        usable = [(name, *each.drives) for name, records in records_in(store).items() for each in records if each.found]
+        assert sorted(usable) == [("V2", "a"), ("V3", "a")]
     (drives / "drives" / "V2" / "b.parquet").unlink()
     added, store = add(drives, tmp_path / "other", database)
     assert (added.left_out, drives_in(store)) == ({}, {name: [("a",)] for name in ("V1", "V2", "V3")})
@@ -186,24 +175,19 @@ def put(name: str, value: float) -> Change:
     return lambda channels: channels[name].put(100, value)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (put("motor", 1e12), "drive d: branch motor shows 1e+12 A, full scale of the junction being 400 A"),
-        (put("motor", np.nan), "drive d: branch motor shows nan A"),
-        (put("battery", -np.inf), "drive d: branch battery shows inf A"),
-        (put("speed", np.nan), "drive d: input speed has values that are no numbers"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (put("motor", 1e12), "drive d: branch motor shows 1e+12 A, full scale of the junction being 400 A"),
+    (put("motor", np.nan), "drive d: branch motor shows nan A"),
+    (put("battery", -np.inf), "drive d: branch battery shows inf A"),
+    (put("speed", np.nan), "drive d: input speed has values that are no numbers"),
+])  # fmt: skip
 def test_impossible_values_are_named(tmp_path: Path, database: VehicleDatabase, change: Change, message: str) -> None:
     write(tmp_path, "V1", "d", database, change=change)
     with pytest.raises(DriveError, match=re.escape(message)):
         read_vehicle_summary(find_fleet(tmp_path).vehicles["V1"], EQUIPMENT, database)
 
 
-def test_a_fault_of_the_program_is_not_one_of_the_drives(
-    tmp_path: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_program_fault_ends_in_70(tmp_path: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "drives", "V1", "a", database)
     path = tmp_path / "sitecustomize.py"  # a bug in a process that reads
     path.write_text("import numpy\nnumpy.ascontiguousarray = lambda *_, **__: 1 // 0\n")

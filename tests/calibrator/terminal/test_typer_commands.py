@@ -35,19 +35,16 @@ def hello() -> None:
     write_output("hello")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "text"),
-    [
-        (["fail", "user"], 1, "prog: no fleet"),
-        (["fail", "contradiction"], 2, "prog: both"),
-        (["fail", "bug"], 70, "prog: internal error: KeyError: 1"),
-        (["fail"], 2, "prog fail: Missing argument 'KIND'; see 'prog fail --help'"),
-        (["fail", "user", "--number", "0"], 2, "prog fail: Invalid value for '--number': "),
-        (["fail", "user", "--numbre", "0"], 2, "prog fail: No such option: --numbre"),
-        (["fail", "user", "more\nlines"], 2, "prog fail: Got unexpected extra argument"),
-        (["fly"], 2, "prog: No such command 'fly'; see 'prog --help'"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "code", "text"), [
+    (["fail", "user"], 1, "prog: no fleet"),
+    (["fail", "contradiction"], 2, "prog: both"),
+    (["fail", "bug"], 70, "prog: internal error: KeyError: 1"),
+    (["fail"], 2, "prog fail: Missing argument 'KIND'; see 'prog fail --help'"),
+    (["fail", "user", "--number", "0"], 2, "prog fail: Invalid value for '--number': "),
+    (["fail", "user", "--numbre", "0"], 2, "prog fail: No such option: --numbre"),
+    (["fail", "user", "more\nlines"], 2, "prog fail: Got unexpected extra argument"),
+    (["fly"], 2, "prog: No such command 'fly'; see 'prog --help'"),
+])  # fmt: skip
 def test_error_is_one_line(arguments: list[str], code: int, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(app, "prog", arguments) == code
     printed = capsys.readouterr()
@@ -81,7 +78,7 @@ COMMANDS += [[name] for names in ALL.values() for name in names if [name] not in
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_help_has_an_example_and_words_that_people_use(
+def test_help_is_readable(
     command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")

@@ -6,34 +6,44 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from calibrator.processes.interrupts import ENDED, TERMINATED, interrupted_message
+from calibrator.processes.interrupts import ENDED, TERMINATED, importing, interrupted_message
 from ecu_node.program import INTERRUPTED
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 
 
-def test_ctrl_c_during_start_up_ends_it_in_one_line() -> None:
-    # The import of the command line sends SIGINT to itself and swallows what comes of it, as libraries do.
-    code = (
-        "import os, signal, sys, types\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name == 'typer':\n"
-        "            try: os.kill(os.getpid(), signal.SIGINT)\n"
-        "            except BaseException: pass\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "from calibrator.__main__ import calibrator_program\n"
-        "sys.argv = ['calibrator', '--version']\n"
-        "calibrator_program()\n"
-    )
+START = "import os, signal, sys; from calibrator.__main__ import calibrator_program as run; sys.argv[1:] = ['{}']; "
+# The import of the command line sends SIGINT to itself and swallows what comes of it, as libraries do.
+SWALLOWED = """
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == 'typer':
+            try: os.kill(os.getpid(), signal.SIGINT)
+            except BaseException: pass
+sys.meta_path.insert(0, Finder())
+run()
+"""
+IMPORTING = (
+    "from calibrator.processes.interrupts import importing\nwith importing(): os.kill(os.getpid(), signal.SIGINT)"
+)
+
+
+@pytest.mark.parametrize(("code", "exit_code", "said"), [
+    (START.format("--version") + "sys.modules['typer'] = None; run()", 1,
+     "calibrator: typer is not installed; pip install 'hv-current-correction[calibrator]'\n"),
+    (START.format("--version") + SWALLOWED, INTERRUPTED, f"{interrupted_message([])}\n"),
+    (START.format("summarise") + IMPORTING, INTERRUPTED, f"{interrupted_message(['summarise'])}\n"),
+], ids=["base install", "Ctrl-C during start-up", "Ctrl-C during imports"])  # fmt: skip
+def test_program_that_cannot_start_says_why_in_one_line(code: str, exit_code: int, said: str) -> None:
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-    assert (run.returncode, run.stdout, run.stderr) == (INTERRUPTED, "", f"{interrupted_message([])}\n")
+    assert (run.returncode, run.stdout, run.stderr) == (exit_code, "", said)
 
 
 def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(tmp_path: Path) -> None:
@@ -54,9 +64,7 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(tmp_path:
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.0])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_and_sigterm_while_logs_are_read_end_readers_too_in_one_line(
-    how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path
-) -> None:
+def test_signal_ends_readers_too(how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path) -> None:
     log, temporary = tmp_path / "V1" / "endless.log.gz", short_folder
     log.parent.mkdir()
     log.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
@@ -89,3 +97,25 @@ def test_closed_pipe_gives_no_traceback(arguments: list[str]) -> None:
     run = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
     os.close(writer)
     assert (run.returncode, run.stderr) == (1, "")
+
+
+def handler() -> "Callable[..., object] | int | None":
+    return signal.getsignal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("before", [signal.default_int_handler, signal.SIG_IGN])
+def test_ctrl_c_is_handled_as_before_afterwards_and_stays_ignored(before: "Callable[..., object] | int") -> None:
+    of_pytest = signal.signal(signal.SIGINT, before)
+    try:
+        with importing():
+            assert (handler() is before) == (before is signal.SIG_IGN)
+        assert handler() is before
+    finally:
+        signal.signal(signal.SIGINT, of_pytest)
+
+
+def test_message_says_whether_a_command_goes_on_where_it_was() -> None:
+    goes_on = "; it goes on with what it had read"
+    for arguments, kept in ((["--debug", "import", "x"], goes_on), (["simulate", "--out", "import"], ""), ([], "")):
+        assert interrupted_message(arguments) == f"calibrator: interrupted; run the same command again{kept}"
+    assert interrupted_message([], ENDED) == "calibrator: ended by SIGTERM; run the same command again"
