@@ -127,7 +127,7 @@ def margin(tmp_path: Path, database: VehicleDatabase) -> Margin:
     def of(*batteries: BranchParameters, **options: float) -> tuple[Any, str]:
         items = [vehicle(database, f"V{j}", battery, sensor()) for j, battery in enumerate(batteries, start=1)]
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
-        text, report = report_page(write_result(folder, items), None, **options)
+        text, report = report_page(write_result(folder, items), **options)
         return report["protection"], visible(text)
 
     return of
