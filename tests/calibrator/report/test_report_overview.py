@@ -124,7 +124,7 @@ Margin = Callable[..., tuple[Any, str]]
 def margin(tmp_path: Path, database: VehicleDatabase) -> Margin:
     """The margin of a fleet with some battery sensors, and the text of its page."""
 
-    def of(*batteries: BranchParameters, **options: float) -> tuple[Any, str]:
+    def of(*batteries: BranchParameters, **options: Any) -> tuple[Any, str]:
         items = [vehicle(database, f"V{j}", battery, sensor()) for j, battery in enumerate(batteries, start=1)]
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
         text, report = report_page(write_result(folder, items), **options)
