@@ -114,7 +114,7 @@ MISTAKES = [
     ("calibrator replay drive.csv --channel c --speed=-1", 2, "'--speed': -1: expected a number from 0 to 1"),
     # parameter files
     ("calibrator export v1.json LAYOUT --format hex --out x", 2, "--format hex needs --elf PROGRAM"),
-    ("calibrator export v1.json LAYOUT --format csv --elf v1.json --out x", 2, "--format csv takes no --elf PROGRAM"),
+    ("calibrator export v1.json LAYOUT --format dcm --elf v1.json --out x", 2, "--format dcm takes no --elf PROGRAM"),
     ("calibrator export none.json LAYOUT --format dcm --out x", 1, "no such parameter file; name one that is there"),
     ("calibrator export empty LAYOUT --format dcm --out x", 1, "empty: not a parameter file: it is empty; correct it"),
     ("calibrator export noise LAYOUT --format dcm --out x", 1, "noise: not a parameter file: "),

@@ -107,8 +107,9 @@ FINE = 1.06 ** np.arange(-8, 9)
 """Bounds that are tried about the best ones so far, relative to them. [1]"""
 TAILS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Shares of faults beyond the bounds that are tried. [1]"""
-LEAST_RANGE = 2.0
-"""Largest over smallest size of usual faults, at least: vehicles that all have the same fault are the reference. [1]"""
+LEAST_RANGE = (2.0, 1.2)
+"""Largest over smallest size of usual drifts and of offsets, at least: vehicles that all have the same drift are the
+reference. All sensors of a branch may have the same offset, where the load is declared. [1]"""
 SIZE_FAULTS, ANY_SIZE = 1.0, TAIL_DENSITY * np.gradient(GRID)
 """Weight of a fault of any size against the fleet's own when bounds are learnt, in faults: one fault alone would have
 them close about it. Probability of its size at :data:`~calibrator.estimator.prior.GRID`, log-uniform."""
@@ -581,7 +582,7 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
     """Bounds and tail of the sizes of drifts and of offsets, each averaged over what the fleet leaves open."""
     slabs = [prior.gain, prior.offset]
     for kind in (GAIN, OFFSET):
-        best, odds = slabs[kind], {}
+        best, odds, least = slabs[kind], {}, LEAST_RANGE[kind]
         for again in (False, True):
             for name in ("high", "low", "tail"):
                 grid: Sequence[float] | Array = TAILS
@@ -589,7 +590,7 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
                     first = COARSE_LOW if name == "low" else COARSE_HIGH
                     grid = first if coarse and not again else getattr(best, name) * FINE
                 tried = [replace(best, **{name: float(value)}, density=np.zeros(0)) for value in grid]
-                tried = [slab for slab in tried if slab.high > LEAST_RANGE * slab.low and slab.low > TAIL_RANGE[0]]
+                tried = [slab for slab in tried if slab.high > least * slab.low and slab.low > TAIL_RANGE[0]]
                 densities = np.stack([slab.density for slab in tried])
                 evidence = size_evidence(draws, prior, kind, densities)
                 evidence += SIZE_FAULTS * np.log(densities) @ ANY_SIZE
@@ -597,7 +598,7 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
                 weight = np.exp(evidence - evidence.max())
                 odds[name] = [(getattr(slab, name), w) for slab, w in zip(tried, weight / weight.sum(), strict=True)]
         both = product(odds["low"], odds["high"])
-        pairs = np.array([(low, high, a * b) for (low, a), (high, b) in both if high > LEAST_RANGE * low])
+        pairs = np.array([(low, high, a * b) for (low, a), (high, b) in both if high > least * low])
         uniform = uniform_density(pairs[:, 0], pairs[:, 1]) @ pairs[:, 2] / pairs[:, 2].sum()
         tail = sum(value * w for value, w in odds["tail"])
         slabs[kind] = replace(best, density=(1.0 - tail) * uniform + tail * TAIL_DENSITY)

@@ -56,10 +56,6 @@ def test_parameters_that_do_not_fit_are_refused(params: Path, tmp_path: Path, ma
         raise refused(params, *more, "--vehicle", "v7")
     with pytest.raises(ParameterError, match=r"made with layout hv_powertrain\.toml .*, this is .*small"):
         raise refused(params, *more, layout=make_database().layout.path)
-    with pytest.raises(ContradictionError, match=r"2 parameter files: dcm holds one vehicle; .* --format csv"):
-        raise refused(params, params, "--format", "dcm", "--output", tmp_path / "out")
-    with pytest.raises(ContradictionError, match="--format hex needs --elf PROGRAM"):
-        raise refused(params, "--format", "hex", "--output", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
