@@ -4,12 +4,13 @@ No fleet is needed. Every vehicle gives K - 1 gain ratios and one constant of th
 
     log(-g_k) = lambda_1 - lambda_k,    c = o_1 - sum over k > 1 of g_k o_k + (1 + d_1) l,    lambda = log(1 + d),
 
-with the offsets o and the load l that no branch measures. They are linear in the unknowns (lambda, o, l), so recordings
-of one car with different meters are one system of equations. Ratios have no scale: that comes from sensors that are
-known; offsets come from known ones, zero-current windows, a declared load, or a charge balance. As no fleet tells what
-is usual, the gain of a sensor that is not known is open: its prior is a wide Gaussian. Its offset is absent (a narrow
-Gaussian: no zero is exact) or present, of any size; each choice is one explanation. What they leave open is reported
-with its standard deviation, and is not corrected.
+with the offsets o and the load l that no branch measures. They are linear in the unknowns (lambda, o, l), but for gains
+before a load or a charge, about which they are linearised again; so recordings of one car with different meters are one
+system of equations. Ratios have no scale: that comes from sensors that are known; offsets come from known ones,
+zero-current windows, a declared load, or a charge balance. As no fleet tells what is usual, the gain of a sensor that
+is not known is open: its prior is a wide Gaussian. Its offset is absent (a narrow Gaussian: no zero is exact) or
+present, of any size; each choice is one explanation. What they leave open is reported with its standard deviation, and
+is not corrected.
 """
 
 from collections.abc import Mapping, Sequence

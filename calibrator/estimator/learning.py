@@ -165,7 +165,9 @@ def learn_fault_models(
         return _Learner(rows.take(np.sort(some)), feed, fixed, known, expected_faults, declared=load is not None)
 
     learner, starter = learner_of(MOST_LEARNT), learner_of(MOST_STARTED)
-    starts = [starter.start(centre, spread) for centre, spread in product(learner.centres(), COMMON_SPREADS)]
+    starts = [
+        starter.initial_model(centre, spread) for centre, spread in product(learner.initial_centres(), COMMON_SPREADS)
+    ]
     climbed = [starter.climb(start, START_ROUNDS) for start in starts]
     references = [learner.climb(model, ROUNDS, begun=True) for model in learner.rivals(climbed, STARTED_LOG_ODDS)]
     models = learner.variants(learner.rivals(references, KEPT_LOG_ODDS))
@@ -214,7 +216,7 @@ class _Learner:
         found = densest_clusters(*self.rows.shown(row), most=most, farthest=farthest)
         return [cluster.centre for cluster in found] or [0.0]
 
-    def zeros(self, constant: float) -> list[Array]:
+    def initial_intercepts(self, constant: float) -> list[Array]:
         """Intercepts of vehicles without faults, each of shape (K,), that add up to a constant of the junction.
 
         All but one are clusters. The first choice is of the densest ones, and the feeding branch takes what is left;
@@ -241,7 +243,7 @@ class _Learner:
                 found.append(tried[i])
         return found
 
-    def slopes(self) -> list[Array]:
+    def initial_slopes(self) -> list[Array]:
         """Slopes of vehicles without faults, each of shape (K,), as logarithms.
 
         How much further the model is off in one branch than in the first, every vehicle tells whatever its faults, by
@@ -264,7 +266,7 @@ class _Learner:
             found += [apart + excess for excess in [cluster.centre for cluster in agreeing] or [0.0]]
         return found
 
-    def centres(self) -> list[Array]:
+    def initial_centres(self) -> list[Array]:
         """Where to start, from what vehicles agree on.
 
         Slopes and zeros are those of clusters. The zero of the feeding branch has several. Intercepts of a vehicle
@@ -277,9 +279,9 @@ class _Learner:
         constants = [*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0]
         constants += [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         constants = [constant for constant in constants if abs(constant) <= LARGEST_SHARED]
-        slopes, found = self.slopes(), list[Array]()
+        slopes, found = self.initial_slopes(), list[Array]()
         for constant in constants if np.isnan(self.fixed[at.junction]) else [float(self.fixed[at.junction])]:
-            for zeros, slope in product(self.zeros(constant), slopes):
+            for zeros, slope in product(self.initial_intercepts(constant), slopes):
                 start = np.zeros(5 * K)
                 start[at.slopes], start[at.intercepts], start[at.junction] = slope, zeros, constant
                 start = np.where(np.isnan(self.fixed), start, self.fixed)
@@ -287,7 +289,7 @@ class _Learner:
                     found.append(start)
         return found
 
-    def start(self, centre: Array, common_spread: float = 0.0) -> FaultModel:
+    def initial_model(self, centre: Array, common_spread: float = 0.0) -> FaultModel:
         """FaultModel before anything is known but a centre, and what vehicles differ by in all branches alike."""
         rows, K = self.rows, self.rows.branches
         junction, eta = self.at.junction, self.design[:, self.parameters.eta]
@@ -358,7 +360,7 @@ class _Learner:
         for model, shared in product(references, self._shared_gains()):
             mean = model.spread.mean.copy()
             mean[at.slopes] = np.where(self.free[at.slopes], slopes - shared[K : 2 * K], mean[at.slopes])
-            fresh = replace(self.start(mean), spread=replace(model.spread, mean=mean, shared=shared))
+            fresh = replace(self.initial_model(mean), spread=replace(model.spread, mean=mean, shared=shared))
             found.append((0.0, self.climb(fresh, START_ROUNDS)))
         if len(found) > 1:
             climbed = [(plausible, self.climb(model, START_ROUNDS, begun=True)) for plausible, model in found]

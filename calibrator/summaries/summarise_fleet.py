@@ -1,7 +1,7 @@
 """Drives of a fleet into a store of summaries: each drive is read once, ever, and only its summary travels.
 
 The store is its own checkpoint: a bucket whose vehicles are read is written, and what a killed run has left is whole.
-A recording counts once. One that two vehicles have counts for neither, as it cannot be told whose it is.
+A recording counts once. One that two vehicles of a run have counts for neither, as it cannot be told whose it is.
 """
 
 import hashlib

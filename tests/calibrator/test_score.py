@@ -80,7 +80,7 @@ def test_slopes_and_intercepts_reproduce_the_measured_currents() -> None:
         np.testing.assert_allclose(measured, a[j] * i_s + b[j])
 
 
-def test_kinds_of_faults_are_told_apart() -> None:
+def test_kinds_of_faults_are_distinguished() -> None:
     assert FAULTS.has_hardware_fault.tolist() == [True, False]
     assert FAULTS.has_sensor_fault.tolist() == [True, False]
     assert len(FAULTS) == 2

@@ -97,7 +97,7 @@ def test_wrong_speed_is_refused(
 
 
 @pytest.mark.parametrize("interface", ["kvaser", "neovi"])
-def test_driver_that_is_missing_is_said(interface: str) -> None:
+def test_driver_that_is_missing_is_reported(interface: str) -> None:
     """python-can calls functions of a driver that it did not find."""
     with pytest.raises(BusError, match=f"^{interface} 0: cannot open the bus: .*; install the driver of the adapter"):
         connect(interface, "0", bitrate=500_000)

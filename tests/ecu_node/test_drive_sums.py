@@ -125,7 +125,7 @@ def test_full_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.Monk
     assert [record.zero_offset_a[0] for record in records] == [pytest.approx(OFFSET_A), None, None]
 
 
-def test_failure_to_write_is_said_once_and_its_end(drive: Drive) -> None:
+def test_failure_to_write_is_reported_once_and_its_end(drive: Drive) -> None:
     shutil.rmtree(drive.folder)
     for _ in range(2):
         drive.go_on(60.0)

@@ -138,7 +138,7 @@ def renamed(layout: Layout, *, branches: bool = False, inputs: Sequence[str] = (
     return msgspec.structs.replace(layout, branch=branch, derived=derived)
 
 
-def test_names_of_a_layout_that_the_builtin_vehicle_lacks_are_said(database: VehicleDatabase) -> None:
+def test_names_of_a_layout_that_the_builtin_vehicle_lacks_are_reported(database: VehicleDatabase) -> None:
     with pytest.raises(FleetError, match=r"two or more branches named battery, motor, .* or give --drives a store"):
         chosen("builtin", renamed(database.layout, branches=True))
     (notice,) = chosen("builtin", renamed(database.layout, inputs=["heater_demand"])).notices

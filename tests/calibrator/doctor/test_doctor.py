@@ -136,7 +136,7 @@ def test_inverted_sign_is_found_of_the_right_branch(branch: str, log: Path, tmp_
     assert told.report["ready"] == ["kirchhoff"]
 
 
-def test_all_signs_inverted_are_told_by_the_voltage(log: Path, tmp_path: Path) -> None:
+def test_all_signs_inverted_are_found_by_the_voltage(log: Path, tmp_path: Path) -> None:
     layout = write_layout(tmp_path, inverted=("battery", "motor", "auxiliary", "dcdc", "motor_rear"))
     told = examined(layout, log)
     assert [(item.subject, item.severity) for item in told.findings("sign")] == [("all branches", "warning")]
@@ -207,7 +207,7 @@ def test_delay_is_found_as_no_error(delay_s: float, tmp_path: Path, layout: Path
     assert delay.number == pytest.approx(delay_s, abs=0.005)
 
 
-def test_gain_below_a_slip_of_units_is_told_in_percent(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+def test_gain_below_a_slip_of_units_is_in_percent(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     drive = true_drive()
     short = write_log(tmp_path, cut(drive, 12.0), database).rename(tmp_path / "short.log")
     log = write_log(tmp_path, with_branch(drive, "motor", 1.08 * drive.branches["motor"].value), database)
@@ -264,7 +264,7 @@ def test_time_out_shorter_than_the_period_is_an_error(log: Path, layout: Path) -
     assert "calibrate --trusted" in told.report["not_ready"]
 
 
-def test_full_scale_that_is_exceeded_or_never_approached_is_told(log: Path, tmp_path: Path) -> None:
+def test_full_scale_that_is_exceeded_or_never_approached_is_reported(log: Path, tmp_path: Path) -> None:
     beyond = examined(write_layout(tmp_path, full_scale_a=50.0), log).findings("full scale")
     assert {item.subject for item in beyond} == {"battery", "motor"}
     assert all(re.search(r"[0-9,]+ of [0-9]+,000 values are beyond full_scale_a = 50 A", item.text) for item in beyond)
@@ -285,7 +285,7 @@ def test_log_of_another_vehicle_is_an_error_that_names_what_it_has(tmp_path: Pat
     assert told.report["ready"] == []
 
 
-def test_branch_that_some_logs_lack_is_told(log: Path, layout: Path, tmp_path: Path) -> None:
+def test_branch_that_some_logs_lack_is_reported(log: Path, layout: Path, tmp_path: Path) -> None:
     without = [line for line in log.read_text().splitlines() if "can0 120#" not in line]
     (tmp_path / "other.log").write_text("\n".join(without))
     (lacks,) = [
@@ -299,7 +299,7 @@ def test_branch_that_some_logs_lack_is_told(log: Path, layout: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("seconds", [3.0, 12.0, 40.0])
-def test_short_log_is_told_by_all(seconds: float, tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+def test_short_log_is_reported_by_all(seconds: float, tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     log = write_log(tmp_path, cut(true_drive(), seconds), database)
     told = examined(layout, log)
     assert told.errors == []

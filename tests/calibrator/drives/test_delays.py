@@ -57,7 +57,7 @@ def test_delays_up_to_the_longest_are_found_ahead_and_behind(delay_s: float) -> 
     assert found.delay_s[1] == pytest.approx(delay_s, abs=1e-3)
 
 
-def test_two_motors_that_do_much_the_same_and_a_slow_converter_are_told_apart() -> None:
+def test_two_motors_that_do_much_the_same_and_a_slow_converter_are_distinguished() -> None:
     vehicle = MadeUp(
         size_a={"motor": 50.0, "motor_rear": 80.0, "dcdc": 20.0},
         delay_s={"battery": 0.1, "motor": 0.28, "motor_rear": 0.0, "dcdc": 0.2},

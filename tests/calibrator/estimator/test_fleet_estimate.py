@@ -75,7 +75,7 @@ def test_a_wrong_sign_or_unit_in_most_vehicles_is_refused(summaries: Summaries, 
         assert learned(few).vehicles == VEHICLES
 
 
-def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_said(truth: Faults) -> None:
+def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_reported(truth: Faults) -> None:
     batch = replace(truth, offset_a=truth.offset_a + np.array([12.0, 0.0]))
     summaries = summaries_of(batch, Conditions(model_error_a=0.3), seed=4)
     learnt = learned(summaries)
@@ -101,7 +101,7 @@ def test_gain_error_shared_by_a_branch_is_reported_but_not_corrected(vehicles: i
 
 
 @pytest.mark.parametrize("larger", [0.0, 0.1])
-def test_two_variants_of_the_vehicle_are_said_and_named(larger: float) -> None:
+def test_two_variants_of_the_vehicle_are_reported_and_named(larger: float) -> None:
     fleet = no_faults(12, K)
     fleet.hardware_drift[6:] = larger
     summaries = summaries_of(fleet, Conditions(samples=900, model_error_a=0.3), seed=6)

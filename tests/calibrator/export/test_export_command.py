@@ -59,7 +59,7 @@ def test_parameters_that_do_not_fit_are_refused(params: Path, tmp_path: Path, ma
     assert not (tmp_path / "out").exists()
 
 
-def test_protection_that_the_core_does_not_know_is_told(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_protection_that_the_core_does_not_know_is_reported(make_database: MakeDatabase, tmp_path: Path) -> None:
     layout = SMALL_LAYOUT + '\n[e2e]\nprofile = "P05"\noffset = 4\nmessages = ["Pair"]\n'
     database = make_database(layout)
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), tmp_path / "v1.json")

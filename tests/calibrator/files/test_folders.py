@@ -129,7 +129,7 @@ def test_no_place_is_refused(place: str) -> None:
         open_storage(place)
 
 
-def test_full_disk_is_told_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_reported_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, content: bytes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -191,7 +191,7 @@ def test_a_folder_on_a_disk_without_locks_is_used_without(tmp_path: Path, monkey
         pass
 
 
-def test_storage_that_lets_nobody_in_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_storage_that_lets_nobody_in_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_credentials(*_: object) -> None:
         raise RuntimeError("Unable to locate credentials")
 

@@ -118,7 +118,7 @@ def shares(found: Any) -> dict[str, float]:
     return {name: found["residual"]["before"][name] for name in ("constant", "gains", "delays", "rest")}
 
 
-def test_sum_of_a_gain_error_is_told_from_a_constant_and_a_delay(tmp_path: Path) -> None:
+def test_sum_of_a_gain_error_is_distinguished_from_a_constant_and_a_delay(tmp_path: Path) -> None:
     noise = 0.05 * np.random.default_rng(5).normal(size=1200)
     late = 60.0 * np.sin(0.7 * (TABLE_S - 0.08)) + 25.0 * np.sin(2.3 * (TABLE_S - 0.08) + 1.0) + 20.0
     for wrong, name in ((1.03 * MOTOR_A - 0.6, "gains"), (MOTOR_A + 2.0, "constant"), (late, "delays")):

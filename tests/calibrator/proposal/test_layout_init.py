@@ -118,7 +118,7 @@ LEFT_OUT = {
 
 
 @pytest.mark.parametrize("kind", LEFT_OUT)
-def test_no_pack_current_is_said_with_the_reason(kind: str, tmp_path: Path) -> None:
+def test_no_pack_current_is_reported_with_the_reason(kind: str, tmp_path: Path) -> None:
     message, why = LEFT_OUT[kind]
     path = database_file(tmp_path, message, INVERTER)
     run = calibrator("layout", "init", path, "--out", tmp_path / "car.toml")
@@ -217,7 +217,7 @@ def log_file(dbc: Path, series: Series, *, seconds: float = 60.0, lines: Sequenc
     return path
 
 
-def test_with_a_log_signs_are_told_against_convention(tmp_path: Path) -> None:
+def test_with_a_log_signs_are_found_against_convention(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     turned = {**DRIVING, "PackCurrent": lambda t: -battery_a(t), "HeaterCurrent": heater_a}
     layout = found(dbc, "--log", log_file(dbc, turned))
@@ -243,7 +243,7 @@ def test_wrong_range_is_judged_by_the_log(tmp_path: Path) -> None:
     assert json.loads(run.stdout)["before"]["sum"]["rmse_a"] < 20.0  # negative currents count: else 60 A
 
 
-def test_unsigned_signal_that_is_signed_is_said(tmp_path: Path) -> None:
+def test_unsigned_signal_that_is_signed_is_reported(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK.replace("@1- (0.1,0) [-1000|1000]", "@1+ (0.1,0) [0|0]"), INVERTER)
     run = calibrator("layout", "init", dbc, "--log", log_file(dbc, DRIVING))
     assert run.returncode == 1

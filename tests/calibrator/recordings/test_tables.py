@@ -160,7 +160,7 @@ def test_row_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     assert table.time_s[-1] == pytest.approx(0.1 * (ROWS - 2))
 
 
-def test_times_without_their_fractions_are_said(tmp_path: Path) -> None:
+def test_times_without_their_fractions_are_reported(tmp_path: Path) -> None:
     csv(frame(time=TIME_S.astype(int)))(tmp_path / "x.csv")
     told = " ".join(before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"])
     assert "10 rows share each time: write its fractions of a second" in told

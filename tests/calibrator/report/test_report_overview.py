@@ -151,7 +151,7 @@ def test_one_margin_for_all_falls_no_lower_than_the_worst_that_is_not_corrected(
     assert f"Not corrected, these keep it large: V2 ({9.0 + DOUBT_A:.1f} A)." in text
 
 
-def test_sensor_that_is_not_known_is_not_counted_and_that_is_said(margin: Margin) -> None:
+def test_sensor_that_is_not_known_is_not_counted_and_reported_so(margin: Margin) -> None:
     lost = sensor(0.3, 50.0, sd=0.2)
     found, text = margin(lost, sensor(0.1, 4.0), sensor())
     assert (found["vehicles"], found["not_known"]) == (2, 1)
@@ -162,7 +162,7 @@ def test_sensor_that_is_not_known_is_not_counted_and_that_is_said(margin: Margin
     assert "How wrong the battery sensor can be is not known, so no margin follows." in text
 
 
-def test_gains_are_told_in_kilowatts_where_the_voltage_is_known(margin: Margin) -> None:
+def test_gains_are_given_in_kilowatts_where_the_voltage_is_known(margin: Margin) -> None:
     _, text = margin(sensor(0.1, 4.0, apply=True), sensor(), voltage_v=350.0)
     assert "44.0 A = 15.4 kW given back with one margin for all" in text
     _, text = margin(sensor(0.1, 4.0, apply=True), sensor())

@@ -126,7 +126,7 @@ def test_findings_are_in_the_workshop_list_and_with_the_vehicle(tmp_path: Path, 
     assert "Workshop list" not in visible(report_page(result, "V1")[0])
 
 
-def test_a_vehicle_that_was_left_out_is_told_why(result: Path) -> None:
+def test_a_vehicle_that_was_left_out_is_reported_with_its_reason(result: Path) -> None:
     with pytest.raises(FleetError, match="it was left out: cannot be read"):
         report_page(result, f"log of {EVIL}")
     with pytest.raises(FleetError, match="no vehicle 'V99' in it"):

@@ -44,7 +44,7 @@ def test_stored_drives_are_the_logs(two_vehicles: Path, report: ImportReport, da
         assert recording_digest(load_drive(kept, database)) == recording_digest(load_drive(log, database))
 
 
-def test_equal_notices_are_told_once_and_json_keeps_those_of_every_drive(report: ImportReport) -> None:
+def test_equal_notices_are_reported_once_and_json_keeps_those_of_every_drive(report: ImportReport) -> None:
     told = [line for line in report.as_text().splitlines() if "junction_box_temperature" in line]
     kept = [notice for drive in json.loads(report.as_json())["drives"] for notice in drive["notices"]]
     frames = [int(re.findall(r"(\d+) of", notice)[0]) for notice in kept if "junction_box_temperature" in notice]

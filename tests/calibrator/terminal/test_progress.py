@@ -81,7 +81,7 @@ def test_figures_are_written_as_people_do(value: float, digits: int, text: str) 
     assert figure(value, digits) == text
 
 
-def test_of_many_reasons_five_are_told_and_how_many_more_there_are() -> None:
+def test_of_many_reasons_five_are_reported_and_how_many_more_there_are() -> None:
     reasons = {f"V{j}": "cut" for j in range(7)}
     five = "; V0: cut; V1: cut; V2: cut; V3: cut; V4: cut"
     assert few_reasons({}) == ""
@@ -103,7 +103,7 @@ def test_one_reason_of_many_vehicles_is_one_line() -> None:
     (["V1/monday", "V1/tuesday", "V2/monday"], "in 3 drives of 2 vehicles: 3 of 6 frames"),
     (["V1/monday", "V2/monday"], "in 2 vehicles: 2 of 4 frames"),
 ])  # fmt: skip
-def test_equal_notices_are_told_once_with_the_sum_of_their_counts(drives: list[str], text: str) -> None:
+def test_equal_notices_are_reported_once_with_the_sum_of_their_counts(drives: list[str], text: str) -> None:
     notice = Notice(text="{} of {} frames", counts=(1, 2))
     notices = {(vehicle, name): [notice] for vehicle, _, name in (each.partition("/") for each in drives)}
     assert merged_notices(notices) == [text]
