@@ -24,8 +24,8 @@ from ecu_node.summary import TIME_RESOLUTION_S
 
 __all__ = ["CHECKS", "findings_of", "readiness"]
 
-MANY_BAD, SOME_BAD = 0.05, 0.001
-"""Shares of frames that cannot be used: worth a warning, worth a hint. [1]"""
+MOST_BAD, MANY_BAD, SOME_BAD = 0.5, 0.05, 0.001
+"""Shares of frames that cannot be used: what is left is no current; worth a warning; worth a hint. [1]"""
 TIMEOUT_PERIODS = 5.0
 """A time-out of this many periods bridges some lost frames. [1]"""
 LEAST_V, GREATEST_V, USUAL_V = 30.0, 1500.0, 400.0
@@ -107,7 +107,7 @@ def bad_frames(facts: Facts) -> Findings:
         share = number / max(row.frames, 1)
         if share < SOME_BAD:
             continue
-        say = error if not row.good else warning if share >= MANY_BAD else hint
+        say = error if share >= MOST_BAD else warning if share >= MANY_BAD else hint
         if not row.is_branch:
             say = hint if not row.needed or say is hint else warning
         reasons = ", ".join(f"{reason} {count:,}" for reason, count in row.bad.items())

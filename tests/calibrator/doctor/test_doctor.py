@@ -232,7 +232,7 @@ def stuck(value: Array) -> Array:
     ("auxiliary", lambda value: 0.0 * value - 5.0, "constant", "it never changes: -5 A in all of 2,400 frames"),
     ("dcdc", lambda value: np.nan * value, "bad frames", r"1,200 of 1,200 frames \(100 %\) .*: not available 1,200"),
 ])  # fmt: skip
-def test_branch_with_useless_values_is_found(
+def test_branch_without_plausible_values_is_found(
     branch: str, change: Callable[[Array], Array], code: str, text: str,
     tmp_path: Path, layout: Path, database: VehicleDatabase,
 ) -> None:  # fmt: skip
@@ -241,6 +241,18 @@ def test_branch_with_useless_values_is_found(
     (found,) = [item for item in examined(layout, log).findings(code) if item.severity != "hint"]
     assert found.subject == branch
     assert re.search(text, found.text)
+
+
+@pytest.mark.parametrize(("lost", "severity"), [(0.7, "error"), (0.2, "warning")])
+def test_branch_of_which_most_frames_cannot_be_used_is_an_error(
+    lost: float, severity: str, tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    """As with the wrong byte order in the DBC: what is left of it is no current."""
+    drive = true_drive()
+    value = drive.branches["dcdc"].value.copy()
+    value[np.random.default_rng(0).random(len(value)) < lost] = np.nan
+    told = examined(layout, write_log(tmp_path, with_branch(drive, "dcdc", value), database))
+    assert [item.severity for item in told.findings("bad frames") if item.subject == "dcdc"] == [severity]
 
 
 def test_gaps_and_failed_checks_are_counted(log: Path, tmp_path: Path, layout: Path) -> None:
