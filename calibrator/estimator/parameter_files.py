@@ -194,6 +194,7 @@ def held_back_lines(parameters: VehicleParameters) -> list[str]:
     for reason, why in REASONS.items():
         held_back = {name: branch for name, branch in parameters.branches.items() if branch.held_back == reason}
         harm = [branch.harm_probability for branch in held_back.values() if branch.harm_probability is not None]
-        more = f", with {max(harm):.2%} (see --harm-limit)" if reason == "harm limit" and harm else ""
+        shares = ", ".join(f"{share:.2%}" for share in harm)
+        more = f", with {shares} (see --harm-limit)" if reason == "harm limit" and harm else ""
         lines += [f"{', '.join(held_back)} not corrected, because {why}{more}"] if held_back else []
     return lines
