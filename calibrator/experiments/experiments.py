@@ -338,6 +338,7 @@ TABLE = (
         ),
         quick={"K=2": (6,)},
         note="S = 80, hardware faults in any vehicle.",
+        picture="dots",
         shown=("confidence", "deployed", "harmed", "worst_a", "sure_wrong"),
         panels=("recovery_rate", "harmed"),
         pooled=False,
