@@ -389,6 +389,7 @@ def estimate_rows(
         fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
         supports.append(_supports(explained, found, j))
         hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
+    confidence[~rows.known.any(axis=1)] = 0.0  # of which nothing is known: the prior alone is no evidence
     first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])
     load_probability, load, group_probability = _unmeasured(explained)
     return RowsEstimate(

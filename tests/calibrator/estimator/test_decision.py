@@ -16,7 +16,7 @@ from calibrator.estimator.decision import (
     harm_probability,
     posterior_points,
 )
-from calibrator.estimator.evidence import EvidenceRows
+from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT
 from calibrator.estimator.learning import learn_fault_models
 from calibrator.estimator.posterior import FaultModel, Spread, draw_explanations, fit_explanations, weigh
@@ -259,3 +259,16 @@ def test_standard_deviations_are_those_of_the_errors() -> None:
     within = np.abs(error[sure]) / sd[sure]
     assert 0.55 < (within < 1.0).mean() < 0.95
     assert (within > 3.5).mean() < 0.02
+
+
+def test_vehicle_of_which_nothing_is_known_has_no_confidence() -> None:
+    """As drives of a minute are: the prior alone is no evidence."""
+    rows = rows_of(no_faults(2, K), seed=1)
+    covariance = rows.covariance.copy()
+    covariance[1] = UNKNOWN_VARIANCE * np.eye(5 * K)
+    spread = Spread(mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(5))
+    law, moments = FaultModel(spread=spread, priors=((1.0, first_prior(K)),)), np.full((2, K), 0.1)
+    rows = replace(rows, covariance=covariance)
+    found = estimate_rows(rows, [law], feed=0, mean=moments, mean_square=moments, usual=moments[:2])
+    assert found.confidence[0] > 0.9
+    assert found.confidence[1] == 0.0
