@@ -104,7 +104,7 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
     ------
     DriveError
         If vehicle or drive has a name that is no file name.
-    StorageError
+    UserError
         If the file cannot be written.
     """
     require_plain_name(drive.vehicle, "vehicle")

@@ -91,7 +91,7 @@ def import_logs(
 
     Raises
     ------
-    StorageError
+    UserError
         If a drive cannot be written: the others could not be either.
     """
     found, start_s = find_logs(logs), time.time()
