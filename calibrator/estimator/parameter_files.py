@@ -195,6 +195,6 @@ def held_back_lines(parameters: VehicleParameters) -> list[str]:
         held_back = {name: branch for name, branch in parameters.branches.items() if branch.held_back == reason}
         harm = [branch.harm_probability for branch in held_back.values() if branch.harm_probability is not None]
         shares = ", ".join(f"{share:.2%}" for share in harm)
-        more = f", with {shares} (see --harm-limit)" if reason == "harm limit" and harm else ""
+        more = f", with a probability of {shares} (see --harm-limit)" if reason == "harm limit" and harm else ""
         lines += [f"{', '.join(held_back)} not corrected, because {why}{more}"] if held_back else []
     return lines

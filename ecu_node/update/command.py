@@ -152,10 +152,7 @@ def _inspect(options: argparse.Namespace) -> int:
             except TrustError as error:
                 problems.append(f"{options.state}: {error}")
     if state.in_force is None:
-        lines.append(
-            "nothing is in force"
-            + (f": the last set was {state.ended}" if state.ended in {"revoked", "expired"} else "")
-        )
+        lines.append("nothing is in force" + (f": the last set was {state.ended}" if state.ended else ""))
     if options.json:
         write_output(msgspec.json.encode({**facts, "problems": problems}).decode())
     else:

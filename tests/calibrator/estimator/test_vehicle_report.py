@@ -169,5 +169,6 @@ def test_each_branch_has_its_own_probability_of_harm(database: VehicleDatabase) 
         changed(sensor(0.1, held_back="harm limit"), harm_probability=probability) for probability in (0.0027, 0.0914)
     )
     assert held_back_lines(vehicle(database, "V1", battery, motor)) == [
-        "battery, motor not corrected, because the correction might do harm, with 0.27%, 9.14% (see --harm-limit)"
+        "battery, motor not corrected, because the correction might do harm, with a probability of 0.27%, 9.14% (see "
+        "--harm-limit)"
     ]
