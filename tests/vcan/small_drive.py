@@ -77,14 +77,19 @@ def protected(database: VehicleDatabase, message: str, counter: int, **codes: in
     return bytes(data)
 
 
-def write_drive(path: Path, database: VehicleDatabase, instants: int) -> dict[str, list[int]]:
-    """Write the drive as a candump log of can0, among frames of others; returns the measured codes per branch."""
+def write_drive(
+    path: Path, database: VehicleDatabase, instants: int, *, standing_at_s: float | None = None
+) -> dict[str, list[int]]:
+    """Write the drive as a candump log of can0, among frames of others; returns the measured codes per branch.
+
+    With `standing_at_s` all instants have the currents of this one: their sum is right whenever it is looked at.
+    """
     codes: dict[str, list[int]] = {name: [] for name in BRANCHES}
     lines = []
     for k in range(instants):
         t = k * PERIOD_S
         frames = list(_foreign_frames(database, k))
-        for name, i in true_currents(t).items():
+        for name, i in true_currents(t if standing_at_s is None else standing_at_s).items():
             branch = BRANCHES[name]
             code = round(branch.measured(i) / float(STEP_A))
             codes[name].append(code)
