@@ -246,9 +246,9 @@ class _Learner:
     def initial_slopes(self) -> list[Array]:
         """Slopes of vehicles without faults, each of shape (K,), as logarithms.
 
-        How much further the model is off in one branch than in the first, every vehicle tells whatever its faults, by
-        two slopes and their gain ratio; and clusters of the slopes, where ratios are vague. By how much in all of them,
-        clusters of all slopes.
+        The fleet model may be off by a factor in each branch. How these factors differ between branches follows from
+        two slopes and their gain ratio, in every vehicle and whatever its faults; where ratios are vague, clusters of
+        the slopes are tried as well. What the factors have in common are clusters of all slopes.
         """
         rows, K, at = self.rows, self.rows.branches, self.at
         by_ratios, by_clusters, first = np.zeros(K), np.zeros(K), at.slope(0)
@@ -290,7 +290,7 @@ class _Learner:
         return found
 
     def initial_model(self, centre: Array, common_spread: float = 0.0) -> FaultModel:
-        """FaultModel before anything is known but a centre, and what vehicles differ by in all branches alike."""
+        """Model before anything is known but a centre, and by how much vehicles differ in all branches alike [1]."""
         rows, K = self.rows, self.rows.branches
         junction, eta = self.at.junction, self.design[:, self.parameters.eta]
         covariance = self.guess + self.least + common_spread**2 * np.outer(eta, eta)
