@@ -71,6 +71,7 @@ def test_late_scheduler_and_lost_worker_change_nothing(tmp_path: Path, monkeypat
         assert sorted(worker.poll() is None for worker in cluster.workers) == [False, True]  # it killed one
 
 
+@pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning")  # distributed's, to a scheduler that was killed
 def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CONNECT_S", 2.0)
     with DaskCluster(tmp_path) as cluster:
