@@ -271,8 +271,8 @@ def simulate_fleet(
     with whole_folder(out) as folder:
         write = partial(_write_vehicle, folder=folder, database=database, trips=trips, seed=plan.seed)
         written = run_many(write, enumerate(vehicles), Workers(processes=workers))
-        told = shown(written, "simulate", len(vehicles), "vehicles")
-        truths = {vehicle.name: truth for vehicle, truth in zip(vehicles, told, strict=True)}
+        finished = shown(written, "simulate", len(vehicles), "vehicles")
+        truths = {vehicle.name: truth for vehicle, truth in zip(vehicles, finished, strict=True)}
         fleet = FleetTruth(
             fleet_id="",
             layout=layout.name,

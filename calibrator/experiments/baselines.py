@@ -153,13 +153,13 @@ class _Linear:
         self.rows, self.order = _evidence_rows(trial)
         self.full_scale_a = trial.full_scale_a
         K = self.rows.branches
-        told = self.rows.places.measured
-        self.design = row_design(K, feed=0)[told, : ParameterPlaces(K).load]
-        covariance = self.rows.covariance[:, told[:, None], told]
+        measured = self.rows.places.measured
+        self.design = row_design(K, feed=0)[measured, : ParameterPlaces(K).load]
+        covariance = self.rows.covariance[:, measured[:, None], measured]
         sd = np.sqrt(np.einsum("nii->ni", covariance))
-        clusters = [densest_clusters(self.rows.values[:, row], sd[:, i])[0] for i, row in enumerate(told)]
+        clusters = [densest_clusters(self.rows.values[:, row], sd[:, i])[0] for i, row in enumerate(measured)]
         centre = np.zeros(5 * K)
-        centre[told] = [cluster.centre for cluster in clusters]
+        centre[measured] = [cluster.centre for cluster in clusters]
         self.evidence = evidence_of(
             self.rows.values, self.rows.covariance, self.rows.means, centre=centre, shared=np.zeros(2 * K + 1), feed=0
         )

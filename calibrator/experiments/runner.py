@@ -122,8 +122,8 @@ def _common(settings: Sequence[Setting]) -> dict[str, Any]:
         for key, value in common.items()
         if isinstance(value, tuple)
     }
-    told = {key: getattr(value, "name", value) for key, value in (common | pairs).items()}
-    return {key: value for key, value in told.items() if value not in {None, ""}}
+    shown = {key: getattr(value, "name", value) for key, value in (common | pairs).items()}
+    return {key: value for key, value in shown.items() if value not in {None, ""}}
 
 
 def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
@@ -169,13 +169,13 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
     groups[ALL] = [table[table.set_index(keys).index.isin(once)] for table in (figures, tenths)]
     pooled = [_pooled(name, *tables) for name, tables in groups.items()]
     figures, tenths = (pd.concat(some, ignore_index=True) for some in zip(*pooled, strict=True))
-    told = {
+    sources = {
         name: " or ".join(sorted({str(result.settings.get(name, "?")) for result in used}))
         for name in ("repetitions", "seed")
     }
     settings = {
         "experiments": ", ".join(result.experiment.name for result in used),
-        **told,
+        **sources,
         "drive": "those of the experiments",
     }
     return ExperimentResult(experiment=CALIBRATION, settings=settings, figures=figures, tenths=tenths)
@@ -205,5 +205,5 @@ def _commit() -> str:
     if git is None or not (root / ".git").exists():
         return ""
     command = [git, "-C", str(root), "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty"]
-    told = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - nothing of a user in it
-    return f" of commit {told.stdout.strip()}" if told.returncode == 0 else ""
+    described = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - nothing of a user in it
+    return f" of commit {described.stdout.strip()}" if described.returncode == 0 else ""

@@ -1,4 +1,4 @@
-"""Texts made of the templates of a room, by jinja2."""
+"""Texts made of the templates of a package, by jinja2."""
 
 from typing import Any
 
@@ -7,16 +7,16 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 __all__ = ["templates_of"]
 
 
-def templates_of(room: str, folder: str = "templates", **settings: Any) -> Environment:
-    """Templates in a folder of a room, such as ``calibrator.report``; a name without a value is an error.
+def templates_of(package: str, folder: str = "templates", **settings: Any) -> Environment:
+    """Templates in a folder of a package, such as ``calibrator.report``; a name without a value is an error.
 
     Parameters
     ----------
-    room, folder : str
+    package, folder : str
         Package, and its folder with the templates.
     **settings
-        Of jinja2's environment, beside those that all rooms share: blocks leave no lines and blanks behind.
+        Of jinja2's environment, beside those that all packages share: blocks leave no lines and blanks behind.
     """
-    loader = PackageLoader(room, folder)
+    loader = PackageLoader(package, folder)
     blocks: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
-    return Environment(loader=loader, undefined=StrictUndefined, **(blocks | settings))  # noqa: S701 (rooms of pages set autoescape)
+    return Environment(loader=loader, undefined=StrictUndefined, **(blocks | settings))  # noqa: S701 (pages set autoescape)

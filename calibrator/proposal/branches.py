@@ -289,7 +289,7 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
     def price(turned: Array) -> float:
         return np.inf if turned[sure] < 0.0 else 1e-6 * float(np.sum(turned < 0.0))
 
-    best, told = usual * likely_multipliers(part, price, factors=(1.0,), sure=False), []
+    best, signed = usual * likely_multipliers(part, price, factors=(1.0,), sure=False), []
     for k, item in enumerate(chosen):
         other = best * np.where(np.arange(len(chosen)) == k, -1.0, 1.0)
         with_it, without = _rms(current @ best), _rms(current @ other)
@@ -299,8 +299,8 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
             reason = "with it the voltage falls when the current rises" if by_voltage else item.sign_reason
         elif without < CLEAR * with_it or without == 0.0:
             sign, reason = item.sign, f"{item.sign_reason}; too little current for the sum to tell"
-        told.append(replace(item, sign=sign, sign_reason=reason))
-    return told
+        signed.append(replace(item, sign=sign, sign_reason=reason))
+    return signed
 
 
 def closure(chosen: Sequence[Candidate], voltage: Candidate | None) -> float:

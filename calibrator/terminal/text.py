@@ -114,9 +114,9 @@ def few_reasons(reasons: Mapping[str, str], *, count: int | None = None) -> str:
     str
         ``"; NAME: why"`` for each of the first :data:`MOST_REASONS`, and how many more there are; empty for none.
     """
-    told = "".join(f"; {name}: {why}" for name, why in list(reasons.items())[:MOST_REASONS])
+    text = "".join(f"; {name}: {why}" for name, why in list(reasons.items())[:MOST_REASONS])
     more = (len(reasons) if count is None else count) - MOST_REASONS
-    return f"{told}; and {more} more" if more > 0 else told
+    return f"{text}; and {more} more" if more > 0 else text
 
 
 def figure(value: float, digits: int = 3) -> str:

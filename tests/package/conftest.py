@@ -3,8 +3,10 @@
 import shutil
 import tarfile
 from collections.abc import Callable
+from importlib import reload
 from pathlib import Path
 
+import can.io.mf4
 import pytest
 from msgspec.structs import replace
 
@@ -18,6 +20,8 @@ from tests.package.clean_venv import ROOT, CleanVenv, new_venv, the_wheel
 DIST = ROOT / "dist"
 VEHICLE = "V001"
 Installed = Callable[..., CleanVenv]
+
+reload(can.io.mf4)  # with its writer: tests/conftest.py imports python-can without asammdf, which takes long
 
 
 @pytest.fixture(scope="session")

@@ -43,7 +43,7 @@ def test_fleet_from_logs_to_exports(installed: Installed, car: Path, fleet: Path
     assert "<script>" in (result / "report.html").read_text()
     calibrator(venv, tmp_path, "report", result, "--vehicle", VEHICLE, "--out", "vehicle.html")
     parameters = result / "params" / f"{VEHICLE}.json"
-    for kind in ("dcm", "cdfx", "csv", "c"):
+    for kind in ("dcm", "cdfx", "c"):
         calibrator(venv, tmp_path, "export", parameters, *layout, "--format", kind, "--out", f"out-{kind}")
     calibrator(venv, tmp_path, "layout", "init", car / "hv_powertrain.dbc", "--log", drive, "--out", "guessed.toml")
     assert json.loads(calibrator(venv, tmp_path, "kirchhoff", drive, *layout, "--plot", "x.html", "--json"))["instants"]
@@ -105,8 +105,10 @@ def test_mf4_logs_are_read(installed: Installed, car: Path, drive: Path, tmp_pat
     with can.Logger(tmp_path / "drive.mf4") as log:
         for frame in can.LogReader(drive):
             log(frame)
-    told = calibrator(installed("mf4"), tmp_path, "kirchhoff", "drive.mf4", "--layout", car / "my_car.toml", "--json")
-    assert json.loads(told)["branches"] == ["battery", "motor"]
+    json_output = calibrator(
+        installed("mf4"), tmp_path, "kirchhoff", "drive.mf4", "--layout", car / "my_car.toml", "--json"
+    )
+    assert json.loads(json_output)["branches"] == ["battery", "motor"]
 
 
 def test_bench_compares_with_its_peer(installed: Installed, unpacked: Path) -> None:
@@ -138,7 +140,7 @@ STEPS: dict[str, tuple[tuple[str, ...], str]] = {
         "calibrator: builtin drives need fastsim; install the extra: ",
     ),
     "mf4": (("kirchhoff", "drive.mf4", *LAYOUT), "calibrator: drive.mf4: reading MF4 needs asammdf; "),
-    "cluster": (  # what is missing is told before the fleet is read, which takes hours
+    "cluster": (  # what is missing is reported before the fleet is read, which takes hours
         ("calibrate", "none", *LAYOUT, "--scheduler", "tcp://127.0.0.1:9", "--out", "never"),
         "calibrator: --scheduler needs Dask: ",
     ),

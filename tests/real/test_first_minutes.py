@@ -48,10 +48,10 @@ def test_three_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> Non
     again = calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--out", "my_car.toml"])
     assert again.returncode == 1
     assert again.stderr.startswith("calibrator: my_car.toml: exists, and is not overwritten")
-    told = calibrator(tesla, *["doctor", "--layout", "my_car.toml", "--log", "drive.log.gz"])
-    assert told.returncode == 0, told.stdout
+    doctor = calibrator(tesla, *["doctor", "--layout", "my_car.toml", "--log", "drive.log.gz"])
+    assert doctor.returncode == 0, doctor.stdout
     ready = "ready for: kirchhoff, import, calibrate --trusted, ecu-node --gateway"  # too short for a fleet
-    assert ready in told.stdout.splitlines()
+    assert ready in doctor.stdout.splitlines()
     drawn = calibrator(tesla, *["kirchhoff", "drive.log.gz", "--layout", "my_car.toml", "--plot", "sum.html", "--json"])
     assert drawn.returncode == 0, drawn.stderr
     total = json.loads(drawn.stdout)["before"]["sum"]
@@ -127,9 +127,9 @@ def test_doctor_names_what_is_wrong_and_nothing_else(
     assert changed or findings == [("hint", "mean", "sum")]
     (tmp_path / "Model3CAN.dbc").write_text(change_dbc(dbc), encoding="cp1252")
     (tmp_path / "layout.toml").write_text(change_layout(layout))
-    told = examined(tmp_path / "layout.toml", tesla / "drive.log.gz").findings()
-    grave = [item for item in told if item.severity == "error" or item.code == "exchanged"]
-    assert sorted((item.severity, item.code, item.subject) for item in grave or told) == findings
+    found = examined(tmp_path / "layout.toml", tesla / "drive.log.gz").findings()
+    grave = [item for item in found if item.severity == "error" or item.code == "exchanged"]
+    assert sorted((item.severity, item.code, item.subject) for item in grave or found) == findings
 
 
 @pytest.mark.parametrize("trip", ["TripA07", "TripA24"])

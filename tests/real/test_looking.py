@@ -37,18 +37,18 @@ def test_sum_of_car_and_station_is_their_disagreement(name: str, mean_a: float, 
 
 
 def test_doctor_sees_that_a_charge_at_full_current_stands_still(i3: Path, shared_data: Path) -> None:
-    told = examined(i3, shared_data / "bmw_i3_charging" / "2019_efacaec_mida.csv.gz")
-    assert told.errors == []
-    (still,) = told.findings("stands still")
+    doctor = examined(i3, shared_data / "bmw_i3_charging" / "2019_efacaec_mida.csv.gz")
+    assert doctor.errors == []
+    (still,) = doctor.findings("stands still")
     assert still.text.startswith("the currents stand still, the greatest at 125 A")
-    assert "calibrate --trusted" in told.report["ready"]
+    assert "calibrate --trusted" in doctor.report["ready"]
 
 
 def test_end_of_a_charge_has_frames_without_a_value_and_no_error(i3: Path, shared_data: Path) -> None:
-    told = examined(i3, shared_data / "bmw_i3_charging" / "2019_Circontrol_end.csv.gz")
-    assert told.errors == []
-    assert {item.code for item in told.findings()} == {"bad frames", "too short", "mean"}
-    assert "19 of 153 frames (12 %) cannot be used: not available 19" in told.findings("bad frames")[0].text
+    doctor = examined(i3, shared_data / "bmw_i3_charging" / "2019_Circontrol_end.csv.gz")
+    assert doctor.errors == []
+    assert {item.code for item in doctor.findings()} == {"bad frames", "too short", "mean"}
+    assert "19 of 153 frames (12 %) cannot be used: not available 19" in doctor.findings("bad frames")[0].text
 
 
 def test_tesla_sum_is_a_constant_for_the_most_part(shared_data: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The node is light, and the rooms of the calibrator import only rooms that docs/architecture.md names before them."""
+"""The node is light, and packages of the calibrator import only those that docs/architecture.md names before them."""
 
 import ast
 import re
@@ -10,9 +10,9 @@ ROOT = Path(__file__).parents[2]
 NODE_PACKAGES = {"_typeshed", "can", "cantools", "e2e", "fastcrc", "msgspec"}
 """What the base install has, and what only type checkers see."""
 NODE_EXTRAS = {"update": {"cryptography", "tuf", "securesystemslib", "urllib3"}}
-"""What rooms or modules of this name may import besides: an extra brings it, and only their commands need it."""
-DOORS = {"__init__", "__main__", "cli"}
-"""They import every room, to start it."""
+"""What packages or modules of this name may import besides: an extra brings it, and only their commands need it."""
+ENTRIES = {"__init__", "__main__", "cli"}
+"""They import every package, to start it."""
 
 
 def imported(path: Path) -> Iterator[str]:
@@ -34,17 +34,18 @@ def test_node_imports_nothing_heavy_and_nothing_of_the_calibrator() -> None:
     assert heavy == []
 
 
-def test_rooms_import_only_rooms_that_are_named_before_them() -> None:
+def test_packages_import_only_packages_that_are_named_before_them() -> None:
     page = (ROOT / "docs" / "architecture.md").read_text()
-    rows = re.findall(r"(?m)^\| (`.+?`) \|", page.partition("| room of `calibrator`")[2])
-    level = {room: number for number, row in enumerate(rows) for room in re.findall(r"`(\w+)`", row)}
-    rooms = {path.name for path in (ROOT / "calibrator").iterdir() if path.is_dir() and any(path.glob("*.py"))}
-    assert rooms <= level.keys(), "each room is named in the table"
+    rows = re.findall(r"(?m)^\| (`.+?`) \|", page.partition("| package of `calibrator`")[2])
+    level = {package: number for number, row in enumerate(rows) for package in re.findall(r"`(\w+)`", row)}
+    packages = {path.name for path in (ROOT / "calibrator").iterdir() if path.is_dir() and any(path.glob("*.py"))}
+    assert packages <= level.keys(), "each package is named in the table"
     wrong = set()
     for path in sorted((ROOT / "calibrator").rglob("*.py")):
-        room = path.relative_to(ROOT / "calibrator").with_suffix("").parts[0]
-        if room not in DOORS:
-            used = {name.split(".")[1] for name in imported(path) if name.startswith("calibrator.")} & rooms
-            # modules beside the rooms stand on the ground floor
-            wrong |= {f"{path.relative_to(ROOT)} imports {each}" for each in used if level[each] > level.get(room, 0)}
+        package = path.relative_to(ROOT / "calibrator").with_suffix("").parts[0]
+        if package not in ENTRIES:
+            used = {name.split(".")[1] for name in imported(path) if name.startswith("calibrator.")} & packages
+            # modules beside the packages come before all packages
+            own = level.get(package, 0)
+            wrong |= {f"{path.relative_to(ROOT)} imports {each}" for each in used if level[each] > own}
     assert wrong == set()

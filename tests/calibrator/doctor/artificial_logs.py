@@ -87,8 +87,8 @@ def write_layout(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Told:
-    """What ``calibrator doctor --json`` told."""
+class DoctorRun:
+    """What ``calibrator doctor --json`` reported."""
 
     code: int
     report: dict[str, Any]
@@ -104,10 +104,10 @@ class Told:
         return [(item.code, item.subject) for item in self.findings() if item.severity == "error"]
 
 
-def examined(layout: Path, *logs: Path) -> Told:
+def examined(layout: Path, *logs: Path) -> DoctorRun:
     """Run the command; its exit code must fit to what it found."""
     done = calibrator("doctor", "--layout", layout, *(word for log in logs for word in ("--log", log)), "--json")
     assert done.stderr == ""
-    told = Told(code=done.returncode, report=json.loads(done.stdout))
-    assert told.code == (1 if told.errors else 0)
-    return told
+    doctor = DoctorRun(code=done.returncode, report=json.loads(done.stdout))
+    assert doctor.code == (1 if doctor.errors else 0)
+    return doctor

@@ -47,17 +47,17 @@ def calibrated(folder: Path, log: Path, layout: Path, *arguments: object) -> tup
 
 
 def test_sound_log_is_ready_for_all(log: Path, layout: Path) -> None:
-    told = examined(layout, log)
-    assert told.errors == []
-    assert told.findings("sign", "unit", "delay", "sum", "stuck", "clipped", "gap", "gain", "stands still") == []
+    doctor = examined(layout, log)
+    assert doctor.errors == []
+    assert doctor.findings("sign", "unit", "delay", "sum", "stuck", "clipped", "gap", "gain", "stands still") == []
     steps = ["kirchhoff", "import", "calibrate --trusted", "calibrate", "ecu-node", "ecu-node --gateway"]
-    assert (told.report["ready"], told.report["not_ready"]) == (steps, {})
-    (mean,) = told.findings("mean")
+    assert (doctor.report["ready"], doctor.report["not_ready"]) == (steps, {})
+    (mean,) = doctor.findings("mean")
     assert mean.number == pytest.approx(2.5, abs=0.1)
-    battery, auxiliary = (told.report["branches"][name] for name in ("battery", "auxiliary"))
+    battery, auxiliary = (doctor.report["branches"][name] for name in ("battery", "auxiliary"))
     assert battery["frames"] == 6000
     assert 1.0 / auxiliary["period_s"] == pytest.approx(20.0, rel=1e-3)
-    assert [item.subject for item in told.findings("not in log") if "Rear" in item.text] == ["motor_rear"]
+    assert [item.subject for item in doctor.findings("not in log") if "Rear" in item.text] == ["motor_rear"]
 
 
 def test_text_names_the_next_commands_in_people_s_figures(log: Path, layout: Path) -> None:
@@ -70,12 +70,12 @@ def test_text_names_the_next_commands_in_people_s_figures(log: Path, layout: Pat
     assert all(len(line) <= 80 for line in lines[1:14]), lines
 
 
-@pytest.mark.parametrize(("declared_a", "told"), [(2.5, False), (1.5, False), (0.5, True)])
-def test_declared_load_is_not_told_again(declared_a: float, told: bool, log: Path, layout: Path) -> None:
+@pytest.mark.parametrize(("declared_a", "reported"), [(2.5, False), (1.5, False), (0.5, True)])
+def test_declared_load_is_not_reported_again(declared_a: float, reported: bool, log: Path, layout: Path) -> None:
     with layout.open("a") as file:
         file.write(f"\n[unmeasured_load]\nmean_a = {declared_a}\nsd_a = 0.5\n")
     found = examined(layout, log).findings("mean")
-    assert bool(found) is told
+    assert bool(found) is reported
     assert all("(0.5 A are declared as a load)" in item.text for item in found)
     assert all("look at the load declared in [unmeasured_load]" in item.advice for item in found)
 
@@ -102,14 +102,14 @@ def test_car_at_rest_is_no_error(
     noise_a: float, offset_a: float, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
     log = at_rest(database, tmp_path, noise_a=noise_a, offset_a=offset_a)
-    told = examined(layout, log)
-    assert told.errors == []
-    (still,) = told.findings("stands still")
+    doctor = examined(layout, log)
+    assert doctor.errors == []
+    (still,) = doctor.findings("stands still")
     assert still.text.startswith("the car stands still: no current varies by more than ")
     assert "and its speed is 0" in still.text
-    assert told.findings("sign", "unit", "cannot tell", "gain", "delay", "constant", "full scale", "inputs") == []
-    assert [round(item.number) for item in told.findings("mean")] == ([2] if offset_a else [])
-    assert "calibrate --trusted" in told.report["ready"]
+    assert doctor.findings("sign", "unit", "cannot tell", "gain", "delay", "constant", "full scale", "inputs") == []
+    assert [round(item.number) for item in doctor.findings("mean")] == ([2] if offset_a else [])
+    assert "calibrate --trusted" in doctor.report["ready"]
     shown = calibrator("kirchhoff", log, "--layout", layout).stdout
     assert still.text in " ".join(shown.split())
     assert "gain error" not in shown
@@ -118,9 +118,9 @@ def test_car_at_rest_is_no_error(
 
 
 def test_constant_current_at_speed_is_no_standstill(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
-    told = examined(layout, at_rest(database, tmp_path, noise_a=0.02, speed=50.0))
-    assert told.findings("stands still") == []
-    assert [item.subject for item in told.findings("full scale")] == ["all branches"]
+    doctor = examined(layout, at_rest(database, tmp_path, noise_a=0.02, speed=50.0))
+    assert doctor.findings("stands still") == []
+    assert [item.subject for item in doctor.findings("full scale")] == ["all branches"]
 
 
 # ---- signs and units
@@ -128,18 +128,18 @@ def test_constant_current_at_speed_is_no_standstill(tmp_path: Path, layout: Path
 
 @pytest.mark.parametrize("branch", ["battery", "motor", "auxiliary"])
 def test_inverted_sign_is_found_of_the_right_branch(branch: str, log: Path, tmp_path: Path) -> None:
-    told = examined(write_layout(tmp_path, inverted=(branch,)), log)
-    assert told.errors == [("sign", branch)]
-    error = told.findings("sign")[0]
+    doctor = examined(write_layout(tmp_path, inverted=(branch,)), log)
+    assert doctor.errors == [("sign", branch)]
+    error = doctor.findings("sign")[0]
     assert error.number > 4.0
     assert re.search(rf'set sign = -?1 in the \[\[branch\]\] "{branch}"', error.advice)
-    assert told.report["ready"] == ["kirchhoff"]
+    assert doctor.report["ready"] == ["kirchhoff"]
 
 
 def test_all_signs_inverted_are_found_by_the_voltage(log: Path, tmp_path: Path) -> None:
     layout = write_layout(tmp_path, inverted=("battery", "motor", "auxiliary", "dcdc", "motor_rear"))
-    told = examined(layout, log)
-    assert [(item.subject, item.severity) for item in told.findings("sign")] == [("all branches", "warning")]
+    doctor = examined(layout, log)
+    assert [(item.subject, item.severity) for item in doctor.findings("sign")] == [("all branches", "warning")]
 
 
 @pytest.mark.parametrize(("branch", "signal", "unit", "factor"), [
@@ -149,17 +149,17 @@ def test_all_signs_inverted_are_found_by_the_voltage(log: Path, tmp_path: Path) 
     ("auxiliary", "AuxiliaryCurrent", "kA", 0.001),
 ])  # fmt: skip
 def test_unit_slip_gives_factor(branch: str, signal: str, unit: str, factor: float, log: Path, tmp_path: Path) -> None:
-    told = examined(write_layout(tmp_path, units={signal: unit}), log)
-    assert told.errors == [("unit", branch)]
-    assert told.findings("unit")[0].number == factor
-    assert told.findings("full scale") == []
+    doctor = examined(write_layout(tmp_path, units={signal: unit}), log)
+    assert doctor.errors == [("unit", branch)]
+    assert doctor.findings("unit")[0].number == factor
+    assert doctor.findings("full scale") == []
 
 
 def test_sign_of_a_branch_too_small_to_tell_is_not_guessed(log: Path, tmp_path: Path) -> None:
     """The converter's current changes too slowly to be seen in the sum."""
-    told = examined(write_layout(tmp_path, inverted=("dcdc",)), log)
-    assert told.errors == []
-    assert [item.subject for item in told.findings("cannot tell")] == ["dcdc"]
+    doctor = examined(write_layout(tmp_path, inverted=("dcdc",)), log)
+    assert doctor.errors == []
+    assert [item.subject for item in doctor.findings("cannot tell")] == ["dcdc"]
 
 
 RNG = np.random.default_rng(3)
@@ -200,9 +200,9 @@ def test_impossible_voltage_is_blamed_for_powers(factor: float, wrong: list[tupl
 @pytest.mark.parametrize("delay_s", [0.06, 0.2, -0.3])
 def test_delay_is_found_as_no_error(delay_s: float, tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     late = {"motor": 0.4 + delay_s, "battery": 0.4, "auxiliary": 0.4, "dcdc": 0.4}
-    told = examined(layout, write_log(tmp_path, true_drive(delay_s=late), database))
-    assert told.errors == []
-    (delay,) = told.findings("delay")
+    doctor = examined(layout, write_log(tmp_path, true_drive(delay_s=late), database))
+    assert doctor.errors == []
+    (delay,) = doctor.findings("delay")
     assert (delay.subject, delay.severity) == ("motor", "warning" if abs(delay_s) >= 0.1 else "hint")
     assert delay.number == pytest.approx(delay_s, abs=0.005)
 
@@ -211,9 +211,9 @@ def test_gain_below_a_slip_of_units_is_in_percent(tmp_path: Path, layout: Path, 
     drive = true_drive()
     short = write_log(tmp_path, cut(drive, 12.0), database).rename(tmp_path / "short.log")
     log = write_log(tmp_path, with_branch(drive, "motor", 1.08 * drive.branches["motor"].value), database)
-    told = examined(layout, short, log)
-    assert told.errors == []
-    (gain,) = told.findings("gain")
+    doctor = examined(layout, short, log)
+    assert doctor.errors == []
+    (gain,) = doctor.findings("gain")
     assert gain.subject in {"motor", "battery"}
     assert abs(gain.number) == pytest.approx(0.08, abs=0.01)
 
@@ -251,8 +251,8 @@ def test_branch_of_which_most_frames_cannot_be_used_is_an_error(
     drive = true_drive()
     value = drive.branches["dcdc"].value.copy()
     value[np.random.default_rng(0).random(len(value)) < lost] = np.nan
-    told = examined(layout, write_log(tmp_path, with_branch(drive, "dcdc", value), database))
-    assert [item.severity for item in told.findings("bad frames") if item.subject == "dcdc"] == [severity]
+    doctor = examined(layout, write_log(tmp_path, with_branch(drive, "dcdc", value), database))
+    assert [item.severity for item in doctor.findings("bad frames") if item.subject == "dcdc"] == [severity]
 
 
 def test_gaps_and_failed_checks_are_counted(log: Path, tmp_path: Path, layout: Path) -> None:
@@ -262,18 +262,18 @@ def test_gaps_and_failed_checks_are_counted(log: Path, tmp_path: Path, layout: P
         if "can0 120#" in line:
             kept[k] = line.replace("can0 120#", "can0 120#FF").rstrip("\n")[:33].ljust(33, "0") + "\n"
     (tmp_path / "drive.log").write_text("".join(kept))
-    told = examined(layout, tmp_path / "drive.log")
-    (gap,) = (item for item in told.findings("gap") if item.subject == "battery")
+    doctor = examined(layout, tmp_path / "drive.log")
+    (gap,) = (item for item in doctor.findings("gap") if item.subject == "battery")
     assert gap.number == pytest.approx(5.0, abs=0.05)
-    (bad,) = (item for item in told.findings("bad frames") if item.subject == "motor")
+    (bad,) = (item for item in doctor.findings("bad frames") if item.subject == "motor")
     assert "E2E check failed" in bad.text
 
 
 def test_time_out_shorter_than_the_period_is_an_error(log: Path, layout: Path) -> None:
     layout.write_text(layout.read_text().replace("timeout_s = 0.25", "timeout_s = 0.03"))
-    told = examined(layout, log)
-    assert told.errors == [("rate", "auxiliary")]
-    assert "calibrate --trusted" in told.report["not_ready"]
+    doctor = examined(layout, log)
+    assert doctor.errors == [("rate", "auxiliary")]
+    assert "calibrate --trusted" in doctor.report["not_ready"]
 
 
 def test_full_scale_that_is_exceeded_or_never_approached_is_reported(log: Path, tmp_path: Path) -> None:
@@ -290,11 +290,11 @@ def test_full_scale_that_is_exceeded_or_never_approached_is_reported(log: Path, 
 
 def test_log_of_another_vehicle_is_an_error_that_names_what_it_has(tmp_path: Path, layout: Path) -> None:
     (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n(1.100000) can0 7FF#01\n")
-    told = examined(layout, tmp_path / "other.log")
-    (error,) = told.findings("no branch")
+    doctor = examined(layout, tmp_path / "other.log")
+    (error,) = doctor.findings("no branch")
     assert error.severity == "error"
     assert "0x7FF" in error.text
-    assert told.report["ready"] == []
+    assert doctor.report["ready"] == []
 
 
 def test_branch_that_some_logs_lack_is_reported(log: Path, layout: Path, tmp_path: Path) -> None:
@@ -313,17 +313,17 @@ def test_branch_that_some_logs_lack_is_reported(log: Path, layout: Path, tmp_pat
 @pytest.mark.parametrize("seconds", [3.0, 12.0, 40.0])
 def test_short_log_is_reported_by_all(seconds: float, tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     log = write_log(tmp_path, cut(true_drive(), seconds), database)
-    told = examined(layout, log)
-    assert told.errors == []
-    assert told.findings("stands still") == []
-    (short,) = told.findings("too short")
+    doctor = examined(layout, log)
+    assert doctor.errors == []
+    assert doctor.findings("stands still") == []
+    (short,) = doctor.findings("too short")
     assert (short.severity, short.number) == ("hint" if seconds == 40.0 else "warning", pytest.approx(seconds, abs=0.5))
     shown = calibrator("kirchhoff", log, "--layout", layout).stdout
     assert short.text in " ".join(shown.split())
     assert ("of the sum measured" in shown) is (seconds == 40.0)
     code, said = calibrated(tmp_path, log, layout, "--trusted", "battery")
-    assert (code == 0) is ("calibrate --trusted" in told.report["ready"]) is (seconds > 5.0)
-    waits = told.report["not_ready"]
+    assert (code == 0) is ("calibrate --trusted" in doctor.report["ready"]) is (seconds > 5.0)
+    waits = doctor.report["not_ready"]
     if seconds == 3.0:
         assert waits["calibrate --trusted"].startswith("3.0 s in which all branches have usable samples; at least 5 s")
         assert waits["calibrate --trusted"] in said
@@ -343,9 +343,9 @@ def exchange(layout: Path, one: str, other: str) -> None:
 
 def test_exchanged_branches_of_other_signs_are_an_error(log: Path, layout: Path, tmp_path: Path) -> None:
     exchange(layout, "battery", "motor")
-    told = examined(layout, log)
-    assert told.errors == [("exchanged", "battery")]
-    (error,) = told.findings("exchanged")
+    doctor = examined(layout, log)
+    assert doctor.errors == [("exchanged", "battery")]
+    (error,) = doctor.findings("exchanged")
     assert "reads HV_Motor.MotorCurrent, and motor reads HV_Battery.BatteryCurrent" in error.text
     assert error.number > 4.0
     assert 'exchange what [[branch]] "battery" and "motor" read' in error.advice
@@ -364,6 +364,6 @@ def test_one_log_with_a_sum_is_enough_for_kirchhoff_in_any_order(
         folder.mkdir()
         part = replace(whole, branches={name: whole.branches[name] for name in names})
         logs.append(write_log(folder, part, database))
-    told = examined(layout, *(logs[k] for k in order))
-    assert "kirchhoff" in told.report["ready"]
-    assert "calibrate --trusted" in told.report["not_ready"]
+    doctor = examined(layout, *(logs[k] for k in order))
+    assert "kirchhoff" in doctor.report["ready"]
+    assert "calibrate --trusted" in doctor.report["not_ready"]

@@ -72,14 +72,14 @@ def test_offset_is_the_mean_of_the_sum_before_and_gone_after(log: Path) -> None:
 
 
 def test_figures_are_those_of_their_definition(tmp_path: Path) -> None:
-    told = figures(*table(tmp_path, battery=MOTOR_A + 3.0, motor=-MOTOR_A))
-    found = told["before"]
+    run = figures(*table(tmp_path, battery=MOTOR_A + 3.0, motor=-MOTOR_A))
+    found = run["before"]
     battery = MOTOR_A + 3.0
     wanted = {"rmse_a": np.sqrt(np.mean(battery**2)), "max_a": np.abs(battery).max(), "mean_a": battery.mean()}
     assert {key: found["battery"][key] for key in wanted} == pytest.approx(wanted, abs=1e-3)
     total = found["sum"]
     assert total["rmse_a"] ** 2 == pytest.approx(total["mean_a"] ** 2 + total["sd_a"] ** 2)
-    assert total["rmse_percent"] == pytest.approx(100.0 * total["rmse_a"] / told["full_scale_a"])
+    assert total["rmse_percent"] == pytest.approx(100.0 * total["rmse_a"] / run["full_scale_a"])
 
 
 def test_rows_without_a_number_are_counted_and_not_used(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_missing_value_widens_the_expected_deviation_at_that_row_only(tmp_path: 
     assert list(np.flatnonzero(sd_a > 3.0 * sd_a.median())) == [600]
 
 
-@pytest.mark.parametrize(("factor", "told", "advice", "column", "sign", "times"), [
+@pytest.mark.parametrize(("factor", "text", "advice", "column", "sign", "times"), [
     (-1.0, "its sign is inverted", "write a minus before motor in --branches", "motor [A]", "-", 1.0),
     (1e3, "its current is 1000 times too large", "of column motor [A]: 'motor [mA]'", "motor [mA]", "", 1.0),
     (1e-3, "its current is 1000 times too small", "of column motor [A]: 'motor [kA]'", "motor [kA]", "", 1.0),
@@ -151,7 +151,7 @@ def test_missing_value_widens_the_expected_deviation_at_that_row_only(tmp_path: 
      "motor", "", 0.1),
 ])  # fmt: skip
 def test_slip_of_sign_or_unit_is_gone_when_its_advice_is_followed(
-    factor: float, told: str, advice: str, column: str, sign: str, times: float, tmp_path: Path
+    factor: float, text: str, advice: str, column: str, sign: str, times: float, tmp_path: Path
 ) -> None:
     heater = 5.0 * np.sin(2.0 * TABLE_S)
 
@@ -161,7 +161,7 @@ def test_slip_of_sign_or_unit_is_gone_when_its_advice_is_followed(
         return [line for line in lines if line.startswith("error")]  # nothing tells full scale
 
     (line,) = errors("motor [A]", "", -factor * MOTOR_A)
-    assert line.startswith(f"error    motor: {told}: ")
+    assert line.startswith(f"error    motor: {text}: ")
     assert line.endswith(advice)
     assert errors(column, sign, -factor * times * MOTOR_A) == []
     assert errors("motor", "", -1.2 * MOTOR_A) == []

@@ -61,8 +61,8 @@ def test_own_power_train_is_found_whole(tmp_path: Path) -> None:
     (tmp_path / "hv_powertrain.dbc").write_bytes((DBC / "hv_powertrain.dbc").read_bytes())
     guessed = found(tmp_path / "hv_powertrain.dbc")
     by_hand = read_layout(DBC / "hv_powertrain.toml")
-    told, wanted = ({(b.source, b.sign, b.timeout_s) for b in each.branch} for each in (guessed, by_hand))
-    assert told == wanted
+    proposed, wanted = ({(b.source, b.sign, b.timeout_s) for b in each.branch} for each in (guessed, by_hand))
+    assert proposed == wanted
     needed = word_set("voltage torque speed heater_demand aircon_demand low_voltage_demand sensor_temperature")
     signals = {item.name: item.signal for item in guessed.input}
     assert signals.items() >= {item.name: item.signal for item in by_hand.input if item.name in needed}.items()
@@ -373,9 +373,9 @@ def test_database_mistake_is_one_line(line: str, said: str, tmp_path: Path, monk
 
 def test_json_has_every_candidate(tmp_path: Path) -> None:
     run = calibrator("layout", "init", database_file(tmp_path, PACK, INVERTER), "--json")
-    told = json.loads(run.stdout)
-    assert told["branches"] == ["battery", "motor"]
-    assert {item["signal"]: item["branch"] for item in told["candidates"]} == {
+    report = json.loads(run.stdout)
+    assert report["branches"] == ["battery", "motor"]
+    assert {item["signal"]: item["branch"] for item in report["candidates"]} == {
         "PackStatus.PackCurrent": "battery",
         "InverterStatus.DcPower": "motor",
         "InverterStatus.PhaseCurrent": None,

@@ -62,9 +62,9 @@ def fitted(example: Any) -> FleetCalibrator:
 # What it offers
 
 
-def test_package_offers_its_door_and_imports_nothing_heavy() -> None:
-    door = ["Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "read_log"]
-    assert sorted(calibrator.__all__) == dir(calibrator) == door
+def test_package_offers_its_interface_and_imports_nothing_heavy() -> None:
+    offered = ["Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "read_log"]
+    assert sorted(calibrator.__all__) == dir(calibrator) == offered
     with pytest.raises(AttributeError, match="no attribute 'fit'; it offers Fleet, FleetCalibrator"):
         _ = calibrator.fit
     heavy = ("numpy", "pandas", "scipy", "numba", "pyarrow", "sklearn", "cantools", "matplotlib", "typer")
