@@ -14,9 +14,9 @@ from calibrator.terminal.text import figure, table
 __all__ = ["draw_kirchhoff", "kirchhoff_text", "save_table"]
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B", "#999999")
-"""Okabe and Ito's colours, which colour-blind readers can tell apart; black is kept for the sum."""
+"""Okabe and Ito's colours, which colour-blind readers can tell apart; black is kept for the sum that is to be 0 A."""
 _BAND_COLOUR = "#D9D9D9"
-_SUMS = {"before": "black", "after": _COLOURS[1]}
+_SUMS = {"before": "#882255", "after": "black"}
 STAGES = {"before": "measured", "after": "corrected"}
 """What people call the stages of a comparison."""
 SLIP = 0.5
@@ -102,11 +102,12 @@ def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
         share = f"{100.0 * rmse_a / comparison.full_scale_a:.2f} % of full scale"
         headings.append(f"{STAGES[stage]}: RMSE of the sum{about} {rmse_a:.2f} A = {share}")
     headings.append(f"sum, and band of right sensors (in it: {_inside(comparison)})")
-    rows = len(headings)
+    rows, named = len(headings), set[str]()
     drawing = make_subplots(rows, shared_xaxes=True, vertical_spacing=0.07, subplot_titles=headings)
 
     def line(name: str, course_a: pd.Series, colour: str, row: int) -> None:
-        style = {"line": {"color": colour, "width": 1.2}, "legendgroup": name, "showlegend": row in {1, rows}}
+        style = {"line": {"color": colour, "width": 1.2}, "legendgroup": name, "showlegend": name not in named}
+        named.add(name)
         drawing.add_scatter(x=course_a.index, y=course_a, name=name, **style, row=row, col=1)
 
     sd_a = pd.Series(comparison.expected_sd_a, comparison.stages["before"].index)[comparison.valid][::every]
@@ -117,8 +118,8 @@ def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
     for row, (stage, frame) in enumerate(stages.items(), start=1):
         for name, colour in zip(comparison.branches, cycle(_COLOURS)):
             line(name, frame[name], colour, row)
-        line("sum of all", frame[SUM], "black", row)
-        line(f"sum {STAGES[stage]}", frame[SUM], _SUMS[stage], rows)
+        for panel in (row, rows):
+            line(f"sum {STAGES[stage]}", frame[SUM], _SUMS[stage], panel)
     drawing.update_yaxes(title_text="current [A]")
     drawing.update_xaxes(title_text="time [s]", row=rows, col=1)
     heading, height = {"text": title.replace(": ", ":<br>", 1), "font_size": 15, "yref": "container"}, 220 + 280 * rows
