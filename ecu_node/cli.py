@@ -168,7 +168,7 @@ def _parser() -> argparse.ArgumentParser:
         help="correct until SIGTERM or SIGINT",
         description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
         "own on the same bus, or, with --gateway, in place on another bus. With parameters that do not fit it passes "
-        "the measured values through and says so in its status message. Changed parameters are read within a second. "
+        "the measured values through and says so in its status message. Changes of --state are seen within a second. "
         "Example: ecu-node run --unsigned --params result/params/V1.json --layout my_car.toml --interface socketcan "
         "--channel can0",
         done=_AT_WORK,

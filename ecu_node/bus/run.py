@@ -15,7 +15,7 @@ from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from cantools.database.can import Message
 
@@ -33,7 +33,6 @@ from ecu_node.bus.wiring import (
     choose_parameters,
     needs_fd,
     open_bus,
-    put_in_force,
     received,
     require_fd,
     rewritten,
@@ -45,68 +44,12 @@ from ecu_node.core.corrector import OF_ONE_DRIVE, Corrector
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Latency, Reason
 from ecu_node.database import VehicleDatabase, node_database
-from ecu_node.documents import signature
 from ecu_node.errors import printable
 from ecu_node.layout import Branch
 from ecu_node.program import write_output
 
-_LOOK_EVERY_S = 1.0
-"""Between looks whether the parameter file has changed. [s]"""
-
-
-class ParameterSource(Protocol):
-    """Where a running node has its parameters from."""
-
-    in_force: InForce
-    """What the node works with."""
-
-    def look(self, corrector: Corrector, now_s: float) -> bool:
-        """See whether other parameters are to be in force from now on, and put them; to be called now and then."""
-
-
-class ParameterFile:
-    """Keeps the parameters of a running node up to date: new ones only if they fit, else the ones before stay.
-
-    Parameters
-    ----------
-    path : Path
-        Parameter file.
-    database : VehicleDatabase
-        Layout and DBC in use.
-    vehicle : str or None
-        Identity of the vehicle; None: not checked.
-    mode : Mode
-        Where corrected values go.
-    say : callable
-        Takes one line for the log.
-    """
-
-    def __init__(
-        self, path: Path, database: VehicleDatabase, vehicle: str | None, *, mode: Mode, say: Callable[[str], None]
-    ) -> None:
-        self._path, self._database, self._mode, self._say = path, database, mode, say
-        self._choose = partial(choose_parameters, path, database, vehicle)
-        self._seen, self._due_s = signature(path), float("-inf")
-        self.in_force: InForce = self._choose()
-
-    def look(self, corrector: Corrector, now_s: float) -> bool:
-        """Read the file again if it was changed; whether new parameters are in force."""
-        if now_s < self._due_s:
-            return False
-        self._due_s = now_s + _LOOK_EVERY_S
-        before, self._seen = self._seen, signature(self._path)
-        if before == self._seen:
-            return False
-        in_force = self._choose()
-        if in_force.parameters is None:
-            corrector.counters.reload_failures += 1
-            self._say(f"new parameters are not used, those before stay in force: {in_force.why_not}")
-            return False
-        put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
-        self.in_force = in_force
-        corrector.counters.reloads += 1
-        self._say(f"parameter set {in_force.parameters.number} of vehicle {in_force.parameters.vehicle} is in force")
-        return True
+if TYPE_CHECKING:
+    from ecu_node.update.store import ParameterStore
 
 
 class StateChanges:
@@ -122,7 +65,7 @@ class StateChanges:
 
     def __init__(self, corrector: Corrector, *, has_memory: bool = True) -> None:
         self._corrector = corrector
-        self._released_by = "other parameters or " + ("'ecu-node clear'" if has_memory else "a restart")
+        self._released_by = "other parameters or 'ecu-node clear'" if has_memory else "a restart"
         self._before = Reason.NONE, False
 
     def news(self) -> str | None:
@@ -173,11 +116,12 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
     mode = Mode.GATEWAY if is_gateway else Mode.OVERLAY
     bus_settings = [bus, {**bus, "channel": options.gateway}] if is_gateway else [bus]
     database = node_database(options.layout)
-    source = _source(options, database, mode, say)
-    corrector = wire(database, source.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
+    store = _store(options, database, mode, say) if options.state is not None else None
+    in_force = store.in_force if store is not None else choose_parameters(options.params, database, options.vehicle)
+    corrector = wire(database, in_force, time.monotonic(), mode=mode, shadow=options.shadow)
     if options.dry_run:
-        text, why_not = _dry_run(bus_settings, database, mode), source.in_force.why_not
-        write_output(text if why_not is None else f"{text}\nwould correct nothing: {why_not}")
+        text = _dry_run(bus_settings, database, mode)
+        write_output(text if in_force.why_not is None else f"{text}\nwould correct nothing: {in_force.why_not}")
         return 0
     routes = None
     if is_gateway and options.interface == "socketcan":
@@ -194,12 +138,12 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         )
         buses = [closed_at_end.enter_context(closing(bus)) for bus in opened]
         stop = stopped_by(signal.SIGTERM, signal.SIGINT)
-        for text in _notes(options, source.in_force.why_not):
+        for text in _notes(options, in_force.why_not):
             say(text)
 
-        def correcting() -> str:
+        def correcting(in_force: InForce) -> str:
             """Which branches are corrected; says which are not, though they have a fault."""
-            hidden = unpublished(database, source.in_force, mode)
+            hidden = unpublished(database, in_force, mode)
             for text in hidden.values():
                 say(text)
             faulty = [
@@ -208,7 +152,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             sends_nothing = " (only in its figures: --listen-only)" if options.listen_only else ""
             return f"correcting {', '.join(faulty) or 'nothing'}{sends_nothing}"
 
-        at_start = correcting()
+        at_start = correcting(in_force)
 
         def ready() -> None:
             if routes is not None:
@@ -226,7 +170,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         if options.summary is not None:
             from ecu_node.bus.on_board_summary import on_board_summary  # noqa: PLC0415  # the only user of statistics
 
-            summing = on_board_summary(options, bus, database, source.in_force.parameters, say)
+            summing = on_board_summary(options, bus, database, in_force.parameters, say)
             records.append(closed_at_end.enter_context(closing(summing)).look)
         changes = StateChanges(corrector, has_memory=options.state is not None)
 
@@ -235,8 +179,8 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
                 manager.alive(now_s)
             for each in buses:
                 each.count_dropped()
-            if source.look(corrector, now_s):
-                manager.status(f"parameter set {corrector.parameter_set} is in force, {correcting()}")
+            if store is not None and store.look(corrector, now_s):
+                manager.status(f"parameter set {corrector.parameter_set} is in force, {correcting(store.in_force)}")
             for look in looks:
                 look(now_s)
             for look in [*records]:
@@ -273,11 +217,9 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
     return 0
 
 
-def _source(
+def _store(
     options: argparse.Namespace, database: VehicleDatabase, mode: Mode, say: Callable[[str], None]
-) -> ParameterSource:
-    if options.params is not None:
-        return ParameterFile(options.params, database, options.vehicle, mode=mode, say=say)
+) -> "ParameterStore":
     from ecu_node.update.store import ParameterStore  # noqa: PLC0415  # imports this room
 
     now, background = partial(datetime.now, UTC), ThreadPoolExecutor(1, "state of the vehicle")

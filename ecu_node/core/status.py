@@ -143,9 +143,7 @@ class Counters:
     telemetry_lost: int = 0
     """Lines of telemetry that could not be written in time."""
     reloads: int = 0
-    """Parameter files that took the place of the one before."""
-    reload_failures: int = 0
-    """Parameter files that did not fit; the ones before stayed in force."""
+    """Times that other parameters came in force, or those in force ended."""
 
     def text(self) -> str:
         """One line for the log: what is not 0."""

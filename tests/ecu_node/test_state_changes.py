@@ -63,7 +63,7 @@ def test_a_fall_back_says_why_until_when_and_that_it_corrects_again(database: Ve
     fit = InForce(parameters=parameters_for(database, battery=(0.0, 5.0)))
     assert node.load(fit) == "correcting again"
     alone = Node(database, has_memory=False)
-    assert f"{FALLS_BACK} other parameters or a restart: " in (alone.latch(Reason.CORRECTION_WORSE) or "")
+    assert f"{FALLS_BACK} a restart: " in (alone.latch(Reason.CORRECTION_WORSE) or "")
 
 
 def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(database: VehicleDatabase) -> None:

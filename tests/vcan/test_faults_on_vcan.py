@@ -6,11 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import write_parameters
 from tests.vcan.conftest import StartNode
 from tests.vcan.processes import (
     CHANNEL,
@@ -25,7 +23,7 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.small_drive import BRANCHES, passed_on, protected, true_parameters
+from tests.vcan.small_drive import BRANCHES, passed_on, protected
 
 INSTANTS = 45
 """A multiple of the counter's period, so that a drive may follow itself."""
@@ -133,24 +131,6 @@ def test_error_frames_are_not_passed_on(
         assert node.stop() == 0
     assert "frames in 3, rewritten 3, forwarded 3, bus errors 2, bus off 1" in node.messages
     assert {item.identifier for item in other_recording.frames} == {"110", "120", "130", "5F0"}
-
-
-def test_changed_file_is_read(
-    database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
-) -> None:
-    with start_node(params) as node:
-        recording.wait_for(STATUS, 1)
-        node.process.send_signal(signal.SIGHUP)
-        params.write_text("{")
-        node.wait_for("new parameters are not used, those before stay in force")
-        send_branches(database, 0)
-        corrected = recording.wait_for(BATTERY_CORRECTED, 1)
-        write_parameters(replace(true_parameters(database), number=8), params)
-        node.wait_for("parameter set 8 of vehicle v0007 is in force")
-        wait_for_correcting(recording)
-        assert node.stop() == 0
-    assert qualities(corrected) == {Quality.CORRECTED}
-    assert "reloads 1, reload failures" in node.messages.splitlines()[-1]
 
 
 def test_second_gateway_refuses_and_the_first_goes_on(
