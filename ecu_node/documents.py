@@ -3,7 +3,6 @@
 msgspec decides whether a document has the structure that it should have; :func:`field_error` says where it has not.
 """
 
-import codecs
 import difflib
 import errno
 import hashlib
@@ -11,15 +10,12 @@ import json
 import os
 import stat
 import tempfile
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import msgspec
-
-from ecu_node.errors import shown_name
 
 
 class UnsuitableFileError(OSError):
@@ -192,25 +188,3 @@ def _shown(value: Any) -> str:
     if len(text) <= _LONGEST_VALUE:
         return text
     return f"{text[:_LONGEST_VALUE]}... ({len(value) if isinstance(value, str) else len(text)} characters)"
-
-
-def read_json(content: bytes) -> Any:
-    """Document of a JSON text; ValueError says in one line why it is none, or which key stands twice in one place."""
-
-    def without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        for key, times in Counter(key for key, _ in pairs).items():
-            if times > 1:
-                raise ValueError(f"'{shown_name(key)}' stands there twice in one place")
-        return dict(pairs)
-
-    if not content.strip():
-        raise ValueError("it is empty")
-    if content.startswith(codecs.BOM_UTF8):
-        raise ValueError("it begins with a byte order mark (BOM); save it as UTF-8 without one")
-    try:
-        msgspec.json.decode(content)  # which is stricter than json with numbers
-        return json.loads(content, object_pairs_hook=without_repetition)
-    except RecursionError:
-        raise ValueError("it is nested too deeply") from None
-    except UnicodeDecodeError:
-        raise ValueError("it is no text in UTF-8") from None

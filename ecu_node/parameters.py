@@ -5,6 +5,7 @@ made from them, which stands in ``ecu_node/parameters.schema.json``. Currents ar
 :func:`check_fit` says whether parameters may be applied here.
 """
 
+import codecs
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +15,7 @@ from msgspec import Meta, Struct
 
 from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.core.status import Reason, UnfitError
-from ecu_node.documents import UnsuitableFileError, field_error, read_json, read_user_file, write_atomically
+from ecu_node.documents import UnsuitableFileError, field_error, read_user_file, write_atomically
 from ecu_node.errors import ParameterError, printable, shown_name
 
 if TYPE_CHECKING:
@@ -215,25 +216,29 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
     Raises
     ------
     UnfitError
-        With reason MALFORMED_PARAMETERS if it is no JSON, outside the schema, signed, or has a key twice.
+        With reason MALFORMED_PARAMETERS if it is no JSON, or outside the schema.
     """
+    if not content.strip():
+        raise _malformed(where, "it is empty")
+    if content.startswith(codecs.BOM_UTF8):
+        raise _malformed(where, "it begins with a byte order mark (BOM); save it as UTF-8 without one")
     try:
-        document = read_json(content)
-    except (msgspec.DecodeError, ValueError) as error:
+        document = msgspec.json.decode(content)
+    except RecursionError:
+        raise _malformed(where, "it is nested too deeply") from None
+    except UnicodeDecodeError:
+        raise _malformed(where, "it is no text in UTF-8") from None
+    except msgspec.DecodeError as error:
         raise _malformed(where, str(error).partition(" - at `")[0]) from None  # its path names no key
     try:
         return msgspec.json.decode(content, type=VehicleParameters)
     except msgspec.ValidationError as error:
-        if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
-            advice = "name the parameter file that was signed"
-            raise _malformed(where, "this file was signed by version 1.0", advice) from None
         steps, what = field_error(error, document, VehicleParameters)
         raise _malformed(where, f"{', '.join(steps)}: {what}" if steps else what) from None
 
 
-def _malformed(
-    where: str, why: str, advice: str = "correct it, or write it anew with 'calibrator calibrate'"
-) -> UnfitError:
+def _malformed(where: str, why: str) -> UnfitError:
+    advice = "correct it, or write it anew with 'calibrator calibrate'"
     return UnfitError(Reason.MALFORMED_PARAMETERS, f"{where}: not a parameter file: {printable(why)}; {advice}")
 
 
