@@ -117,7 +117,7 @@ def _written(database: VehicleDatabase, mode: Mode) -> list[_WrittenSignal]:
         names = {branch.corrected: 0, branch.quality: Quality.INVALID} if own else {branch.source: 0}
         found += [_WrittenSignal(name, f"branch {branch.name}", most, own) for name, most in names.items() if name]
     if status is not None:
-        widths = {"state": max(State), "reason": Reason.ON_TRIAL, "parameter_set": PARAMETER_SETS - 1}
+        widths = {"state": max(State), "reason": max(Reason), "parameter_set": PARAMETER_SETS - 1}
         widths["alive_counter"] = 1
         found += [_WrittenSignal(name, "status", widths.get(key, 0), True) for key, name in status.signals.items()]
     return found

@@ -296,11 +296,6 @@ OF_ONE_DRIVE = frozenset((Reason.BRANCH_STALE, Reason.BRANCH_STUCK))
 """What is tried anew after the bus has slept."""
 _FOREIGN_S = 10.0
 """For so long after the last frame the status says that another node sends what only a gateway may. [s]"""
-_IN_4_BITS = {
-    Reason.SUM_IMPLAUSIBLE: Reason.CORRECTION_WORSE,
-    Reason.FOREIGN_FRAMES: Reason.NONE,
-    Reason.E2E_INVALID: Reason.INPUT_MISSING,
-}
 
 
 class StatusFields(NamedTuple):
@@ -426,8 +421,6 @@ class Corrector:
             return None
         payload = bytearray(fields.message.data)
         state, reason = self.state()
-        if reason > fields.places["reason"].highest:
-            reason = _IN_4_BITS[reason]
         values = {"state": state, "reason": reason, "parameter_set": self.parameter_set, "alive_counter": self._alive}
         for key, place in fields.places.items():
             place.put(payload, values[key] % (place.highest + 1))

@@ -58,11 +58,9 @@ class Reason(_WithWords):
     REVOKED = 14, "the parameters were revoked"
     ON_TRIAL = 15, "the parameters are on trial"
     SUM_IMPLAUSIBLE = 16, "the corrected Kirchhoff sum is not what it may be: a sensor is wrong"
-    """In a signal of 4 bits CORRECTION_WORSE stands for it."""
     FOREIGN_FRAMES = 17, "another node sends frames that only this gateway may send; they are dropped"
-    """Nothing is held back for it; in a signal of 4 bits NONE stands for it."""
+    """Nothing is held back for it."""
     E2E_INVALID = 18, "so many frames of a message fail their end-to-end check that it is not used"
-    """In a signal of 4 bits INPUT_MISSING stands for it."""
 
 
 class UnfitError(ParameterError):

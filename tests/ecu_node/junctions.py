@@ -34,7 +34,7 @@ _DBC = """VERSION ""
 BU_: N C X
 {measured}{corrected}BO_ 48 S: 2 C
  SG_ State : 0|4@1+ (1,0) [0|15] "" X
- SG_ Reason : 8|{reason_bits}@1+ (1,0) [0|255] "" X
+ SG_ Reason : 8|8@1+ (1,0) [0|255] "" X
 {values}"""
 _CURRENT = ' SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" X\n'
 KEYS = {name: FrameKey(16 + number, False) for number, name in enumerate(NAMES)}
@@ -44,14 +44,14 @@ BREAK_S = 15.0
 """When sensors break. [s]"""
 
 
-def three_branches(folder: Path, quality_bits: int = 3, reason_bits: int = 8) -> VehicleDatabase:
+def three_branches(folder: Path, quality_bits: int = 3) -> VehicleDatabase:
     """Layout and DBC of the junction."""
     measured = (f"BO_ {16 + number} {letter}: 2 N\n{_CURRENT}" for number, letter in enumerate("BMH"))
     quality = f' SG_ Q : 16|{quality_bits}@1+ (1,0) [0|7] "" X\n'
     corrected = (f"BO_ {32 + number} {letter}C: 3 C\n{_CURRENT}{quality}" for number, letter in enumerate("BMH"))
     values = (f'VAL_ {32 + number} I -32768 "SNA";\n' for number in range(3))
     blocks = {"measured": "".join(measured), "corrected": "".join(corrected), "values": "".join(values)}
-    (folder / "three.dbc").write_text(_DBC.format(**blocks, reason_bits=reason_bits))
+    (folder / "three.dbc").write_text(_DBC.format(**blocks))
     (folder / "three.toml").write_text(LAYOUT)
     return read_database(read_layout(folder / "three.toml"))
 

@@ -58,7 +58,7 @@ BO_ 512 PairOut: 8 Corrector
 {_HEADER}{_CURRENTS} SG_ Quality : 48|2@1+ (1,0) [0|3] "" X
 BO_ 513 Status: 8 Corrector
 {_HEADER} SG_ State : 16|3@1+ (1,0) [0|7] "" X
- SG_ Reason : 24|4@1+ (1,0) [0|15] "" X
+ SG_ Reason : 24|8@1+ (1,0) [0|255] "" X
 VAL_ 256 Battery -32768 "SNA";
 VAL_ 512 Battery -32768 "SNA";
 VAL_ 512 Motor -32768 "SNA";
