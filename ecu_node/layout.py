@@ -362,8 +362,6 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
     status: StatusMessage | None = None
     e2e: EndToEnd | list[EndToEnd] = []
     """One profile is a table, several are a list of tables."""
-    on_bad_frame: Literal["hold", "invalid"] = "hold"
-    """What the node makes of a frame that fails its check: nothing, or one that is seen to be invalid."""
     watch: Watch = Watch()
     activation: Activation = Activation()
 

@@ -364,7 +364,6 @@ def c_text(checked: Checked) -> str:
         branches=branches,
         calibration=zip(names, values + [BranchValues(0, 0, 0, 0, 0)] * unused, strict=True),
         digest=f"0x{_layout_digest(database):016X}",
-        passes_bad_frames=database.layout.on_bad_frame == "invalid",
         greatest=_GREATEST,
     )
 

@@ -383,7 +383,6 @@ def wire(
                 readers=readers[key],
                 targets=answers.get(key, []),
                 counters=counters,
-                pass_on_invalid=layout.on_bad_frame == "invalid",
             )
             for key, message in received(database).items()
         },

@@ -213,12 +213,12 @@ static hv_result_t forward(const hv_layout_t *layout, const hv_calibration_t *ca
     const check_t check = check_of(message, payload, length, &state->expected[number]);
     const bool is_usable = (check == OK) || (check == LOST);
     hv_result_t result = HV_SAME;
-    if (!is_usable && message->has_branches && !layout->passes_invalid) {
-        result = HV_HELD_BACK;
-    } else if ((check != CORRUPT) && (calibration->layout == layout->digest)) {
+    if (!is_usable) {
+        result = message->has_branches ? HV_HELD_BACK : HV_SAME;
+    } else if (calibration->layout == layout->digest) {
         for (size_t k = 0U; k < layout->branch_count; k++) { /* voltages first: a frame may have both */
             const hv_branch_t *const branch = &layout->branches[k];
-            if (is_usable && (branch->voltage != NULL) && (branch->voltage_message == number) &&
+            if ((branch->voltage != NULL) && (branch->voltage_message == number) &&
                 is_present(branch->voltage, payload, length)) {
                 state->voltage[k] = read_code(&branch->voltage->place, payload);
                 state->has_voltage[k] = true;

@@ -88,7 +88,6 @@ typedef struct {
     size_t message_count;
     const hv_branch_t *branches;
     size_t branch_count;
-    bool passes_invalid; /* frames that fail their check go on as they are, instead of being held back */
 } hv_layout_t;
 
 typedef struct { /* what is remembered from frame to frame; one for each layout, in RAM */

@@ -23,7 +23,7 @@ from ecu_node.parameters import JunctionResidual
 
 __all__ = ["OF_ONE_DRIVE", "Corrector", "StatusFields"]
 
-_OK, _LAST_USABLE, _CORRUPT = Check.OK, Check.LOST, Check.CORRUPT  # looking up members of an enumeration is slow
+_OK, _LAST_USABLE = Check.OK, Check.LOST  # looking up members of an enumeration is slow
 _INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
 _LEAST_SILENCE_S = 1.0
 """After a silence of this long, or of a branch's timeout, a message's counter begins anew. [s]"""
@@ -152,8 +152,6 @@ class Source:
         Messages that answer it.
     counters : Counters
         Where it is counted what happened.
-    pass_on_invalid : bool
-        A frame that fails its check is answered, or passed on, so that it is seen to be invalid; else it is held back.
 
     Attributes
     ----------
@@ -172,11 +170,10 @@ class Source:
         readers: Sequence[tuple[HeardSignal, PlacedSignal]],
         targets: Sequence[OwnMessage],
         counters: Counters,
-        pass_on_invalid: bool,
     ) -> None:
         self._receiver = Receiver(protection) if protection is not None else None
         self._seal = protection.seal if protection is not None else None
-        self._counters, self._pass_on_invalid, self.targets = counters, pass_on_invalid, tuple(targets)
+        self._counters, self.targets = counters, tuple(targets)
         self.branches = [part for part, _ in readers if isinstance(part, LiveBranch)]
         self.timeout_s = max((branch.timeout_s for branch in self.branches), default=float("inf"))
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch in self.branches)])
@@ -208,10 +205,9 @@ class Source:
             To be sent.
         """
         ways = self.ways.get(len(payload)) or self._find(len(payload))
-        is_usable = self._take(payload, now_s, ways) <= _LAST_USABLE
-        if not (is_usable or self._pass_on_invalid):
+        if self._take(payload, now_s, ways) > _LAST_USABLE:
             return ()
-        if not is_usable or self.is_invalid:
+        if self.is_invalid:
             for branch in self.branches:
                 branch.spoil(now_s)
             ways = self._find(0)  # nothing is read from it
@@ -240,12 +236,11 @@ class Source:
             it judges for itself whether so many frames fail their check that it cannot rely on the message.
         """
         ways = self.ways.get(len(payload)) or self._find(len(payload))
-        check = self._take(payload, now_s, ways)
-        if check > _LAST_USABLE and self.branches and not self._pass_on_invalid:
+        if self._take(payload, now_s, ways) > _LAST_USABLE:
+            if not self.branches:
+                return payload
             self._counters.held_back += 1
             return None
-        if check is _CORRUPT:
-            return payload
         made = ways.in_place(payload, payload, now_s)
         if made == payload:
             return payload

@@ -112,7 +112,7 @@ class Oracle:
 
     def __init__(self, database: VehicleDatabase, parameters: VehicleParameters, mode: Mode) -> None:
         layout, no_fault = database.layout, BranchParameters(drift=0.0, offset_a=0.0, apply=False)
-        self._is_gateway, self._passes_invalid = mode is Mode.GATEWAY, layout.on_bad_frame == "invalid"
+        self._is_gateway = mode is Mode.GATEWAY
         self._branches = [
             _Branch(database, branch, parameters.branches.get(branch.name, no_fault), mode) for branch in layout.branch
         ]
@@ -157,20 +157,19 @@ class Oracle:
             if net.name in codes:
                 is_value = Codes(net).is_value(codes[net.name])
                 self._volts = Codes(net).worth(codes[net.name]) if is_value else None
-        used = is_new or (self._is_gateway and self._passes_invalid and check is not Check.CORRUPT)
-        for item in own if used else ():
+        for item in own if is_new else ():
             if len(data) < _end(message, item.source):  # bits are beyond the end
                 item.spoil()
             elif item.source.name in codes:
                 item.take(codes[item.source.name], self._volts)
         if self._is_gateway:
-            if used:
+            if is_new:
                 return self._rewritten(message, own, data, sent)
-            expected = [(identifier, data)] if self._passes_invalid or not own else []
+            expected = [] if own else [(identifier, data)]
             return None if sent == expected else f"a frame that is {check.name} was not held back or left alone"
-        if not used and not self._passes_invalid:
+        if not is_new:
             return f"a frame that is {check.name} was answered" if sent else None
-        if not used or (receiver is not None and receiver.state is E2EState.INVALID):
+        if receiver is not None and receiver.state is E2EState.INVALID:
             for item in own:
                 item.spoil()
         wanted = {item.target[0].name for item in own if item.target is not None}

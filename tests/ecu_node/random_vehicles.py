@@ -210,7 +210,7 @@ def _draw(rng: Random, kinds: Collection[str]) -> tuple[dict[str, Any], list[Mes
     keys = ("signal", "power", "voltage", "corrected")
     named = {branch[key].split(".")[0] for branch in branches for key in keys if key in branch}
     used = [draft for draft in (*sources, *targets) if draft.name in named]
-    layout = {**_SETTINGS, "on_bad_frame": rng.choice(("hold", "invalid")), "branch": branches}
+    layout = {**_SETTINGS, "branch": branches}
     layout["e2e"] = [draft.e2e for draft in used if draft.e2e]
     return layout, [draft.message() for draft in used], faults
 

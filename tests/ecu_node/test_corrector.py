@@ -457,13 +457,6 @@ def test_a_signal_beyond_the_end_of_its_frame_is_invalid(make_database: MakeData
     assert corrector.counters.short == 2
 
 
-def test_bad_frame_is_published_as_invalid_if_the_layout_says_so(make_database: MakeDatabase) -> None:
-    own = whole_vehicle(make_database, "", ("full_scale_a", 'on_bad_frame = "invalid"\nfull_scale_a'))
-    corrector = corrector_for(own, battery=(0.25, 5.0))
-    found = [published(own, corrector, frame, 0.0) for frame in (battery(own, 3), damaged(battery(own, 4)))]
-    assert found == [(76.0, Quality.CORRECTED), (-655.36, Quality.INVALID)]
-
-
 MOTOR_SNA = '512 Motor -32768 "SNA"'
 INIT = (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"')
 PAGE = (" SG_ Quality", ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1')

@@ -16,14 +16,10 @@ from tests.ecu_node.vehicles import (
     MakeDatabase,
     battery,
     corrector_for,
-    damaged,
     decoded,
     frame_of,
     passed_on,
-    whole_vehicle,
 )
-
-INVALID = ("full_scale_a", 'on_bad_frame = "invalid"\nfull_scale_a')
 
 
 def gateway_for(database: VehicleDatabase, **faults: tuple[float, float]) -> Corrector:
@@ -66,19 +62,6 @@ def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_datab
         LayoutError, match=r"branch motor: no_value: Pair\.Motor has no code 32768; it has -32768 to 32767"
     ):
         gateway_for(make_database(layout.replace("32000", "32768")))
-
-
-def test_bad_frames_are_passed_on_so_that_they_are_seen_to_be_bad(make_database: MakeDatabase) -> None:
-    own = whole_vehicle(make_database, "", INVALID)
-    corrector = gateway_for(own, battery=(0.25, 5.0))
-    good = battery(own, 3)
-    first = passed_on(corrector, good, 0.0)
-    assert passed_on(corrector, damaged(good), 0.1) == damaged(good).data, "its CRC stays wrong"
-    assert passed_on(corrector, good, 0.2) == first, "its counter stays the one before"
-    jumped = passed_on(corrector, battery(own, 13), 0.3)
-    assert decoded(own, "HV_Battery", jumped or b"")["AliveCounter"] == 13
-    assert corrector.counters.held_back == 0
-    assert corrector.branches[0].time_s == 0.0, "what they say is not used"
 
 
 def test_a_power_is_written_back_as_a_power(make_database: MakeDatabase) -> None:

@@ -29,7 +29,7 @@ static const hv_branch_t branches[] = {
 {% endfor %}
 };
 const hv_layout_t hv_layout = {
-    UINT64_C([[ digest ]]), messages, [[ messages | length ]]U, branches, [[ branches | length ]]U, [[ passes_bad_frames | tojson ]]
+    UINT64_C([[ digest ]]), messages, [[ messages | length ]]U, branches, [[ branches | length ]]U
 };
 const hv_calibration_t hv_calibration = {
     UINT64_C([[ digest ]]), UINT64_C([[ provenance.parameter_set ]]), {
