@@ -147,17 +147,6 @@ def test_second_gateway_refuses_and_the_first_goes_on(
     assert counters == [k % 15 for k in range(len(counters))], "all of the first one"
 
 
-def test_a_gateway_on_joined_buses_ends(params: Path, drive: Path, start_node: StartNode, recording: Recording) -> None:
-    bridge = ("-s", OTHER_CHANNEL, "-d", CHANNEL, "-e")
-    run_tool("cangw", "-A", *bridge)
-    try:
-        with start_node(params, *GATEWAY) as node:
-            assert node.wait_for_end() == 1
-    finally:
-        run_tool("cangw", "-D", *bridge)
-    assert "which only this one may send there; two nodes on one bus, or two buses that are joined?" in node.messages
-
-
 def test_clock_step_is_no_fault(
     database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
 ) -> None:
