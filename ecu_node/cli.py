@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from ecu_node import __version__
-from ecu_node.errors import LayoutError
 from ecu_node.program import CommandParser, load_python_can, run_program, write_output, write_result
 from ecu_node.update.command import add_update_commands
 
@@ -313,11 +312,6 @@ def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> s
     """
     layout = database.layout
     expected_a = layout.unmeasured_load.mean_a if layout.unmeasured_load is not None else 0.0
-    if expected_a > layout.offset_limit_a:
-        raise LayoutError(
-            f"{layout.path}: [unmeasured_load] mean_a = {expected_a:g} is beyond the layout's limit of "
-            f"{layout.offset_limit_a:g} A ([limits] offset_a), so that no parameters would fit; correct one of them"
-        )
     document = {
         "schema_version": 1,
         "vehicle": vehicle,

@@ -2,8 +2,7 @@
 
 All of it is one file, ``state.json``, which is replaced whole: after a power cut at any moment the state is that of
 before a change or that of after it. Its first line is the SHA-256 of the rest, so that a bit that the disk has changed
-is noticed. ``decisions.log`` is a log for people: one line of JSON for each decision; a full one is kept as
-``decisions.log.1`` until the next is full.
+is noticed. ``decisions.log`` is a log for people: one line of JSON for each decision.
 """
 
 import errno
@@ -44,8 +43,6 @@ _CAREFUL = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """Root writes into a folder that belongs to the node's user: no link is followed, and no pipe blocks."""
 _LONGEST_WAIT_S = 30.0
 """For another process that holds the lock; one that was stopped never ends. [s]"""
-_LARGEST_LOG_BYTES = 1_000_000
-"""Some thousand decisions: years of them."""
 
 
 class ParameterSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -180,8 +177,6 @@ def add_decision(folder: Path, event: str, text: str, now: datetime, *, reason: 
     line |= {"reason": reason.name.title().replace("_", "")} if reason is not None else {}
     path = folder / "decisions.log"
     try:
-        if os.path.lexists(path) and path.lstat().st_size > _LARGEST_LOG_BYTES:
-            path.replace(folder / "decisions.log.1")
         _write(path, os.O_CREAT | os.O_APPEND, msgspec.json.encode(line) + b"\n")
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}; '{event}' holds all the same") from None

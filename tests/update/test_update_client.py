@@ -318,15 +318,6 @@ def test_root_leaves_files_to_the_owner_of_the_folder_and_follows_no_link(repo: 
     assert (repo.folder / "of root").stat().st_uid == 0
 
 
-def test_full_log_of_decisions_is_kept_until_the_next_is_full(state: Path) -> None:
-    path = state / "decisions.log"
-    for content in (b"first", b"second"):
-        path.write_bytes(content.ljust(1_000_001))
-        add_decision(state, "x", "y", datetime.now(UTC))
-        assert path.read_bytes().count(b"\n") == 1
-        assert (state / "decisions.log.1").read_bytes().startswith(content)
-
-
 def test_two_commands_at_once_are_both_done(repo: Repo, new: Path) -> None:
     command = [sys.executable, "-m", "ecu_node", "update", repo.path, "--state", new, "--layout", LAYOUT]
     both = [subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE) for _ in range(2)]
