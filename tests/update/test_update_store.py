@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -19,9 +20,10 @@ from ecu_node.parameters import VehicleParameters
 from ecu_node.update.state import VehicleState, locked, read_state, write_state
 from ecu_node.update.store import ParameterStore
 from ecu_node.update.trial import ParameterTrial, TrialResult
-from tests.ecu_node.vehicles import AtOnce
+from tests.ecu_node.test_adapters import running
+from tests.ecu_node.vehicles import LAYOUT, AtOnce
 from tests.update.damage import a_folder, cut, without
-from tests.update.held import NOW, put_on_trial
+from tests.update.held import NOW, held, put_on_trial
 
 DRIFT, OTHER_DRIFT = 0.05, 0.06
 AT_ONCE = AtOnce()
@@ -189,3 +191,20 @@ def test_trial_needs_a_valid_set(correcting: Path, other: VehicleParameters, dat
     put_on_trial(correcting, other)
     running.look(*range(110, 120, 2))
     assert running.said[-1].endswith(" is on trial")
+
+
+def test_running_node_takes_a_set_that_comes_into_its_state(
+    vehicle: Path, parameters: VehicleParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And says so to the service manager."""
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    bus = ["--interface", "virtual", "--channel", "state"]
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(60.0)
+        with running("run", "--state", str(vehicle), "--layout", str(LAYOUT), *bus) as log:
+            write_state(vehicle, replace(read_state(vehicle), in_force=held(parameters, days=36500)))
+            while b"STATUS=parameter set" not in (told := manager.recv(4096)):
+                pass
+    assert told == b"STATUS=parameter set 44 is in force, correcting battery, motor"
+    assert any("of vehicle v1 is in force" in line for line in log)
