@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, qmc
 
-from calibrator.compiled import compiled_with_notice, inner
+from calibrator.compiled import compiled, inner
 from calibrator.drive import Array, Mask
 from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces, RowPlaces
 from calibrator.estimator.prior import GRID, Prior
@@ -227,7 +227,7 @@ def row_residuals(evidence: Evidence, theta: Array) -> Array:
     return left
 
 
-@compiled_with_notice
+@compiled
 def _all_residuals(evidence: Evidence, theta: Array, left: Array) -> None:
     for j in range(theta.shape[0]):
         for q in range(theta.shape[1]):
@@ -266,7 +266,7 @@ def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
     e[c + feed] -= load
 
 
-@compiled_with_notice
+@compiled
 def _fit_all(evidence: Evidence, log_prior: Array, best_ahead: Array, log_load: float, fits: Fits) -> None:
     for j in range(len(evidence.values)):
         scores, codes = _rough_weights(evidence, j, log_prior, best_ahead, log_load)
@@ -446,7 +446,7 @@ def _place(size: float) -> int:
     return min(max(index, 0), len(GRID) - 1)
 
 
-@compiled_with_notice
+@compiled
 def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: NDArray[np.int16], base: Array) -> None:
     N, P, M = fits.theta.shape[0], fits.theta.shape[2], len(normal)
     K = P // 3
@@ -579,7 +579,7 @@ def weigh(draws: Draws, prior: Prior) -> tuple[Array, Array]:
     return weight, log_evidence
 
 
-@compiled_with_notice
+@compiled
 def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array) -> None:
     N, _, M, G = weight.shape
     P = draws.values.shape[3]
@@ -628,7 +628,7 @@ def size_evidence(draws: Draws, prior: Prior, kind: int, candidates: Array, *, e
     return evidence
 
 
-@compiled_with_notice
+@compiled
 def _size_evidence(draws: Draws, prior: _Tables, kind: int, candidates: Array, every: int, evidence: Array) -> None:
     N, _, M, P = draws.values.shape
     G, C = 1 + len(prior.group_centre), len(evidence)
