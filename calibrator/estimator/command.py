@@ -3,11 +3,11 @@
 import math
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from calibrator.estimator.settings import Classifier, Method
+from calibrator.estimator.settings import Method
 from calibrator.files.folders import require_possible_file, require_possible_folder
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
@@ -19,11 +19,7 @@ from calibrator.terminal.options import (
     FleetOrSummariesArgument,
     JsonOption,
     LayoutOption,
-    MagnitudeOption,
     SchedulerOption,
-    SeedOption,
-    SparsityOption,
-    SymmetricOption,
     TimeLimitOption,
     WorkersOption,
     given_options,
@@ -34,14 +30,10 @@ from ecu_node.documents import write_atomically
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.program import say_error, write_output
 
-if TYPE_CHECKING:
-    from calibrator.fleet_truth import FleetTruth
-
 __all__ = ["calibrate", "identify", "params"]
 
 OF_POSTERIOR = ("harm_limit", "trusted", "readings", "load", "charge", "meter", "expected_faults", "scheduler", "since")
-OF_PUBLISHED = ("classifier", "truth", "sparsity", "magnitude", "symmetric", "seed")
-"""What only one method heeds."""
+"""What only this method heeds."""
 
 
 def calibrate(
@@ -96,19 +88,11 @@ def calibrate(
         float | None,
         number_option("--expected-faults", 0, 1, "Share of vehicles with a sensor fault, if known (posterior)"),
     ] = None,
-    classifier: Annotated[
-        Classifier, typer.Option("--classifier", help="Tells hardware faults (published).")
-    ] = Classifier.TREE,
-    truth: Annotated[Path | None, typer.Option("--truth", help="truth.json, for the perfect classifier.")] = None,
-    sparsity: SparsityOption = 80.0,
-    magnitude: MagnitudeOption = (0.05, 0.25),
-    symmetric: SymmetricOption = False,
     branches: BranchesOption = None,
     hold_out: Annotated[
         list[str] | None,
         typer.Option("--hold-out", metavar="NAME", help="Vehicle to calibrate, but to learn nothing from for others."),
     ] = None,
-    seed: SeedOption = 0,
     workers: WorkersOption = 2,
     scheduler: SchedulerOption = None,
     since: Annotated[
@@ -120,9 +104,8 @@ def calibrate(
 ) -> None:
     """Estimate the sensor faults of every vehicle and write its parameter file.
 
-    The default method, posterior, says how sure it is and corrects a branch only if that hardly harms. The options
-    classifier, truth, sparsity, magnitude, symmetric and seed are for the published method, which is kept as a
-    reference: its classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
+    The default method, posterior, says how sure it is and corrects a branch only if that hardly harms. The published
+    method is kept as a reference.
     """
     with importing():
         from calibrator.estimator.results import left_out_of
@@ -130,17 +113,9 @@ def calibrate(
         from calibrator.estimator.settings import CalibrationSettings
         from calibrator.processes.run_many import Workers
 
-    other, names = (Method.PUBLISHED, OF_PUBLISHED) if method is Method.POSTERIOR else (Method.POSTERIOR, OF_POSTERIOR)
-    if given := given_options(context, names):  # without a word, it would be ignored
+    if method is Method.PUBLISHED and (given := given_options(context, OF_POSTERIOR)):  # it would be ignored
         raise typer.BadParameter(
-            f"belongs to --method {other.value}, not {method.value}; leave it out or change the method",
-            param_hint=given[0],
-        )
-    if (classifier is Classifier.PERFECT) != (truth is not None):
-        raise typer.BadParameter(
-            "the perfect classifier is told the truth: give both --classifier perfect and --truth FILE, the truth.json "
-            "of this artificial fleet, or neither",
-            param_hint="--truth" if truth else "--classifier",
+            "belongs to --method posterior, not published; leave it out or change the method", param_hint=given[0]
         )
     settings = CalibrationSettings(
         method=method,
@@ -151,14 +126,8 @@ def calibrate(
         charge_ah=dict(_charge(item) for item in charge or ()),
         meter=meter,
         expected_faults=expected_faults,
-        classifier=classifier,
-        truth=_truth_of(fleet, truth) if truth is not None else None,
-        sparsity=sparsity,
-        magnitude=magnitude,
-        symmetric=symmetric,
         branches=tuple(branches.split(",")) if branches else None,
         hold_out=_named(hold_out),
-        seed=seed,
         time_limit_s=time_limit,
     )
     where = Workers(processes=workers, scheduler=scheduler)
@@ -226,19 +195,6 @@ def _charge(text: str) -> tuple[str, tuple[float, float]]:
     if not sd:
         raise typer.BadParameter(f"{text!r}: give its standard deviation as well, {text}:0.1", param_hint="--charge")
     return branch.strip(), (mean, sd)
-
-
-def _truth_of(fleet: str, path: Path) -> "FleetTruth":
-    """The truth, if it is that of the fleet's vehicles."""
-    from calibrator.drives.fleet_id import require_same_fleet
-    from calibrator.fleet_truth import faults_of, read_truth
-    from calibrator.sources.fleet_source import find_fleet
-
-    truth = read_truth(path)
-    source = find_fleet(fleet)
-    require_same_fleet(source.fleet_ids, truth.fleet_id, drives=fleet, truth=path)
-    faults_of(truth, list(source.vehicles))
-    return truth
 
 
 def identify(

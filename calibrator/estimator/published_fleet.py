@@ -17,13 +17,11 @@ import numpy as np
 from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import align
-from calibrator.errors import FleetError
 from calibrator.estimator.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.estimator.results import encode_chunk
-from calibrator.estimator.settings import CalibrationSettings, Classifier, require_learning
-from calibrator.fleet_truth import faults_of
+from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.processes.run_many import Workers
-from calibrator.published.classify import classify_by_expected_trees, classify_by_threshold, classify_by_truth
+from calibrator.published.classify import classify_by_expected_trees
 from calibrator.published.recovery import Recovery, recover_fleet
 from calibrator.published.state_space import VehicleModel, evidence_of_models, identify_vehicle
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
@@ -33,6 +31,8 @@ from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParamete
 
 __all__ = ["calibrate_fleet_published", "read_vehicle_model"]
 
+EXPECTED = FaultSettings(sparsity=80.0, magnitude=(0.05, 0.25), balanced=True)
+"""Faults of the artificial fleet that the trees learn from: one of five parameters, as in the paper."""
 MISFIT = 5.0
 """Simulation error over the fleet's median from which on a model is not one of the fleet. [1]"""
 SLOPE_SPREAD = 0.093
@@ -89,26 +89,17 @@ def calibrate_fleet_published(
     vehicles = _without_misfits(vehicles, settings.hold_out, branches, left_out)
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
-    learners, truth = list(compress(vehicles, learning)), settings.truth
-    if truth is not None and tuple(truth.branches) != branches:
-        raise FleetError(f"the truth is of branches {truth.branches}, the fleet has {branches}")
+    learners = list(compress(vehicles, learning))
     with progress_bar("estimate the faults", None):
         evidence, reference, unity = evidence_of_models(vehicles, learning)
-        if settings.classifier is Classifier.PERFECT:
-            assert truth is not None  # the command asks for it
-            classes = classify_by_truth(faults_of(truth, names))
-        elif settings.classifier is Classifier.THRESHOLD:
-            classes = classify_by_threshold(evidence.features, np.array(learning))
-        else:
-            classes = classify_by_expected_trees(
-                evidence.features,
-                reference,
-                _median_error_a(learners),
-                full_scale_a=layout.full_scale_a,
-                expected=FaultSettings(sparsity=settings.sparsity, magnitude=settings.magnitude, balanced=True),
-                seed=settings.seed,
-                reference_vehicles=None if settings.symmetric else len(learners),
-            )
+        classes = classify_by_expected_trees(
+            evidence.features,
+            reference,
+            _median_error_a(learners),
+            full_scale_a=layout.full_scale_a,
+            expected=EXPECTED,
+            reference_vehicles=len(learners),
+        )
         recovery = recover_fleet(evidence, classes, full_scale_a=layout.full_scale_a)
     left_out |= {names[j]: reason for j, reason in recovery.failed.items()}
     parameters = [
@@ -122,7 +113,7 @@ def calibrate_fleet_published(
         "simulation_snr_db": by_branch(branches, np.nanmedian([vehicle.snr_db for vehicle in vehicles], axis=0)),
     }
     notices: tuple[str, ...] = ()
-    if len(learners) < LEAST_VEHICLES and not settings.symmetric:
+    if len(learners) < LEAST_VEHICLES:
         notices = (
             f"{len(learners)} vehicles are few for the published method, which takes the mean of the fleet for the "
             f"truth: with faults of 5 to 25 % in one of five parameters it is off by about "

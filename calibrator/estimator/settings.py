@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from calibrator.errors import ContradictionError, FleetError
-from calibrator.fleet_truth import FleetTruth
 from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few, few_reasons
 from ecu_node.documents import text_digest
 from ecu_node.layout import UnmeasuredLoad, file_digest
 
-__all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "Classifier", "Method", "require_learning"]
+__all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "Method", "require_learning"]
 
 FEWEST_VEHICLES = 5
 """Of a fleet that is compared with itself: in a smaller one it is not clear who differs from whom."""
@@ -26,14 +25,6 @@ class Method(StrEnum):
 
     POSTERIOR = "posterior"
     PUBLISHED = "published"
-
-
-class Classifier(StrEnum):
-    """How the published method tells vehicles with hardware faults, section III-B of the paper."""
-
-    THRESHOLD = "threshold"
-    TREE = "tree"
-    PERFECT = "perfect"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,18 +57,6 @@ class CalibrationSettings:
         Largest posterior probability of making a branch worse with which it is corrected. [1]
     expected_faults : float or None
         Share of the vehicles that have a sensor fault, if it is known; None: learnt from the fleet. [1]
-    classifier : Classifier
-        Of the published method.
-    truth : FleetTruth or None
-        For the perfect classifier.
-    sparsity : float
-        Of the artificial fleet that the tree is trained on. [%]
-    magnitude : tuple of float
-        Of the same: range of drifts [1] and of offsets in fractions of full scale.
-    symmetric : bool
-        Whether the fleet is symmetric as in the paper, so that its mean has no error of its own.
-    seed : int
-        Seed of the training fleet.
     time_limit_s : float
         Longest time to read one vehicle, in whatever method; one that takes longer is left out. [s]
 
@@ -98,12 +77,6 @@ class CalibrationSettings:
     meter: str | None = None
     harm_limit: float = HARM_LIMIT
     expected_faults: float | None = None
-    classifier: Classifier = Classifier.TREE
-    truth: FleetTruth | None = None
-    sparsity: float = 80.0
-    magnitude: tuple[float, float] = (0.05, 0.25)
-    symmetric: bool = False
-    seed: int = 0
     time_limit_s: float = TIME_LIMIT_S
 
     def __post_init__(self) -> None:
@@ -116,8 +89,7 @@ class CalibrationSettings:
         """What the method in use heeds, for the record of a run."""
         found: dict[str, Any] = {"branches": self.branches, "hold_out": sorted(self.hold_out)}
         if self.method is Method.PUBLISHED:
-            names = ("classifier", "sparsity", "magnitude", "symmetric", "seed")
-            return found | {name: getattr(self, name) for name in names}
+            return found
         return found | {
             "harm_limit": self.harm_limit,
             "trusted": sorted(self.trusted),

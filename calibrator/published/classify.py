@@ -161,7 +161,6 @@ def classify_by_expected_trees(
     *,
     full_scale_a: float,
     expected: FaultSettings,
-    seed: int,
     reference_vehicles: int | None,
 ) -> Classification:
     """Classify a real fleet by trees that learn from an artificial fleet with the faults that the user expects.
@@ -178,12 +177,10 @@ def classify_by_expected_trees(
         Full scale of the junction. [A]
     expected : FaultSettings
         What the fleet's faults are like.
-    seed : int
-        Seed of the artificial fleet.
     reference_vehicles : int or None
         How many vehicles the reference is the mean of; None: the fleet is symmetric, so its mean is the ideal vehicle.
     """
-    i_s, rng = reference - reference.mean(axis=1, keepdims=True), random_stream(Purpose.TRAINING_FAULTS, seed)
+    i_s, rng = reference - reference.mean(axis=1, keepdims=True), random_stream(Purpose.TRAINING_FAULTS, 0)
     K = reference.shape[1]
     faults = expected.draw(rng, vehicles=TRAINING_VEHICLES, branches=K, full_scale_a=full_scale_a)
     learnt = expected_features(faults, i_s, simulation_error_a, reference_vehicles=reference_vehicles)

@@ -1,4 +1,4 @@
-"""``python -m tests.vcan.calibrated_fleet DIR``: a small fleet of two branches, calibrated with the perfect classifier.
+"""``python -m tests.vcan.calibrated_fleet DIR``: a small fleet of two branches, calibrated.
 
 On user-mode-linux this takes minutes; ``make test`` makes it beforehand and names the folder in HV_CALIBRATED_FLEET.
 """
@@ -17,13 +17,10 @@ def make_calibrated_fleet(folder: Path) -> None:
     folder.mkdir(parents=True)
     layout, fleet = write_patient_layout(folder), folder / "fleet"
     calibrator(
-        *("simulate", "--vehicles", 4, "--sparsity", 60, "--common-drive", "--symmetric", "--balanced"),
+        *("simulate", "--vehicles", 12, "--sparsity", 80, "--common-drive", "--symmetric", "--balanced"),
         *("--minutes", 3, "--unseen-minutes", 1, "--seed", 5, "--layout", layout, "--out", fleet, "--workers", 1),
     )
-    calibrator(
-        *("calibrate", fleet, "--layout", layout, "--out", folder / "result", "--workers", 1),
-        *("--method", "published", "--classifier", "perfect", "--truth", fleet / "truth.json"),
-    )
+    calibrator("calibrate", fleet, "--layout", layout, "--out", folder / "result", "--workers", 1)
 
 
 def calibrator(*arguments: object) -> None:

@@ -146,7 +146,6 @@ def test_symmetric_fleet_is_recovered_through_noise(perfect: bool, least: float)
             np.full(3, 0.05),
             full_scale_a=FULL_SCALE_A,
             expected=FaultSettings(sparsity=80.0, balanced=True),
-            seed=0,
             reference_vehicles=None,
         )
     found = recover_fleet(evidence, classes, full_scale_a=FULL_SCALE_A)
@@ -166,7 +165,7 @@ def test_vehicle_held_out_of_the_reference_moves_nothing_and_its_drive_is_not_th
 
 
 def test_small_fleet_is_noticed_on_the_screen_and_in_the_record(two_vehicles: Path, tmp_path: Path) -> None:
-    options = ("--method", "published", "--classifier", "threshold", "--layout", LAYOUT, "--workers", 1)
+    options = ("--method", "published", "--layout", LAYOUT, "--workers", 1)
     run = calibrator("calibrate", two_vehicles, *options, "--out", tmp_path / "result")
     record = json.loads((tmp_path / "result" / "run.json").read_text())
     (notice,) = (each for each in record["notices"] if each.startswith("2 vehicles are few"))
