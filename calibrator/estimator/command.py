@@ -13,7 +13,6 @@ from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import (
     TIME_LIMIT_S,
-    BankOption,
     BranchesOption,
     FleetArgument,
     FleetOrSummariesArgument,
@@ -200,24 +199,21 @@ def _charge(text: str) -> tuple[str, tuple[float, float]]:
 def identify(
     fleet: FleetArgument,
     layout: LayoutOption,
-    bank: BankOption = None,
     out: Annotated[Path | None, typer.Option("--out", help="File to write the filter bank to (JSON).")] = None,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:
     """Choose the filter bank that a fleet's vehicles share, and tell how well it simulates each of them.
 
-    Without --bank it is chosen from some vehicles, by how well it simulates blocks of their drives that were held out.
+    It is chosen from some vehicles, by how well it simulates blocks of their drives that were held out.
     """
     if out is not None:
         require_possible_file(out)
     with importing():
         from calibrator.estimator.fleet_identification import identify_fleet
         from calibrator.processes.run_many import Workers
-        from calibrator.summaries.filter_bank import read_bank
 
-    given = None if bank is None else read_bank(bank)
-    report = identify_fleet(fleet, vehicle_database(layout), bank=given, workers=Workers(processes=workers))
+    report = identify_fleet(fleet, vehicle_database(layout), workers=Workers(processes=workers))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, report.bank.to_json())

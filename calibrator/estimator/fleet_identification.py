@@ -226,10 +226,8 @@ class IdentificationReport:
         return rows
 
 
-def identify_fleet(
-    path: str | Path, database: VehicleDatabase, *, bank: FilterBank | None, workers: Workers
-) -> IdentificationReport:
-    """Choose the filter bank of a fleet, or take one that is given, and judge it by every vehicle.
+def identify_fleet(path: str | Path, database: VehicleDatabase, *, workers: Workers) -> IdentificationReport:
+    """Choose the filter bank of a fleet, and judge it by every vehicle.
 
     Parameters
     ----------
@@ -237,8 +235,6 @@ def identify_fleet(
         The fleet, see :func:`calibrator.sources.fleet_source.find_fleet`.
     database : VehicleDatabase
         DBC and layout.
-    bank : FilterBank or None
-        A bank that is given; None: one is chosen from some vehicles of the fleet.
     workers : Workers
         Where the drives are read.
 
@@ -250,18 +246,11 @@ def identify_fleet(
     Raises
     ------
     UserError
-        If no vehicle can be used, or the bank is not of the fleet's inputs.
+        If no vehicle can be used.
     """
-    fleet, period_s = find_fleet(path), database.layout.period_s
+    fleet = find_fleet(path)
     equipment = probe_equipment(fleet, database, None)
-    if bank is None:
-        bank = _chosen_bank(fleet, equipment, database, workers=workers)
-    if (bank.input_names, bank.period_s) != (equipment.fleet_inputs, period_s):
-        raise DriveError(
-            f"the filter bank is of the inputs {', '.join(bank.input_names)} every {bank.period_s:g} s, the fleet has "
-            f"{', '.join(equipment.fleet_inputs)} every {period_s:g} s; choose one with 'calibrator identify' for this "
-            f"fleet"
-        )
+    bank = _chosen_bank(fleet, equipment, database, workers=workers)
     read_one = partial(read_vehicle_summary, bank=bank)
     vehicles, left_out = read_vehicles(read_one, fleet, equipment, database, workers=workers)
     snr_db = held_out_snr_db([vehicle.summary for vehicle in vehicles]).tolist()
