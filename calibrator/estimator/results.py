@@ -497,7 +497,7 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
         parameters=parameters,
         run=run,
         verdicts=_counts(vehicles["verdict"]),
-        undecided=said(vehicles[vehicles["verdict"] == "cannot tell"], lambda mine: mine["reason"].iloc[0] or ""),
+        undecided=said(vehicles[vehicles["verdict"] == "cannot tell"], lambda mine: mine["reason"].fillna("").iloc[0]),
         corrected=said(rows[(rows["verdict"] == "corrected") & rows["applied"]], corrected),
         hardware_suspected=said(suspected, probability),
         hardware_count=len(suspected),
