@@ -171,15 +171,12 @@ class FleetSource:
         Why a vehicle, or a file where its vehicle is unclear, was left out.
     sizes : mapping of str to int
         Size of the drives of each vehicle. [byte]
-    fleet_ids : frozenset of str
-        Artificial fleets that the drives come from, see :mod:`calibrator.drives.fleet_id`; empty if unknown.
     """
 
     place: str
     vehicles: Mapping[str, tuple[DriveFile, ...]]
     left_out: Mapping[str, str] = field(default_factory=dict)
     sizes: Mapping[str, int] = field(default_factory=dict)
-    fleet_ids: frozenset[str] = frozenset()
 
     @property
     def name(self) -> str:

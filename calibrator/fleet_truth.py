@@ -1,6 +1,5 @@
 """Truth of an artificial fleet: ``truth.json``, written by ``calibrator simulate`` and read by ``calibrator score``."""
 
-import hashlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,11 +10,9 @@ from calibrator.errors import FleetError
 from calibrator.faults import Faults
 from ecu_node.documents import write_atomically
 
-__all__ = ["TRUTH_FILE", "FleetTruth", "VehicleTruth", "faults_of", "read_truth", "with_fleet_id", "write_truth"]
+__all__ = ["TRUTH_FILE", "FleetTruth", "VehicleTruth", "faults_of", "read_truth", "write_truth"]
 
 TRUTH_FILE = "truth.json"
-ID_DIGITS = 16
-"""Of SHA-256; two fleets agree in them by chance once in 10^19."""
 
 _REMEDY = "name the truth.json that 'calibrator simulate' wrote beside the logs"
 
@@ -41,8 +38,6 @@ class FleetTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """How an artificial fleet was made, and every vehicle of it."""
 
     schema_version: Literal[1] = 1
-    fleet_id: str
-    """Digest of all that follows; the same as in ``fleet.id`` beside the logs."""
     layout: str
     branches: list[str]
     full_scale_a: float
@@ -56,12 +51,6 @@ class FleetTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     noise: float
     """Standard deviation of the sensor noise in fractions of full scale."""
     vehicles: dict[str, VehicleTruth]
-
-
-def with_fleet_id(truth: FleetTruth) -> FleetTruth:
-    """Name a fleet by the digest of its settings and of all its vehicles' faults."""
-    content = msgspec.json.encode(msgspec.structs.replace(truth, fleet_id=""))
-    return msgspec.structs.replace(truth, fleet_id=hashlib.sha256(content).hexdigest()[:ID_DIGITS])
 
 
 def write_truth(path: Path, truth: FleetTruth) -> None:

@@ -23,11 +23,10 @@ from calibrator.artificial.trips import (
     with_branches,
 )
 from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.fleet_id import write_fleet_ids
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.files.folders import whole_folder
-from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fleet_id, write_truth
+from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, write_truth
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.recordings.write_logs import FrameSeries, encode_message, sent_values, write_candump
 from calibrator.terminal.progress import shown
@@ -274,17 +273,13 @@ def simulate_fleet(
         finished = shown(written, "simulate", len(vehicles), "vehicles")
         truths = {vehicle.name: truth for vehicle, truth in zip(vehicles, finished, strict=True)}
         fleet = FleetTruth(
-            fleet_id="",
             layout=layout.name,
             branches=list(branches),
             full_scale_a=layout.full_scale_a,
             vehicles=truths,
             **{field: getattr(plan, field) for field in WRITTEN_DOWN},
         )
-        fleet = with_fleet_id(fleet)
         write_truth(folder / TRUTH_FILE, fleet)
-        for kind in ("logs", "unseen"):
-            write_fleet_ids(folder / kind, {fleet.fleet_id})
     return fleet
 
 

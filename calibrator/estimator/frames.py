@@ -207,7 +207,7 @@ def summarise_frames(
     drives, database = _drives(recordings, junction, columns, inputs=chosen)
     _require_amperes(drives, junction)
     equipment = Equipment(branches=tuple(junction.branches), inputs=chosen, fleet_inputs=chosen, notices=())
-    identity = store_identity(equipment, database, vehicles=len(drives), fleet="frames", fleet_ids=frozenset())
+    identity = store_identity(equipment, database, vehicles=len(drives), fleet="frames")
     store = SummaryStore(storage=open_storage(folder), identity=identity)
     write_identity(store.storage, identity)
     for bucket, names in store.by_bucket(drives).items():

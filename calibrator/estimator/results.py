@@ -124,8 +124,6 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     tool: str
     method: str
     fleet: str
-    fleet_ids: list[str] = []
-    """Artificial fleets that the drives come from; empty if they are recorded."""
     layout: str
     branches: list[str]
     model_inputs: list[str]

@@ -114,7 +114,7 @@ def calibrate_fleet(
     calibrate: Calibrate | None = None
     if identity is not None:
         _require_summaries_enough(storage, settings, database.layout)
-        name, fleet_ids = identity.fleet, list(identity.fleet_ids)
+        name = identity.fleet
     elif since is not None:
         raise FleetError(
             f"{place}: drives, and --since goes on with summaries; add the new drives to the store that {since} was "
@@ -122,7 +122,7 @@ def calibrate_fleet(
         )
     else:
         fleet = find_fleet(storage.url)
-        name, fleet_ids = fleet.name, sorted(fleet.fleet_ids)
+        name = fleet.name
         calibrate = _at_once(fleet, settings, database.layout)
         passes = 5 if calibrate is None else 3 if settings.method is Method.PUBLISHED else 2
         if calibrate is None or settings.method is Method.PUBLISHED:
@@ -131,9 +131,7 @@ def calibrate_fleet(
     run_identity = RunIdentity(database=database, method=settings.method, fleet=name, created=time_of_run())
     with whole_folder(out) as result, TemporaryDirectory(dir=result) as summaries, numbered_passes(passes):
         (result / PARTS).mkdir()
-        run = _Run(
-            result=result, shown=out, identity=run_identity, fleet_ids=fleet_ids, settings=settings, workers=workers
-        )
+        run = _Run(result=result, shown=out, identity=run_identity, settings=settings, workers=workers)
         if identity is not None:
             return run.summaries(SummaryStore(storage=storage, identity=identity), {}, since)
         assert fleet is not None
@@ -302,7 +300,6 @@ class _Run:
     result: Path
     shown: Path
     identity: RunIdentity
-    fleet_ids: list[str]
     settings: CalibrationSettings
     workers: Workers
 
@@ -380,7 +377,6 @@ class _Run:
             tool=identity.tool,
             method=identity.method.value,
             fleet=identity.fleet,
-            fleet_ids=self.fleet_ids,
             layout=layout.name,
             branches=list(equipment.branches),
             model_inputs=list(equipment.inputs),

@@ -17,7 +17,6 @@ from typing import TypeVar
 
 from calibrator.drive import Drive, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import choose_inputs
-from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import (
     DRIVES_FOLDER,
     is_drive_file,
@@ -110,9 +109,7 @@ def find_fleet(place: str | Path) -> FleetSource:
     fleet = find_logs([folder.url])
     if not fleet.vehicles:
         raise FleetError(f"{place}: no drive in it{few_reasons(fleet.left_out)}")
-    beside = storage.url.rpartition("/")[0] if folder is storage and Path(storage.url).is_file() else folder.url
-    ids = read_fleet_ids(storage.url if folder.url.endswith(f"/{DRIVES_FOLDER}") else beside)
-    return replace(fleet, place=str(place), fleet_ids=ids)
+    return replace(fleet, place=str(place))
 
 
 def find_logs(arguments: Iterable[str | Path]) -> FleetSource:

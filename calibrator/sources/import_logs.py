@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from calibrator.drive import DriveFile
-from calibrator.drives.fleet_id import read_fleet_ids, write_fleet_ids
 from calibrator.drives.store import has_drive, remove_leftovers, write_drive
-from calibrator.files.storage import Storage, StorageError, local_copy, open_storage
+from calibrator.files.storage import StorageError, local_copy, open_storage
 from calibrator.processes.run_many import Failed, Workers, try_many_shown
 from calibrator.recordings.readers import read_recording
 from calibrator.sources.fleet_source import find_logs
@@ -114,24 +113,8 @@ def import_logs(
             else:
                 already_there.append(f"{log.vehicle}/{log.name}")
     if drives:
-        _note_fleets(open_storage(store), logs)
         remove_leftovers(store, {drive.vehicle for drive in drives}, before_s=start_s)
     return ImportReport(store=str(store), drives=tuple(drives), already_there=tuple(already_there), left_out=left_out)
-
-
-def _note_fleets(store: Storage, logs: Sequence[str | Path]) -> None:
-    """Carry over which artificial fleets the logs are of, as noted beside the folders of their vehicles."""
-    places = [open_storage(log).url.rstrip("/") for log in logs]
-    beside = {folder for place in places for folder in (place, f"{place}/logs", *_above(place, 2))}
-    fleet_ids = read_fleet_ids(store.url).union(*map(read_fleet_ids, beside))
-    if fleet_ids:
-        write_fleet_ids(store.url, fleet_ids)
-
-
-def _above(place: str, levels: int) -> list[str]:
-    """Folders above a place."""
-    parts = place.split("/")
-    return ["/".join(parts[:-level]) for level in range(1, levels + 1) if len(parts) > level + 1]
 
 
 def _import_one(log: DriveFile, database: VehicleDatabase, store: str) -> ImportedDrive | StorageError | None:

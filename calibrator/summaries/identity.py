@@ -52,8 +52,6 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         Number of files that the vehicles are spread over.
     fleet : str
         Name of the fleet.
-    fleet_ids : tuple of str
-        Artificial fleets that the drives come from.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -68,7 +66,6 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     block_s: float
     buckets: Annotated[int, msgspec.Meta(ge=FEWEST_BUCKETS, le=MOST_BUCKETS)]
     fleet: str
-    fleet_ids: tuple[str, ...] = ()
 
     @property
     def equipment(self) -> Equipment:
@@ -104,7 +101,6 @@ def store_identity(
     *,
     vehicles: int,
     fleet: str,
-    fleet_ids: frozenset[str],
     bank: FilterBank | None = None,
 ) -> StoreIdentity:
     """Identity of a new store.
@@ -119,8 +115,6 @@ def store_identity(
         Number of vehicles expected; it decides the number of buckets.
     fleet : str
         Name of the fleet.
-    fleet_ids : frozenset of str
-        Artificial fleets that the drives come from.
     bank : FilterBank or None
         Filters of the fleet inputs; None: the plain inputs.
 
@@ -142,7 +136,6 @@ def store_identity(
         block_s=BLOCK_S,
         buckets=min(max(wanted, FEWEST_BUCKETS), MOST_BUCKETS),
         fleet=fleet,
-        fleet_ids=tuple(sorted(fleet_ids)),
     )
 
 

@@ -231,8 +231,7 @@ def open_store(
             f"the filter bank is for the inputs {', '.join(bank.input_names)}, this fleet has "
             f"{', '.join(equipment.fleet_inputs)}; choose a bank for it with 'calibrator identify'"
         )
-    vehicles, ids = len(fleet.vehicles), fleet.fleet_ids
-    wanted = store_identity(equipment, database, bank=bank, vehicles=vehicles, fleet=fleet.name, fleet_ids=ids)
+    wanted = store_identity(equipment, database, bank=bank, vehicles=len(fleet.vehicles), fleet=fleet.name)
     if identity is None:
         write_identity(storage, wanted)
         identity = read_identity(storage, database)  # another process may have made the store just now

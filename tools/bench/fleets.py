@@ -71,7 +71,7 @@ def _summaries(branches: int) -> tuple[Equipment, list[VehicleSummary]]:
 def make_store(folder: Path, *, vehicles: int, branches: int = 2) -> None:
     """Write a store of summaries of so many vehicles with the faults of the paper, half of them without hardware's."""
     database, (equipment, summaries) = read_database(read_layout(LAYOUT)), _summaries(branches)
-    identity = store_identity(equipment, database, vehicles=vehicles, fleet="synthetic", fleet_ids=frozenset())
+    identity = store_identity(equipment, database, vehicles=vehicles, fleet="synthetic")
     store = SummaryStore(storage=open_storage(folder), identity=identity)
     write_identity(store.storage, identity)
     buckets = store.by_bucket(f"V{number:08d}" for number in range(vehicles))

@@ -7,9 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from calibrator.drive import Channel, Drive
-from calibrator.drives.fleet_id import read_fleet_ids, require_same_fleet, write_fleet_ids
 from calibrator.drives.store import iterate_drives, list_drives, read_drive_file, write_drive
-from calibrator.errors import DriveError, FleetError
+from calibrator.errors import DriveError
 from calibrator.files.storage import StorageError
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
@@ -101,20 +100,3 @@ def test_a_store_that_cannot_be_written_is_named(tmp_path: Path, layout: Layout)
     (tmp_path / "store").write_text("a file")
     with pytest.raises(StorageError, match=r"cannot write it: .*; choose another folder"):
         write_drive(tmp_path / "store", some_drive(), layout)
-
-
-def test_ids_are_read_as_they_were_written_and_recorded_drives_have_none(tmp_path: Path) -> None:
-    assert read_fleet_ids(tmp_path) == read_fleet_ids(tmp_path / "none") == frozenset()
-    write_fleet_ids(tmp_path, {"b", "a"})
-    assert read_fleet_ids(tmp_path) == {"a", "b"}
-    (tmp_path / "fleet.id").write_bytes(b"\xff\xfe")
-    with pytest.raises(FleetError, match=r"fleet\.id: cannot be read; remove it"):
-        read_fleet_ids(tmp_path)
-
-
-def test_truth_of_another_fleet_is_refused() -> None:
-    for found in (set[str](), {"a"}):
-        require_same_fleet(found, "a", drives=Path("result"), truth=Path("truth.json"))
-    for found in ({"b"}, {"a", "b"}):
-        with pytest.raises(FleetError, match=r"truth\.json: the truth of fleet a, but result is of fleet (a and )?b;"):
-            require_same_fleet(found, "a", drives=Path("result"), truth=Path("truth.json"))

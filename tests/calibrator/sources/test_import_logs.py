@@ -9,7 +9,6 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import recording_digest
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import find_fleet, load_drive
@@ -71,11 +70,6 @@ def test_left_over_of_a_killed_import_goes(two_vehicles: Path, tmp_path: Path, d
     os.utime(other, (2e9, 2e9))
     imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     assert {path.name for path in folder.iterdir()} == {"drive.parquet", other.name}
-
-
-def test_store_knows_its_artificial_fleet(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
-    imported([two_vehicles / "logs" / "V001" / "drive.log.gz"], tmp_path, database)
-    assert read_fleet_ids(tmp_path) == read_fleet_ids(two_vehicles / "logs") != frozenset()
 
 
 def test_import_into_a_closed_bucket_reads_nothing(two_vehicles: Path, monkeypatch: pytest.MonkeyPatch) -> None:

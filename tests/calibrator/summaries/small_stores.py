@@ -59,7 +59,7 @@ def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",),
 
 def identity_of(database: VehicleDatabase, vehicles: int) -> StoreIdentity:
     bank = FilterBank(input_names=EQUIPMENT.fleet_inputs, period_s=PERIOD_S)
-    return store_identity(EQUIPMENT, database, vehicles=vehicles, fleet="small", fleet_ids=frozenset(), bank=bank)
+    return store_identity(EQUIPMENT, database, vehicles=vehicles, fleet="small", bank=bank)
 
 
 def small_store(
