@@ -89,8 +89,6 @@ class FleetReference:
         Logarithms of the factors on all currents of two variants of the vehicle; empty if there is only one. [1]
     distrusted : mapping of int to str
         Vehicles called trusted that contradict it, by position among those learnt from, and how.
-    differing : tuple of int
-        Trusted vehicles that differ as by a hardware fault, and do not carry the reference.
     """
 
     branches: tuple[str, ...]
@@ -108,7 +106,6 @@ class FleetReference:
     agreeing: tuple[float, ...]
     variants: tuple[float, ...]
     distrusted: Mapping[int, str]
-    differing: tuple[int, ...]
 
     @property
     def ordered(self) -> list[str]:
@@ -212,7 +209,7 @@ def learn_fleet(
         Direct readings of single sensors.
     trusted : ndarray of bool of shape (N,) or None
         Vehicles whose sensors were found faultless on a bench; at least three carry the reference. Those that break
-        the junction law are not trusted, those that differ from the others do not carry.
+        the junction law are not trusted.
     load : UnmeasuredLoad or None
         Load that no branch measures, if it is known; None: estimated from the fleet.
     expected_faults : float or None
@@ -247,22 +244,15 @@ def learn_fleet(
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
 
-    def learn() -> tuple[list[FaultModel], RowsEstimate]:
-        models = learn_fault_models(
-            rows,
-            feed=feed,
-            fixed=_carried_centre(rows, carriers),
-            load=None if load is None else load.mean_a / full_scale_a,
-            known=known,
-            expected_faults=expected_faults,
-        )
-        return models, estimate_rows(rows, models, feed=feed, mean=mean, mean_square=square, usual=usual)
-
-    models, everyone = learn()
-    differing = carriers & (everyone.hardware_probability > SUSPECTED) & (carriers.sum() >= FEWEST_TRUSTED)
-    if differing.any():
-        carriers &= ~differing
-        models, everyone = learn()
+    models = learn_fault_models(
+        rows,
+        feed=feed,
+        fixed=_carried_centre(rows, carriers),
+        load=None if load is None else load.mean_a / full_scale_a,
+        known=known,
+        expected_faults=expected_faults,
+    )
+    everyone = estimate_rows(rows, models, feed=feed, mean=mean, mean_square=square, usual=usual)
     place = np.argsort(order)
     own_read_out = read_out[:, place]
     return FleetReference(
@@ -281,7 +271,6 @@ def learn_fleet(
         agreeing=tuple(_agreeing(rows, int(p)) for p in place),
         variants=_variants(everyone.hardware_drift),
         distrusted=distrusted,
-        differing=tuple(np.flatnonzero(differing).tolist()),
     )
 
 

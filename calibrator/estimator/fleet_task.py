@@ -202,18 +202,13 @@ def learn_task(
 def _distrust(vehicles: Sequence[VehicleSummary], trusted: Mask, reference: FleetReference) -> list[str]:
     """Which trusted vehicles contradict the trust in them, or are too few to carry the reference."""
     notices, names = [], [vehicle.vehicle for vehicle in vehicles]
-    carriers = int(np.count_nonzero(trusted)) - len(reference.distrusted) - len(reference.differing)
+    carriers = int(np.count_nonzero(trusted)) - len(reference.distrusted)
     if trusted.any() and carriers < FEWEST_TRUSTED:
         notices.append(
             f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: it is the "
             f"fleet's"
         )
     notices += [f"vehicle {names[j]} is not trusted: {why}; check it again" for j, why in reference.distrusted.items()]
-    notices += [
-        f"trusted vehicle {names[j]} does not carry the reference: it differs from the other trusted ones as by a "
-        f"hardware fault"
-        for j in reference.differing
-    ]
     (_, offset_a), (_, sd_a) = window_readings(vehicles)
     shown = trusted[:, None] & (
         np.abs(offset_a) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * reference.full_scale_a)
