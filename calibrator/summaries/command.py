@@ -81,11 +81,10 @@ def check(store: StoreArgument, json: JsonOption = False) -> None:
 
 @store_app.command(epilog=example("calibrator store compact summaries"))
 def compact(store: StoreArgument, json: JsonOption = False) -> None:
-    """Put the files of each bucket together, and remove damaged records, whose drives are then summarised again."""
+    """Put the files of each bucket together."""
     with importing():
         from calibrator.summaries.summary_store import compact_store
 
-    buckets, removed = compact_store(store)
-    text = f"{counted(buckets, 'bucket')} written anew, {counted(removed, 'damaged record')} removed"
-    facts = {"store": store, "buckets": buckets, "removed": removed}
-    write_output(dumps(facts) if json else f"{store}: {text}")
+    buckets = compact_store(store)
+    facts = {"store": store, "buckets": buckets}
+    write_output(dumps(facts) if json else f"{store}: {counted(buckets, 'bucket')} written anew")

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from calibrator.drive import Equipment, FleetSource
-from calibrator.drives.store import is_plain_name
 from calibrator.errors import FleetError
 from calibrator.files.storage import Storage, open_storage
 from calibrator.summaries.filter_bank import FilterBank
@@ -130,7 +129,7 @@ class SummaryStore:
         for record in decode_records(contents, self.identity, where, whole=whole):
             found.setdefault(record.vehicle, []).append(record)
         for name in found:
-            if (right := self.bucket_of(name)) != bucket and is_plain_name(name):
+            if (right := self.bucket_of(name)) != bucket:
                 raise FleetError(
                     f"{where}: vehicle {name} belongs into bucket {right:05d}; this file was renamed or copied: remove "
                     f"it and summarise again"
@@ -321,8 +320,6 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
             report.drives += len(outline.drives)
             report.hours += sum(record.duration_s for record in records) / 3600.0
             for record in records if whole else ():
-                if record.damaged:
-                    report.faults[name] = record.problem
                 for digest in record.digests if not record.problem else ():
                     if (other := owners.setdefault(digest, name)) != name:
                         problem = f"has a recording that {other} has as well; remove it where it is wrong"
@@ -330,16 +327,13 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
     return report
 
 
-def compact_store(place: str) -> tuple[int, int]:
-    """Make one file of each bucket, without damaged records; how many buckets and records. FleetError if no store."""
-    store, merged, removed = existing_store(place), 0, 0
-    buckets = store.buckets()
-    for bucket in shown(buckets, "put files together", len(buckets), "buckets"):
-        damaged = sum(record.damaged for records in store.read(bucket).values() for record in records)
-        if damaged or sum(map(len, store.files(bucket))) > 1:
-            store.change(bucket, lambda record: None if record.damaged else record, whole=True)
-            merged, removed = merged + 1, removed + damaged
-    return merged, removed
+def compact_store(place: str) -> int:
+    """Make one file of each bucket; of how many. FleetError if it is no store."""
+    store = existing_store(place)
+    many = [bucket for bucket in store.buckets() if sum(map(len, store.files(bucket))) > 1]
+    for bucket in shown(many, "put files together", len(many), "buckets"):
+        store.change(bucket, lambda record: record, whole=True)
+    return len(many)
 
 
 def existing_store(place: str | Path) -> SummaryStore:

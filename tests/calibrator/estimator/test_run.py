@@ -194,16 +194,15 @@ def test_same_parameters_in_any_company(store: SummaryStore, task: FleetTask, tm
         assert found.decode().splitlines() == together[name].decode().splitlines()
 
 
-@pytest.mark.parametrize("what", ["moments", "noise_a2"])
-def test_impossible_numbers_stop_neither_pass(store: SummaryStore, task: FleetTask, tmp_path: Path, what: str) -> None:
+def test_impossible_numbers_stop_neither_pass(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
     expected = texts(calibrate_bucket(bucket, store=store, task=task))
     bad = min(records)
     found = records[bad][0].found
     assert found is not None
-    spoilt = np.inf * np.ones_like(getattr(found.summary, what))
-    records[bad] = [replace(records[bad][0], found=replace(found, summary=replace(found.summary, **{what: spoilt})))]
+    spoilt = replace(found.summary, moments=np.inf * found.summary.moments)
+    records[bad] = [replace(records[bad][0], found=replace(found, summary=spoilt))]
     other = rewritten(store, tmp_path, bucket, records)
     sample = read_sample(other, take_census(other, ONE), CalibrationSettings(), ())
     assert {item.vehicle for item in sample} == records.keys() - {bad}
