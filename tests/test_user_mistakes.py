@@ -84,7 +84,6 @@ MISTAKES = [
     ("calibrator kirchhoff drive.csv CURRENTS --plot sum.doc", 2, "sum.doc"),
     ("calibrator kirchhoff drive.csv CURRENTS --table drive.csv", 2, "drive.csv"),
     ("calibrator kirchhoff drive.csv CURRENTS --parameters noise", 2, "--parameters belong to a layout"),
-    ("calibrator kirchhoff drive.csv CURRENTS --dbc car.dbc", 2, "--dbc goes with --layout"),
     ("calibrator kirchhoff CAR", 2, "Missing argument 'LOG'"),
     ("calibrator kirchhoff drive.csv --branches sum=Ibat,motor=Imot", 1, "branch 'sum' is called like the sum"),
     ("calibrator layout init none.dbc --log drive.csv --out x", 1, "none.dbc"),

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibrator.files.layout_files import chosen_layout
+from calibrator.files.layout_files import checked_layout
 from calibrator.processes.interrupts import importing
-from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption
+from calibrator.terminal.options import JsonOption, LayoutOption
 from calibrator.terminal.text import counted, dumps, figure, table
 from ecu_node.program import write_output
 
@@ -24,7 +24,6 @@ __all__ = ["doctor", "doctor_json", "doctor_text"]
 def doctor(
     layout: LayoutOption,
     log: Annotated[list[Path], typer.Option("--log", metavar="PATH", help="Log or table of the vehicle.")],
-    dbc: DbcOption = None,
     json: JsonOption = False,
 ) -> None:
     """Tell what of a layout and of logs can be used, what is wrong with it, and what to do.
@@ -36,7 +35,7 @@ def doctor(
         from calibrator.doctor.checks import findings_of, readiness
         from calibrator.doctor.facts import facts_of
 
-    facts = facts_of(chosen_layout(layout, dbc), log)
+    facts = facts_of(checked_layout(layout), log)
     findings = findings_of(facts)
     steps = readiness(facts, findings)
     if json:

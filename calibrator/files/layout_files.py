@@ -2,29 +2,19 @@
 
 from pathlib import Path
 
-import msgspec
-
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.errors import LayoutError
 from ecu_node.formulas import formula_names, parse_formula
 from ecu_node.layout import Layout, read_layout
 
-__all__ = ["check_formulas", "chosen_layout", "vehicle_database"]
+__all__ = ["check_formulas", "checked_layout", "vehicle_database"]
 
 
-def chosen_layout(layout: Path, dbc: Path | None = None) -> Layout:
-    """Read a layout, its formulas too, and let it name another DBC if one is given; see :func:`vehicle_database`."""
-    settings = read_layout(layout)
-    check_formulas(settings)
-    if dbc is None:
-        return settings
-    if not dbc.is_file():
-        raise DatabaseError(f"{dbc}: no such DBC; check --dbc")
-    if len(settings.bus) > 1:
-        raise LayoutError(f"{layout}: names several buses with a DBC each; leave --dbc out")
-    buses = [msgspec.structs.replace(bus, dbc=str(dbc.absolute())) for bus in settings.bus]
-    changed: Layout = msgspec.structs.replace(settings, dbc=None if buses else str(dbc.absolute()), bus=buses)
-    return changed
+def checked_layout(path: Path) -> Layout:
+    """Read a layout, and check its formulas, too; LayoutError if it cannot be used."""
+    layout = read_layout(path)
+    check_formulas(layout)
+    return layout
 
 
 def check_formulas(layout: Layout) -> None:
@@ -52,24 +42,6 @@ def check_formulas(layout: Layout) -> None:
         known.add(derived)
 
 
-def vehicle_database(layout: Path, dbc: Path | None = None) -> VehicleDatabase:
-    """Read a layout with its DBC, or with another one.
-
-    Parameters
-    ----------
-    layout : Path
-        Layout (TOML).
-    dbc : Path or None
-        DBC to use instead of the one that the layout names.
-
-    Returns
-    -------
-    VehicleDatabase
-        DBC and layout.
-
-    Raises
-    ------
-    LayoutError, DatabaseError
-        If one of them cannot be used.
-    """
-    return read_database(chosen_layout(layout, dbc))
+def vehicle_database(layout: Path) -> VehicleDatabase:
+    """Read a layout (TOML) with its DBC; LayoutError or DatabaseError if one of them cannot be used."""
+    return read_database(checked_layout(layout))

@@ -10,7 +10,7 @@ import typer
 from calibrator.files.folders import require_possible_file
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
-from calibrator.terminal.options import DbcOption, JsonOption
+from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps
 from ecu_node.program import say_error, write_output
 
@@ -29,7 +29,6 @@ def kirchhoff(
     *,
     log: Annotated[Path, typer.Argument(help="Log of frames, or table of currents (.csv, .parquet ...).")],
     layout: Annotated[Path | None, typer.Option(help="Layout (TOML) that says what the signals mean.")] = None,
-    dbc: DbcOption = None,
     branches: Annotated[
         str | None,
         typer.Option(
@@ -49,8 +48,6 @@ def kirchhoff(
         raise typer.BadParameter(
             "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table"
         )
-    if dbc is not None and layout is None:
-        raise typer.BadParameter("--dbc goes with --layout")
     if parameters is not None and layout is None:
         raise typer.BadParameter("--parameters belong to a layout; give --layout, not --branches")
     with importing():
@@ -65,7 +62,7 @@ def kirchhoff(
         from ecu_node.parameters import check_fit, read_parameters
 
     logs = filter(is_log, files_in(log))
-    read = {path.resolve() for path in filter(None, (log, *logs, layout, dbc, parameters))}
+    read = {path.resolve() for path in filter(None, (log, *logs, layout, parameters))}
     for path, ends in ((plot, PAGES), (table, TABLES)):
         if path is not None and path.suffix.lower() not in ends:
             raise typer.BadParameter(f"{path}: expected a file name that ends with {', '.join(ends)}")
@@ -74,7 +71,7 @@ def kirchhoff(
         if path is not None:
             require_possible_file(path)
     if layout is not None:
-        database = with_voltages(vehicle_database(layout, dbc))
+        database = with_voltages(vehicle_database(layout))
     elif is_table(log) or not log.exists():
         database = layout_from_branches(str(branches), table=read_table(log))
     else:

@@ -16,7 +16,6 @@ __all__ = [
     "TIME_LIMIT_S",
     "BankOption",
     "BranchesOption",
-    "DbcOption",
     "FleetArgument",
     "FleetOrSummariesArgument",
     "JsonOption",
@@ -131,7 +130,6 @@ StoreOption = Annotated[
     str, typer.Option("--out", callback=_named, help="Store of summaries, path or URL; drives are added to one.")
 ]
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
-DbcOption = Annotated[Path | None, typer.Option("--dbc", help="DBC to use instead of the one the layout names.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 WorkersOption = Annotated[int, whole_option("--workers", 1, MAX_WORKERS, "Number of processes")]
 TimeLimitOption = Annotated[

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrator.drives.align import evaluate_formula
-from calibrator.files.layout_files import chosen_layout
+from calibrator.files.layout_files import checked_layout
 from ecu_node.errors import LayoutError
 from ecu_node.formulas import formula_value, parse_formula
 from tests.ecu_node.vehicles import SMALL_LAYOUT
@@ -40,7 +40,7 @@ def test_layout_with_wrong_formula_is_refused(tmp_path: Path, formula: str, word
     derived = f'derived = [{{ name = "d", formula = "{formula}" }}]\nfull_scale_a'
     path.write_text(SMALL_LAYOUT.replace("full_scale_a", derived))
     with pytest.raises(LayoutError, match=rf"small\.toml: derived input d: .*{words}") as caught:
-        chosen_layout(path)
+        checked_layout(path)
     assert "\n" not in str(caught.value)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
@@ -198,7 +199,8 @@ def test_parameters_correct_as_the_node_would(log: Path, tmp_path: Path) -> None
 def test_parameters_of_another_layout_are_refused(log: Path, tmp_path: Path) -> None:
     file = parameters(tmp_path, offset_a=12.0, apply=True)
     (tmp_path / "other.toml").write_text(LAYOUT.read_text() + "# other\n")
-    done = run(log, "--layout", tmp_path / "other.toml", "--dbc", LAYOUT.with_suffix(".dbc"), "--parameters", file)
+    shutil.copy(LAYOUT.with_suffix(".dbc"), tmp_path)
+    done = run(log, "--layout", tmp_path / "other.toml", "--parameters", file)
     assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
     assert "parameters were made with layout hv_powertrain" in done.stderr
     path, *rest = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
