@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numba as _numba
 
-__all__ = ["compiled", "inner"]
+__all__ = ["compiled", "inner", "is_compiled"]
 
 numba: Any = _numba  # its type hints leave out options
 
@@ -66,6 +66,11 @@ def compiled(function: _Function) -> _Function:
 def inner(function: _Function) -> _Function:
     """Compile a function that compiled functions alone call."""
     return cast("_Function", _dispatcher(function, no_cpython_wrapper=True))
+
+
+def is_compiled(module: str) -> bool:
+    """Whether functions of a module of this name were compiled before, and kept."""
+    return _FOLDER is not None and any(_FOLDER.rglob(f"{module}.*.nbi"))
 
 
 def _dispatcher(function: Callable[..., object], **options: Any) -> Any:

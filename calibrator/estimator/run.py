@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 from threadpoolctl import threadpool_limits
 
+from calibrator.compiled import is_compiled
 from calibrator.drive import Equipment, FleetSource
 from calibrator.drives.store import DRIVES_FOLDER
 from calibrator.errors import ContradictionError, DriveError, FleetError
@@ -328,7 +329,8 @@ class _Run:
         census = take_census(store, self.workers_if(is_large), settings.hold_out | settings.trusted | checked)
         _require_named(settings, census.named, census.reasons, f"fleet {self.identity.fleet}")
         self.check(bench, census.named, census.reasons)
-        with progress_bar("learn the fleet", None), threadpool_limits(1):  # one: the reference is the same anywhere
+        first = "" if is_compiled("posterior") else " (compiled before its first use: half a minute more)"
+        with progress_bar(f"learn the fleet{first}", None), threadpool_limits(1):  # one thread: the same anywhere
             task, notices = learn_task(
                 read_sample(store, census, settings, checked),
                 settings,

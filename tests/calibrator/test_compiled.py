@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import calibrator
-from calibrator.compiled import SOURCES, compiled, inner
+from calibrator.compiled import SOURCES, compiled, inner, is_compiled  # noqa: F401 (by the program)
 from calibrator.drive import Array
 
 ROOT = Path(calibrator.__file__).parents[1]
@@ -33,9 +33,14 @@ def largest(values: Array) -> float:
 def test_code_is_kept_where_that_is_possible(tmp_path: Path, writable: bool) -> None:
     (tmp_path / "file").touch()
     cache = tmp_path / "cache" if writable else tmp_path / "file" / "cache"
-    program = "from tests.calibrator.test_compiled import largest, np; print(largest(np.array([1.0, 3.0, 2.0])))"
+    program = "from tests.calibrator.test_compiled import is_compiled, largest, np; " + (
+        "print(is_compiled('test_compiled'), largest(np.array([1.0, 3.0, 2.0])), is_compiled('test_compiled'))"
+    )
     variables = {**os.environ, "CALIBRATOR_CACHE": str(cache)}
-    assert subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, env=variables, text=True) == "6.0\n"
+    assert (
+        subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, env=variables, text=True)
+        == f"False 6.0 {writable}\n"
+    )
     assert any(cache.rglob("*.nbc")) == writable
 
 
