@@ -7,10 +7,10 @@ Read in this order, with docs/method.md beside it:
     learning                        what the fleet says of its faults, and of vehicles without any
     decision, checks                estimate, confidence, harm; whether the best explanation fits
     fleet_estimate, vehicle_report  all of this for a fleet, then for each vehicle; what is said of it
-    junction, junction_run          one junction without a fleet: an estimator of its own, by what is known; its door
+    junction, junction_run          one junction without a fleet: an estimator of its own, by what is known
     settings, fleet_task, run       the command: bucket by bucket, over processes
     results                         the folder that it writes
-    fleet, frames                   the door for Python: data frames in, parameters out
+    fleet, frames                   the Python interface: data frames in, parameters out
 
 ``published_fleet`` is the published method in the same frame; ``fleet_identification`` finds a filter bank where inputs
 alone do not tell the currents.

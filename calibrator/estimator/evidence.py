@@ -795,9 +795,9 @@ def _pivot(means: Array, values: Array) -> Array:
 
 def _shifted(covariance: Array, by: Array, *, first: int) -> Array:
     """Covariance if ``by`` (N, c, r) times the first r variables is added to c variables from ``first`` on."""
-    turn = np.tile(np.eye(covariance.shape[-1]), (len(covariance), 1, 1))
-    turn[:, first : first + by.shape[1], : by.shape[2]] += by
-    return np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
+    jacobian = np.tile(np.eye(covariance.shape[-1]), (len(covariance), 1, 1))
+    jacobian[:, first : first + by.shape[1], : by.shape[2]] += by
+    return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2))
 
 
 def row_design(branches: int, feed: int) -> Array:

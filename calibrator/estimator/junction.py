@@ -103,8 +103,8 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
     constant_sd_a = float(np.hypot(np.sqrt(covariance[-1, -1]), LAW_OFFSET_SD * scale_a))
     unit = np.append(1.0 / ratio, 1.0 / scale_a)
     # an error of a ratio turns the line about the mean current, and so moves the constant
-    turn = np.vstack([np.eye(K - 1), ratio * mean_a[others] / scale_a]) * LAW_GAIN_SD
-    covariance = covariance * np.outer(unit, unit) + turn @ turn.T
+    jacobian = np.vstack([np.eye(K - 1), ratio * mean_a[others] / scale_a]) * LAW_GAIN_SD
+    covariance = covariance * np.outer(unit, unit) + jacobian @ jacobian.T
     covariance[-1, -1] += LAW_OFFSET_SD**2
     return JunctionLaw(order, np.append(np.log(ratio), constant_a / scale_a), covariance, (constant_a, constant_sd_a))
 

@@ -512,7 +512,7 @@ class _Learner:
         return grouped if gain > GROUP_GAIN else prior
 
     def _next_spread(self, draws: Draws, weight: Array, spread: Spread) -> Spread:
-        """Centre, covariance and dispersion of what the explanations leave of the rows."""
+        """Centre, covariance and dispersion of what the explanations leave of the rows, (M14a) and (M14b)."""
         rows, b, N = self.rows, self.at.intercepts, len(self.rows)
         of_fit = weight.sum(axis=(2, 3))
         top = np.argsort(-of_fit, axis=1, kind="stable")[:, :USED_FITS]
@@ -527,7 +527,7 @@ class _Learner:
         left = row_residuals(evidence, theta)
 
         def counted(square: Array, variance: Array) -> Array:
-            """Weights of Student's t, row by row."""
+            """Weights w of Student's t, row by row (M14a)."""
             return share[:, :, None] * (TAIL_DEGREES + 1.0) / (TAIL_DEGREES + square / variance)
 
         def expected(prior_covariance: Array, gain: Array) -> tuple[Array, Array]:

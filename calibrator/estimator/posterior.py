@@ -466,10 +466,10 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
                     weight += 0.5 * (x[p] / WIDE_SD) ** 2 + log(WIDE_SD) + LOG_ROOT_TAU  # ... whose density goes
                     fitted += (theta[p] ** 2 - x[p] ** 2) / WIDE_SD**2 + normal[m, p] ** 2
                 for k in range(K):  # known is the offset, not what a doubtful gain makes of it in true currents
-                    turn = x[1 + k] - theta[1 + k]
-                    if turn != 0.0 and fits.support[j, q, 2 * K + k]:
-                        x[2 * K + k] = (x[2 * K + k] + theta[2 * K + k] * turn) * exp(-turn)
-                        weight -= turn
+                    change = x[1 + k] - theta[1 + k]
+                    if change != 0.0 and fits.support[j, q, 2 * K + k]:
+                        x[2 * K + k] = (x[2 * K + k] + theta[2 * K + k] * change) * exp(-change)
+                        weight -= change
                 if widest > OPEN_SD**2:
                     residual(x, evidence, j, e)
                     exact = 0.0
