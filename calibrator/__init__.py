@@ -1,6 +1,6 @@
 """Learn from recorded drives what each vehicle's high-voltage current sensors do wrong.
 
-Twelve vehicles from data frames (currents positive into the junction, in A) to what their sensors do wrong:
+A fleet of twelve vehicles, given as data frames with currents in A, positive into the junction:
 
     from calibrator import Fleet, FleetCalibrator, Junction
 
@@ -13,7 +13,7 @@ One car with a sensor that is trusted needs no fleet:
 
     JunctionCalibrator(trusted=["battery"]).fit(frame, junction).parameters_
 
-Importing the package is quick; what takes time is imported when it is used.
+Importing the package is quick; modules that take time are imported on first use.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,6 +1,6 @@
-"""``python -m calibrator`` and the console command; the base install has the node alone.
+"""Start the calibrator as ``python -m calibrator`` or console command; say what to install if only the node is there.
 
-All that takes time is imported inside a function, so that Ctrl-C and a closed pipe end it the same way at any time.
+Slow modules are imported inside a function, so that Ctrl-C or a closed pipe ends the program alike even during imports.
 """
 
 import signal
@@ -29,7 +29,7 @@ def calibrator_program() -> None:
     except BrokenPipeError:
         drop_output()
         code = 1
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done or undone; threads only have to be joined
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # work is finished or rolled back; only threads are left to join
     if code == INTERRUPTED:
         say_error(interrupted_message(sys.argv[1:]))
     raise SystemExit(code)

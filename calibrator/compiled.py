@@ -1,9 +1,9 @@
-"""Compilation of numerical loops: what is written as plain Python runs as machine code.
+"""Compile numerical loops with numba: functions written in plain Python run as machine code.
 
-A function so marked may use numbers, arrays, tuples and other such functions only.
+A compiled function may use only numbers, arrays, tuples and other compiled functions.
 
-Compilation of the estimator takes about half a minute, when it is first used. Numba keeps the result in the user's
-cache folder, one folder per state of the source; it tells Python, numba and processors apart by itself.
+Compiling the estimator takes about half a minute on first use. Numba keeps the result in the user's cache folder, in
+one folder per version of the source; within it numba itself separates versions of Python and numba, and processors.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ numba: Any = _numba  # its type hints leave out options
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
 CACHE_VARIABLE = "CALIBRATOR_CACHE"
-"""Environment variable that names another folder than the user's cache folder."""
+"""Environment variable that names a folder to use instead of the user's cache folder."""
 SOURCES = (
     "calibrator/compiled.py",
     "calibrator/drives/align.py",
@@ -36,11 +36,12 @@ SOURCES = (
     "calibrator/summaries/summariser.py",
     "ecu_node/summary.py",
 )
-"""Files whose functions or constants are compiled: numba by itself notices no change of another file."""
+"""Files whose functions or constants are compiled; a change in any of them starts a new cache folder, as numba itself
+notices only changes in the file of the compiled function, not in files that it imports."""
 
 
 def _cache_folder() -> Path | None:
-    """Folder of what was compiled of this source, made if missing; None if it cannot be."""
+    """Return the cache folder of this version of the source, made if missing; None if it cannot be made or written."""
     digest = hashlib.sha256()
     try:
         for source in SOURCES:
@@ -59,17 +60,17 @@ if _FOLDER is not None:
 
 
 def compiled(function: _Function) -> _Function:
-    """Compile a function that Python calls, when it is first called; division by zero gives infinity, as in arrays."""
+    """Compile a function that Python calls, at its first call; division by zero gives infinity, as in NumPy arrays."""
     return cast("_Function", _dispatcher(function, cache=_FOLDER is not None))
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a function that compiled functions alone call."""
+    """Compile a function that only other compiled functions call."""
     return cast("_Function", _dispatcher(function, no_cpython_wrapper=True))
 
 
 def is_compiled(module: str) -> bool:
-    """Whether functions of a module of this name were compiled before, and kept."""
+    """Check whether compiled functions of a module of this name are in the cache."""
     return _FOLDER is not None and any(_FOLDER.rglob(f"{module}.*.nbi"))
 
 

@@ -57,7 +57,7 @@ class Drive:
     Attributes
     ----------
     vehicle, name : str
-        Whose, and which; a vehicle has no two drives of one name.
+        Name of the vehicle, and name of the drive, which is unique within the vehicle.
     branches : mapping of str to Channel
         Measured branch currents, positive into the junction, by branch name. [A]
     inputs : mapping of str to Channel
@@ -79,7 +79,7 @@ class Drive:
 
 
 def good_values(drives: Iterable[Drive], name: str) -> Array:
-    """Good values of a branch [A] or of an input [its unit] over all drives; of none that a drive lacks, shape (n,)."""
+    """Return the good values of a branch [A] or an input [its unit] from all drives that have it, shape (n,)."""
     channels = [{**drive.inputs, **drive.branches}.get(name) for drive in drives]
     return np.concatenate([np.zeros(0), *(each.value[each.good] for each in channels if each is not None)])
 
@@ -118,18 +118,18 @@ class Samples:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DriveFile:
-    """One file that holds a drive, a log or a file of a store, and whose it is; nothing of it has been read.
+    """One file that holds a drive (a log, or a file of a drive store) and its vehicle; its content is not read yet.
 
     Attributes
     ----------
     vehicle, name : str
-        Whose, and which drive.
+        Names of the vehicle and of the drive.
     place : str
-        Path of the file, in an archive perhaps, or its URL.
+        Path of the file, possibly inside an archive, or its URL.
     size : int
-        0 in an archive. [byte]
+        Size of the file; 0 for a file in an archive. [byte]
     version : str
-        Changes when the file changes.
+        Text that changes when the file changes.
     """
 
     vehicle: str
@@ -141,12 +141,12 @@ class DriveFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Equipment:
-    """Which branches and model inputs a fleet has, and what it lacks of the layout's.
+    """Branches and model inputs that a fleet has, and those of the layout that it lacks.
 
     Attributes
     ----------
     branches, inputs, fleet_inputs : tuple of str
-        Names of its branches, and of its model inputs: for each vehicle, and for the model that all share.
+        Names of its branches, of the inputs for a model of each vehicle, and of those for the model that all share.
     notices : tuple of str
         What the layout has and the fleet lacks.
     """
@@ -159,7 +159,7 @@ class Equipment:
 
 @dataclass(frozen=True, kw_only=True)
 class FleetSource:
-    """A fleet that can be loaded.
+    """A fleet whose drives have been located, so that they can be loaded.
 
     Attributes
     ----------
@@ -180,5 +180,5 @@ class FleetSource:
 
     @property
     def name(self) -> str:
-        """Name of its folder."""
+        """Name of the folder that holds the fleet."""
         return self.place.rstrip("/").rpartition("/")[2] if "://" in self.place else Path(self.place).resolve().name

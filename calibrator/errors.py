@@ -21,18 +21,18 @@ __all__ = [
 ]
 
 INTERNAL_ERROR = "internal error: "
-"""How the reason of a vehicle begins that a fault of the program left out."""
+"""Start of the reason for leaving out a vehicle, where a fault of the program is the cause."""
 
 
 def internal_error(error: Exception) -> str:
-    """Reason of a vehicle that a fault of the program itself left out."""
+    """Return the reason for leaving out a vehicle on which the program itself failed, with the failing line."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{INTERNAL_ERROR}{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno}); report it"
 
 
 @contextmanager
 def naming(shown: str, copy: Path) -> Iterator[None]:
-    """Within the block errors of the user that name a copy name what is shown in its place."""
+    """Replace the path of a local copy by the name that the user knows in all user errors raised within the block."""
     try:
         yield
     except UserError as error:

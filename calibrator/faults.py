@@ -1,4 +1,4 @@
-"""Fault model: how measured, true and ideal currents of a vehicle belong together.
+"""Fault model: how the measured, true and ideal currents of a vehicle are related.
 
 Symbols: i_s ideal, i true, i_m measured currents (T samples, K branches, N vehicles), d drift, o offset; index h
 hardware, m measurement (sensor). Currents are positive into the junction. Equations are those of [1]_.
@@ -48,7 +48,7 @@ class Faults:
 
     @classmethod
     def of_parameters(cls, x: Array, full_scale_a: float) -> "Faults":
-        """Faults of the 3K free parameters of N vehicles, of footnote 1 of [1]_.
+        """Make faults from the 3K free parameters of each of N vehicles, as footnote 1 of [1]_ defines them.
 
         Parameters
         ----------
@@ -67,7 +67,7 @@ class Faults:
         )
 
     def take(self, index: Index) -> "Faults":
-        """Return the same faults for some of the vehicles; an integer gives arrays without the leading N."""
+        """Return the faults of some of the vehicles; an integer gives arrays without the leading axis of length N."""
         return Faults(**{name: values[index] for name, values in vars(self).items()})
 
     @property

@@ -28,13 +28,13 @@ class Finding(msgspec.Struct, frozen=True):
     severity : Severity
         How much it matters.
     code : str
-        What it is, in a word or two, for programs: ``sign``, ``unit``, ``delay``, ...
+        Kind of finding in a word or two, for programs: ``sign``, ``unit``, ``delay``, ...
     subject : str
         Branch, input or log that it is about; ``sum`` for the sum of the currents.
     text : str
-        What, with its figure.
+        What is wrong, with the figure that shows it.
     advice : str
-        What to do: which line of the layout to change, where it is the layout; empty if the text says it.
+        What to do, for example which line of the layout to change; empty if the text says it.
     number : float or None
         The figure of the text, in its unit: A, s, or a share or factor of 1.
     """

@@ -18,20 +18,20 @@ _REMEDY = "name the truth.json that 'calibrator simulate' wrote beside the logs"
 
 
 class VehicleTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What was put into one vehicle; branch values are positive into the junction."""
+    """Faults and load of one vehicle, and moments of its currents; currents are positive into the junction."""
 
     hardware_drift: float
     hardware_offset_a: dict[str, float]
     drift: dict[str, float]
     offset_a: dict[str, float]
     delay_s: dict[str, float]
-    """How much later than it flowed each current is seen. [s]"""
+    """Delay of each measured current behind the true one. [s]"""
     unmeasured_a: float
     """Load that no branch measures. [A]"""
     unseen_mean_a: dict[str, float]
     """Mean of the true currents on a drive that is not in the logs. [A]"""
     unseen_mean_square_a2: dict[str, float]
-    """Mean square of the same. [A^2]"""
+    """Mean square of the true currents on that drive. [A^2]"""
 
 
 class FleetTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -86,7 +86,7 @@ def faults_of(truth: FleetTruth, vehicles: list[str]) -> Faults:
     Raises
     ------
     FleetError
-        If the fleet has no vehicle of a name.
+        If one of the names is no vehicle of the fleet.
     """
     unknown = [name for name in vehicles if name not in truth.vehicles]
     if unknown:

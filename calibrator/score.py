@@ -56,12 +56,12 @@ def f2_score(predicted: Mask, actual: Mask) -> float:
     Parameters
     ----------
     predicted, actual : ndarray of bool of shape (N,)
-        Which vehicles are held to be, and which are, faulty.
+        Which vehicles are classified as faulty, and which really are.
 
     Returns
     -------
     float
-        5 p r / (4 p + r) of precision p and recall r; 1 if no vehicle is faulty and none is held to be.
+        5 p r / (4 p + r) with precision p and recall r; 1 if no vehicle is faulty and none is classified as faulty.
     """
     hits = np.sum(predicted & actual)
     weighed = hits + 0.8 * np.sum(actual & ~predicted) + 0.2 * np.sum(predicted & ~actual)
@@ -88,13 +88,13 @@ class UnseenDrive:
 
     @classmethod
     def of_samples(cls, drives: Sequence[tuple[Array, Array]]) -> "UnseenDrive":
-        """Moments of the true and the measured currents, both of shape (T, K), of N vehicles. [A]"""
+        """Compute the moments from pairs of true and measured currents, each of shape (T, K), of N vehicles. [A]"""
         moments = [(i, i**2, i_m - i, (i_m - i) ** 2, (i_m - i) * i) for i, i_m in drives]
         return cls(*np.array([[values.mean(axis=0) for values in own] for own in moments]).swapaxes(0, 1))
 
     @classmethod
     def of_linear_sensors(cls, mean_a: Array, mean_square_a2: Array, truth: Faults) -> "UnseenDrive":
-        """Moments of N vehicles with linear sensors (13), from those of their true currents, shape (K,) or (N, K)."""
+        """Compute the moments for linear sensors (13) from those of the true currents, shape (K,) or (N, K)."""
         d, o, i, i2 = truth.drift, truth.offset_a, mean_a, mean_square_a2
         return cls(i, i2, d * i + o, d**2 * i2 + 2.0 * d * o * i + o**2, d * i2 + o * i)
 

@@ -1,7 +1,7 @@
-"""What the names, comments and senders of a DBC say, in words.
+"""Split names, comments and senders of a DBC into words, and recognise words for places and quantities.
 
-Names of signals are split into words where case, digits or underscores change: ``SmoothBattCurrent132`` is *smooth batt
-current 132*. The words that are known stand in ``vocabulary.toml``.
+Names of signals are split where case, digits or underscores change: ``SmoothBattCurrent132`` becomes *smooth batt
+current 132*. The known words are listed in ``vocabulary.toml``.
 """
 
 import re
@@ -28,27 +28,28 @@ _SPLIT = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
 
 
 def word_set(text: str) -> frozenset[str]:
-    """Words that stand apart in a text."""
+    """Return the set of the words of a text that are separated by white space."""
     return frozenset(text.split())
 
 
 VOCABULARY: dict[str, Any] = tomllib.loads((Path(__file__).parent / "vocabulary.toml").read_text(encoding="utf-8"))
-"""What is known by words, and the words, as texts for :func:`word_set`."""
+"""Content of ``vocabulary.toml``: by meaning, the words that express it, as one text for :func:`word_set`."""
 PLACES = {place: word_set(words) for place, words in VOCABULARY["places"].items()}
-"""Where a current may flow, and words for it."""
+"""Places where a current may flow (battery, motor, ...), each with the words for it."""
 POSITIONS = ("front", "rear", "left", "right")
-"""Of branches that a vehicle has twice; numbers count where two signals differ in nothing else."""
+"""Words that tell apart branches that a vehicle has twice; numbers do so where two signals differ in nothing else."""
 CURRENT, VOLTAGE, POWER = (word_set(VOCABULARY[quantity]) for quantity in ("current", "voltage", "power"))
-"""Words for what flows, in names without a unit."""
+"""Words for current, voltage and power in the names of signals that have no unit."""
 _LETTERS = {"i": "i", "u": "u", "v": "u", "p": "p", "hv": "hv", "lv": "lv"}
-"""First letters of names such as ``Ibat`` and ``HVBatt``, when a place follows them."""
+"""Leading letters that are a word of their own if a place follows, as in ``Ibat`` and ``HVBatt``; and that word."""
 _GLUED = sorted((CURRENT | VOLTAGE | POWER) - set("iuvp") - {"cur", "amp", "volt"}, key=len, reverse=True)
 
 
 def words_of(*texts: str | None) -> tuple[str, ...]:
-    """Words of some names or sentences, in lower case.
+    """Return the words of names or sentences, in lower case.
 
-    ``dc dc``, ``air con`` and ``low voltage`` are joined each; ``Ibat``, ``HVBatt`` and ``Batteriestrom`` are parted.
+    ``dc dc``, ``air con`` and ``low voltage`` become one word each; ``Ibat``, ``HVBatt`` and ``Batteriestrom`` are
+    split into two.
     """
     return tuple(word for text in texts if text for word in _joined(text))
 
@@ -76,12 +77,12 @@ def _parted(word: str) -> list[str]:
 
 
 def places_of(words: Iterable[str]) -> set[str]:
-    """Places that some words name."""
+    """Return the places that the words name."""
     known = set(words)
     return {place for place, names in PLACES.items() if names & known}
 
 
 def is_battery(name: str, signal: str) -> bool:
-    """Whether a branch of this name, or else of this signal, is the battery."""
+    """Check whether a branch is the battery, by its name; by the name of its signal if its own name tells no place."""
     named = places_of(words_of(name))
     return named == {"battery"} if named else "battery" in places_of(words_of(signal))

@@ -1,9 +1,9 @@
-"""Does a vehicle have hardware faults, and its sensors faults? Section III-B of [1]_.
+"""Classify vehicles: is the vehicle itself faulty, and is any of its sensors? Section III-B of [1]_.
 
-Two rules on the features (5) and (6): a threshold, and decision trees that learned from an artificial fleet. For a
-real fleet, of which nobody knows the truth, that fleet is made on the real one's reference: with the sparsity and
-magnitudes that the user expects, the simulation error that the models show on held-out data, and the error that the
-mean of as many vehicles has when the fleet is not symmetric.
+Two rules use the features (5) and (6): a threshold, and decision trees that learn from an artificial fleet. The truth
+about a real fleet is not known, so the artificial fleet imitates it: it has the real fleet's reference as ideal
+currents, the sparsity and magnitudes that are expected, the simulation error of the models on held-out data, and the
+error that the mean of as many vehicles has when the fleet is not symmetric.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -28,20 +28,20 @@ TRAINING_VEHICLES = 3000
 THRESHOLD_SHARE = 1.0 / 3.0
 """delta_h in standard deviations of the criterion across the fleet, section V-B. [1]"""
 TREE_DEPTH = 6
-"""Against overfitting, section V-B. [1]"""
+"""Largest depth of a tree, against overfitting, section V-B. [1]"""
 RECALL_WEIGHT = 5.0
-"""Weight of a missed fault against a false alarm. The paper judges by f2; that is largest if a vehicle counts as faulty
-above a probability of f2 / (1 + 2^2), at odds of 1:5 for the paper's f2 of 0.84. [1]"""
+"""Weight of a missed fault against a false alarm. The paper judges by f2, which is largest if a vehicle counts as
+faulty above a probability of f2 / (1 + 2^2), that is at odds of 1:5 for the paper's f2 of 0.84. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Classification:
-    """What N vehicles are held to have.
+    """Classes of N vehicles.
 
     Attributes
     ----------
     hardware, sensor : ndarray of bool of shape (N,)
-        Whether the vehicle itself, and any of its sensors, is faulty.
+        Whether the vehicle itself, and whether any of its sensors, is taken as faulty.
     """
 
     hardware: Mask
@@ -49,7 +49,7 @@ class Classification:
 
 
 def decision_criterion(features: Array) -> Array:
-    """Evaluate eta of (7): estimated mean square of what hardware faults add to the currents.
+    """Compute the criterion eta of (7): the estimated mean square of what hardware faults add to the currents.
 
     Parameters
     ----------
@@ -66,10 +66,10 @@ def decision_criterion(features: Array) -> Array:
 
 
 def classify_by_threshold(features: Array, in_reference: Mask | None = None) -> Classification:
-    """Simple thresholding classifier, (7) with delta_h of (27).
+    """Classify vehicles by a threshold on the criterion, (7) with delta_h of (27).
 
-    The paper gives no threshold for sensor faults, so all sensors are held to be faulty: then every vehicle is
-    regressed, which finds the faults of healthy sensors to be nearly zero.
+    The paper gives no threshold for sensor faults, so every vehicle is taken to have some: their sizes are then
+    estimated for all vehicles, and come out nearly zero for healthy sensors.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def classify_by_threshold(features: Array, in_reference: Mask | None = None) -> 
 
 
 def classify_by_truth(faults: Faults) -> Classification:
-    """Perfect classifier: the truth."""
+    """Classify vehicles perfectly, by their true faults."""
     return Classification(hardware=faults.has_hardware_fault, sensor=faults.has_sensor_fault)
 
 
@@ -118,7 +118,7 @@ def classify_by_trees(learnt: Array, truth: Faults, features: Array) -> Classifi
 def expected_features(
     faults: Faults, i_s: Array, simulation_error_a: Array, *, reference_vehicles: int | None
 ) -> Array:
-    """Features (5) and (6) that vehicles with given faults have, from the moments of the ideal currents.
+    """Compute the features (5) and (6) of vehicles with given faults, from the moments of the ideal currents.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def expected_features(
     simulation_error_a : ndarray of shape (K,)
         Standard deviation of the simulation error. [A]
     reference_vehicles : int or None
-        So many vehicles in a row share their mean as their reference (3); None: the reference is the ideal current.
+        Size of the groups of consecutive vehicles whose mean is their reference (3); None: it is the ideal current.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def expected_features(
 
 
 def _mean_of_groups(values: Array, size: int) -> Array:
-    """Mean over each group of rows in a row, repeated for its rows; what is left over belongs to the last group."""
+    """Replace each row by the mean of its group of ``size`` consecutive rows; left-over rows join the last group."""
     group = np.minimum(np.arange(len(values)) // size, max(len(values) // size - 1, 0))
     return np.stack([values[group == number].mean(axis=0) for number in range(group[-1] + 1)])[group]
 
@@ -163,7 +163,7 @@ def classify_by_expected_trees(
     expected: FaultSettings,
     reference_vehicles: int | None,
 ) -> Classification:
-    """Classify a real fleet by trees that learn from an artificial fleet with the faults that the user expects.
+    """Classify a real fleet by decision trees that learn from an artificial fleet with the expected faults.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def classify_by_expected_trees(
     expected : FaultSettings
         What the fleet's faults are like.
     reference_vehicles : int or None
-        How many vehicles the reference is the mean of; None: the fleet is symmetric, so its mean is the ideal vehicle.
+        Number of vehicles whose mean is the reference; None: the fleet is symmetric, so its mean is the ideal vehicle.
     """
     i_s, rng = reference - reference.mean(axis=1, keepdims=True), random_stream(Purpose.TRAINING_FAULTS, 0)
     K = reference.shape[1]

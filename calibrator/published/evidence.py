@@ -1,4 +1,4 @@
-"""What the simulations of a fleet on the unity drive say of each vehicle: regressions (15) and features (5) (6).
+"""Evidence on each vehicle from its simulation on the unity drive: the regression (15), and the features (5), (6).
 
 Symbols: N vehicles, K branches, T samples of the unity drive. Currents are positive into the junction. Equations are
 those of [1]_.
@@ -29,7 +29,7 @@ class FleetEvidence:
     intercepts_a : ndarray of shape (N, K)
         b_k of (15). [A]
     slope_variances, intercept_variances_a2 : ndarray of shape (N, K)
-        Of the same, for residuals without correlation in time. [1], [A^2]
+        Variances of slopes and intercepts if residuals are not correlated in time. [1], [A^2]
     deviation_a2 : ndarray of shape (N, K)
         Mean square of simulated minus reference current, (5). [A^2]
     junction_a2 : ndarray of shape (N,)

@@ -1,14 +1,16 @@
-"""The four cases of [1]_, section III-B, put together for a whole fleet.
+"""Recover the fault parameters of a whole fleet, by the four cases of [1]_, section III-B.
 
-1 nothing faulty and 2 only hardware faults: no sensor parameters. 3 only sensor faults: slopes and intercepts are the
-parameters. 4 both: quadratic basis pursuit (18), the sparsest faults that explain slopes and intercepts, by lifting
-[2]_. With the unknowns x = (d_h, o_h,1 .. o_h,K-1, D_m, o_m, 1) each of (15) is a quadratic form x' Q_i x = y_i, linear
-in the matrix X = x x'. Dropping the rank leaves a convex problem:
+In case 1 (nothing is faulty) and 2 (only hardware) there are no sensor parameters. In case 3 (only sensors) they follow
+directly from slopes and intercepts. In case 4 (both) quadratic basis pursuit (18) finds the sparsest faults that
+explain slopes and intercepts, by lifting [2]_. With the unknowns x = (d_h, o_h,1 .. o_h,K-1, D_m, o_m, 1) each equation
+of (15) is a quadratic form x' Q_i x = y_i, which is linear in the matrix X = x x'. Without the condition that X has
+rank 1 this is a convex problem:
 
     min  trace X + lambda |X|_1    s.t.  sum_i (trace(Q_i X) - y_i)^2 <= epsilon,  X_nn = 1,  X positive semidefinite
 
 Offsets are in fractions of full scale here, so that they weigh like drifts. As in footnote 1 of [1]_, o_h,K is minus
-the sum of the others and is not in the norm. Least squares on the support that is found take out the shrinkage.
+the sum of the others and is not in the norm. Least squares on the support that was found removes the shrinkage that
+the norm causes.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 .. [2] H. Ohlsson, A. Y. Yang, R. Dong, S. S. Sastry, "Quadratic Basis Pursuit", arXiv:1301.7002 (2013).
@@ -31,15 +33,15 @@ __all__ = ["BasisPursuit", "BasisPursuitError", "Recovery", "quadratic_forms", "
 cp: Any = cvxpy  # its type hints leave out the atoms
 
 L1_WEIGHT = 1.0
-"""lambda; the result is the same from 1 to 100, and wrong at 0. [1]"""
+"""lambda, the weight of the L1 norm; the result is the same from 1 to 100, and wrong at 0. [1]"""
 EPSILON_SHARE = 0.25
-"""epsilon of (18) in sums of the variances of slopes and intercepts; the recovery is flat from 0.05 to 4. [1]"""
+"""epsilon of (18) over the sum of the variances of slopes and intercepts; results hardly change from 0.05 to 4. [1]"""
 SMALLEST_RADIUS = 1e-6
-"""Residual norm below which the solver's own accuracy rules. [1]"""
+"""Least bound on the norm of the residual: below it the solver's own accuracy decides. [1]"""
 LEAST_DEVIATION = 1e-9
-"""Stands for the deviation of noise-free slopes and intercepts when they are weighed. [1]"""
+"""Least standard deviation of slopes and intercepts when they are weighted; without noise it would be 0. [1]"""
 SMALLEST_PARAMETER = 0.02
-"""Below this a parameter is taken as zero: what the norm leaves of the noise is smaller, known faults larger. [1]"""
+"""Magnitude below which a parameter is taken as zero: noise that the norm leaves is smaller, faults are larger. [1]"""
 STEPS = 8
 """Gauss-Newton steps; the model is bilinear and the start close, so 4 already reach rounding. [1]"""
 
@@ -49,7 +51,7 @@ class BasisPursuitError(Exception):
 
 
 def quadratic_forms(branches: int) -> Array:
-    """Matrices Q_i of (16): slopes, then intercepts.
+    """Build the matrices Q_i of (16), those of the slopes first, then those of the intercepts.
 
     Parameters
     ----------
@@ -59,7 +61,7 @@ def quadratic_forms(branches: int) -> Array:
     Returns
     -------
     ndarray of shape (2K, 3K + 1, 3K + 1)
-        Symmetric; x' Q_i x is the i-th of (15) for x = (d_h, o_h,1 .. o_h,K-1, D_m, o_m, 1).
+        Symmetric; x' Q_i x is the i-th slope or intercept of (15) for x = (d_h, o_h,1 .. o_h,K-1, D_m, o_m, 1).
     """
     K, one = branches, 3 * branches
     Q = np.zeros((2 * K, one + 1, one + 1))
@@ -74,7 +76,7 @@ def quadratic_forms(branches: int) -> Array:
 
 
 class BasisPursuit:
-    """The problem for K branches, built once and solved for many vehicles.
+    """Quadratic basis pursuit (18) for K branches; the problem is built once and solved for many vehicles.
 
     Parameters
     ----------
@@ -133,7 +135,7 @@ def refit_support(x: Array, slopes: Array, intercepts: Array, deviations: Array)
     Parameters
     ----------
     x : ndarray of shape (3K,)
-        Start; its support, at most the 2K largest, stays.
+        Start values. Those above :data:`SMALLEST_PARAMETER`, at most the 2K largest, are refitted, the others zeroed.
     slopes, intercepts : ndarray of shape (K,)
         a [1], and b in fractions of full scale [1].
     deviations : ndarray of shape (2K,)
@@ -142,7 +144,7 @@ def refit_support(x: Array, slopes: Array, intercepts: Array, deviations: Array)
     Returns
     -------
     ndarray of shape (3K,)
-        Refitted parameters; the start with its small entries set to zero if the refit leaves the model's range.
+        Refitted parameters; the start with the others zeroed if the refit diverges (a magnitude exceeds 1).
     """
     largest = np.argsort(np.argsort(-np.abs(x), kind="stable")) < len(deviations)  # there are 2K equations
     support = largest & (np.abs(x) > SMALLEST_PARAMETER)
@@ -183,7 +185,7 @@ class Recovery:
     faults : Faults
         Estimate.
     classification : Classification
-        What each vehicle was held to have; ``classification.hardware`` is the hardware suspicion.
+        Class that each vehicle was put in; ``classification.hardware`` tells where a hardware fault is suspected.
     failed : mapping of int to str
         Vehicles, by position, whose optimisation failed, and why; they have no sensor parameters (zero).
     """
@@ -208,7 +210,7 @@ def recover_fleet(evidence: FleetEvidence, classification: Classification, *, fu
     Returns
     -------
     Recovery
-        Estimates; a failed optimisation is named in it, the other vehicles go on.
+        Estimates of all vehicles; those whose optimisation failed are listed in it and do not stop the others.
     """
     N, K = evidence.slopes.shape
     x = np.zeros((N, 3 * K))

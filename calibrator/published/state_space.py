@@ -38,21 +38,22 @@ __all__ = [
 TRAIN_SHARE = 0.8
 """Share of each drive that a model is identified on, section IV-C of [1]_. [1]"""
 LEAD_IN_S = 60.0
-"""Inputs before the held-out part by which the states of the models settle. [s]"""
+"""Length of the inputs before the held-out part, during which the states of the models settle. [s]"""
 LEAST_DURATION_S = 60.0
-"""Valid data below which a vehicle is left out: a few changes of speed and load. [s]"""
+"""Least valid data that a vehicle needs: it has a few changes of speed and load by then. [s]"""
 QUIET = 0.03
-"""Standard deviation over mean below which an input counts as constant: a constant power over a varying voltage. [1]"""
+"""Ratio of standard deviation to mean below which an input counts as constant, like constant power at a voltage that
+varies. [1]"""
 GAP_S = 60.0
 """Invalid time put between two drives of a vehicle, so that no state carries over. [s]"""
 ORDERS = (0, 1, 2, 3, 4, 6, 8)
 """Orders to choose from: a power train as seen at 10 Hz has few modes. [1]"""
 BLOCK_ROWS = 10
-"""Past and future samples that the subspace step sees: more than the largest order needs. [1]"""
+"""Number of past and of future samples that the subspace step uses: more than the largest order needs. [1]"""
 CHUNK_ROWS = 4096
 """Rows of lagged data that are in memory at a time."""
 RIDGE = 1e-12
-"""Added to standardised second moments: above rounding, far below any signal. [1]"""
+"""Added to the diagonal of standardised second moments: above rounding errors, far below any signal. [1]"""
 ROWS_PER_COLUMN = 2
 """Least ratio of rows to columns of lagged data for the moments to mean anything. [1]"""
 FITTED_SHARE = 0.8
@@ -62,7 +63,7 @@ ORDER_TOLERANCE_DB = 0.2
 LARGEST_POLE = 0.9999
 """Radius of the slowest pole allowed: 1000 s at 10 Hz, longer than drives can distinguish from an offset. [1]"""
 ROUNDS = 2
-"""Times that C, D and the offset follow B, D, x0 and the offset; the error no longer changes after. [1]"""
+"""Rounds that fit first B, D, x0 and the offset, then C, D and the offset; further rounds change no error. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +91,7 @@ class StateSpaceModel:
     snr_db: Array
 
     def simulate(self, inputs: Array, *, initial_state: Array | None = None) -> Array:
-        """Currents for given inputs, (2) in [1]_.
+        """Simulate the currents for given inputs, (2) in [1]_.
 
         Parameters
         ----------
@@ -114,9 +115,9 @@ class StateSpaceModel:
 
 
 def simulation_snr_db(measured: Array, simulated: Array) -> Array:
-    """Power of measured currents (T, K) about their mean over that of the simulation error.
+    """Return the variance of the measured currents (T, K) over the power of the simulation error, per channel. [dB]
 
-    Returns the ratio of each channel [dB]: infinite where the simulation is exact, NaN for a constant channel.
+    It is infinite where the simulation is exact, and NaN for a constant channel.
     """
     return snr_from_power(measured.var(axis=0), np.mean((measured - simulated) ** 2, axis=0))
 
@@ -159,10 +160,11 @@ def identify_model(
 
 
 def choose_order(inputs: Array, currents: Array, *, valid: Mask | None = None) -> int:
-    """Smallest order that simulates held-out samples as well as the best; otherwise as :func:`identify_model`.
+    """Choose the smallest order that simulates held-out samples about as well as the best order does.
 
-    Models of all :data:`ORDERS` are fitted on the first 80 % and simulated on the rest. The error of an order is the
-    mean over channels of its power in dB; chosen is the smallest order within 0.2 dB of the smallest error.
+    Models of all :data:`ORDERS` are fitted on the first 80 % of the samples and simulated on the rest. The error of an
+    order is its error power in dB, averaged over the channels; the smallest order within 0.2 dB of the least error is
+    returned. Arguments are as in :func:`identify_model`.
     """
     mask = np.ones(len(inputs), bool) if valid is None else valid
     stop = int(FITTED_SHARE * len(inputs))
@@ -176,7 +178,7 @@ def choose_order(inputs: Array, currents: Array, *, valid: Mask | None = None) -
 
 
 def pooled_poles(drives: Sequence[tuple[Array, Array, Mask]], orders: Sequence[int]) -> list[Complex]:
-    """Poles of one system of each order, identified from the drives of several vehicles together.
+    """Identify the poles of one system of each order from the drives of several vehicles together.
 
     Parameters
     ----------
@@ -188,7 +190,7 @@ def pooled_poles(drives: Sequence[tuple[Array, Array, Mask]], orders: Sequence[i
     Returns
     -------
     list of ndarray of complex
-        Of each order: real poles, and of each complex pair the one with positive imaginary part.
+        For each order the real poles, and of each complex pair the one with positive imaginary part.
 
     Raises
     ------
@@ -207,7 +209,7 @@ def bridged(values: Array, valid: Mask) -> Array:
 
 
 def _standardised(values: Array, mask: Mask) -> tuple[Array, Array, Array]:
-    """Values (T, M) of mean 0 and deviation 1, gaps bridged; their means and deviations. A constant keeps its unit."""
+    """Scale values (T, M) to mean 0 and deviation 1, gaps bridged; return them, means and scales (1 if constant)."""
     mean, scale = values[mask].mean(axis=0), values[mask].std(axis=0)
     scale[scale <= RIDGE * np.maximum(np.abs(mean), 1.0)] = 1.0
     return (bridged(values, mask) - mean) / scale, mean, scale
@@ -227,16 +229,16 @@ def _models(inputs: Array, currents: Array, mask: Mask, orders: Sequence[int]) -
 
 
 def _observability(drives: Sequence[tuple[Array, Array, Mask]]) -> Array:
-    """Extended observability matrix (BLOCK_ROWS * K, BLOCK_ROWS * K) of one system by PO-MOESP, from (u, y, valid).
+    """Find the extended observability matrix (BLOCK_ROWS * K, BLOCK_ROWS * K) by PO-MOESP, from drives (u, y, valid).
 
-    Weighted left singular vectors of future currents on the past: the first n columns are a system of order n. The
-    Cholesky factor of the moments is the triangle of a QR of the lagged data.
+    Its columns are weighted left singular vectors of the future currents regressed on the past; the first n columns
+    stand for a system of order n. The Cholesky factor of the moments is the triangle of a QR of the lagged data.
     """
     s, M, channels = BLOCK_ROWS, drives[0][0].shape[1], drives[0][0].shape[1] + drives[0][1].shape[1]
     columns, count = 2 * s * channels, 0
     moments = np.zeros((columns, columns))
     for u, y, mask in drives:
-        # Padding gives a short drive windows too, none of which is valid.
+        # By padding, even a drive that is too short has windows; none of them is valid.
         windows = sliding_window_view(np.pad(np.hstack([u, y]), ((0, 2 * s), (0, 0))), 2 * s, axis=0)
         whole = np.flatnonzero(sliding_window_view(np.pad(mask, (0, 2 * s)), 2 * s).all(axis=1))
         count, total = count + len(whole), np.zeros(columns)
@@ -252,14 +254,14 @@ def _observability(drives: Sequence[tuple[Array, Array, Mask]]) -> Array:
     index = np.arange(columns).reshape(channels, 2 * s)
     order = np.concatenate([index[:M, s:].ravel(), index[:, :s].ravel(), index[M:, s:].T.ravel()])  # future u, past, y
     moments = moments[np.ix_(order, order)] / count
-    ridge = max(RIDGE, -2.0 * np.linalg.eigvalsh(moments)[0])  # more where rounding is, as of inputs that hardly move
+    ridge = max(RIDGE, -2.0 * np.linalg.eigvalsh(moments)[0])  # more if rounding errors are larger: still inputs
     L = np.linalg.cholesky(moments + ridge * np.eye(columns))
     left, singular, _ = np.linalg.svd(L[-s * (channels - M) :, s * M : s * (M + channels)])
     return np.asarray(left * np.sqrt(singular))
 
 
 def _stable_modes(observed: Array, branches: int, order: int) -> tuple[Complex, Complex]:
-    """Poles (n,) inside the unit circle and complex C (K, n), by shift invariance of the observability matrix."""
+    """Find poles (n,) inside the unit circle and complex C (K, n), by shift invariance of the observability matrix."""
     blocks = observed[:, :order]
     A = np.linalg.lstsq(blocks[:-branches], blocks[branches:], rcond=None)[0] if order else np.zeros((0, 0))
     poles, vectors = (part.astype(complex) for part in np.linalg.eig(A))
@@ -269,14 +271,14 @@ def _stable_modes(observed: Array, branches: int, order: int) -> tuple[Complex, 
 
 
 def _fit_output_error(poles: Complex, C: Complex, u: Array, y: Array, mask: Mask) -> tuple[Array, ...]:
-    """A, B, C, D, x0, offset and SNR of the simulation that is nearest to the data, from the modes and a first C.
+    """Fit A, B, C, D, x0 and the offset to simulate the data best, starting from poles and C; return them and the SNR.
 
-    All that the model can show is linear in few signals, the features: the inputs and an impulse at the start, filtered
-    by each mode; the inputs; 1. Every least-squares problem needs only their second moments.
+    The simulated currents are linear in a few signals, the features: the inputs and an impulse at the start, filtered
+    by each mode; the inputs themselves; 1. Every least-squares problem needs only their second moments.
     """
     y, n, width = y[mask], len(poles), u.shape[1] + 1
     pair = np.flatnonzero(poles.imag > 0.0)  # the conjugate of each follows it
-    modes = np.eye(n, dtype=complex)  # of real states (columns); those of a pair are real and negative imaginary part
+    modes = np.eye(n, dtype=complex)  # over real states: of a pair, the real and the negative imaginary part
     modes[pair + 1, pair + 1], modes[pair, pair + 1], modes[pair + 1, pair] = 1j, -1j, 1.0
     driven = np.vstack([np.eye(width)[-1], np.pad(u[:-1], ((0, 0), (0, 1)))])  # impulse for x0; inputs for later states
     filtered = [lfilter([1.0], [1.0, -pole], driven, axis=0) for pole in poles]
@@ -301,7 +303,7 @@ def _fit_output_error(poles: Complex, C: Complex, u: Array, y: Array, mask: Mask
 
 
 def solve_scaled(normal: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
-    """Solve scaled normal equations (..., Q, Q), (..., Q, R) with a relative ridge; columns that are zero get zero."""
+    """Solve scaled normal equations (..., Q, Q), (..., Q, R) with a relative ridge; zero columns get coefficient 0."""
     scale = np.sqrt(np.einsum("...ii->...i", normal).real)[..., None]
     scale = np.where(scale > 0.0, scale, 1.0)
     scaled = normal / (scale * np.swapaxes(scale, -1, -2)) + RIDGE * np.eye(normal.shape[-1])
@@ -410,12 +412,12 @@ def identify_vehicle(
 
 
 def _in_training(valid: Mask) -> Mask:
-    """First 80 % of the valid samples of a drive, and what lies between them."""
+    """Mark the first 80 % of the valid samples of a drive, and the invalid ones between them."""
     return np.asarray(np.cumsum(valid) <= TRAIN_SHARE * valid.sum())
 
 
 def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpaceModel:
-    """Identify from the inputs that vary; what the others do cannot be learnt from this vehicle, so it is zero."""
+    """Identify a model from the inputs that vary; others get coefficients of 0, as their effect cannot be learnt."""
     excited = inputs[valid].std(axis=0) > QUIET * np.abs(inputs[valid].mean(axis=0))
     if not excited.any():
         raise DriveError("none of its inputs varies: was it parked? record a drive in which it is used")
@@ -448,7 +450,7 @@ def evidence_of_models(
     reference : ndarray of shape (T, K)
         Fleet reference. [A]
     unity : VehicleModel
-        Whose held-out drive is the unity drive.
+        The vehicle whose held-out drive is the unity drive.
     """
     unity = max(compress(vehicles, in_reference), key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in)
     simulated = [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles]
