@@ -1,8 +1,8 @@
-"""Does the best explanation fit? For each vehicle: what no gain error and no offset of any sensor can explain.
+"""Check whether the best explanation fits each vehicle: find what no gain error and no offset of a sensor explains.
 
 The junction law is regressed once more on the vehicle's own data, with a column or a split for each cause that is not
-linear: by level of a current, by time, by temperature. What is left then tells of noise and of loads that switch. The
-fleet says how much of each is usual; the junction says that something is wrong, the fleet model which sensor it is.
+linear: by level of a current, by time, by temperature. The remaining residual shows noise and loads that switch. The
+fleet shows how much of each is usual; the junction law shows that something is wrong, the fleet model in which sensor.
 Equations: (M22) to (M25) of docs/method.md, section "Does the best explanation fit?".
 """
 
@@ -26,68 +26,68 @@ __all__ = ["UsualMisfits", "find_misfits", "learn_usual_misfits"]
 PRIOR = 0.01
 """Probability of each cause in a vehicle, before anything is seen. [1]"""
 LEAST_PROBABILITY = 0.5
-"""From which on a cause is a finding. [1]"""
+"""Probability from which on a cause is reported as a finding. [1]"""
 NAMED = 0.9
 """Probability from which on one sensor is named. [1]"""
 TAIL = 12.0
-"""Degrees of freedom of Student's t, as which the vehicles of a fleet differ: heavier than normal. [1]"""
+"""Degrees of freedom of Student's t, the distribution of a fleet's vehicles: heavier tails than normal. [1]"""
 LEAST_MISFIT = 1e-5
-"""Usual misfit of a fleet, at least, in fractions of full scale: less harms no correction. [1]"""
+"""Least value of the usual misfit of a fleet, in fractions of full scale: a smaller one harms no correction. [1]"""
 LARGEST_MISFIT = 0.2
-"""In fractions of full scale; before anything is seen, a misfit's size is log-uniform up to it. [1]"""
+"""Largest misfit, in fractions of full scale; before anything is seen, its size is log-uniform up to it. [1]"""
 EXPLAINED = 0.7
-"""Share of the unusual residual that a cause explains, at least, if what is left of it is large still. [1]"""
+"""Share of the unusual residual that a cause has to explain, or switching is reported, too, if much is left. [1]"""
 LEAST_NOISE_SPREAD = 0.2
-"""Of the logarithm of the mean square residual of healthy vehicles, at least. [1]"""
+"""Least spread over healthy vehicles of the logarithm of the mean square residual. [1]"""
 NOISE_RANGE = 9.0
-"""Of the same logarithm, over which it is uniform where there is noise. [1]"""
+"""Range of that logarithm over which it is uniform in vehicles with noise. [1]"""
 FEWEST = 30
-"""Samples beyond a bend, for it to be looked for. [1]"""
+"""Least number of samples beyond a bend for it to be considered. [1]"""
 CLIPPED = 0.55
 """Share of the gain that is lost beyond a bend, from which on the sensor counts as clipped. [1]"""
 OVERSHOOT = 1.3
-"""Times the bend: less is read by a clipped sensor, more by another one. [1]"""
+"""Multiple of the bend that a clipped sensor does not reach, but another sensor does. [1]"""
 CHANCE = 0.3
 """Correlation by chance between the fleet model and its errors in one vehicle. [1]"""
 GAIN_SD, DEAD_SD = 0.3, 0.04
-"""How far gains of running sensors are from 1 or -1, and of dead ones from 0. [1]"""
+"""Standard deviation of the gains of running sensors about 1 or -1, and of dead ones about 0. [1]"""
 MOVING = 0.02
-"""Least standard deviation of a current whose level counts, in fractions of full scale: of others it is noise. [1]"""
+"""Least standard deviation of a current whose level is used, in fractions of full scale: others are noise. [1]"""
 NEAR_ZERO = 0.07
-"""Bends below this are two gains by sign whose zero is not known better, in fractions of full scale. [1]"""
+"""A bend below this is taken for two gains by sign whose zero is not known better, in fractions of full scale. [1]"""
 SPIKE_RATE = 5e-4
-"""Usual share of spikes among the samples, at least. [1]"""
+"""Least value of the usual share of spikes among the samples. [1]"""
 NOISE_RATE = 0.015
 """Share of spikes in both directions from which on they are bursts of noise. [1]"""
 ONE_SIDED = 0.1
 """Share of spikes in the rarer direction up to which they count as one-sided. [1]"""
 WARMING_K = 2.0
-"""Standard deviation of the temperature in a drive, for its effect to be looked for. [K]"""
+"""Least standard deviation of the temperature in a drive for its effect to be considered. [K]"""
 RIDGE = 1e-10
-"""On normalised moments: a branch that stands still gets no gain. [1]"""
+"""Added to the diagonal of normalised moments: a branch that stands still gets no gain. [1]"""
 TINY = 1e-12
-"""Instead of zero in denominators."""
+"""Replaces zero in denominators."""
 LEAST_STRETCH = 0.1
-"""A gain that falls by more is that of another sensor that is clipped. [1]"""
+"""Least gain of a transformed current that counts in its likelihood: a lower one means another, clipped sensor. [1]"""
 ALONE = 1e-6
 """Least share of a column that gains and offsets do not explain. [1]"""
 WHITE_GAIN = 1.5
 """Variance of the second difference of white noise of variance 1."""
 SHARE_SD = 0.15
-"""How well a misfit is found again in the branch that has it, where its model is exact. [1]"""
+"""Standard deviation of the share of a misfit that is found in the branch that has it, even with an exact model. [1]"""
 
 BENDS_A: Array = np.array(
     [10.0, 15, 20, 25, 30, 37, 45, 55, 65, 77, 90, 105, 120, 140, 160, 185, 210, 245, 280, 325, 370, 430, 500]
 )
-"""Currents at which a gain may change, two per level; below, noise sorts samples into levels. They are absolute as the
-levels are: summaries are made without the full scale of the junction. [A]"""
+"""Currents at which a gain may change, two per level; below them noise decides which level a sample is in. They are
+absolute, as the levels are: summaries are made without the full scale of the junction. [A]"""
 CAUSES = ("quadratic", "cubic", "sign", "bend", "step", "ramp", "temperature")
 """Causes that are columns or splits of the junction law; a bend is a clipped or a saturating sensor."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class UsualMisfits:
-    """How vehicles of a fleet usually differ from linear sensors: the null of every check.
+    """How far vehicles of a fleet usually are from having linear sensors: the null hypothesis of every check.
 
     Attributes
     ----------
@@ -96,11 +96,11 @@ class UsualMisfits:
     residual_a2, fast_a2 : float
         Mean square residual of the junction law, and its white part. [A^2]
     residual_spread : float
-        Of the logarithm of the first. [1]
+        Spread over the vehicles of the logarithm of ``residual_a2``. [1]
     slope_spread, model_error_a : ndarray of shape (K,)
         Robust standard deviation of slopes over the fleet model [1], and of currents about it [A].
     spike_rate : float
-        Share of spikes. [1]
+        Share of samples that are spikes. [1]
     """
 
     misfit_a: Array
@@ -113,14 +113,14 @@ class UsualMisfits:
 
 
 class _Checked:
-    """N vehicles with fit sums: their junction law, their currents over the fleet model, and what each cause explains.
+    """Checks of N vehicles with fit sums: junction law, currents over the fleet model, and what each cause explains.
 
     The residual of the law is r = y - g^T z: y the branch that moves most, z the others and 1.
 
     Attributes
     ----------
     fleet : FleetMoments
-        Of the vehicles.
+        Moments of the vehicles.
     fast, levels : ndarray of shape (N, K, K), (N, K, L, p + 1)
         Sums of the products of second differences [A^2], and of samples by level of each current.
     total : ndarray of shape (N, p, p)
@@ -128,42 +128,41 @@ class _Checked:
     samples : ndarray of shape (N,)
         Number of samples.
     y, z : int, ndarray of int of shape (K,)
-        Columns of the law.
+        Places of y and z in the moments.
     law, weights : ndarray of shape (N, K)
         g: gain ratios and constant [A]; weight of each branch in r [1].
     noise : ndarray of shape (N, K)
-        Product of the noise of each branch with itself that a column of it has in common with r, per sample; 0 for y.
+        Noise variance of each branch times its g: noise lowers the mean product of the current with r by this; 0 for y.
         [A^2]
     with_z : ndarray of shape (B, K)
-        Sums of z r, without the product of the noise of z with itself.
+        Sums of z r, with the effect of the noise of z taken out.
     square_a2, n_eff : ndarray of shape (N,)
-        Sum of r^2 [A^2], number of samples that do not repeat each other.
+        Sum of r^2 [A^2], effective number of independent samples.
     columns, basis : ndarray of shape (M + 1,), (K, M + 1, 2)
-        Inputs and 1 among the columns of the moments; the fleet model's current and 1, over these.
+        Places of the inputs and of 1 in the moments; coefficients over these of the fleet model's current and of 1.
     model_gram, model_right : ndarray of shape (N, K, 2, 2), (N, K, 2)
         Normal equations of each current over the fleet model's and 1.
     slope, slope_sd, zero_a : ndarray of shape (N, K)
-        Slope and its standard deviation [1], reading where the model has no current [A].
+        Slope over the model and its standard deviation [1], reading at zero current of the model [A].
     variance_a2 : ndarray of shape (N, K)
-        Variance of that residual times the number of neighbouring samples that repeat each other. [A^2]
+        Variance of the residual over the model times the number of neighbouring samples that are alike. [A^2]
     moves_a, error_a : ndarray of shape (N, K)
-        Standard deviations of the model and of that residual. [A]
+        Standard deviations of the model and of the residual over it. [A]
     fit : ndarray of shape (N, C)
-        Of each of :data:`CAUSES`: logarithm of the likelihood over that of linear sensors, less what the parameters
-        cost.
+        Log likelihood of each of :data:`CAUSES` relative to linear sensors, less a penalty for its parameters.
     size, place : ndarray of shape (N, C)
-        Of causes by level: error at full scale, or change of the gain [1]. Where it is: level at which a bend begins
+        Size of causes by level: error at full scale, or change of the gain [1]. Place: level at which a bend begins
         [A], share of the time before a step [1], standard deviation of a temperature [K].
     level_branch : ndarray of int of shape (N, C)
-        Branch by whose level it is; -1 for causes by time.
+        Branch on whose level the cause depends; -1 for causes by time.
     branch_fit : ndarray of shape (N, C, K)
-        Logarithm of the likelihood that the sensor of branch k has it, by the fleet model; 0 without one.
+        Log likelihood that the sensor of branch k has the cause, by the fleet model; 0 without one.
     misfit_a : ndarray of shape (N, C)
         Root mean square of what each cause explains beyond gains and offsets. [A]
     residual_a2 : ndarray of shape (N, C + 1)
-        Mean square of what each cause, or none (last), leaves of the junction law. [A^2]
+        Mean square residual of the junction law with each cause, and with none (last). [A^2]
     fast_a2 : ndarray of shape (N,)
-        White part of it. [A^2]
+        White part of the mean square residual. [A^2]
     noise_share : ndarray of shape (N, K)
         Share of each sensor in the fast part of the residual. [1]
     spikes : ndarray of shape (N, K, 2)
@@ -190,7 +189,7 @@ class _Checked:
         stacked = [np.stack(part, axis=1) for part in zip(*causes, strict=True)]
         explained_a2, self.fit, self.size, self.place, self.level_branch, self.branch_fit = stacked
         samples, weights = self.samples, self.weights
-        unit = np.sqrt((weights**2).mean(axis=1))  # gain errors of the branches do not scale the residual
+        unit = np.sqrt((weights**2).mean(axis=1))  # so gain errors of the branches do not scale the residual
         fast_sum = np.einsum("nkl,nl->nk", self.fast, weights)
         white = np.einsum("nk,nk->n", weights, fast_sum)
         left = np.maximum(self.square_a2[:, None] - np.column_stack([explained_a2, np.zeros(len(unit))]), 0.0)
@@ -201,10 +200,11 @@ class _Checked:
         self.spikes = np.stack([fit.spikes.sum(axis=0) for fit in fits]) / samples[:, None, None]
 
     def _regress_law(self) -> None:
-        """Junction law of each vehicle.
+        """Regress the junction law of each vehicle.
 
-        The noise of z draws g towards zero. White noise n_k makes fast changes that the junction law does not balance:
-        with the residual's fast part q = sum w_l q_l, E[q_k q] = 1.5 n_k w_k. It is taken out of the moments.
+        The noise of z would bias g towards zero, so it is taken out of the moments. Noise makes fast changes that the
+        junction law does not balance: with the fast part q = sum w_l q_l of the residual, white noise of variance n_k
+        gives E[q_k q] = 1.5 n_k w_k.
         """
         fleet, total, samples = self.fleet, self.total, self.samples
         M, K, blocks, variance_a2 = fleet.inputs, fleet.branches, fleet.blocks, fleet.variance_a2
@@ -224,10 +224,10 @@ class _Checked:
         scores = products(fleet.moments[:, M:, M:], sums)  # of (measured currents, 1) with r
         own = fleet.moments[:, -1, -1]
         squares = blocks.total(_dot(scores, sums))
-        # Neighbouring samples repeat each other where blocks' sums of r scatter more than white noise's would.
+        # Neighbouring samples are alike where sums of r over blocks scatter more than those of white noise would.
         scatter = blocks.total(scores[:, -1] ** 2 / own) / blocks.count
         repeated = max(float(np.median(scatter / np.maximum(squares / samples, TINY))), 1.0)
-        # A block in which a current stands still has no noise of it.
+        # In a block in which a current stands still it has no noise.
         varies = np.diagonal(fleet.moments, axis1=1, axis2=2)[:, z] - fleet.moments[:, z, -1] ** 2 / own[:, None]
         noisy = np.clip(varies, 0.0, own[:, None] * noise[blocks.vehicle])
         noisy *= (samples[:, None] * noise / np.maximum(blocks.total(noisy), TINY))[blocks.vehicle]
@@ -271,11 +271,11 @@ class _Checked:
         level_branch: ArrayLike = -1,
         stretch: ArrayLike = 0.0,
     ) -> tuple[Array, ...]:
-        """What a cause explains, and its part of :attr:`fit` to :attr:`branch_fit`.
+        """Return what a cause explains, and its entries of :attr:`fit` to :attr:`branch_fit`.
 
-        The fit is that with noise of unknown size, less what the parameters cost (BIC). ``pattern`` (N, p) and
-        ``square`` (N,) are products of the misfit with all columns and with itself; ``stretch`` is the mean logarithm
-        of what a transformed variable is stretched by.
+        The fit is the log likelihood with noise of unknown size, less a penalty for the parameters (BIC). ``pattern``
+        (N, p) and ``square`` (N,) are products of the misfit with all columns and with itself; ``stretch`` is the mean
+        logarithm of the derivative of a transformed variable.
         """
         explained_a2, N = np.maximum(explained_a2, 0.0), len(explained_a2)
         left = np.maximum(1.0 - explained_a2 / self.square_a2, RIDGE)
@@ -284,10 +284,10 @@ class _Checked:
         return explained_a2, fit, size, place, level_branch, self._whose(pattern, square)
 
     def _whose(self, pattern: Array, square: Array) -> Array:
-        """Logarithm of the likelihood that each branch's sensor makes a misfit, shape (N, K).
+        """Return the log likelihood that each branch's sensor makes a misfit, shape (N, K).
 
-        The misfit is regressed out of each branch's residual over the fleet model: where it is this branch's, all of it
-        is found there, and nothing in the others.
+        The misfit is looked for in each branch's residual over the fleet model: in the branch that has it, all of it is
+        found, and in the others nothing.
         """
         if not self.has_fleet:
             return np.zeros_like(self.weights)
@@ -311,12 +311,12 @@ class _Checked:
         return self.total[:, self.z[:, None], self.z]
 
     def _by_level(self) -> list[tuple[Array, ...]]:
-        """Quadratic, cubic, two gains by sign, a bend: a column h that depends on the level of one of the currents.
+        """Fit the causes quadratic, cubic, sign and bend: a column h that depends on the level of one of the currents.
 
-        The current at which h is taken has noise n in it, which is in r, too: E[h n] = var(n) E[h'] if normal (Stein).
-        Of y everything is noise that z does not explain, as the current of a branch without a sensor: the likelihood of
-        y - b h(y) = g^T z has the factor prod |1 - b h'(y)| of a transformed variable, which a straight h leaves alone.
-        In a fleet what noise makes is part of what is usual, and counted there.
+        The current in h contains noise n that is in r, too: E[h n] = var(n) E[h'] if it is normal (Stein). In y all
+        that z does not explain acts as noise, such as the current of a branch without a sensor: the likelihood of
+        y - b h(y) = g^T z has the factor prod |1 - b h'(y)| of a transformed variable, so that a straight h explains
+        nothing. In a fleet both are left out, as the effect of noise is part of what is usual.
         """
         fleet, z, levels, full_scale_a, (N, K) = self.fleet, self.z, self.levels, self.full_scale_a, self.zero_a.shape
         count = levels[..., -2]
@@ -344,9 +344,9 @@ class _Checked:
             alone = square - _dot(_solve(gram, with_all[..., z]), with_all[..., z])
             with_r = with_all[..., self.y] - np.einsum("nksi,ni->nks", with_all[..., z], self.law)
             if not self.has_fleet:
-                # Noise moves no sample of a current that is switched between two levels, as levels are wide. So the
-                # product counts with the noise's part or without it, whichever is nearer to 0, and not if they differ
-                # in sign.
+                # If a current is switched between two levels, noise moves no sample to another level, as levels are
+                # wide. So the product with r is taken with or without the noise's part, whichever is nearer to 0; it is
+                # 0 if the two differ in sign.
                 sign = np.sign(with_r)
                 clean = with_r + self.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count)
                 with_r = sign * np.clip(sign * clean, 0.0, np.abs(with_r))
@@ -355,7 +355,7 @@ class _Checked:
             size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)
             stretch = np.zeros(size.shape)
             if not self.has_fleet:
-                if bent:  # a clipped sensor reads no more than that, others do; else a ramp's delay
+                if bent:  # a clipped sensor reads no more than this, others do; else it is a ramp's delay
                     beyond_a = OVERSHOOT * np.tile(BENDS_A, 3)
                     reached = (least_a <= beyond_a) & (beyond_a <= greatest_a)
                     size = np.where((abs(size) < CLIPPED) | reached, size, 0.0)
@@ -382,13 +382,13 @@ class _Checked:
         return found
 
     def _step(self) -> tuple[Array, ...]:
-        """Another law from some block on; the block in which it changes has one of its own."""
+        """Fit a step: another junction law from some block on; the block of the change has a law of its own."""
         z, blocks, gram, right = self.z, self.fleet.blocks, self._of_z[:, self.z], self.with_z
         last = np.cumsum(blocks.count)
         first, vehicle = last - blocks.count, blocks.vehicle
 
         def before(values: Array) -> Array:
-            """Sums over the earlier blocks of the same vehicle."""
+            """Sum over the earlier blocks of the same vehicle."""
             sums = np.cumsum(values, axis=0) - values
             return np.asarray(sums - sums[first][vehicle])
 
@@ -411,7 +411,7 @@ class _Checked:
         )
 
     def _drifting(self, course: Array, *, least: float) -> tuple[Array, ...]:
-        """A law that changes in proportion to a course (B,), as time or temperature; NaN where that is not known."""
+        """Fit a law that changes in proportion to a course (B,), such as time or temperature; NaN where not known."""
         z, blocks, own = self.z, self.fleet.blocks, self.fleet.moments[:, -1, -1]
         known = np.isfinite(course)
         course = np.where(known, course, 0.0)
@@ -433,12 +433,12 @@ class _Checked:
         )
 
     def of_slopes(self, usual: UsualMisfits) -> tuple[Array, Array]:
-        """Probabilities that each sensor is inverted, and that it is dead, shape (N, K)."""
+        """Return the probabilities that each sensor is inverted, and that it is dead, shape (N, K)."""
 
         def density(about: float, sd: Array) -> Array:
             return np.asarray(np.exp(-0.5 * ((self.slope - about) / sd) ** 2) / sd)
 
-        # What the model misses may follow it by chance, and hides it where the current hardly moves.
+        # Errors of the model may correlate with it by chance, and hide it where the current hardly moves.
         chance = CHANCE * usual.model_error_a / np.maximum(self.moves_a, TINY)
         sd = np.hypot(self.slope_sd, np.minimum(chance, 100.0))
         wide = np.hypot(np.hypot(GAIN_SD, usual.slope_spread), sd)
@@ -448,7 +448,7 @@ class _Checked:
 
 
 def _solve(gram: Array, right: Array) -> Array:
-    """Solutions of normal equations, (..., q) of (..., q, q) and (..., q)."""
+    """Solve normal equations (..., q, q), (..., q); return (..., q)."""
     scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=-2, axis2=-1), TINY))
     normal = gram / scale[..., :, None] / scale[..., None, :] + RIDGE * np.eye(gram.shape[-1])
     return np.asarray(np.linalg.solve(normal, (right / scale)[..., None])[..., 0] / scale)
@@ -512,7 +512,7 @@ def find_misfits(
     read_out : ndarray of shape (M + 1, K)
         Of the fleet model, its branches in the order of the summaries; zeros of shape (1, K) without one. [A]
     usual : UsualMisfits or None
-        Of the fleet; None: nothing is found.
+        Usual misfits of the fleet; None: nothing is found.
     full_scale_a : float
         Full scale of the junction. [A]
     branches : sequence of str
@@ -523,7 +523,7 @@ def find_misfits(
     list of N tuples of SensorFinding
         By falling probability; causes are ``inverted``, ``dead``, ``clipped``, ``saturating``, ``quadratic``,
         ``cubic``, ``sign``, ``step``, ``ramp``, ``temperature``, ``spikes``, ``outliers``, ``noise`` and ``switching``.
-        No branch is named where the evidence does not say which sensor it is, or it is none.
+        No branch is named where the evidence does not tell the sensor, or the cause is no sensor.
     """
     found: list[tuple[SensorFinding, ...]] = [()] * len(summaries)
     places = [j for j, summary in enumerate(summaries) if summary.fit is not None]
@@ -554,7 +554,7 @@ def _posterior(odds: ArrayLike) -> Array:
 
 
 def _probability(misfit_a: Array, usual_a: Array, largest_a: float) -> Array:
-    """Probability of a misfit of this size: log-uniform against half a Student's t of the usual size."""
+    """Return the probability that a misfit is none of the usual ones: log-uniform size against half a Student's t."""
     z = np.maximum(misfit_a / usual_a, 1.0)
     alternative = 1.0 / (z * np.log(np.maximum(largest_a / usual_a, math.e)))
     return _posterior(PRIOR * alternative / np.maximum(2.0 * student_t.pdf(z, TAIL), 1e-300))
@@ -570,7 +570,7 @@ def _who(name: str | None) -> str:
 
 
 class _Vehicle(NamedTuple):
-    """Vehicle j of some misfits; its methods word what is found in it."""
+    """Vehicle j of those checked; its methods put what is found in it into words."""
 
     misfits: _Checked
     usual: UsualMisfits
@@ -578,7 +578,7 @@ class _Vehicle(NamedTuple):
     branches: Sequence[str]
 
     def of_slopes(self, inverted: Array, dead: Array) -> list[SensorFinding]:
-        """Sensors that are inverted or dead, by their slope over the fleet model."""
+        """Report sensors that are inverted or dead, by their slope over the fleet model."""
         found, slope, mean_a = [], self.misfits.slope[self.j], self.misfits.fleet.mean_a[self.j]
         for k, name in enumerate(self.branches):
             reversed_ = (
@@ -594,7 +594,7 @@ class _Vehicle(NamedTuple):
         return found
 
     def of_law(self, shape: Array, unusual: Array) -> list[SensorFinding]:
-        """The cause that explains most of the junction law's residual; noise and switched loads by what is left."""
+        """Report the cause that explains most of the junction law's residual; noise or switching by what is left."""
         misfits, usual, j = self.misfits, self.usual, self.j
         fit, level, left = misfits.fit[j], misfits.level_branch[j], misfits.residual_a2[j]
         c = int(fit.argmax())
@@ -619,7 +619,7 @@ class _Vehicle(NamedTuple):
         return found
 
     def _worded(self, c: int, probability: float) -> SensorFinding:
-        """One of :data:`CAUSES`, with its sensor and figures."""
+        """Put one of :data:`CAUSES` into words, with its sensor and figures."""
         misfits, j, cause = self.misfits, self.j, CAUSES[c]
         weight = np.exp(misfits.branch_fit[j, c] - misfits.branch_fit[j, c].max())
         k = int(weight.argmax())
@@ -650,7 +650,7 @@ class _Vehicle(NamedTuple):
         return _finding(name, cause, probability, f"{_who(name)}: {text}; {this_makes}")
 
     def of_spikes(self) -> list[SensorFinding]:
-        """Sensors with many spikes."""
+        """Report sensors with many spikes."""
         found, n, usual = [], self.misfits.samples[self.j], self.usual.spike_rate
         for name, (up, down) in zip(self.branches, self.misfits.spikes[self.j], strict=True):
             if (rate := float(up + down)) <= usual:

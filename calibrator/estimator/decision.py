@@ -1,10 +1,10 @@
-"""What to say of vehicles: estimate, confidence, and whether correction could make a branch worse.
+"""Find the estimate for each vehicle, the confidence in it, and the probability that correction makes a branch worse.
 
 :func:`estimate_rows` does it for N vehicles: fault models of the fleet -> weighted draws (:class:`Explained`) -> one
 posterior per vehicle (:class:`Points`) -> :class:`RowsEstimate`.
 
-The estimate is the point near which, within the tolerance of "recovered", most of the posterior lies; that share is
-the confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
+The estimate is the point that has most of the posterior within the tolerance of "recovered"; that share is the
+confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
 
     alpha^2 E[i^2] + 2 alpha beta E[i] + beta^2  >  d^2 E[i^2] + 2 d o E[i] + o^2                               (M19)
 
@@ -41,22 +41,22 @@ __all__ = [
 NEGLIGIBLE = 1e-8
 """Weight of a draw below which it is left out. [1]"""
 CANDIDATES, LEAST_CANDIDATE = 8, 0.01
-"""Explanations that are tried as estimates, and the least probability of all but the first. [1]"""
+"""Number of explanations that are tried as estimates, and least probability of those after the first. [1]"""
 EQUALLY_GOOD = 0.01
 """Difference of confidence below which the estimate of the more probable explanation is taken. [1]"""
 SAME = 1e-3
-"""Difference of two offsets that cancel, in fractions of full scale: neither is known better. [1]"""
+"""Largest sum of two offsets that cancel, in fractions of full scale: neither is known better. [1]"""
 RESOLUTION = 3e-4
-"""Drift [1] and offset in fractions of full scale that are taken for zero: no sensor's resolution is finer."""
+"""Drift [1] and offset in fractions of full scale below which they are zero: no sensor's resolution is finer."""
 MOST_GAIN_SD = 0.1
-"""Standard deviation from which on a gain is not known: smaller than the faults that matter. [1]"""
+"""Standard deviation from which on a gain counts as unknown: smaller than the faults that matter. [1]"""
 LEAST_EXPLANATION = 1e-5
-"""Probability of an explanation that is reported. [1]"""
+"""Least probability of an explanation that is reported. [1]"""
 CENTRAL = 0.6827
 """Share of a normal distribution within one standard deviation. [1]"""
 LIKE_ESTIMATE = (0.1, 0.001)
-"""Share of the estimate's largest fault, and drift [1] or offset over full scale beside it, within which the faults of
-an explanation are those of the estimate. [1]"""
+"""Faults of an explanation count as those of the estimate if none differs by more than this share of the estimate's
+largest fault, plus this drift [1] or offset over full scale. [1]"""
 
 
 class Explained(NamedTuple):
@@ -65,11 +65,11 @@ class Explained(NamedTuple):
     Attributes
     ----------
     probability : float
-        Of this model.
+        Probability of this fault model.
     draws : Draws
-        Of the vehicles.
+        Draws from the explanations of the vehicles.
     weight : ndarray of shape (N, Q, M, 1 + g)
-        Of the draws, see :func:`calibrator.estimator.posterior.weigh`.
+        Weights of the draws, see :func:`calibrator.estimator.posterior.weigh`.
     group_centre : ndarray of shape (g,)
         What the vehicles of each group share, in fractions of full scale.
     """
@@ -88,11 +88,11 @@ class Points(NamedTuple):
     faults : ndarray of shape (n, 2K)
         Drifts [1], then offsets in fractions of full scale.
     weight : ndarray of shape (n,)
-        Sums to 1, but for what is negligible.
+        Weights of the points; they sum to 1, apart from negligible draws that are left out.
     explanation : ndarray of int of shape (n,)
         Number of the explanation that a point comes from.
     model, fit : ndarray of int of shape (e,)
-        Of each explanation: its model, and its place among the fits of the vehicle.
+        Fault model of each explanation, and its place among the fits of the vehicle.
     """
 
     faults: Array
@@ -103,7 +103,7 @@ class Points(NamedTuple):
 
 
 def posterior_points(models: Sequence[Explained]) -> list[Points]:
-    """Posterior of each vehicle over all models that explain its fleet."""
+    """Collect the posterior of each vehicle over all models that explain its fleet."""
     faults, weight, number, vehicle = [], [], [], []
     for i, model in enumerate(models):
         shared, feed, K = model.draws.shared, model.draws.feed, model.draws.values.shape[3] // 3
@@ -118,7 +118,7 @@ def posterior_points(models: Sequence[Explained]) -> list[Points]:
         else:
             offset[:, feed] -= np.where(alone, 0.0, of_group * gain[:, feed])
         total = offset + shared[:K]
-        cancel = (x[:, 2 * K : 3 * K] == 0.0) & (np.abs(total) <= SAME)  # what a group and all sensors share
+        cancel = (x[:, 2 * K : 3 * K] == 0.0) & (np.abs(total) <= SAME)  # shares of a group and of all sensors
         faults.append(np.hstack([gain - 1.0, np.where(cancel, 0.0, total)]))
         weight.append(model.weight[j, q, m, g] * model.probability)
         number.append((q * model.weight.shape[3] + g) * len(models) + i)
@@ -135,14 +135,14 @@ def posterior_points(models: Sequence[Explained]) -> list[Points]:
 
 
 def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
-    """Find the point that most of the posterior is within tolerance of.
+    """Find the point that has most of the posterior within its tolerance.
 
     Parameters
     ----------
     points : Points
         Of one vehicle.
     smallest : ndarray of shape (2,)
-        Least norms that drifts and offsets are counted with: the smallest faults of the fleet. [1]
+        Least norms that the vectors of drifts and of offsets count with: the smallest faults of the fleet. [1]
 
     Returns
     -------
@@ -167,7 +167,7 @@ def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
 
 
 def recovery_probability(points: Points, candidates: Array, smallest: Sequence[float] | Array) -> Array:
-    """Find how much of a posterior is within the tolerance of "recovered" of each candidate.
+    """Compute for each candidate the share of a posterior for which it counts as "recovered".
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
     candidates : ndarray of shape (C, 2K)
         Drifts [1] and offsets in fractions of full scale.
     smallest : sequence of float or ndarray of shape (2,)
-        Least norms that drifts and offsets are counted with. [1]
+        Least norms that the vectors of drifts and of offsets count with. [1]
 
     Returns
     -------
@@ -194,21 +194,21 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
 
 
 def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: Array) -> Array:
-    """Probability that correction makes each branch worse.
+    """Compute the probability that correction makes each branch worse (M19).
 
     Parameters
     ----------
     points : Points
         Of one vehicle.
     estimate : ndarray of shape (2K,)
-        What the branches would be corrected with.
+        Drifts [1] and offsets in fractions of full scale that the branches would be corrected with.
     mean, mean_square : ndarray of shape (D, K)
         Moments of the true currents on D drives, in fractions of full scale and their squares.
 
     Returns
     -------
     ndarray of shape (K,)
-        That it does so on any of the drives; 0 where nothing would be corrected.
+        Probability that it does so on any of the drives; 0 where nothing would be corrected.
     """
     K = len(estimate) // 2
     d, o, d_hat, o_hat = points.faults[:, :K], points.faults[:, K:], estimate[:K], estimate[K:]
@@ -222,24 +222,25 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SensorEstimate:
-    """What is found of N vehicles with K branches, branches in their own order.
+    """Estimated sensor faults of N vehicles with K branches, branches in the vehicles' own order.
 
     Attributes
     ----------
     drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N, K)
         Sensor faults and their standard deviations. [1], [A]
     hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
-        Of a hardware fault; probability that the estimate is recovered: within 10 % of the truth. [1]
+        Drift and probability of a hardware fault; probability that the estimate is within 10 % of the truth. [1]
     hardware_offset_a : ndarray of shape (N, K)
-        Of a hardware fault. [A]
+        Offsets of a hardware fault. [A]
     fault_probability, harm_probability : ndarray of shape (N, K)
-        That the sensor is faulty; that its correction makes the branch worse. [1]
+        Probability that the sensor is faulty; that its correction makes the branch worse. [1]
     identifiable : ndarray of bool of shape (N, K)
         Whether the branch moved enough for its gain to be known: some row shows it.
     points : sequence of N Points
         The posterior.
     order : tuple of int
-        Branches of the points, whose offsets are in fractions of full scale: position of each in their own order.
+        Order of the branches in the points: position of each in the vehicles' own order. Offsets of the points are in
+        fractions of full scale.
     full_scale_a : float
         Full scale of the junction. [A]
     """
@@ -280,18 +281,18 @@ class SensorEstimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RowsEstimate(SensorEstimate):
-    """The same of evidence rows, before anything is decided.
+    """Estimate from evidence rows, before it is decided what is corrected.
 
     Attributes
     ----------
     load_probability, load_a : ndarray of shape (N,)
-        That a load without a sensor is carried by the feeding branch in this vehicle alone, and its expected size. [1],
-        [A]
+        Probability that the feeding branch carries a load without a sensor in this vehicle alone [1], and its expected
+        size [A].
     group_probability : ndarray of shape (N, g)
-        That the vehicle is one of each group that shares a constant of the feeding branch. [1]
+        Probability that the vehicle belongs to each group that shares a constant of the feeding branch. [1]
     supports : sequence of N sequences of (float, ndarray of shape (4, K))
-        Explanations by falling probability: this; hardware drift (first column), hardware offsets, drifts and offsets,
-        branches and units as those of the points.
+        Explanations by falling probability, each as its probability and four rows: hardware drift (first column only),
+        hardware offsets, drifts, and offsets; branches and units are those of the points.
     """
 
     load_probability: Array
@@ -302,7 +303,7 @@ class RowsEstimate(SensorEstimate):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FleetEstimate(SensorEstimate):
-    """The same of whole vehicles, with what is decided and said.
+    """Estimate of whole vehicles, with what is decided and reported.
 
     Attributes
     ----------
@@ -311,13 +312,13 @@ class FleetEstimate(SensorEstimate):
     held_back : ndarray of str of shape (N, K)
         Why a fault that was found is not corrected; empty where it is, or where none was found.
     verdicts : sequence of N str
-        Of each vehicle.
+        Verdict on each vehicle.
     explanations : sequence of N sequences of Explanation
-        By falling probability, at least one.
+        Explanations by falling probability, at least one.
     findings : sequence of N sequences of SensorFinding
-        What no explanation fits.
+        What gain errors and offsets do not explain, and what the vehicle shares with others.
     evidence : ndarray of shape (N, 3, 5K)
-        For the pages of a report, see :func:`.reported_evidence`; of single junctions it has no rows.
+        Evidence rows for a report, see :func:`.reported_evidence`; there are none for single junctions.
     """
 
     corrected: Mask
@@ -339,14 +340,14 @@ def estimate_rows(
     order: Sequence[int] | None = None,
     full_scale_a: float = 1.0,
 ) -> RowsEstimate:
-    """Estimate N vehicles from their evidence rows.
+    """Estimate the sensor faults of N vehicles from their evidence rows.
 
     Parameters
     ----------
     rows : EvidenceRows
         Of the vehicles.
     models : sequence of FaultModel
-        That explain their fleet.
+        Fault models that explain their fleet.
     feed : int
         Branch that carries loads without a sensor.
     mean, mean_square : ndarray of shape (N, K)
@@ -354,7 +355,7 @@ def estimate_rows(
     usual : ndarray of shape (2, K)
         The same moments of the fleet's usual drive.
     order : sequence of int or None
-        Branches of the rows: position of each in their own order; None: the same.
+        Order of the branches in the rows: position of each in the vehicles' own order; None: both are the same.
     full_scale_a : float
         Full scale of the junction; 1: the offsets of the estimate are fractions of it. [A]
 
@@ -389,7 +390,7 @@ def estimate_rows(
         fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
         supports.append(_supports(explained, found, j))
         hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
-    confidence[~rows.known.any(axis=1)] = 0.0  # of which nothing is known: the prior alone is no evidence
+    confidence[~rows.known.any(axis=1)] = 0.0  # nothing is known of these: a prior is no evidence
     first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])
     load_probability, load, group_probability = _unmeasured(explained)
     return RowsEstimate(
@@ -415,7 +416,7 @@ def estimate_rows(
 
 
 def _unmeasured(models: Sequence[Explained]) -> tuple[Array, Array, Array]:
-    """Probability and size of a load without a sensor, probabilities of the groups, over all fault models."""
+    """Return probability and size of a load without a sensor, and the probability of each group, over all models."""
     own, size = [], []
     centres = max((model.group_centre for model in models), key=len)  # the first model's, if it has any
     groups = np.zeros((len(models[0].weight), len(centres)))
@@ -431,13 +432,13 @@ def _unmeasured(models: Sequence[Explained]) -> tuple[Array, Array, Array]:
 
 
 def _total(values: Array) -> Array:
-    """Sum over draws (N, Q, M, ...), one after the other: the same however many explanations other vehicles have."""
+    """Sum over draws (N, Q, M, ...) one by one, so that the number of other vehicles' explanations has no effect."""
     N, Q, M = values.shape[:3]
     return np.asarray(np.cumsum(values.reshape(N, Q * M, *values.shape[3:]), axis=1)[:, -1])
 
 
 def _central_sd(points: Points, estimate: Array) -> Array:
-    """Distance from the estimate within which 68 % of the posterior lies, shape (2K,)."""
+    """Return the distance from the estimate within which 68 % of the posterior lies, shape (2K,)."""
     sd, total = np.zeros(len(estimate)), points.weight.sum()
     exactly = points.weight @ (points.faults == estimate)
     for i in np.flatnonzero(exactly < CENTRAL * total):
@@ -449,7 +450,7 @@ def _central_sd(points: Points, estimate: Array) -> Array:
 
 
 def _supports(models: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
-    """Supports of a vehicle with the signs of their parameters, over all models; each with its mean parameters."""
+    """List the explanations of a vehicle with mean parameters, merged over all models by support and signs."""
     K = points.faults.shape[1] // 2
     at, share = ParameterPlaces(K), np.bincount(points.explanation, points.weight)
     order = np.argsort(-share, kind="stable")
@@ -471,7 +472,7 @@ def _supports(models: Sequence[Explained], points: Points, j: int) -> list[tuple
 
 
 def _nearest(supports: list[tuple[float, Array]], estimate: Array) -> Array:
-    """Parameters of the most probable explanation with sensor faults like the estimate's."""
+    """Return the parameters of the most probable explanation whose sensor faults are like the estimate's."""
     K = len(estimate) // 2
     apart = [float(np.abs(np.concatenate(values[2:]) - estimate).max()) for _, values in supports]
     share, least = LIKE_ESTIMATE
@@ -480,7 +481,7 @@ def _nearest(supports: list[tuple[float, Array]], estimate: Array) -> Array:
 
 
 def _identifiable(rows: EvidenceRows) -> Mask:
-    """Branches whose gain some row shows better than :data:`MOST_GAIN_SD`: slope, gain ratio, or a bench reading."""
+    """Find branches whose gain a slope, gain ratio or bench reading shows better than :data:`MOST_GAIN_SD`."""
     at, sd = rows.places, np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
     best = np.minimum(sd[:, at.slopes], sd[:, at.gain_reads])
     best[:, 1:] = np.minimum(best[:, 1:], sd[:, at.ratios])
@@ -490,10 +491,10 @@ def _identifiable(rows: EvidenceRows) -> Mask:
 def decided(
     faulty: Mask, *, unfit: Mask, in_doubt: Mask, still: Mask, harmful: Mask, beyond: Mask, sound: Mask
 ) -> tuple[NDArray[np.str_], Mask, list[str]]:
-    """Why faults are not corrected (N, K), which branches are (N, K), and the verdicts of N vehicles.
+    """Return why faults are not corrected (N, K), which branches are corrected (N, K), and the verdicts of N vehicles.
 
-    Of the reasons, arrays that broadcast to (N, K), the first that applies is reported; ``sound`` (N,) says which
-    vehicles have no sensor fault.
+    The arguments from ``unfit`` to ``beyond`` are reasons not to correct and broadcast to (N, K); the first one that
+    applies is reported. ``sound`` (N,) says which vehicles have no sensor fault.
     """
     reasons = {
         "": ~faulty,

@@ -5,8 +5,9 @@
       -> slopes and intercepts over it (15), and each vehicle's own junction regression (M8)
       -> evidence rows (M9) to (M11) with their covariance (collect_rows)
 
-Every step is done for all vehicles at once. What each block of a drive moves an estimate by (its influence) gives the
-covariance, correlation in time and heteroscedasticity included [1]_, also between regressions on the same blocks.
+Every step is done for all vehicles at once. Covariances follow from how far each block of a drive moves an estimate
+(its influence): they include correlation in time and heteroscedasticity [1]_, and hold also between regressions on the
+same blocks.
 
 With lambda_k = log(1 + d_k), eta = log(1 + d_h) and omega_k = o_k / (1 + d_k), equations (11), (13) and (15) of [2]_
 and the junction's sum of currents sum_k (i_m,k - o_k) / (1 + d_k) = l (l: load that no branch measures) become
@@ -17,12 +18,12 @@ and the junction's sum of currents sum_k (i_m,k - o_k) / (1 + d_k) = l (l: load 
     log of a bench reading   = lambda_k                       offset reading_k / (1 + d_k) = omega_k
 
 a, b are slopes and intercepts over the fleet model; g, c those of the first measured current over the others. m, n, q
-are what a vehicle and its drives differ from the fleet without any fault: the model spread. An unknown row has the
+are differences of a vehicle and its drives from the fleet that are no fault: the model spread. An unknown row has the
 value 0 and a variance of :data:`UNKNOWN_VARIANCE`.
 
-b and c are where lines meet zero. If a ratio is wrong, its line pivots about the mean of its data, which is known far
-better, and b or c follows: (M10). The covariance holds this to first order, the residuals of an explanation (M11)
-exactly: :func:`calibrator.estimator.posterior.row_residuals`.
+b and c are values of lines at zero current. If a slope or ratio is in error, its line pivots about the mean of its
+data, where it is known far better, and b or c changes with it: (M10). The covariance includes this to first order, the
+residuals of an explanation (M11) exactly: :func:`calibrator.estimator.posterior.row_residuals`.
 
 .. [1] H. White, "A heteroskedasticity-consistent covariance matrix estimator", Econometrica 48 (1980) 817-838.
 .. [2] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
@@ -65,62 +66,63 @@ __all__ = [
 ]  # fmt: skip
 
 REGRESSION_ROUNDS = 3
-"""The residual's variance rho depends on the estimate and the estimate, weakly, on rho. [1]"""
+"""Rounds of a regression: the residual's variance rho depends on the estimate, and the estimate weakly on rho. [1]"""
 LEAST_RHO = 1e-9
-"""Of the mean square of y: a regression that fits exactly. [1]"""
+"""Least rho over the mean square of y, reached where a regression fits exactly. [1]"""
 LEAST_VARIANCE = 1e-12
-"""Of y where it is zero throughout, so that the prior stays: below a microampere, in any unit that is used."""
+"""Least rho where y is zero throughout, so that the prior still counts: below a microampere, in any unit in use."""
 TOO_FEW = 4.0
-"""Blocks from which no variance can be estimated: two for slope and intercept, two because the error of the variance
-itself makes the tails heavier than normal."""
+"""Number of blocks that is too few to estimate a variance: two go to slope and intercept, two because the error of the
+variance itself makes the tails heavier than normal."""
 SINGULAR = 1e-12
 """Eigenvalue over the largest one below which a direction counts as unknown. [1]"""
 TINY = np.finfo(float).tiny
 LEAST_PRIOR = 100.0 * SINGULAR
-"""Of the prior in the diagonal of the normal equations where z stands still, and looks like the constant. [1]"""
+"""Least share of the prior in the diagonal of the normal equations where z stands still: it looks like the constant."""
 GAIN_SD = 0.4
 """Prior deviation of a gain ratio from -1: no running sensor is farther off. [1]"""
 NOISE_ROUNDS = 3
-"""The bound on the noise depends on the gains, and they on it; three rounds settle it. [1]"""
+"""Rounds of the junction regression: the noise taken out depends on the gains, and they on it; three suffice. [1]"""
 MOST_NOISE = 0.9
 """Largest share of a current's variance that is taken for noise. [1]"""
 LEAST_WEIGHT = 0.1
-"""Of a branch in the junction sum, where its share of the residual is bounded. [1]"""
+"""Least squared weight of a branch in the junction sum, where its share of the residual's noise is limited. [1]"""
 MODEL_ROUNDS = 12
-"""Of alternating least squares; slopes change by less than 1e-4 after eight on all fleets tried. [1]"""
+"""Rounds of alternating least squares; slopes change by less than 1e-4 after eight on all fleets tried. [1]"""
 RIDGE = 1e-9
-"""On the normalised moments of the inputs: an input that hardly varies gets no read-out."""
+"""Added to the diagonal of the normalised moments of the inputs: an input that hardly varies gets no read-out."""
 SLOPE_SD = 0.4
 """Prior deviation of a slope from 1: a branch that hardly moves counts as faultless. [1]"""
 LEAST_SLOPE_SD = 1e-5
-"""Of slopes and intercepts where a model fits exactly. [1], [A]"""
+"""Least standard deviation of slopes and intercepts, where a model fits exactly. [1], [A]"""
 MOST_VARIATION = 100.0
-"""Deviation of an input over the fleet's median deviation from which on a vehicle has another unit there. [1]"""
+"""Standard deviation of an input over the fleet's median one, above which the vehicle must use another unit. [1]"""
 TINY_A2 = 1e-12
-"""Of a fleet that stands still. [A^2]"""
+"""Least variance of all currents together, for a fleet that stands still. [A^2]"""
 CONSTANT = 1e-12
-"""Variance over mean square below which a column counts as constant: rounding. [1]"""
+"""Variance over mean square below which a column counts as constant: the rest is rounding. [1]"""
 MOST_CENTRES = 200
 SPREADS = 12
 SHARE_STEPS = 8
 MARGIN = 0.1
 """The background reaches beyond the values by this share of their range. [1]"""
 SD_OF_RANGE = 9.0
-"""Range of the background over the deviation of its Gaussian half, where faults say how wide it is. [1]"""
+"""Range of the background over the standard deviation of its Gaussian half, where faults set its width. [1]"""
 UNKNOWN_VARIANCE = 100.0
-"""Of an unknown row: ten times full scale, or a factor of 20 000. [1]"""
+"""Variance of an unknown row: a standard deviation of ten times full scale, or of a factor of 20 000. [1]"""
 LEAST_GAIN = 0.3
-"""Slopes and gain ratios below are no sensor's, but those of a branch that hardly moved. [1]"""
+"""Least slope or gain ratio that is used: a lower one comes from a branch that hardly moved, not from a sensor. [1]"""
 FEWEST_BLOCKS = 4
-"""Of a vehicle; from fewer no variance can be estimated."""
+"""Least number of blocks of a vehicle; from fewer no variance can be estimated."""
 FLEET_BLOCKS = 20.0
 """Weight of the fleet's usual correlation of rows against that of one vehicle, in blocks."""
 LEAST_SD = np.array([5e-4, 2.5e-4])
-"""Least deviation of relative and constant rows: how exact a sound sensor is, 0.05 % and 0.025 % of full scale. [1]
+"""Standard deviations added to relative and constant rows, as sound sensors are not exact: 0.05 %, and 0.025 % of full
+scale. [1]
 
-Where most sensors of a fleet are exact the learnt model spread is far smaller, and an error of 0.1 % of a few others
-was explained by large faults that cancel ("small errors" of ``experiment attacks``). With 60 % of these values, or 1e-4
-for the constants, some still were; with 5e-5 for gains alone fewer vehicles were recovered.
+Where most sensors of a fleet are exact, the learnt model spread is far smaller. Errors of 0.1 % of a few others were
+then explained by large faults that cancel ("small errors" of ``experiment attacks``). With 60 % of these values, or
+1e-4 for the constants, some still were; with 5e-5 for gains alone fewer vehicles were recovered.
 """
 
 
@@ -141,12 +143,12 @@ class Blocks:
 
     @classmethod
     def of_lengths(cls, lengths: Sequence[int]) -> "Blocks":
-        """Make the blocks of vehicles that have so many each."""
+        """Make the blocks of vehicles from the number that each has."""
         count = np.asarray(lengths, np.int64)
         return cls(count=count, vehicle=np.repeat(np.arange(len(count)), count))
 
     def total(self, values: Array) -> Array:
-        """Sums over the blocks of each vehicle, shape (N, ...) of (B, ...); the same to the bit beside any others."""
+        """Sum (B, ...) over the blocks of each vehicle to (N, ...); to the last bit, other vehicles have no effect."""
         first = np.cumsum(self.count) - self.count
         return np.asarray(np.add.reduceat(np.ascontiguousarray(values), first, axis=0))
 
@@ -161,7 +163,7 @@ class FleetMoments:
         Sums of products of (inputs, measured currents [A], 1), as in a
         :class:`~calibrator.summaries.moments.DriveSummary`, stacked vehicle after vehicle.
     noise_a2 : ndarray of shape (B, K)
-        White noise of each measured current. [A^2]
+        Variance of the white noise of each measured current; an upper bound where it changes fast itself. [A^2]
     blocks : Blocks
         Which blocks belong to which vehicle.
     branches : int
@@ -189,7 +191,7 @@ class FleetMoments:
 
     @property
     def covariance(self) -> Array:
-        """Covariances of the same columns, shape (N, p, p), see :func:`covariances`."""
+        """Covariances of (inputs, measured currents, 1), shape (N, p, p), see :func:`covariances`."""
         return covariances(self.mean)
 
     @property
@@ -209,7 +211,7 @@ class FleetMoments:
 
 
 def covariances(mean: Array) -> Array:
-    """Covariances of columns of mean products (N, p, p), whose last column is 1; zero where a column is constant."""
+    """Compute covariances from mean products (N, p, p) of columns, the last of them 1; zero where one is constant."""
     means = mean[:, :, -1]
     covariance = mean - means[:, :, None] * means[:, None, :]
     varies = np.diagonal(covariance, axis1=1, axis2=2) > CONSTANT * means**2
@@ -224,7 +226,7 @@ def stack_summaries(summaries: Sequence[DriveSummary], order: Sequence[int] | No
     summaries : sequence of DriveSummary
         Of N vehicles, at least one, with the same inputs and branches.
     order : sequence of int or None
-        Branches to take, in this order; None: all in theirs.
+        Branches to take, in this order; None: all, in the order of the summaries.
 
     Returns
     -------
@@ -250,15 +252,15 @@ def stack_summaries(summaries: Sequence[DriveSummary], order: Sequence[int] | No
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleRegressions:
-    """The same regression of N vehicles.
+    """Results of one regression that was done for each of N vehicles.
 
     Attributes
     ----------
     estimate : ndarray of shape (N, p)
-        theta of each vehicle.
+        Coefficients theta of each vehicle.
     influence : ndarray of shape (B, p)
-        What each block moves the estimate of its vehicle by; the sum of their outer products is the covariance of the
-        sampling error.
+        How far each block moves the estimate of its vehicle; the sum of the outer products over the blocks is the
+        covariance of the sampling error.
     prior_covariance : ndarray of shape (N, p, p)
         Part of the covariance that is due to the prior.
     blocks : Blocks
@@ -280,7 +282,7 @@ class VehicleRegressions:
 def regress_vehicles(
     gram: Array, right: Array, power: Array, blocks: Blocks, *, prior_mean: Array, prior_precision: Array
 ) -> VehicleRegressions:
-    """Regress y on z in each of N vehicles.
+    """Regress y on z in each of N vehicles, by least squares with a weak prior (M9).
 
     Parameters
     ----------
@@ -303,7 +305,7 @@ def regress_vehicles(
     count, p = blocks.count, right.shape[1]
     Z, y = blocks.total(gram), blocks.total(right)
     least = np.maximum(LEAST_RHO * power, LEAST_VARIANCE)
-    still = np.diagonal(covariances(Z / Z[:, -1:, -1:]), axis1=1, axis2=2) == 0.0  # the prior alone tells of these
+    still = np.diagonal(covariances(Z / Z[:, -1:, -1:]), axis1=1, axis2=2) == 0.0  # only the prior sets these
     least_prior = LEAST_PRIOR * np.diagonal(Z, axis1=1, axis2=2) * (still & (prior_precision > 0.0))
     rho = least
     for _ in range(REGRESSION_ROUNDS):
@@ -316,7 +318,7 @@ def regress_vehicles(
         estimate = products(inverse, y + prior * prior_mean)
         scores = right - products(gram, estimate[blocks.vehicle])
         influence = products(inverse[blocks.vehicle], scores)
-        # long-run variance of the residual: its variance times by how much neighbouring samples repeat each other
+        # long-run variance of the residual: its variance times the number of neighbouring samples that are alike
         rho = np.maximum(blocks.total(np.sum(scores * influence, axis=1)) / p, least)
     influence -= (blocks.total(influence) / count[:, None])[blocks.vehicle]
     prior = np.maximum(rho[:, None] * prior_precision, least_prior)
@@ -330,15 +332,16 @@ def regress_vehicles(
 
 
 def products(matrices: Array, vectors: Array) -> Array:
-    """Each matrix times its vector, shape (N, q) of (N, q, p) and (N, p).
+    """Multiply each matrix by its vector: (N, q, p) and (N, p) to (N, q).
 
-    The same to the bit for any N, which neither matmul nor einsum promise: these choose their way by the whole shape.
+    The result is the same to the bit for any N. Neither matmul nor einsum promises that: both choose their algorithm
+    by the whole shape.
     """
     return np.asarray(np.sum(np.ascontiguousarray(matrices) * vectors[:, None, :], axis=2))
 
 
 def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
-    """Regress the first measured current on the others.
+    """Regress the first measured current on the others (M8), with their noise taken out of the moments.
 
     Parameters
     ----------
@@ -348,7 +351,7 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
     Returns
     -------
     VehicleRegressions
-        Of (g_2 .. g_K [1], c [A]).
+        Estimates of (g_2 .. g_K [1], c [A]).
     """
     M, K, N = fleet.inputs, fleet.branches, len(fleet)
     z = np.array([*range(M + 1, M + K), M + K])
@@ -375,7 +378,7 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
 
 
 def _shared_noise_a2(residual_a2: Array, bound_a2: Array, weight: Array) -> Array:
-    """Noise of each current (N, K), equal up to its bound, whose weighted sum is the residual (N,) at most. [A^2]"""
+    """Share the residual (N,) out as equal noise of the currents (N, K), of each at most its bound. [A^2]"""
     order = np.argsort(bound_a2, axis=1, kind="stable")
     bound, weight = np.take_along_axis(bound_a2, order, axis=1), np.take_along_axis(weight, order, axis=1)
     # level: noise of the currents from here on, if all before are at their bounds (water filling)
@@ -387,7 +390,7 @@ def _shared_noise_a2(residual_a2: Array, bound_a2: Array, weight: Array) -> Arra
 
 
 def fit_fleet_model(fleet: FleetMoments) -> Array:
-    """Learn the fleet model.
+    """Learn the fleet model (M7).
 
     Parameters
     ----------
@@ -397,8 +400,8 @@ def fit_fleet_model(fleet: FleetMoments) -> Array:
     Returns
     -------
     ndarray of shape (M + 1, K)
-        Read-out: ideal currents per unit of each input, and the constant, with the scale and zero of the vehicles that
-        agree; each row sums to zero. [A]
+        Read-out: ideal currents per unit of each input, and in the last row the constants. Scale and zero are those of
+        the vehicles that agree; each row sums to zero. [A]
     """
     M, K = fleet.inputs, fleet.branches
     u = [*range(M), M + K]  # columns of the inputs and the constant
@@ -428,9 +431,9 @@ def fit_fleet_model(fleet: FleetMoments) -> Array:
         read_out = read_out * scale
         read_out[-1] += zero
         slopes = np.stack([fit.estimate[:, 0] for fit in fits], axis=1) / scale
-    # Ideal currents sum to zero, whatever the inputs. The excess of an input is shared by the branches as their
-    # currents' variance. The excess of the constants is the mean load that no branch measures: it is taken from the
-    # source, as it does not grow with others.
+    # Ideal currents sum to zero, whatever the inputs. The excess of an input is shared among the branches in proportion
+    # to the variance of their currents. The excess of the constants is the mean load that no branch measures: it is
+    # taken from the source, as it does not grow with other currents.
     mean = fleet.mean[usual].mean(axis=0)
     mean_a = mean[-1, u] @ read_out
     variance_a2 = np.diag(read_out.T @ mean[np.ix_(u, u)] @ read_out) - mean_a**2
@@ -441,7 +444,7 @@ def fit_fleet_model(fleet: FleetMoments) -> Array:
 
 
 def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegressions]:
-    """Slope and intercept (15) of each branch of each vehicle over the fleet model on its own drives.
+    """Regress each branch of each vehicle on the fleet model, on its own drives: slope and intercept (15).
 
     Parameters
     ----------
@@ -453,7 +456,7 @@ def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegres
     Returns
     -------
     list of K VehicleRegressions
-        Of (a_k [1], b_k [A]).
+        Estimates of (a_k [1], b_k [A]).
     """
     M, K = fleet.inputs, fleet.branches
     u = np.array([*range(M), M + K])
@@ -476,12 +479,12 @@ def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegres
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """One cluster.
+    """One cluster of values that agree.
 
     Attributes
     ----------
     centre, spread : float
-        Mean and standard deviation of its members, sampling error apart.
+        Mean of its members, and their standard deviation without the sampling error.
     share : float
         Share of the values in it. [1]
     """
@@ -509,8 +512,8 @@ def densest_clusters(
     farthest : float
         Largest magnitude of a centre.
     widest : float
-        Range of what faults can make of the values: the background is at least as wide, so that values that all agree
-        are a cluster too.
+        Range of values that faults can produce: the background is at least as wide, so that values that all agree are
+        a cluster, too.
 
     Returns
     -------
@@ -549,26 +552,26 @@ def densest_clusters(
 
 
 class RowPlaces:
-    """Where an array of 5K rows holds each kind of row, for K branches.
+    """Places of each kind of row in an array of 5K rows, for K branches.
 
     Attributes
     ----------
     slopes : slice
-        K, log a. [1]
+        K rows log a. [1]
     ratios : slice
-        K - 1, log(-g) of every branch but the first. [1]
+        K - 1 rows log(-g), of every branch but the first. [1]
     gain_reads : slice
-        K, bench readings of log(1 + d). [1]
+        K rows of bench readings of log(1 + d). [1]
     intercepts : slice
-        K, b, in fractions of full scale.
+        K rows b, in fractions of full scale.
     junction : int
-        c, in fractions of full scale.
+        The row c, in fractions of full scale.
     offset_reads : slice
-        K, readings of the offsets, in fractions of full scale.
+        K rows of readings of the offsets, in fractions of full scale.
     relative, constant : slice
         The 3K - 1 rows of the first three kinds, and the 2K + 1 of the others.
     measured : ndarray of int
-        The 3K rows that drives show; the others are readings.
+        The 3K rows that come from drives; the others are readings.
     """
 
     def __init__(self, branches: int) -> None:
@@ -592,7 +595,7 @@ class RowPlaces:
 
 
 class ParameterPlaces:
-    """Where an array of 3K + 1 parameters holds each kind, for K branches, in the symbols above.
+    """Places of each kind of parameter in an array of 3K + 1, for K branches, in the symbols of the module's docstring.
 
     Attributes
     ----------
@@ -628,10 +631,10 @@ class EvidenceRows:
         Relative rows: log a (K), log(-g) (K - 1), bench readings of log(1 + d) (K); then constant rows in fractions of
         full scale: b (K), c (1), readings of the offsets (K). [1]
     covariance : ndarray of shape (N, 5K, 5K)
-        Of their sampling error; of the constant rows as seen in true currents, that is divided by 1 + d. [1]
+        Covariance of their sampling errors; constant rows are seen in true currents, that is divided by 1 + d. [1]
     means : ndarray of shape (N, 2, K)
-        Means of the fleet model's and of the measured currents, in fractions of full scale, about which the lines of
-        the constants pivot; zero where constants do not depend on the ratios. [1]
+        Means of the fleet model's and of the measured currents, in fractions of full scale: the lines of the constants
+        pivot about them; zero where constants do not depend on the ratios. [1]
     """
 
     values: Array
@@ -652,7 +655,7 @@ class EvidenceRows:
 
     @property
     def places(self) -> RowPlaces:
-        """Where ``values``, :attr:`known` and the covariance hold each kind of row."""
+        """Places of each kind of row in ``values``, :attr:`known` and the covariance."""
         return RowPlaces(self.branches)
 
     @property
@@ -667,11 +670,11 @@ class EvidenceRows:
 
     @property
     def known(self) -> Mask:
-        """Which rows say something, shape (N, 5K)."""
+        """Which rows are known, shape (N, 5K)."""
         return np.asarray(np.diagonal(self.covariance, axis1=1, axis2=2) < UNKNOWN_VARIANCE / 2.0)
 
     def shown(self, row: int) -> tuple[Array, Array]:
-        """Values of a row in the vehicles that show it, and their standard deviations."""
+        """Return the values of a row in the vehicles where it is known, and their standard deviations."""
         known = self.known[:, row]
         return self.values[known, row], np.sqrt(self.covariance[known, row, row])
 
@@ -685,7 +688,7 @@ class EvidenceRows:
         return _shifted(self.covariance, -_pivot(self.means, self.values), first=b.start)[:, b, b]
 
     def dispersed(self, dispersion: Array | float) -> tuple[Array, Array]:
-        """Covariance if that of the intercepts at their means is larger.
+        """Return the covariance with the variance of the intercepts at their means multiplied by a factor.
 
         Parameters
         ----------
@@ -695,9 +698,9 @@ class EvidenceRows:
         Returns
         -------
         whole : ndarray of shape (N, 5K, 5K)
-            Of all rows.
+            Covariance of all rows.
         added : ndarray of shape (N, K, K)
-            What of it is added to the intercepts, independent of everything else.
+            Part of it that was added to the intercepts, independent of everything else.
         """
         b = self.places.intercepts
         more = np.sqrt(np.broadcast_to(np.asarray(dispersion) - 1.0, self.branches))
@@ -717,12 +720,12 @@ def collect_rows(
     fleet : FleetMoments
         Of N vehicles.
     read_out : ndarray of shape (M + 1, K)
-        Of the model of the same fleet. [A]
+        Read-out of the model of the same fleet. [A]
     full_scale_a : float
         Full scale of the junction. [A]
     usual_correlation : ndarray of shape (3K, 3K), or None
         Correlation of the rows that is usual in the fleet, as an earlier call returned it; None: the mean over these
-        vehicles. That of each vehicle is smoothed with it, as few blocks show little of a correlation. [1]
+        vehicles. The correlation of each vehicle is drawn towards it, as a few blocks say little about it. [1]
 
     Returns
     -------
@@ -756,7 +759,7 @@ def collect_rows(
     covariance = _shifted(covariance, to_means, first=R)
     blocks = fleet.blocks.count[:, None, None]
     covariance[blocks[:, 0, 0] < FEWEST_BLOCKS] = UNKNOWN_VARIANCE * np.eye(3 * K)
-    sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))  # exact ones are rounding
+    sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))  # below 0 is rounding
     safe_sd = np.where(sd > 0.0, sd, np.inf)
     own = covariance / (safe_sd[:, :, None] * safe_sd[:, None, :])
     usual = own.mean(axis=0) if usual_correlation is None else usual_correlation
@@ -764,7 +767,7 @@ def collect_rows(
     correlation[:, range(3 * K), range(3 * K)] = 1.0
     covariance = correlation * sd[:, :, None] * sd[:, None, :]
 
-    # Logarithms of the ratios, constants as seen in true currents. An unknown ratio becomes 1; its constant follows.
+    # Logarithms of the ratios, constants as seen in true currents. An unknown ratio becomes 1; its constant pivots.
     ratios, constant = values[:, :R], values[:, R:]
     known = ratios > LEAST_GAIN
     safe = np.where(known, ratios, 1.0)
@@ -794,14 +797,14 @@ def _pivot(means: Array, values: Array) -> Array:
 
 
 def _shifted(covariance: Array, by: Array, *, first: int) -> Array:
-    """Covariance if ``by`` (N, c, r) times the first r variables is added to c variables from ``first`` on."""
+    """Return the covariance after ``by`` (N, c, r) times the first r variables is added to the c from ``first`` on."""
     jacobian = np.tile(np.eye(covariance.shape[-1]), (len(covariance), 1, 1))
     jacobian[:, first : first + by.shape[1], : by.shape[2]] += by
     return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2))
 
 
 def row_design(branches: int, feed: int) -> Array:
-    """Rows over parameters, linear as they are in true currents.
+    """Build the design matrix of the rows over the parameters, which is linear in true currents.
 
     Parameters
     ----------
@@ -833,12 +836,12 @@ def evidence_names(branches: Sequence[str]) -> list[str]:
     Parameters
     ----------
     branches : sequence of str
-        The K branches, the most moving first: the junction law is written for it.
+        The K branches; the first is the one that moves most, for which the junction law is solved.
 
     Returns
     -------
     list of str
-        3K - 1 ratios [1], then 2K + 1 constants [A].
+        Names of 3K - 1 ratios [1], then of 2K + 1 constants [A].
     """
     first = branches[0]
     return [
@@ -862,16 +865,16 @@ def reported_evidence(
     hardware_offset_a: Array,
     full_scale_a: float,
 ) -> Array:
-    """The evidence rows in the units of the sensors, beside what the estimates make of them, for the pages of a report.
+    """Return the evidence rows in the units of the sensors, and what the estimates predict for them, for a report.
 
     Parameters
     ----------
     rows : EvidenceRows
-        Of N vehicles with K branches; all that follows has its order of branches.
+        Of N vehicles with K branches; all other arguments have its order of branches.
     centre : ndarray of shape (5K,)
-        What vehicles without faults show in the rows: the load without a sensor belongs to the junction constant. [1]
+        Rows of vehicles without faults; that of the junction constant includes the load without a sensor. [1]
     covariance : ndarray of shape (N, 5K, 5K)
-        Of each reading together with what faultless vehicles differ by. [1]
+        Covariance of the rows' sampling errors plus that of the differences between faultless vehicles. [1]
     drift, offset_a, hardware_offset_a : ndarray of shape (N, K)
         Estimates. [1], [A], [A]
     hardware_drift : ndarray of shape (N,)
@@ -882,12 +885,12 @@ def reported_evidence(
     Returns
     -------
     ndarray of shape (N, 3, 5K)
-        What was measured, its standard deviation, and what the estimate makes of it; NaN for the first two where a row
-        is unknown. ``evidence`` in the details of ``run.json`` names the rows: ratios [1], then constants [A].
+        Measured value, its standard deviation, and what the estimate predicts; NaN for the first two where a row is
+        unknown. ``evidence`` in the details of ``run.json`` names the rows: ratios [1], then constants [A].
     """
     gain, first = 1.0 + drift, 1.0 + drift[:, :1]
     ratios = np.exp(rows.relative)
-    seen = np.concatenate([gain, first, np.ones_like(gain)], axis=1) * full_scale_a  # constants are held over (1 + d)
+    seen = np.concatenate([gain, first, np.ones_like(gain)], axis=1) * full_scale_a  # constants are stored over 1 + d
     value = np.concatenate([ratios, rows.constant * full_scale_a], axis=1)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * np.concatenate([ratios, seen], axis=1)
     # a_k = (1 + d_k)(1 + d_h); -g_k = (1 + d_1) / (1 + d_k); b_k = o_k + (1 + d_k) o_h,k; c = (1 + d_1) sum o/(1 + d)

@@ -3,7 +3,7 @@
     summaries -> fleet model, evidence rows (learn_fleet) -> fault models of the fleet -> FleetReference
     summaries of any vehicles + FleetReference (estimate_vehicles) -> explanations -> decision, checks -> FleetEstimate
 
-What is said of a vehicle does not depend on which others are estimated with it.
+The estimate of a vehicle does not depend on which others are estimated in the same call.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,37 +40,37 @@ __all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "estimate_vehicles",
 CONFIDENT, SUSPECTED = 0.95, 0.5
 """Confidence from which on a vehicle counts as sound, and probability from which on hardware is suspected. [1]"""
 MOST_RATIO, SURE = 3.0, 0.9
-"""Gain ratio that no two sensors have, and partial correlation from which on noise does not make it. [1]"""
+"""Gain ratio that no two sensors have, and partial correlation from which on a ratio is not due to noise. [1]"""
 LEAST_OWN = 1e-9
-"""Share of a current's variance that is its own at least. [1]"""
+"""Least share of a current's variance that is taken to be independent of the other currents. [1]"""
 LEAST_SAID = 0.005
-"""Probability of a cause that a notice names. [1]"""
+"""Least probability of a cause that a notice names. [1]"""
 LEFT_OUT_CAUSES = ("spikes", "outliers")
-"""Findings whose samples are not in the sums: the other branches of the vehicle are not concerned."""
+"""Causes of findings whose samples are not in the sums: they do not concern the other branches of the vehicle."""
 LINEAR_CAUSES = (*LEFT_OUT_CAUSES, "noise", "switching")
-"""Findings of sensors that have a gain and an offset all the same."""
+"""Causes of findings with which a sensor still has a gain and an offset."""
 VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
-"""Share of the fleet, half width of the hardware drift, and number of vehicles of a variant. [1]"""
+"""Least share of the fleet, half width of the hardware drift, and least number of vehicles of a variant. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FleetReference:
-    """What a fleet says of every vehicle of its kind.
+    """What was learnt from a fleet, with which every vehicle of its kind can be estimated.
 
     Attributes
     ----------
     branches : tuple of str
         Names of the K branches, in the vehicles' own order.
     order : tuple of int
-        Branches as they are worked with, the most moving first: position of each in their own order.
+        Order of the branches in the estimator, the one that moves most first: position of each in their own order.
     feed : int
         Place in that order of the branch that feeds the others, and any load without a sensor.
     read_out : ndarray of shape (M + 1, K)
         Of the fleet model: ideal currents over the inputs, branches in their own order. [A]
     usual_correlation : ndarray of shape (3K, 3K)
-        Of the evidence rows. [1]
+        Usual correlation of the evidence rows that come from drives. [1]
     models : tuple of FaultModel
-        Of the faults.
+        Fault models that explain the fleet, by falling probability.
     usual : ndarray of shape (2, K)
         Mean and mean square of the measured currents on the fleet's usual drive, over full scale.
     misfits : UsualMisfits or None
@@ -82,13 +82,13 @@ class FleetReference:
     vehicles : int
         Number of vehicles learnt from.
     carried : bool
-        Whether enough trusted vehicles carry it, however few there are.
+        Whether enough trusted vehicles carry the reference, so that the fleet may be small.
     agreeing : tuple of float
         Per branch in their own order: share of the vehicles whose slopes agree. [1]
     variants : tuple of float
         Logarithms of the factors on all currents of two variants of the vehicle; empty if there is only one. [1]
     distrusted : mapping of int to str
-        Vehicles called trusted that contradict it, by position among those learnt from, and how.
+        How vehicles that the user trusts contradict that trust, by position among those learnt from.
     """
 
     branches: tuple[str, ...]
@@ -114,7 +114,7 @@ class FleetReference:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether nothing may be corrected by it: a small fleet is compared with itself."""
+        """Whether nothing may be corrected with this reference, as a small fleet is compared with itself."""
         return not self.carried and self.vehicles < FEWEST_VEHICLES
 
     @property
@@ -124,7 +124,7 @@ class FleetReference:
         return float((spread.mean[RowPlaces(K).junction] - spread.shared[:K].sum()) * self.full_scale_a)
 
     def details(self) -> dict[str, object]:
-        """What the run records of it."""
+        """Return what the record of the run keeps of the reference."""
         ordered, model = self.ordered, self.models[0]
         prior, spread = model.prior, np.sqrt(np.diag(model.spread.covariance))
         return {
@@ -275,13 +275,13 @@ def learn_fleet(
 
 
 def _require_balance(fleet: FleetMoments, branches: Sequence[str]) -> None:
-    """Refuse a fleet in which most currents balance in a ratio that is no gain error: a sign or a unit is wrong."""
+    """Refuse a fleet whose currents mostly balance in a ratio that is no gain error: a sign or a unit is wrong."""
     M, K = fleet.inputs, fleet.branches
     covariance = fleet.covariance[:, M:-1, M:-1]
     sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), np.finfo(float).tiny))
     precision = np.linalg.inv(covariance / sd[:, :, None] / sd[:, None, :] + LEAST_OWN * np.eye(K))
     own = np.diagonal(precision, axis1=1, axis2=2)
-    partial = precision[:, 0, 1:] / np.sqrt(own[:, :1] * own[:, 1:])  # correlation with all others the same; < 0 is odd
+    partial = precision[:, 0, 1:] / np.sqrt(own[:, :1] * own[:, 1:])  # minus the partial correlation; < 0: wrong sign
     ratio = precision[:, 0, 1:] / own[:, :1] * sd[:, :1] / sd[:, 1:]
     wrong = (np.abs(partial) > SURE) & ((ratio < 1.0 / MOST_RATIO) | (ratio > MOST_RATIO))
     found = np.flatnonzero(wrong.mean(axis=0) > 0.5)
@@ -296,7 +296,7 @@ def _require_balance(fleet: FleetMoments, branches: Sequence[str]) -> None:
 
 
 def _carried_centre(rows: EvidenceRows, carriers: Mask) -> Array:
-    """Centre (5K,) of the rows that enough trusted vehicles show; NaN in the others."""
+    """Return the centre (5K,) of the rows that enough trusted vehicles show; NaN in the others."""
     fixed = np.full(rows.values.shape[1], np.nan)
     if np.count_nonzero(carriers) >= FEWEST_TRUSTED:
         for row in np.flatnonzero(centre_rows(rows.branches)):
@@ -307,13 +307,13 @@ def _carried_centre(rows: EvidenceRows, carriers: Mask) -> Array:
 
 
 def _agreeing(rows: EvidenceRows, branch: int) -> float:
-    """Share of the vehicles whose slopes of a branch agree."""
+    """Return the share of the vehicles whose slopes of a branch agree."""
     found = densest_clusters(*rows.shown(rows.places.slope(branch)), widest=1.0)
     return found[0].share if found else 0.0
 
 
 def _variants(hardware_drift: Array) -> tuple[float, ...]:
-    """Two variants of the vehicle: groups in each of which a hardware drift is the same, as logarithms."""
+    """Find two variants of the vehicle: two groups, each with one hardware drift in common; return their logarithms."""
     eta = np.log1p(hardware_drift)
     near = np.abs(eta[:, None] - eta[None, :]) < VARIANT_SPREAD
     centres: list[float] = []
@@ -329,7 +329,7 @@ def _variants(hardware_drift: Array) -> tuple[float, ...]:
 
 
 def _causes(models: Sequence[FaultModel], branches: Sequence[str]) -> str:
-    """Causes of what most vehicles share, with their probabilities."""
+    """Name the causes of what most vehicles share, with their probabilities."""
     share = {"a load without a sensor": 0.0}
     for model in models:
         offsets = model.spread.shared[: len(branches)]
@@ -428,7 +428,7 @@ def estimate_vehicles(
 
 
 def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
-    """Loads without a sensor, batches and variants, of each vehicle: explained, and nothing of them is corrected."""
+    """Report loads without a sensor, batches and variants of each vehicle; these are explained, and not corrected."""
     feed, findings = reference.ordered[reference.feed], list[list[SensorFinding]]()
     sensor = sum(model.probability for model in reference.models if model.spread.shared[-1])
     cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
@@ -459,7 +459,7 @@ def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[lis
 
 
 def _unfit(findings: Sequence[SensorFinding], branches: Sequence[str]) -> list[bool]:
-    """Branches that a finding concerns: all, as they share the junction law, unless its samples are left out."""
+    """Tell which branches findings concern: all, as they share the junction law, unless bad samples are left out."""
     everywhere = any(each.cause not in LEFT_OUT_CAUSES or each.branch is None for each in findings)
     return [everywhere or any(each.branch == name for each in findings) for name in branches]
 

@@ -4,8 +4,9 @@ A read-out is C, D and the offset of (2) in [1]_ by least squares on summaries. 
 inputs alone, so noise of the sensors leaves no bias. Fit and simulation of held-out blocks need second moments only.
 
 Candidate banks are the plain inputs; low-passes whose time constants are spaced evenly in their logarithm; and poles of
-systems of several orders, identified from some vehicles together, as they are, and with several poles about each, which
-follow vehicles whose own is a little off. Of those about as good as the best on held-out blocks the smallest is taken.
+systems of several orders, identified from some vehicles together: as they are, or each replaced by several poles about
+it, which suit vehicles whose own pole is a little off. Of those about as good as the best on held-out blocks the
+smallest is taken.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -37,11 +38,11 @@ from ecu_node.database import VehicleDatabase
 __all__ = ["IdentificationReport", "choose_filter_bank", "held_out_snr_db", "identify_fleet", "read_outs"]
 
 POOLED_VEHICLES = 8
-"""Vehicles that a bank is chosen from: more of them hardly move its poles. [1]"""
+"""Number of vehicles that a bank is chosen from: more of them hardly move its poles. [1]"""
 FOLDS = 5
 """Every fifth block is held out, as the published method holds out 20 %."""
 FIRST_HELD_OUT = 2
-"""So that three blocks already have one to judge from, amid the others."""
+"""Index of the first block that is held out: three blocks are enough to have one to judge by, amid the others."""
 ORDERS = (1, 2, 3, 4, 5, 6, 8)
 """Of the pooled systems: a power train as seen at 10 Hz has few modes. [1]"""
 LOW_PASSES = (1, 2, 4, 6)
@@ -53,8 +54,8 @@ SPLITS = (
     ((1.0 / 1.3, 1.3), (1.0 / 1.2, 1.0, 1.2)),
     ((1.0 / 1.15, 1.0, 1.15), (1.0 / 1.15, 1.0, 1.15)),
 )
-"""Factors on the rates of a real pole and of a resonance that replace it: as it is, and so that they follow vehicles
-whose poles are within 15 % of the fleet's. [1]"""
+"""Ways to replace a pole by several: factors on the rate of a real pole, and on that of a resonance. The first way
+leaves poles as they are, the others suit vehicles whose poles are within 15 % of the fleet's. [1]"""
 TOLERANCE_DB = 0.003
 """A bank is large enough if its simulation error, noise included, is this close to the best: at a signal-to-noise
 ratio of 20 dB a misfit of -52 dB. [dB]"""
@@ -79,14 +80,14 @@ def held_out_snr_db(summaries: Sequence[DriveSummary]) -> Array:
     held_out = np.stack([summary.moments[FIRST_HELD_OUT::FOLDS].sum(axis=0) for summary in summaries])
     coefficients, offset_a = read_outs(np.stack([summary.total for summary in summaries]) - held_out, K)
     own = np.broadcast_to(np.eye(K), (len(held_out), K, K))
-    weights = np.concatenate([-coefficients, own, -offset_a[:, None]], axis=1)  # current less what is simulated
+    weights = np.concatenate([-coefficients, own, -offset_a[:, None]], axis=1)  # measured minus simulated current
     error_a2 = np.einsum("nqk,nqr,nrk->nk", weights, held_out, weights) / np.maximum(held_out[:, -1:, -1], 1.0)
     signal_a2 = np.einsum("nkk->nk", covariances(_mean(held_out)))[:, -K - 1 : -1]
     return snr_from_power(signal_a2, np.maximum(error_a2, 0.0))
 
 
 def read_outs(moments: Array, branches: int) -> tuple[Array, Array]:
-    """Coefficients (N, P, K) [A] and offsets (N, K) [A] of K currents over P columns, by moments (N, P+K+1, P+K+1)."""
+    """Fit K currents over P columns, by moments (N, P+K+1, P+K+1): coefficients (N, P, K) [A], offsets (N, K) [A]."""
     mean = _mean(moments)
     covariance = covariances(mean)
     P = moments.shape[1] - branches - 1
@@ -95,7 +96,7 @@ def read_outs(moments: Array, branches: int) -> tuple[Array, Array]:
 
 
 def _mean(moments: Array) -> Array:
-    """Mean products of all columns (N, Q, Q), zero where there is no sample."""
+    """Return the mean products of all columns (N, Q, Q); zero where there is no sample."""
     return np.asarray(moments / np.maximum(moments[:, -1:, -1:], 1.0))
 
 
@@ -138,7 +139,7 @@ def choose_filter_bank(vehicles: Sequence[Sequence[Samples]], *, period_s: float
 
 
 def _candidates(vehicles: Sequence[Sequence[Samples]], period_s: float) -> Iterator[Poles]:
-    """Sets of poles, from the smallest on."""
+    """Yield candidate sets of poles, beginning with the empty one."""
     yield ()
     for count in LOW_PASSES:
         yield low_passes(np.geomspace(LONGEST_S, 2.0 * period_s, count + 2)[1:-1], period_s=period_s)
@@ -161,7 +162,7 @@ def _candidates(vehicles: Sequence[Sequence[Samples]], period_s: float) -> Itera
 
 
 def _error_db(bank: FilterBank, vehicles: Sequence[Sequence[Samples]], settling: int) -> float:
-    """Mean over vehicles and branches of the power of the simulation error on held-out blocks, over the signal's."""
+    """Return the simulation error on held-out blocks over the signal, as mean dB over vehicles and branches."""
     summaries = []
     for drives in vehicles:
         with suppress(DriveError):  # no block: this vehicle cannot judge
@@ -216,7 +217,7 @@ class IdentificationReport:
         return "\n\n".join(part for part in parts if part)
 
     def _by_branch(self) -> dict[str, dict[str, Any]]:
-        """Median over vehicles [dB] and worst vehicle; NaN and nobody where no vehicle could be judged."""
+        """Return median over vehicles [dB] and worst vehicle by branch; NaN and "" where no vehicle could be judged."""
         rows = {}
         for branch in self.branches:
             judged = {name: snr_db[branch] for name, snr_db in self.snr_db.items() if np.isfinite(snr_db[branch])}
@@ -236,12 +237,12 @@ def identify_fleet(path: str | Path, database: VehicleDatabase, *, workers: Work
     database : VehicleDatabase
         DBC and layout.
     workers : Workers
-        Where the drives are read.
+        Processes or cluster that read the drives.
 
     Returns
     -------
     IdentificationReport
-        The bank, and how well it does.
+        The bank, and how well it simulates each vehicle.
 
     Raises
     ------
@@ -265,7 +266,7 @@ def identify_fleet(path: str | Path, database: VehicleDatabase, *, workers: Work
 def _chosen_bank(
     fleet: FleetSource, equipment: Equipment, database: VehicleDatabase, *, workers: Workers
 ) -> FilterBank:
-    """Bank chosen from vehicles that are spread evenly over the fleet."""
+    """Choose a bank from vehicles that are spread evenly over the fleet."""
     names = list(fleet.vehicles)
     some = [names[j] for j in np.unique(np.linspace(0, len(names) - 1, POOLED_VEHICLES).round().astype(int))]
     read, _ = read_vehicles(

@@ -1,16 +1,16 @@
-"""What a fleet says of its faults, and of vehicles without faults: the fault models that explain it.
+"""Learn from a fleet what faults its vehicles have and how vehicles without faults differ: the fault models.
 
-A fault model is a prior of the faults and a model spread (what vehicles without faults differ by). It is learnt by
+A fault model is a prior of the faults and a model spread (how vehicles without faults differ). It is learnt by
 expectation maximisation on the fleet's own evidence (M14):
 
-    expectation    explanations of each vehicle under the present model, weighed
-    maximisation   numbers and sizes of faults, groups of vehicles that share a constant, centre and covariance of what
-                   vehicles without faults differ by
+    expectation    explanations of each vehicle under the present model, weighted
+    maximisation   numbers and sizes of faults, groups of vehicles that share a constant, centre and covariance of the
+                   model spread
 
-The likelihood has several maxima, as a cluster of faulty vehicles can stand for the reference. So it is climbed from
-clusters of the evidence, and all models that explain the fleet about as well are kept, with their probabilities. What a
-whole fleet shares in the junction's constant may be a load without a sensor or an offset of the sensors of a branch:
-each is a model of its own.
+The likelihood has several maxima, as a cluster of faulty vehicles can be mistaken for the reference. So it is climbed
+from several clusters of the evidence, and all models that explain the fleet about as well are kept, with their
+probabilities. What a whole fleet shares in the junction's constant may be a load without a sensor or an offset of the
+sensors of a branch: each is a model of its own.
 """
 
 from collections.abc import Sequence
@@ -48,59 +48,61 @@ from calibrator.estimator.prior import (
 __all__ = ["LEAST_SHARED", "centre_rows", "learn_fault_models"]
 
 MOST_LEARNT, MOST_STARTED = 200, 60
-"""Vehicles that a model is learnt from, and that decide between its starts; more change it less than the faults. [1]"""
+"""Most vehicles that a model is learnt from, and that starts are tried on; more change it less than faults do. [1]"""
 START_ROUNDS, ROUNDS, PRIOR_STEPS = 2, 5, 6
 """Rounds of each start, of the best ones after that, and steps of the prior in each round."""
 MOST_COMMON = 3
-"""Clusters of all slopes that are started from: vehicles with a hardware fault agree with themselves. [1]"""
+"""Clusters of all slopes to start from: slopes of a vehicle with a hardware fault agree with each other, too. [1]"""
 MOST_ZEROS, MOST_CHOICES = 3, 1000
-"""Clusters of the intercepts of a branch that are tried, and about how many choices of them. [1]"""
+"""Clusters of the intercepts of a branch that are tried, and about how many combinations over all branches. [1]"""
 SAME_REFERENCE, NEARLY_AS_MANY = 0.005, 3
-"""Difference of two references in a row below which they are one, some A as drives differ, and by how many votes of
-vehicles another choice of zeros may stay behind the best."""
+"""Difference in any row up to which two references count as one (some A, as drives differ), and number of votes of
+vehicles by which another choice of intercepts may stay behind the best."""
 SAME_DENSITY = 0.2
-"""Logarithm of densities of sizes up to which two priors count as one."""
+"""Difference of the log densities of sizes below which two priors count as one."""
 KEPT_LOG_ODDS = 7.0
-"""Logarithm of the odds against the best model up to which another one is kept."""
+"""Log odds of the best model over another one up to which the other is kept."""
 STARTED_LOG_ODDS, MOST_RIVALS = 15.0, 4
-"""The same after the first rounds, which look at fewer vehicles, and number of references that are kept."""
+"""Such log odds after the first rounds, which use fewer vehicles, and largest number of references that are kept."""
 SAME_START = 0.001
-"""Difference of two starts in every row, in fractions of full scale, below which they are one."""
+"""Difference in any row, in fractions of full scale, below which two starts count as one."""
 LEAST_SHARED = 0.001
-"""Constant that vehicles share below which it does not matter what makes it, in fractions of full scale."""
+"""Size of a constant that vehicles share below which its cause does not matter, in fractions of full scale."""
 GROUP_SD = 0.001
-"""How far vehicles of a group are from what they share, before they are looked at, in fractions of full scale."""
+"""Standard deviation of vehicles of a group from what they share, before they are known, in fractions of full scale."""
 SPREAD_VEHICLES = 5.0
 """Weight of the guessed model spread, in vehicles."""
 SPREAD_OVER_SAMPLING, JUNCTION_SPREAD_OVER_SAMPLING = 2.0, 1.0
-"""Guess of the model spread over the usual sampling deviation: the fleet model errs alike over a whole drive. [1]"""
+"""Guessed model spread over the usual sampling deviation, in rows of the fleet model and of the junction law: errors of
+the fleet model last for a whole drive. [1]"""
 COMMON_SPREADS = (0.0, 0.005)
-"""What vehicles without faults differ by in all branches alike, beyond the guess, to begin with: on recorded trips
-0.5 to 0.8 %. From a narrow spread those at its edge keep a small hardware fault each. [1]"""
+"""Spreads, beyond the guess, that all branches of a vehicle have in common, to start from: on recorded trips it is 0.5
+to 0.8 %. If learning starts with a narrow spread, vehicles at its edge keep a small hardware fault each. [1]"""
 MOST_LOAD_SPREAD = 0.005
-"""Of loads without a sensor over vehicles before anything is known, in fractions of full scale: some A. [1]"""
+"""Largest spread over vehicles of loads without a sensor, before anything is known, over full scale: some A. [1]"""
 LEAST_SPREAD = (1e-5, 1e-6)
 """Least model spread of relative and constant rows: far below any sensor's resolution. [1]"""
 FIRST_DISPERSION = 4.0
-"""Where the variance of intercepts over what their blocks show starts: it falls fast. [1]"""
+"""First value of the dispersion, the variance of intercepts over that expected from their blocks: it falls fast. [1]"""
 TAIL_DEGREES = 8.0
-"""Degrees of freedom of Student's t, as which the vehicles differ in each row: what is far off counts less. [1]"""
+"""Degrees of freedom of Student's t, the distribution of vehicles in each row: those far off count less. [1]"""
 COUNT_VEHICLES = 2.5
 """Weight of the distribution (20) of sparse faults against the fleet's own numbers of faults, in vehicles."""
 OTHERS_STEPS, LEAST_OTHERS = 3, 1e-3
-"""Steps to the numbers of faults of the other vehicles, and the least share of a number that is theirs. [1]"""
+"""Steps that count the faults of the other vehicles, and least share of each count that is left to them. [1]"""
 USED_FITS = 16
-"""Explanations of each vehicle that the model spread is learnt from, the most probable ones."""
+"""Number of explanations of each vehicle that the model spread is learnt from, the most probable ones."""
 LEAST_GROUP, MOST_GROUPS, GROUP_GAIN = 2.0, 2, 5.0
-"""Vehicles of a group, number of groups, and what one must gain in log evidence: three vehicles that agree do."""
+"""Fewest vehicles of a group, most groups, and least log evidence that one must gain: three vehicles that agree do."""
 LEAST_SHARED_GAIN = (0.3, 0.004)
 """Share of the vehicles that agree, and size of a gain error from which on their sensors may share it. [1]"""
 SURELY_SHARED = 2.0
-"""The same size over the standard deviation of one vehicle's gain ratio. Errors of the noise that is taken out of the
-junction regression are alike in all vehicles: they bias ratios by up to half of it, which no mean removes. [1]"""
+"""Size from which on sensors may share a gain error, over the standard deviation of one vehicle's gain ratio. Errors of
+the noise that is taken out of the junction regression are alike in all vehicles: they bias ratios by up to half of it,
+and averaging over vehicles does not remove that. [1]"""
 LEAST_EXPECTED = 1e-6
-"""Least probability of a vehicle without and of one with a sensor fault, whatever share is expected: zero could not be
-outvoted by any evidence. [1]"""
+"""Least probability of a vehicle without and of one with a sensor fault, whatever share is expected: no evidence could
+overcome a probability of zero. [1]"""
 COARSE_LOW, COARSE_HIGH = np.geomspace(0.003, 0.4, 14), np.geomspace(0.015, 1.2, 14)
 """Bounds of sizes that are tried first: drifts [1], offsets in fractions of full scale."""
 FINE = 1.06 ** np.arange(-8, 9)
@@ -108,17 +110,17 @@ FINE = 1.06 ** np.arange(-8, 9)
 TAILS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Shares of faults beyond the bounds that are tried. [1]"""
 LEAST_RANGE = (2.0, 1.2)
-"""Largest over smallest size of usual drifts and of offsets, at least: vehicles that all have the same drift are the
-reference. All sensors of a branch may have the same offset, where the load is declared. [1]"""
+"""Least ratio of the upper to the lower bound of drifts and of offsets. Vehicles that all have the same drift would be
+the reference; all sensors of a branch may have the same offset, where the load is declared. [1]"""
 SIZE_FAULTS, ANY_SIZE = 1.0, TAIL_DENSITY * np.gradient(GRID)
-"""Weight of a fault of any size against the fleet's own when bounds are learnt, in faults: one fault alone would have
-them close about it. Probability of its size at :data:`~calibrator.estimator.prior.GRID`, log-uniform."""
+"""Weight, in faults, of a fault of any size that is added when bounds are learnt: a single fault would make them close
+about it. And the log-uniform probability of its size at :data:`~calibrator.estimator.prior.GRID`."""
 SIZE_STARTS = ((0.004, 1.0), (0.03, 0.4), (0.1, 0.2))
-"""Bounds from which the prior is climbed again: small faults that combine can stand for large ones that do not."""
+"""Bounds from which the prior is climbed again: several small faults together can look like fewer large ones."""
 
 
 def centre_rows(branches: int) -> Mask:
-    """Rows whose centre the fleet shows, shape (5K,): slopes, intercepts, junction constant; ratios have none."""
+    """Mark rows whose centre is learnt, shape (5K,): slopes, intercepts, junction constant; that of ratios is 0."""
     free, at = np.zeros(5 * branches, bool), RowPlaces(branches)
     free[at.slopes] = free[at.intercepts] = free[at.junction] = True
     return free
@@ -142,7 +144,8 @@ def learn_fault_models(
     feed : int
         Branch that carries loads without a sensor.
     fixed : ndarray of shape (5K,) or None
-        Centre of rows that trusted vehicles carry; NaN in the others. None: the fleet carries all. [1]
+        Centre of the rows for which trusted vehicles are the reference; NaN in the others. None: the whole fleet is the
+        reference for all rows. [1]
     load : float or None
         Load that no branch measures, in fractions of full scale, if it is known. [1]
     known : Prior or None
@@ -199,7 +202,7 @@ class _Learner:
         self.design = row_design(K, feed)
 
     def _guessed_spread(self) -> Array:
-        """A multiple of the usual sampling covariance, in rows that the fleet model or the junction law makes."""
+        """Guess the model spread: a multiple of the usual sampling covariance, in rows that come from drives."""
         rows, K, at = self.rows, self.rows.branches, self.at
         variance = np.diagonal(rows.covariance, axis1=1, axis2=2).copy()
         variance[:, at.intercepts] = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)
@@ -212,15 +215,15 @@ class _Learner:
         return np.diag(factor**2 * guess)
 
     def clusters(self, row: int, most: int = 1, farthest: float = np.inf) -> list[float]:
-        """Centres of the densest clusters of a row, 0 if there is none."""
+        """Find the centres of the densest clusters of a row; 0 if there is none."""
         found = densest_clusters(*self.rows.shown(row), most=most, farthest=farthest)
         return [cluster.centre for cluster in found] or [0.0]
 
     def initial_intercepts(self, constant: float) -> list[Array]:
-        """Intercepts of vehicles without faults, each of shape (K,), that add up to a constant of the junction.
+        """Propose intercepts of vehicles without faults, each of shape (K,), that add up to the junction's constant.
 
-        All but one are clusters. The first choice is of the densest ones, and the feeding branch takes what is left;
-        others follow that about as many vehicles show, or more, as a cluster of few vehicles may be chance.
+        All but one are centres of clusters. The first proposal has the densest clusters, and the feeding branch takes
+        what is left. Others follow that about as many vehicles support, or more, as a cluster of few may be chance.
         """
         K = self.rows.branches
         most = min(MOST_ZEROS, int(MOST_CHOICES ** (1.0 / K)))
@@ -232,7 +235,7 @@ class _Learner:
             chosen.append(zeros)
         tried = np.concatenate(chosen)
         votes = np.zeros(len(tried), np.int64)
-        for k, near in product(range(K), (SAME_START, SAME_REFERENCE)):  # who agrees closely has two votes
+        for k, near in product(range(K), (SAME_START, SAME_REFERENCE)):  # close agreement has two votes
             values, sd = self.rows.shown(self.at.intercept(k))
             agree = np.abs(values[:, None] - tried[:, k]) < np.maximum(3.0 * sd, near)[:, None]
             votes += np.count_nonzero(agree, axis=0)
@@ -244,11 +247,11 @@ class _Learner:
         return found
 
     def initial_slopes(self) -> list[Array]:
-        """Slopes of vehicles without faults, each of shape (K,), as logarithms.
+        """Propose slopes of vehicles without faults, each of shape (K,), as logarithms.
 
         The fleet model may be off by a factor in each branch. How these factors differ between branches follows from
         two slopes and their gain ratio, in every vehicle and whatever its faults; where ratios are vague, clusters of
-        the slopes are tried as well. What the factors have in common are clusters of all slopes.
+        the slopes are tried as well. The factor that all branches have in common comes from clusters of all slopes.
         """
         rows, K, at = self.rows, self.rows.branches, self.at
         by_ratios, by_clusters, first = np.zeros(K), np.zeros(K), at.slope(0)
@@ -267,15 +270,15 @@ class _Learner:
         return found
 
     def initial_centres(self) -> list[Array]:
-        """Where to start, from what vehicles agree on.
+        """Propose centres to start from, by what vehicles agree on.
 
-        Slopes and zeros are those of clusters. The zero of the feeding branch has several. Intercepts of a vehicle
-        without faults add up to its junction constant, as do those of a centre.
+        Slopes and intercepts are those of clusters; of the feeding branch's intercept several clusters are tried. The
+        intercepts of a centre add up to its junction constant, as those of a vehicle without faults do.
         """
         K, at = self.rows.branches, self.at
         intercept = at.intercept(self.feed)
         others = sum(self.clusters(at.intercept(k))[0] for k in range(K) if k != self.feed)
-        # The junction shows its constant most exactly. What is larger than any load comes of zeros that few share.
+        # The junction law shows the constant most exactly. Values beyond any load come from intercepts that few share.
         constants = [*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0]
         constants += [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         constants = [constant for constant in constants if abs(constant) <= LARGEST_SHARED]
@@ -290,7 +293,7 @@ class _Learner:
         return found
 
     def initial_model(self, centre: Array, common_spread: float = 0.0) -> FaultModel:
-        """Model before anything is known but a centre, and by how much vehicles differ in all branches alike [1]."""
+        """Make a first model from a centre, and from the spread that all branches of a vehicle have in common. [1]"""
         rows, K = self.rows, self.rows.branches
         junction, eta = self.at.junction, self.design[:, self.parameters.eta]
         covariance = self.guess + self.least + common_spread**2 * np.outer(eta, eta)
@@ -306,7 +309,7 @@ class _Learner:
         return FaultModel(spread=spread, priors=((1.0, self.known or first_prior(K)),))
 
     def climb(self, model: FaultModel, rounds: int, *, begun: bool = False) -> FaultModel:
-        """Some rounds of expectation and maximisation; the best model that was met."""
+        """Do some rounds of expectation and maximisation, and return the best model of all rounds."""
         best = replace(model, log_evidence=-np.inf)
         for n in range(rounds):
             draws = explain(self.rows, model, feed=self.feed)
@@ -320,7 +323,7 @@ class _Learner:
         return best if best.log_evidence > -np.inf else model
 
     def _recentred(self, model: FaultModel) -> FaultModel:
-        """The model about the largest group, if it is not the vehicles of no group that are most."""
+        """Move the centre to the largest group, if that has more vehicles than are in no group."""
         prior, spread, at = model.prior, model.spread, self.at
         shares = prior.group_share
         if not shares.size or shares.max() <= 1.0 - shares.sum() or spread.shared.any() or not self.free[at.junction]:
@@ -331,7 +334,7 @@ class _Learner:
         return replace(model, spread=replace(spread, mean=mean), priors=((1.0, alone),), log_evidence=-np.inf)
 
     def rivals(self, models: Sequence[FaultModel], log_odds: float) -> list[FaultModel]:
-        """The best model, and those about as good with another reference: which of them is right is then open."""
+        """Select the best model, and those about as good with another reference: which of them is right is open."""
         found = list[FaultModel]()
         for model in sorted(models, key=lambda model: -model.log_evidence):
             apart = (np.abs(model.spread.mean - other.spread.mean).max() > SAME_REFERENCE for other in found)
@@ -340,7 +343,7 @@ class _Learner:
         return found[:MOST_RIVALS]
 
     def variants(self, references: Sequence[FaultModel]) -> list[FaultModel]:
-        """These models with each cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
+        """Vary these models by the cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
         K, at = self.rows.branches, self.at
         found = [
             (plausible, replace(model, spread=replace(model.spread, shared=shared)))
@@ -349,14 +352,14 @@ class _Learner:
         ]
         for model in references:
             if not len(model.prior.group_centre):
-                # Sensors of a batch agree in what they read; through their gain errors it looks like different loads.
+                # Sensors of a batch read the same offset; seen through their gain errors it looks like different loads.
                 shared = np.append(model.spread.shared[:-1], 1.0)
                 spread = replace(model.spread, shared=shared)
                 batch = self.climb(replace(model, spread=spread), START_ROUNDS, begun=True)
                 if batch.prior.group_share.max(initial=0.0) > 1.0 / len(self.rows):
                     c0 = float(batch.spread.mean[at.junction])
                     found.append((_log_plausible(c0, 0.0, batch.prior, of_sensor=True), batch))
-        slopes = np.array([self.clusters(at.slope(k))[0] for k in range(K)])  # with what most vehicles' sensors share
+        slopes = np.array([self.clusters(at.slope(k))[0] for k in range(K)])  # includes what most sensors share
         for model, shared in product(references, self._shared_gains()):
             mean = model.spread.mean.copy()
             mean[at.slopes] = np.where(self.free[at.slopes], slopes - shared[K : 2 * K], mean[at.slopes])
@@ -364,7 +367,7 @@ class _Learner:
             found.append((0.0, self.climb(fresh, START_ROUNDS)))
         if len(found) > 1:
             climbed = [(plausible, self.climb(model, START_ROUNDS, begun=True)) for plausible, model in found]
-            # Where no vehicle is left in a group, its cause is no question.
+            # If no vehicle is left in a group, the cause of the group does not matter.
             found = [
                 (p, model)
                 for p, model in climbed
@@ -373,7 +376,7 @@ class _Learner:
         evidence = np.array([model.log_evidence for _, model in found])
         of_gains = np.array([model.spread.shared[K : 2 * K].any() for _, model in found])
         if self.free[at.slopes].all() and of_gains.any():
-            # Which branch it is shows in the noise of the constants alone, seen through the gain: that is no evidence.
+            # Models of different branches differ only in the noise of the constants, scaled by the gain: no evidence.
             evidence[of_gains] = evidence[of_gains].max()
         log_odds = evidence + [plausible for plausible, _ in found]
         odds = np.where(log_odds > log_odds.max() - KEPT_LOG_ODDS, np.exp(log_odds - log_odds.max()), 0.0)
@@ -381,7 +384,7 @@ class _Learner:
         return [replace(model, probability=share) for share, (_, model) in kept if share]
 
     def _shared_constants(self, c0: float, prior: Prior) -> list[tuple[float, Array]]:
-        """What vehicles may share in the junction's constant, and how plausible it is, as a logarithm."""
+        """List what vehicles may share in the junction's constant, and the logarithm of how plausible it is."""
         K = self.rows.branches
         found: list[tuple[float, Array]] = []
         for of_sensor in (False, True) if len(prior.group_centre) else (False,):
@@ -399,7 +402,7 @@ class _Learner:
         return found
 
     def _shared_gains(self) -> list[Array]:
-        """Gains that the sensors of a branch may share: most vehicles break the junction law alike."""
+        """List gains that the sensors of a branch may share, if enough vehicles break the junction law alike."""
         K = self.rows.branches
         off = np.zeros(K)
         for k in range(1, K):
@@ -419,7 +422,7 @@ class _Learner:
         return [of_first] * bool(alike) + [of_others] * bool(K == 2 or not alike)
 
     def with_modes(self, model: FaultModel) -> FaultModel:
-        """The same model with all priors that explain the fleet about as well; several starts, one set of draws."""
+        """Give the model all priors that explain the fleet about as well: from several starts, by one set of draws."""
         if self.known is not None:
             return model
         draws = explain(self.rows, model, feed=self.feed)
@@ -452,7 +455,7 @@ class _Learner:
         return prior
 
     def _next_shares(self, draws: Draws, prior: Prior) -> Prior:
-        """Numbers of faults, loads and groups from the weights of the draws."""
+        """Update the numbers of faults, loads and groups from the weights of the draws."""
         weight, _ = weigh(draws, prior)
         N, load = len(weight), self.parameters.load
         tally = _tally(draws, weight, prior)
@@ -480,7 +483,7 @@ class _Learner:
         )
 
     def _with_group(self, draws: Draws, prior: Prior) -> Prior:
-        """The prior with one group more, if vehicles that share a constant of the feeding branch make it likelier."""
+        """Add a group of vehicles that share a constant of the feeding branch, if the fleet's evidence gains enough."""
         N, fits = len(draws.values), draws.fits
         weight = weigh(draws, prior)[0][..., 0].sum(axis=2)
         found = []
@@ -512,7 +515,7 @@ class _Learner:
         return grouped if gain > GROUP_GAIN else prior
 
     def _next_spread(self, draws: Draws, weight: Array, spread: Spread) -> Spread:
-        """Centre, covariance and dispersion of what the explanations leave of the rows, (M14a) and (M14b)."""
+        """Update centre, covariance and dispersion from the residuals of the explanations, (M14a) and (M14b)."""
         rows, b, N = self.rows, self.at.intercepts, len(self.rows)
         of_fit = weight.sum(axis=(2, 3))
         top = np.argsort(-of_fit, axis=1, kind="stable")[:, :USED_FITS]
@@ -558,10 +561,10 @@ class _Learner:
 
 
 def _tally(draws: Draws, weight: Array, prior: Prior) -> Array:
-    """Expected number of vehicles with so many hardware and sensor faults, shape (K + 1, 2K + 1).
+    """Count the expected vehicles with each number of hardware and of sensor faults, shape (K + 1, 2K + 1).
 
-    Each vehicle is judged by the numbers of faults of the others (CVB0 of [1]_): a few vehicles would else confirm what
-    their own faults have made likely.
+    Each vehicle is judged by the numbers of faults of the others (CVB0 of [1]_): otherwise a few vehicles would confirm
+    what their own faults have made likely.
 
     .. [1] A. Asuncion et al., "On smoothing and inference for topic models", UAI 2009.
     """
@@ -581,7 +584,7 @@ def _tally(draws: Draws, weight: Array, prior: Prior) -> Array:
 
 
 def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
-    """Bounds and tail of the sizes of drifts and of offsets, each averaged over what the fleet leaves open."""
+    """Update bounds and tail of the sizes of drifts and offsets, averaged over the values that the fleet allows."""
     slabs = [prior.gain, prior.offset]
     for kind in (GAIN, OFFSET):
         best, odds, least = slabs[kind], {}, LEAST_RANGE[kind]
@@ -609,10 +612,10 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
 
 
 def _log_plausible(c0: float, offset: float, prior: Prior, *, of_sensor: bool) -> float:
-    """Prior of a cause of what vehicles share, as a logarithm.
+    """Return the log prior of a cause of what vehicles share.
 
-    An offset that most sensors share is rarer than one of a few; a load takes current; and currents that sum to zero
-    although both a load and an offset are there would do so by chance.
+    An offset that most sensors share is rarer than one of a few; a load can only take current; and a load and an offset
+    would cancel only by chance.
     """
     levels = c0 + np.append(0.0, prior.group_centre)  # what the currents of the vehicles of each group sum to
     shares = np.append(1.0 - prior.group_share.sum(), prior.group_share)

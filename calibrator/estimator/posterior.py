@@ -22,11 +22,11 @@ over draws from its fit. A draw weighs
     w = p(rows | draw) p(draw) / q(draw)                                                                      (M17)
 
 with the prior p of the fleet and the density q of the draws. So the prior may have any shape, and probabilities,
-confidence and harm are sums over the same draws. A constant of the feeding branch that vehicles share (a group of the
-prior) is one more thing that a draw may have; column 0 of the weights is a vehicle of no group.
+confidence and harm are sums over the same draws. A vehicle may also belong to a group of the prior, whose vehicles
+share a constant of the feeding branch; column 0 of the weights is for a vehicle of no group.
 
-A vehicle has some ten thousand residuals to evaluate in a millisecond, so the loops are compiled by numba; in them rows
-and parameters go by these numbers.
+For each vehicle some ten thousand residuals are evaluated in a millisecond, so the loops are compiled by numba; they
+address rows and parameters by the numbers above.
 """
 
 from dataclasses import dataclass, field
@@ -68,11 +68,11 @@ Integers = NDArray[np.int64]
 WIDE_SD = 0.4
 """Standard deviation of the wide Gaussian under which every support is fitted. [1]"""
 MARGIN = 12.0
-"""Logarithm of the weight below the best one from which on a support is not fitted any further."""
+"""Distance of a support's log weight below the best one's from which on the support is not fitted any further."""
 MOST_FITTED = 96
-"""Supports of a vehicle that are kept, the most probable ones."""
+"""Largest number of supports of a vehicle that are kept, the most probable ones."""
 MOST_PARAMETERS = 6
-"""Largest number of parameters of a support; 20 faults of a hundred parameters leave few vehicles with more."""
+"""Largest number of parameters of a support; if 20 % of all parameters are faulty, few vehicles have more."""
 MOST_TURN = 3.0
 """Largest logarithm by which a measured ratio can be off. [1]"""
 LOWEST, HIGHEST, STEP = -2.5, 1.2, 0.5
@@ -82,9 +82,9 @@ MOST_STEPS, LAST_STEP = 7, 1e-7
 DIFFERENCE = 1e-6
 """Step by which residuals are differentiated: rounding and curvature leave 1e-9 of a derivative. [1]"""
 DRAWS = 64
-"""Draws from each explanation; half of them mirror the others."""
+"""Number of draws from each explanation; half of them mirror the others."""
 OPEN_SD = 0.02
-"""Standard deviation of a parameter from which on draws are weighed by the exact likelihood: rows curve. [1]"""
+"""Standard deviation of a parameter above which draws need the exact likelihood: rows are not linear so far out. [1]"""
 LOAD_GIVES_NONE = 100.0
 """Logarithm of the odds against a load that would supply current: finite, so that every vehicle has an explanation."""
 GAIN, OFFSET, LOAD = 0, 1, 2
@@ -93,7 +93,7 @@ LOG_FIRST, LOG_STEP = float(np.log(GRID[0])), float(np.log(GRID[1] / GRID[0]))
 LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
 
 MISFIT_SD = 4.0
-"""Standard deviations of chi square from which on a vehicle's evidence is widened. [1]"""
+"""Excess of chi square, in its standard deviations, above which a vehicle's covariance is made wider. [1]"""
 
 
 class Evidence(NamedTuple):
@@ -106,11 +106,11 @@ class Evidence(NamedTuple):
     means : ndarray of shape (N, 2, K)
         Means of the fleet model's and of the measured currents, about which the lines of the constants pivot. [1]
     centre : ndarray of shape (5K,)
-        Of the rows of vehicles without faults. [1]
+        Centre of the rows of vehicles without faults. [1]
     shared : ndarray of shape (2K + 1,)
-        What all sensors of a branch share: offsets, in fractions of full scale, which the centre holds, and logarithms
-        of gains; last 1 if what a group of vehicles shares is an offset of the feeding sensor, 0 if it is a load. An
-        offset does not grow with the current: seen through a gain error it is another one, and a load is not (M16).
+        What all sensors of a branch share: K offsets, in fractions of full scale, which the centre includes, and K
+        logarithms of gains. The last entry is 1 if what a group of vehicles shares is an offset of the feeding sensor,
+        and 0 if it is a load: seen through a gain error an offset is another one, and a load is not (M16).
     precision, precision_relative : ndarray of shape (N, 5K, 5K)
         Inverse covariance of all rows, and of the relative rows alone; zero for the others.
     log_scale : ndarray of shape (N,)
@@ -135,7 +135,7 @@ class Fits(NamedTuple):
     Attributes
     ----------
     number : ndarray of int of shape (N,)
-        Number of explanations of each vehicle; what stands behind them in the other arrays means nothing.
+        Number of explanations of each vehicle; entries beyond it in the other arrays are meaningless.
     support : ndarray of bool of shape (N, Q, P)
         Which parameters are not zero.
     hardware, sensor : ndarray of int of shape (N, Q)
@@ -161,7 +161,7 @@ class Fits(NamedTuple):
 
 
 def evidence_of(values: Array, covariance: Array, means: Array, *, centre: Array, shared: Array, feed: int) -> Evidence:
-    """Evidence with the inverses of its covariance (N, 5K, 5K); the other parameters as in :class:`Evidence`."""
+    """Make the evidence with the inverses of its covariance (N, 5K, 5K); other arguments as in :class:`Evidence`."""
     rows = values.shape[1]
     relative = RowPlaces(rows // 5).relative
     precision, of_relative = np.linalg.inv(covariance), np.zeros_like(covariance)
@@ -179,17 +179,17 @@ def evidence_of(values: Array, covariance: Array, means: Array, *, centre: Array
 
 
 def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> Fits:
-    """Fit the supports that may matter.
+    """Fit those supports that may matter in each vehicle.
 
     Parameters
     ----------
     evidence : Evidence
         Of N vehicles.
     log_prior : ndarray of shape (K + 1, 2K + 1)
-        Logarithm of the prior probability of one support with so many hardware and sensor faults, roughly: it decides
-        which supports are looked at closely.
+        Rough logarithm of the prior probability of one support, by its numbers of hardware and sensor faults; it
+        decides which supports are looked at closely.
     log_load : float
-        The same of a load without a sensor.
+        Rough logarithm of the prior probability of a load without a sensor.
 
     Returns
     -------
@@ -210,7 +210,7 @@ def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> F
         chi2=np.zeros((N, MOST_FITTED)),
     )
     backwards = np.maximum.accumulate(np.maximum.accumulate(log_prior[::-1, ::-1], axis=0), axis=1)
-    best_ahead = np.ascontiguousarray(backwards[::-1, ::-1])  # of as many faults or more: few may be rarer than many
+    best_ahead = np.ascontiguousarray(backwards[::-1, ::-1])  # of as many faults or more, as few may be rarer
     _fit_all(evidence, log_prior, best_ahead, log_load, fits)
     at, on = ParameterPlaces(K), fits.support
     fits.hardware[:] = on[:, :, at.eta] + on[:, :, at.hardware_offsets].sum(axis=2)
@@ -221,7 +221,7 @@ def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> F
 
 
 def row_residuals(evidence: Evidence, theta: Array) -> Array:
-    """What parameters (N, Q, P) leave of the rows of N vehicles, shape (N, Q, 5K)."""
+    """Return the residuals of the rows of N vehicles with parameters (N, Q, P), shape (N, Q, 5K)."""
     left = np.empty((*theta.shape[:2], evidence.values.shape[1]))
     _all_residuals(evidence, theta, left)
     return left
@@ -236,7 +236,7 @@ def _all_residuals(evidence: Evidence, theta: Array, left: Array) -> None:
 
 @inner
 def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
-    """Fill e with the rows of vehicle j less what parameters make of them, (M11)."""
+    """Fill e with the residuals of vehicle j: its rows minus what the parameters predict, (M11)."""
     y, means, centre = evidence.values[j], evidence.means[j], evidence.centre
     shared, feed, K = evidence.shared, evidence.feed, len(evidence.values[j]) // 5
     c, oh_last = 3 * K - 1, 0.0  # first of the intercepts; hardware offset of the last branch
@@ -254,7 +254,7 @@ def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
         seen = y[c + k] * unit  # a constant as seen in true currents
         seen += means[0, k] * (exp(theta[0]) * expm1(min(e[k], MOST_TURN)) - e[k])  # pivots with its slope
         hardware = theta[K + 1 + k] if k < K - 1 else oh_last
-        batch = shared[k] * (unit - 1.0)  # of what the centre holds
+        batch = shared[k] * (unit - 1.0)  # change of the offset that the centre includes
         e[c + k] = seen - centre[c + k] - hardware - theta[2 * K + k] - batch
         e[c + K + 1 + k] = y[c + K + 1 + k] * unit - centre[c + K + 1 + k] - theta[2 * K + k]
         junction -= theta[2 * K + k] + batch
@@ -321,11 +321,11 @@ def _without(H: Array, g: Array, i: int) -> tuple[Array, Array]:
 def _rough_weights(
     evidence: Evidence, j: int, log_prior: Array, best_ahead: Array, log_load: float
 ) -> tuple[Array, Integers]:
-    """Rough log weights of the supports that may matter, and the supports as bits.
+    """Return rough log weights of the supports that may matter, and the supports as bits.
 
-    For each set of gains, which the relative rows tell, the constants are linear: one after the other is eliminated
-    from the normal equations, depth first. A branch of the search ends where even all constants together could not
-    make it matter, with the best prior that as many faults or more can have.
+    Once a set of gains is fitted to the relative rows, the constants are linear: they are eliminated one by one from
+    the normal equations, depth first. A branch of the search ends where it could not matter even with all remaining
+    constants, and with the best prior of as many faults or more.
     """
     K, log_wide = evidence.values.shape[1] // 5, log(WIDE_SD)
     P, feeding_offset = 3 * K + 1, 2 * K + evidence.feed
@@ -347,7 +347,7 @@ def _rough_weights(
         for _ in range(n):
             weight += 0.5 * g[0] ** 2 / H[0, 0] - 0.5 * log(H[0, 0]) - log_wide
             H, g = _without(H, g, 0)
-        possible = 0.5 * (g * np.linalg.solve(H, g)).sum()  # by all constants together
+        possible = 0.5 * (g * np.linalg.solve(H, g)).sum()  # what all constants together could add
         hardware = mask & 1
         sensor = n - hardware
         scores.append(weight + log_prior[hardware, sensor])
@@ -373,7 +373,7 @@ def _rough_weights(
 
 @inner
 def _refine(evidence: Evidence, j: int, chosen: Integers, theta: Array, root: Array) -> tuple[float, float]:
-    """Gauss-Newton on all rows; fills theta and root, returns log evidence and chi2."""
+    """Fit the chosen parameters by Gauss-Newton on all rows; fill theta and root, return log evidence and chi2."""
     for _ in range(MOST_STEPS):
         H, g, chi2 = _normal_equations(evidence, j, theta, chosen, evidence.precision[j])
         if not len(chosen):
@@ -398,7 +398,7 @@ def _refine(evidence: Evidence, j: int, chosen: Integers, theta: Array, root: Ar
 
 
 class Draws(NamedTuple):
-    """Draws of N vehicles from Q explanations each, M of each, before they are weighed.
+    """Draws from the explanations of N vehicles, not weighted yet: M from each of Q explanations.
 
     Attributes
     ----------
@@ -407,9 +407,9 @@ class Draws(NamedTuple):
     values : ndarray of shape (N, Q, M, P)
         Parameters. [1]
     place : ndarray of int of shape (N, Q, M, P)
-        Where the sizes of faults and loads lie in the grid of the prior.
+        Index in the grid of the prior of the size of each fault and load.
     base : ndarray of shape (N, Q, M)
-        Logarithm of p(rows | draw) / q(draw), with the densities of signs and of the change to sizes.
+        Logarithm of p(rows | draw) / q(draw), with the probability of the signs and the change of variables to sizes.
     feed : int
         Branch that carries loads without a sensor.
     shared : ndarray of shape (2K + 1,)
@@ -463,9 +463,9 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
                     x[p] = theta[p]
                     for i in chosen:
                         x[p] += root[p, i] * normal[m, i]
-                    weight += 0.5 * (x[p] / WIDE_SD) ** 2 + log(WIDE_SD) + LOG_ROOT_TAU  # ... whose density goes
+                    weight += 0.5 * (x[p] / WIDE_SD) ** 2 + log(WIDE_SD) + LOG_ROOT_TAU  # ... which is taken out
                     fitted += (theta[p] ** 2 - x[p] ** 2) / WIDE_SD**2 + normal[m, p] ** 2
-                for k in range(K):  # known is the offset, not what a doubtful gain makes of it in true currents
+                for k in range(K):  # the offset is known, but with a doubtful gain its size in true currents is not
                     change = x[1 + k] - theta[1 + k]
                     if change != 0.0 and fits.support[j, q, 2 * K + k]:
                         x[2 * K + k] = (x[2 * K + k] + theta[2 * K + k] * change) * exp(-change)
@@ -495,7 +495,7 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
 def _terms(
     draws: Draws, prior: "_Tables", j: int, q: int, m: int, places: Integers, kinds: Integers
 ) -> tuple[float, int]:
-    """Prior of a draw but for the feeding branch: log weight so far; fills places and kinds of the sizes it has."""
+    """Return a draw's log weight without sizes and feeding branch, and how many sizes it has; fill places and kinds."""
     fits, place = draws.fits, draws.place[j, q, m]
     K = place.shape[0] // 3
     n = 0
@@ -510,7 +510,7 @@ def _terms(
 def _feeding(
     draws: Draws, prior: "_Tables", j: int, q: int, m: int, g: int, places: Integers, kinds: Integers, n: int
 ) -> tuple[float, int]:
-    """Prior of the feeding branch's constant in a vehicle of group g (0: of none); -inf where it cannot be."""
+    """Return the log prior of the feeding branch's constant in group g (0: no group), -inf if impossible; and n."""
     fits, x = draws.fits, draws.values[j, q, m]
     K = x.shape[0] // 3
     offset, load = 2 * K + draws.feed, 3 * K
@@ -526,7 +526,7 @@ def _feeding(
             return prior.log_none, n + 1
         gain = exp(x[1 + draws.feed] + draws.shared[K + draws.feed])
         own = x[offset] * gain - prior.group_centre[g - 1] * (1.0 if draws.shared[2 * K] else gain)
-        places[n], kinds[n] = _place(abs(own)), OFFSET  # a fault beside what the group shares
+        places[n], kinds[n] = _place(abs(own)), OFFSET  # its own fault beside what the group shares
         return prior.log_group[g - 1], n + 1
     return (prior.log_none if g == 0 else -np.inf), n
 
@@ -557,7 +557,7 @@ def _tables(prior: Prior) -> _Tables:
 
 
 def weigh(draws: Draws, prior: Prior) -> tuple[Array, Array]:
-    """Weights of the draws under a prior.
+    """Weight the draws by a prior (M17).
 
     Parameters
     ----------
@@ -569,7 +569,7 @@ def weigh(draws: Draws, prior: Prior) -> tuple[Array, Array]:
     Returns
     -------
     weight : ndarray of shape (N, Q, M, 1 + g)
-        Posterior probability of each draw in a vehicle of no group, and of each group; sums to 1 over a vehicle.
+        Posterior probability of each draw with the vehicle in no group, and in each group; sums to 1 for a vehicle.
     log_evidence : ndarray of shape (N,)
         Logarithm of the probability density of each vehicle's rows.
     """
@@ -603,25 +603,25 @@ def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array) -> 
 
 
 def size_evidence(draws: Draws, prior: Prior, kind: int, candidates: Array, *, every: int = 4) -> Array:
-    """Log evidence of a fleet if the sizes of one kind of faults had other densities.
+    """Compute the log evidence of a fleet for other densities of the sizes of one kind of fault.
 
     Parameters
     ----------
     draws : Draws
         Of N vehicles.
     prior : Prior
-        Of their fleet otherwise.
+        Prior of their fleet in all other respects.
     kind : int
         :data:`GAIN` or :data:`OFFSET`.
     candidates : ndarray of shape (C, G)
         Densities at the grid of the prior.
     every : int
-        Only every so many draws of an explanation are looked at.
+        Only every n-th draw of an explanation is used, for n = ``every``.
 
     Returns
     -------
     ndarray of shape (C,)
-        Sum over the vehicles.
+        Log evidence with each candidate, summed over the vehicles.
     """
     evidence = np.zeros(len(candidates))
     _size_evidence(draws, _tables(prior), kind, np.ascontiguousarray(np.log(candidates).T), every, evidence)
@@ -664,16 +664,17 @@ def _size_evidence(draws: Draws, prior: _Tables, kind: int, candidates: Array, e
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """What vehicles without any fault differ by in the rows of the evidence: the model spread.
+    """Model spread: how vehicles without any fault are distributed in the rows of the evidence.
 
     Attributes
     ----------
     mean : ndarray of shape (5K,)
-        Centre of the fleet in each row: what is left of the error of the reference, and the mean unmeasured load. [1]
+        Centre of the fleet in each row: remaining error of the reference, and mean unmeasured load. [1]
     covariance : ndarray of shape (5K, 5K)
-        Over vehicles. [1]
+        Covariance over the vehicles. [1]
     dispersion : ndarray of shape (K,)
-        Variance of each intercept over what its blocks show, at least 1: a model errs alike for longer than a block.
+        Actual variance of each intercept over that expected from its blocks, at least 1: errors of a model last longer
+        than a block.
     shared : ndarray of shape (2K + 1,)
         See :class:`calibrator.estimator.posterior.Evidence`.
     """
@@ -691,13 +692,13 @@ class FaultModel:
     Attributes
     ----------
     probability : float
-        Of this model, over all that are kept.
+        Probability of this model among all that are kept.
     spread : Spread
         Of vehicles without faults.
     priors : tuple of (float, Prior)
         Priors of the faults that explain the fleet about as well, with their probabilities; the first is the best.
     log_evidence : float
-        Of the vehicles that it was learnt from.
+        Log evidence of the vehicles that it was learnt from.
     """
 
     probability: float = 1.0
@@ -712,10 +713,10 @@ class FaultModel:
 
 
 def explain(rows: EvidenceRows, model: FaultModel, *, feed: int) -> Draws:
-    """Explain vehicles under the best prior and the model spread of a model; their draws are not weighed yet.
+    """Explain vehicles with the best prior and the model spread of a fault model; their draws are not weighted yet.
 
-    A vehicle that even its best explanation leaves too much of has a wider covariance, in proportion to its chi square
-    (Birge ratio): something about it is not in the model, and nothing about it is known as well as it seems.
+    Where even the best explanation of a vehicle fits badly, its covariance is multiplied by chi square over the degrees
+    of freedom (Birge ratio): something about it is not in the model, and nothing is known as well as it seems.
     """
     prior, spread = model.prior, model.spread
     n_h, n_s = np.indices(prior.counts.shape)

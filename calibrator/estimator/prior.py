@@ -1,8 +1,8 @@
 """Prior of the faults of a fleet: how many a vehicle has, how large they are, and what several vehicles share.
 
 Sizes are uniform between two bounds (a slab), with a log-uniform tail far below and above them, so that no size is
-impossible. Numbers of faults are distributed as (20) of [1]_ has it: n of the 3K parameters are not zero, and in some
-vehicles none of the hardware (M13). Bounds, tail and numbers are learned: :mod:`calibrator.estimator.learning`.
+impossible. Numbers of faults follow (20) of [1]_: n of the 3K parameters are not zero, and in some vehicles no hardware
+parameter is (M13). Bounds, tail and numbers are learned from the fleet: :mod:`calibrator.estimator.learning`.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -19,13 +19,13 @@ __all__ = ["GRID", "LARGEST_SHARED", "Prior", "Slab", "first_prior", "known_prio
 GRID: Array = np.geomspace(1e-4, 4.0, 500)
 """Magnitudes at which densities are tabulated: drifts [1], offsets and loads in fractions of full scale."""
 TAIL_RANGE = (0.002, 1.5)
-"""Of the log-uniform tail: from the resolution of sensors to what no layout would correct. [1]"""
+"""Range of the log-uniform tail: from the resolution of sensors to faults that no layout would correct. [1]"""
 LOAD_RANGE = (0.002, 0.04)
-"""Of a load without a sensor in one vehicle, in fractions of full scale: from the resolution of the junction's sum to
-some kW, the largest consumer that is fitted to single vehicles. [1]"""
+"""Range of a load without a sensor in one vehicle, in fractions of full scale: from the resolution of the junction's
+sum to some kW, the largest consumer that is fitted to single vehicles. [1]"""
 LARGEST_SHARED = 0.08
-"""Largest offset or load that vehicles share, in fractions of full scale: larger ones stop a vehicle. More than one
-vehicle's load (:data:`LOAD_RANGE`), as the sensors of a batch are off by more than what is fitted takes. [1]"""
+"""Largest offset or load that vehicles share, in fractions of full scale: larger ones stop a vehicle. It is more than
+one vehicle's load (:data:`LOAD_RANGE`), as sensors of a batch can be off by more than such a consumer takes. [1]"""
 EDGE = 0.03
 """Relative width of the edges of a slab, so that its evidence is smooth in its bounds. [1]"""
 GUESSED_LOAD_SHARE = 0.01
@@ -45,7 +45,7 @@ class Slab:
     tail : float
         Share of faults outside. [1]
     density : ndarray of shape (G,)
-        At :data:`GRID`; may be averaged over what the fleet leaves open of bounds and tail.
+        Density at :data:`GRID`; may be an average over the bounds and tails that the fleet leaves possible.
     """
 
     low: float
@@ -71,8 +71,8 @@ class Prior:
     Attributes
     ----------
     counts : ndarray of shape (K + 1, 2K + 1)
-        Probability of so many hardware (rows) and sensor faults (columns); all supports with the same numbers are
-        equally likely.
+        Probability of each number of hardware faults (rows) and of sensor faults (columns); all supports with the same
+        numbers are equally likely.
     gain, offset : Slab
         Sizes of drifts, and of offsets.
     load_share : float
@@ -109,7 +109,7 @@ class Prior:
 
 
 def uniform_density(low: Array, high: Array) -> Array:
-    """Densities of magnitudes between bounds with soft edges, shape (G, S) of two arrays (S,)."""
+    """Return uniform densities at :data:`GRID` between S pairs of bounds (S,) with soft edges, shape (G, S)."""
     x = np.log(GRID)[:, None]
     rise, fall = np.clip((x - np.log(low)) / EDGE, -50.0, 50.0), np.clip((x - np.log(high)) / EDGE, -50.0, 50.0)
     density = 1.0 / (1.0 + np.exp(-rise)) / (1.0 + np.exp(fall))
@@ -134,15 +134,16 @@ def first_prior(branches: int) -> Prior:
 
 
 def known_prior(counts: Array, magnitude: tuple[float, float]) -> Prior:
-    """Prior of a fleet whose faults were drawn in a known way: numbers (K + 1, 2K + 1), and bounds of all sizes."""
+    """Prior of a fleet whose faults were drawn in a known way: ``counts`` (K + 1, 2K + 1), and bounds of all sizes."""
     slab = Slab(low=magnitude[0], high=magnitude[1], tail=1e-6)
     return Prior(counts=counts + 1e-9, gain=slab, offset=slab, load_share=1e-9)
 
 
 def _sparse(K: int) -> Array:
-    """Probability of (n_h, n_s) if n parameters are not zero, shape (2, 3K + 1, K + 1, 2K + 1).
+    """Probability of (n_h, n_s) if n parameters are drawn, shape (2, 3K + 1, K + 1, 2K + 1).
 
-    First of any vehicle, all supports of n parameters being equally likely; then of one whose hardware ones are zero.
+    The first is for vehicles where all supports of n parameters are equally likely; the second for vehicles whose
+    hardware parameters are then set to zero.
     """
     given = np.zeros((2, 3 * K + 1, K + 1, 2 * K + 1))
     for h in range(K + 1):
@@ -153,18 +154,18 @@ def _sparse(K: int) -> Array:
 
 
 def sparse_counts(tally: Array) -> Array:
-    """Most probable distribution of sparse faults for a fleet.
+    """Fit the most probable distribution of sparse faults (M13) to a fleet, by expectation maximisation.
 
     Parameters
     ----------
     tally : ndarray of shape (K + 1, 2K + 1)
-        Expected number of vehicles with so many hardware and sensor faults.
+        Expected number of vehicles with each number of hardware faults (rows) and of sensor faults (columns).
 
     Returns
     -------
     ndarray of shape (K + 1, 2K + 1)
-        FaultModel with a free distribution of the number n of faults about a binomial, and a share of vehicles without
-        hardware faults; by expectation maximisation.
+        Probabilities of these numbers. The total number n of faults has a free distribution, drawn towards a binomial;
+        a share of the vehicles has no hardware faults.
     """
     K, N = len(tally) - 1, float(tally.sum())
     given, n = _sparse(K), np.arange(3 * K + 1)

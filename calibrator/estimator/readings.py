@@ -42,30 +42,30 @@ __all__ = [
 TRUSTED_DRIFT_SD = 0.002
 """Accuracy of a bench check of the gain, as of a laboratory shunt. [1]"""
 TRUSTED_OFFSET_SD = 0.0005
-"""The same of the zero, in fractions of full scale. [1]"""
+"""Accuracy of a bench check of the zero, in fractions of full scale. [1]"""
 FEWEST_TRUSTED = 3
-"""Trusted vehicles from which on they carry the reference."""
+"""Least number of trusted vehicles that can carry the reference."""
 CONTRADICTION = 4.0
-"""Standard deviations from which on two readings of one sensor contradict each other. [1]"""
+"""Difference of two readings of one sensor, in standard deviations, above which they contradict each other. [1]"""
 LEAST_GAIN, LEAST_OFFSET = 0.003, 0.001
-"""What else than its sensors may bend a gain ratio or move the constant: the latter in fractions of full scale. [1]"""
+"""Standard deviations of what else than sensors changes a gain ratio, and the junction constant over full scale. [1]"""
 MOST_LOAD = 0.015
 """Largest load without a sensor that a trusted vehicle may have, over full scale: a DC/DC converter or a cooler that
-always runs. What a fleet may share (``prior.LARGEST_SHARED``) is more, but trust shall not hide that much. [1]"""
+always runs. A fleet may share more (``prior.LARGEST_SHARED``), but trust in a vehicle must not hide that much. [1]"""
 
 PAIRS = (("drift", "drift_sd"), ("offset_a", "offset_sd_a"))
 COLUMNS = ("vehicle", "branch", *PAIRS[0], *PAIRS[1])
 MEANING = {"drift": "a relative gain error; 2 % is 0.02", "drift_sd": "a standard deviation; 0.1 % is 0.001"}
 LEAST_SD = 1e-5
-"""Least standard deviation of a reading: no bench is sharper; of offsets over full scale. [1]"""
+"""Least standard deviation of a reading (of offsets: over full scale), as no bench is more exact. [1]"""
 MOST_BYTES = 100_000_000
-"""Of a table: a million vehicles. [byte]"""
+"""Largest size of a bench table: enough for a million vehicles. [byte]"""
 LARGEST = 0.9
-"""Largest fault that a sensor of a running vehicle is read with; a drift of 2 is 2 %, wrongly typed. [1]"""
+"""Largest fault that is accepted: a larger one is a typing error, such as a drift of 2 that means 2 %. [1]"""
 
 
 class BenchReading(NamedTuple):
-    """What a bench showed of one sensor; NaN where it was not read. [1], [A]"""
+    """Bench reading of one sensor, values NaN where they were not read. [1], [A]"""
 
     drift: float
     drift_sd: float
@@ -81,13 +81,13 @@ BenchTable = Mapping[tuple[str, str], BenchReading]
 
 
 def window_readings(vehicles: Sequence[VehicleSummary]) -> Array:
-    """What the sensors of N vehicles showed in zero-current windows, as :func:`bench_readings`: offsets alone."""
+    """Return the offsets that the sensors showed in zero-current windows, in the form of :func:`bench_readings`."""
     shown = np.array([(each.zero_current.offset_a, each.zero_current.sd_a) for each in vehicles])
     return np.stack([np.full_like(shown, np.nan), shown]).transpose(2, 0, 1, 3)
 
 
 def bench_readings(bench: BenchTable, vehicles: Sequence[str], branches: Sequence[str]) -> Array:
-    """Readings of a bench table for N vehicles and K branches, by their names.
+    """Look up the readings of N vehicles and K branches in a bench table, by their names.
 
     Returns
     -------
@@ -108,18 +108,18 @@ def with_knowledge(
     full_scale_a: float,
     load: UnmeasuredLoad | None,
 ) -> EvidenceRows:
-    """Evidence with what is known beside the drives.
+    """Add to the evidence what is known from other sources than the drives.
 
     Parameters
     ----------
     rows : EvidenceRows
         Of N vehicles.
     readings : ndarray of shape (2, 2, N, K), or None
-        Direct readings of their sensors, see :func:`bench_readings`, branches in their own order.
+        Direct readings of their sensors, see :func:`bench_readings`, branches in the vehicles' own order.
     trusted : ndarray of bool of shape (N,)
-        Vehicles all of whose sensors read right.
+        Vehicles whose sensors are all known to be right.
     order : sequence of int
-        Branches of the rows: position of each in their own order.
+        Order of the branches in the rows: position of each in the vehicles' own order.
     full_scale_a : float
         Full scale of the junction. [A]
     load : UnmeasuredLoad or None
@@ -128,7 +128,7 @@ def with_knowledge(
     Returns
     -------
     EvidenceRows
-        The same with rows of readings, and the constant of the junction as sure as the load is.
+        Evidence with rows for the readings; the variance of the junction constant includes that of the load.
     """
     at, N, K = rows.places, len(rows), rows.branches
     given = np.full((2, 2, N, K), np.nan) if readings is None else readings
@@ -162,7 +162,7 @@ def read_bench_table(source: Path | str, branches: Names, *, full_scale_a: float
     Parameters
     ----------
     source : Path or str
-        CSV file with a header; or the text of one, which a data frame was written to.
+        CSV file with a header, or the CSV text of a data frame.
     branches : collection of str
         Names of the K branches.
     full_scale_a : float
@@ -171,12 +171,12 @@ def read_bench_table(source: Path | str, branches: Names, *, full_scale_a: float
     Returns
     -------
     mapping
-        The readings by vehicle and branch; the vehicles are not yet known to exist, see :func:`check_bench_table`.
+        The readings by vehicle and branch; whether the vehicles exist, :func:`check_bench_table` checks.
 
     Raises
     ------
     FleetError
-        Naming file, line, what was expected.
+        If the table cannot be used; the message names file, line and what was expected.
     """
     bench: dict[tuple[str, str], BenchReading] = {}
     text, where = (source, "readings") if isinstance(source, str) else (_text(source), str(source))
@@ -213,7 +213,7 @@ def read_bench_table(source: Path | str, branches: Names, *, full_scale_a: float
 
 
 def _reading(row: Mapping[str, str], place: str, full_scale_a: float) -> BenchReading:
-    """Numbers of one line, each pair NaN where both cells are empty."""
+    """Read the numbers of one line; a pair is NaN where both of its cells are empty."""
     numbers = dict.fromkeys(COLUMNS[2:], math.nan)
     for pair in (pair for pair in PAIRS if any(row[name] for name in pair)):
         for name in pair:
@@ -228,7 +228,7 @@ def _reading(row: Mapping[str, str], place: str, full_scale_a: float) -> BenchRe
         unit = full_scale_a if name.startswith("offset") else 1.0
         value = numbers[name] if "sd" in name else abs(numbers[name])
         size, low = ("a number", LEAST_SD) if "sd" in name else ("a magnitude", 0.0)
-        if value < low * unit or value > LARGEST * unit:  # NaN, which was not read, is neither
+        if value < low * unit or value > LARGEST * unit:  # both are false for NaN: not read
             expected = f"{size} from {low * unit:g} to {LARGEST * unit:g}: {MEANING.get(name, 'in A')}"
             raise FleetError(f"{place}: {name} is {row[name]}; expected {expected}")
     return BenchReading(**numbers, place=place)
@@ -255,7 +255,7 @@ def check_bench_table(
     Raises
     ------
     FleetError
-        Naming file and line of the reading.
+        If there is such a reading; the message names its file and line.
     """
     accuracy_a = TRUSTED_OFFSET_SD * full_scale_a
     for (vehicle, branch), (drift, drift_sd, offset_a, offset_sd_a, place) in bench.items():
@@ -290,9 +290,9 @@ def merge_readings(
     Returns
     -------
     readings : ndarray of shape (2, 2, N, K)
-        Both together, see :func:`bench_readings`; neither where they contradict each other.
+        Weighted means of both, see :func:`bench_readings`; NaN where they contradict each other.
     notices : list of str
-        Where they do, and readings that could not be used.
+        Sensors whose readings contradict each other, and readings that could not be used.
     """
     names = [vehicle.vehicle for vehicle in vehicles]
     read, shown = bench_readings(bench, names, branches), window_readings(vehicles)
@@ -318,9 +318,9 @@ def untrusted_vehicles(
     full_scale_a: float,
     load: UnmeasuredLoad | None = None,
 ) -> dict[int, str]:
-    """Find trusted vehicles whose measured currents break the junction law: some sensor of theirs is faulty.
+    """Find trusted vehicles whose measured currents break the junction law, so that some sensor must be faulty.
 
-    Other vehicles are no measure: where most of a fleet share an offset, the trusted ones are those that differ.
+    They are not compared with other vehicles: where most of a fleet share an offset, the trusted ones would stand out.
 
     Parameters
     ----------
@@ -333,12 +333,12 @@ def untrusted_vehicles(
     full_scale_a : float
         Full scale of the junction. [A]
     load : UnmeasuredLoad or None
-        Load that no branch measures; None: any that such a load can be, so that an offset as small is not found.
+        Load that no branch measures; None: anything up to :data:`MOST_LOAD`, so that offsets of this size pass.
 
     Returns
     -------
     dict of int to str
-        How each such vehicle breaks it, by position.
+        How each such vehicle breaks the law, by its position.
     """
     K, at = rows.branches, rows.places
     sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))

@@ -15,9 +15,9 @@ from ecu_node.layout import UnmeasuredLoad, file_digest
 __all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "Method", "require_learning"]
 
 FEWEST_VEHICLES = 5
-"""Of a fleet that is compared with itself: in a smaller one it is not clear who differs from whom."""
+"""Least size of a fleet that is compared with itself: in a smaller one it is not clear which vehicle differs."""
 HARM_LIMIT = 0.001
-"""Default probability of making a branch worse up to which it is corrected. [1]"""
+"""Default limit: a branch is corrected if the probability of making it worse is below this. [1]"""
 
 
 class Method(StrEnum):
@@ -40,25 +40,25 @@ class CalibrationSettings:
     hold_out : frozenset of str
         Vehicles that are calibrated, but from which nothing is learnt for the others.
     trusted : frozenset of str
-        Names as they were given: of vehicles whose sensors were found faultless on a bench, which carry the reference
-        of the posterior; or of branches whose sensor is right, where each vehicle is calibrated by itself.
+        Names as the user gave them: either vehicles whose sensors were found faultless on a bench, which carry the
+        reference of the posterior method; or branches whose sensor is right, if each vehicle is calibrated by itself.
     readings : Path, str or None
         Table of bench readings (CSV), or its text.
     alone : bool
         Whether each vehicle is calibrated by itself in any case.
     load : UnmeasuredLoad or None
-        What no branch measures; None: as the layout says, if it does.
+        Load that no branch measures; None: that of the layout, if it states one.
     charge_ah : mapping of str to (float, float)
-        Of single junctions: charge into the junction through a branch during the recordings, and its standard
+        For single junctions: charge into the junction through a branch during the recordings, and its standard
         deviation. [Ah]
     meter : str or None
-        Of single junctions: branch that has another sensor in each folder of recordings of one car.
+        For single junctions: branch that has another sensor in each folder of recordings of one car.
     harm_limit : float
-        Largest posterior probability of making a branch worse with which it is corrected. [1]
+        A branch is corrected if the posterior probability of making it worse is below this. [1]
     expected_faults : float or None
         Share of the vehicles that have a sensor fault, if it is known; None: learnt from the fleet. [1]
     time_limit_s : float
-        Longest time to read one vehicle, in whatever method; one that takes longer is left out. [s]
+        Longest time to read one vehicle, with either method; a vehicle that takes longer is left out. [s]
 
     Raises
     ------
@@ -86,7 +86,7 @@ class CalibrationSettings:
             )
 
     def record(self) -> dict[str, Any]:
-        """What the method in use heeds, for the record of a run."""
+        """Return the settings that the method in use takes into account, for the record of a run."""
         found: dict[str, Any] = {"branches": self.branches, "hold_out": sorted(self.hold_out)}
         if self.method is Method.PUBLISHED:
             return found
@@ -108,9 +108,10 @@ def require_learning(
     *,
     left_out_count: int | None = None,
 ) -> list[bool]:
-    """Which vehicles the fleet learns from; FleetError if they are too few.
+    """Return for each vehicle whether the fleet learns from it; FleetError if too few remain.
 
-    ``left_out`` says why others cannot be used; of many the first ones, ``left_out_count`` being how many there are.
+    ``left_out`` says why other vehicles cannot be used. If it lists only the first of many, ``left_out_count`` is
+    their number.
     """
     learning = [name not in settings.hold_out for name in names]
     if sum(learning) < 2:

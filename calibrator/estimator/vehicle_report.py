@@ -1,4 +1,4 @@
-"""What is said of one vehicle: its parameters, what would decide where they are in doubt, and all of it in words."""
+"""Report on one vehicle: its parameters, the evidence that would decide where they are in doubt, and both in words."""
 
 from collections.abc import Sequence
 from typing import Any, cast
@@ -31,7 +31,7 @@ RESOLVED = 0.002
 
 
 def impossible(estimate: FleetEstimate, j: int, branches: Sequence[str]) -> str:
-    """Why the currents of vehicle j are none that a parameter file can describe; empty if they are."""
+    """Return why a parameter file cannot describe the sensors of vehicle j; empty if it can."""
     possible = np.abs(estimate.drift[j]) < 1.0  # as in the schema of the parameter file
     if possible.all():
         return ""
@@ -43,7 +43,7 @@ def impossible(estimate: FleetEstimate, j: int, branches: Sequence[str]) -> str:
 
 
 def explained_faults(explanation: Explanation, branches: Sequence[str]) -> Array:
-    """Drifts [1] and offsets [A] of the K sensors by an explanation, shape (2, K)."""
+    """Return the drifts [1] and offsets [A] of the K sensors in an explanation, shape (2, K)."""
     return np.array([[part.get(name, 0.0) for name in branches] for part in (explanation.drift, explanation.offset_a)])
 
 
@@ -63,17 +63,17 @@ def parameters_of(
     Parameters
     ----------
     vehicle, estimate, j : VehicleSummary, FleetEstimate, int
-        The vehicle, and which of the estimate it is.
+        The vehicle, the estimate, and the position of the vehicle in it.
     identity : RunIdentity
-        Of the run.
+        Identity of the run.
     branches : sequence of str
         Names of the K branches.
     expected_a : float
-        Mean junction sum that right sensors show. [A]
+        Mean junction sum that faultless sensors show. [A]
     fleet_size : int
-        Vehicles that can be used.
+        Number of vehicles that can be used.
     decisive : str or None
-        What would decide; None: found from the explanations.
+        Evidence that would decide what is in doubt; None: it is found from the explanations.
 
     Returns
     -------
@@ -136,30 +136,30 @@ def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int
 
 
 def _probability(value: float) -> float | None:
-    """A probability free of rounding beyond its range; None where it is not known (NaN)."""
+    """Clip a probability to its range, which rounding may exceed; None where it is not known (NaN)."""
     return None if np.isnan(value) else float(np.clip(value, 0.0, 1.0))
 
 
 def deciding_evidence(
     estimate: FleetEstimate, j: int, branches: Sequence[str], *, layout: str
 ) -> tuple[str, Explanation | None]:
-    """What would decide where it cannot be told what is faulty, or where a correction is held back.
+    """Say what evidence would decide which sensor is faulty, or would allow a correction that is held back.
 
     Parameters
     ----------
     estimate, j : FleetEstimate, int
-        Of N vehicles, and which of them.
+        Estimate of N vehicles, and position of the vehicle in it.
     branches : sequence of str
         Names of the K branches.
     layout : str
-        What the limits stand in.
+        Name of the layout file, which contains the limits.
 
     Returns
     -------
     text : str
         One sentence.
     rival : Explanation or None
-        The explanation that it tells from the most probable one, if it is about one.
+        The explanation that this evidence would tell from the most probable one, if the text is about one.
     """
     held_back, drift, offset_a = estimate.held_back[j], estimate.drift[j], estimate.offset_a[j]
     full_scale_a = estimate.full_scale_a
@@ -186,7 +186,7 @@ def deciding_evidence(
     text, rival = _rival(estimate.explanations[j], branches, held_back != "", full_scale_a)
     if text:
         return text, rival
-    # One explanation is left, and known too little: which sensor least, in parts of the faults that were found?
+    # One explanation is left, and not known well enough: which sensor is known least, relative to the faults found?
     sd = np.array([estimate.drift_sd[j], estimate.offset_sd_a[j] / full_scale_a])
     size = np.linalg.norm([drift, offset_a / full_scale_a], axis=1, keepdims=True)
     unsure = (sd / np.where(size > 0.0, size, 1.0)).max(axis=0)
@@ -201,7 +201,7 @@ def deciding_evidence(
 def _rival(
     found: Sequence[Explanation], branches: Sequence[str], held: Mask, full_scale_a: float
 ) -> tuple[str, Explanation | None]:
-    """What would tell the most probable explanation from the one that stands most in its way; empty if none does."""
+    """Say what would tell the most probable explanation from its strongest rival; empty if there is none."""
     least = LEAST_IN_THE_WAY if held.any() else LEAST_RIVAL
     others = [each for each in found[1:] if each.probability >= least]
     best, *rivals = (explained_faults(each, branches) / [[1.0], [full_scale_a]] for each in (found[0], *others))
@@ -223,7 +223,7 @@ def _rival(
 
 
 def explained(parameters: VehicleParameters) -> str:
-    """What was found for a vehicle, why, and what would decide, for people: a few lines."""
+    """Describe in a few lines for people what was found for a vehicle, why, and what would decide what is open."""
     confidence, hardware, residual = parameters.confidence, parameters.hardware_fault, parameters.junction_residual
     sure = "" if confidence is None else f" (confidence {confidence:.2f})"
     lines = [f"{parameters.vehicle}: {parameters.verdict}{sure}"]
@@ -247,7 +247,7 @@ def explained(parameters: VehicleParameters) -> str:
 
 
 def sensor_texts(parameters: VehicleParameters) -> dict[str, str]:
-    """Faults of each sensor by branch, how sure they are, and whether they are corrected."""
+    """Describe for each branch the faults of its sensor, how sure they are, and whether they are corrected."""
     alone = parameters.provenance.fleet_size == 1  # values then are means over all explanations
     rivals = parameters.explanations if alone else []
     return {
@@ -257,7 +257,7 @@ def sensor_texts(parameters: VehicleParameters) -> dict[str, str]:
 
 
 def _sensor_text(branch: BranchParameters, offsets: Sequence[tuple[float, float]]) -> str:
-    """The same of one sensor; offsets: what it may be by each explanation, with its probability. [1], [A]"""
+    """Describe the faults of one sensor; ``offsets`` has probability [1] and offset [A] by each explanation."""
     chance = branch.fault_probability
     probability = "" if chance is None else f" (probability of a fault {chance:.2f})"
     if not branch.drift and not branch.offset_a:
@@ -274,7 +274,7 @@ def _sensor_text(branch: BranchParameters, offsets: Sequence[tuple[float, float]
 
 
 def explanation_text(explanation: Explanation) -> str:
-    """One explanation in words, without its probability."""
+    """Put one explanation into words, without its probability."""
     sensors = []
     for name in dict.fromkeys([*explanation.drift, *explanation.offset_a]):
         drift, offset_a = explanation.drift.get(name), explanation.offset_a.get(name)
