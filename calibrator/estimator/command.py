@@ -32,7 +32,7 @@ from ecu_node.program import say_error, write_output
 __all__ = ["calibrate", "identify", "params"]
 
 OF_POSTERIOR = ("harm_limit", "trusted", "readings", "load", "charge", "meter", "expected_faults", "scheduler", "since")
-"""What only this method heeds."""
+"""Options that only the posterior method uses."""
 
 
 def calibrate(
@@ -156,12 +156,12 @@ def params(
 
 
 def _named(values: list[str] | None) -> frozenset[str]:
-    """Vehicles of an option that is given several times, or once with commas; no name has a comma."""
+    """Return the names given by an option several times, or once with commas; no name has a comma."""
     return frozenset(name.strip() for value in values or () for name in value.split(","))
 
 
 def _value(text: str, option: str) -> tuple[float, float]:
-    """A number with its standard deviation, MEAN:SD; without one it is exact."""
+    """Read a number with its standard deviation, MEAN:SD; without SD the number is exact."""
     mean, _, sd = text.partition(":")
     try:
         found = float(mean), float(sd or 0.0)

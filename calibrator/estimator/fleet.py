@@ -73,14 +73,14 @@ COLUMNS = {
     "confidence": "confidence",
     "hardware_probability": "hardware_probability",
 }
-"""Columns of ``results.parquet`` and their names in ``parameters_``: a drift is a change over time to most."""
+"""Columns of ``results.parquet`` and their names in ``parameters_``; to most people a drift is a change over time."""
 NO_NODE_FILES = (
     "no parameter files for the node are written: they belong to a layout; make the junction by Junction.from_layout"
 )
 
 
 def _with_sd(given: Any, what: str, least: float = -1e6) -> tuple[float, float]:
-    """A value with its standard deviation."""
+    """Return an argument that is a value with its standard deviation; refuse any other."""
     good = isinstance(given, Sequence) and len(given) == 2 and is_number(given[0], least, 1e6)
     above = " from 0" if least == 0.0 else ""
     require(good and is_number(given[1], 0.0, 1e6), what, given, f"a value{above} with its standard deviation")
@@ -88,7 +88,7 @@ def _with_sd(given: Any, what: str, least: float = -1e6) -> tuple[float, float]:
 
 
 def _in_python(text: str) -> str:
-    """A text of the command with arguments instead of its options."""
+    """Replace the options of the command in a message by the names of arguments."""
     text = text.replace("--charge", "charge_ah").replace("another --out", "another folder")
     return re.sub("--([a-z]+)-?([a-z]*)", lambda found: "_".join(filter(None, found.groups())), text)
 
@@ -187,7 +187,7 @@ class Fleet:
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
             database = summarise_frames(Path(folder), frames, junction, inputs=inputs)
             fleet = cls(place=folder, database=database, has_layout=junction.layout is not None, in_memory=True)
-            weakref.finalize(fleet, stack.pop_all().close)  # the summaries go with the fleet
+            weakref.finalize(fleet, stack.pop_all().close)  # the summaries are deleted with the fleet
         return fleet
 
     def __getstate__(self) -> dict[str, Any]:
@@ -272,7 +272,7 @@ class _Calibrator:
         return f"{type(self).__name__}({', '.join(changed)})"
 
     def _settings(self, *, alone: bool) -> CalibrationSettings:
-        """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
+        """Convert the parameters of the constructor to settings of the command; FleetError if one makes no sense."""
         given = self.get_params()
         for name in ("harm_limit", "expected_faults"):
             value = given.get(name)
@@ -301,7 +301,7 @@ class _Calibrator:
     def _calibrate(
         self, place: str | Path, database: VehicleDatabase, *, alone: bool, has_layout: bool, workers: Workers
     ) -> None:
-        """Calibrate as the command does, and take over what stands in the result folder."""
+        """Calibrate as the command does, and keep the content of the result folder."""
         with TemporaryDirectory(prefix="calibrator-") as folder:
             out = Path(folder) / "result"
             report = calibrate_fleet(place, database, out, self._settings(alone=alone), workers=workers)
@@ -385,7 +385,7 @@ class FleetCalibrator(_Calibrator):
     readings : path or DataFrame or None
         Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
     hold_out : collection of str
-        Vehicles to calibrate, but to learn nothing from for others.
+        Vehicles that are calibrated, but from which nothing is learnt for others.
     expected_faults : float or None
         Share of vehicles with a sensor fault, if it is known. [1]
     workers : int
@@ -459,12 +459,13 @@ class JunctionCalibrator(_Calibrator):
     """Learns from recordings of one junction, and what is known of it, what its current sensors do wrong.
 
     No fleet is needed. The junction law gives every ratio of gains; a sensor that is known gives their scale, and a
-    zero-current window, a bench reading or a declared load the offsets. What stays open is said, with its deviation.
+    zero-current window, a bench reading or a declared load the offsets. What stays open is reported with its deviation.
 
     Parameters
     ----------
     trusted : collection of str
-        Branches whose sensor is right, to 0.2 % and 0.05 % of full scale; others by ``readings``.
+        Branches whose sensor is right, to 0.2 % in gain and 0.05 % of full scale in offset; for another accuracy, give
+        ``readings``.
     readings : path or DataFrame or None
         Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
     load : tuple of (float, float), or None
@@ -479,7 +480,7 @@ class JunctionCalibrator(_Calibrator):
     Attributes
     ----------
     parameters_, vehicles_, left_out_, notices_
-        As of :class:`FleetCalibrator`; gain errors and offsets are reported of all sensors.
+        As in :class:`FleetCalibrator`; gain errors and offsets are reported of all sensors.
 
     Examples
     --------
@@ -541,7 +542,7 @@ class RecordedLog:
     drive : Drive
         Every signal at its own instants: ``drive.branches`` and ``drive.inputs`` by name.
     layout : Layout
-        Of the log.
+        Layout that says what the signals of the log mean.
     """
 
     drive: Drive
@@ -587,7 +588,7 @@ def read_log(path: str | Path, layout: str | Path) -> RecordedLog:
     Returns
     -------
     RecordedLog
-        With ``to_frame()``.
+        The log; its ``to_frame()`` makes a data frame.
 
     Raises
     ------

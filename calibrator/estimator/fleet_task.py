@@ -1,6 +1,6 @@
-"""All that it takes to calibrate the vehicles of a fleet: its reference, learned once, and what the user knows.
+"""Task with all that is needed to calibrate vehicles of a fleet: its reference, learned once, and what the user knows.
 
-It goes to other processes, which calibrate a bucket of vehicles each (:func:`calibrate_bucket`).
+The task is sent to other processes, which calibrate a bucket of vehicles each (:func:`calibrate_bucket`).
 
 Only the project's own errors about data leave a vehicle out with advice. Any other exception is a fault of the program:
 its vehicle is left out by name, and the others go on.
@@ -40,33 +40,33 @@ from ecu_node.parameters import VehicleParameters, decode_parameters
 __all__ = ["FleetTask", "calibrate_bucket", "learn_task"]
 
 LEAST_PROBABILITY = 1e-4
-"""Of the explanations near a bench reading: below, the drives contradict it. [1]"""
+"""Least probability of the explanations near a bench reading: below it the drives contradict the reading. [1]"""
 MOVED_SD, MOVED_PROBABILITY = 4.0, 1e-3
 """Standard deviations within which earlier and new faults of a sensor are the same [1]; a sensor has moved if the
 explanations near the earlier faults are less probable than this. [1]"""
 AT_ONCE = 32
-"""Vehicles of a bucket that are estimated together: more take more memory at a time. [1]"""
+"""Number of vehicles of a bucket that are estimated together: more take more memory at a time. [1]"""
 NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FleetTask:
-    """All that it takes to calibrate vehicles of a fleet whose reference is known; goes to other processes.
+    """All that is needed to calibrate vehicles of a fleet whose reference is known; it is sent to other processes.
 
     Attributes
     ----------
     reference : FleetReference
-        Of the fleet; its branches are those of the vehicles.
+        Reference of the fleet; its branches are those of the vehicles.
     identity : RunIdentity
-        For the parameter files.
+        Identity of the run, for the parameter files.
     harm_limit : float
         Largest probability of harm with which a branch is corrected. [1]
     bench : mapping
         Bench readings that are used.
     believed : frozenset of str
-        Trusted vehicles that do not contradict it.
+        Trusted vehicles whose currents do not contradict the trust in them.
     fleet_size : int
-        Vehicles of the fleet that can be used.
+        Number of vehicles of the fleet that can be used.
     """
 
     reference: FleetReference
@@ -82,7 +82,7 @@ class FleetTask:
         return self.reference.branches
 
     def estimate(self, vehicles: Sequence[VehicleSummary]) -> FleetEstimate:
-        """Estimate some vehicles, at least one; what comes out does not depend on which others are among them."""
+        """Estimate some vehicles, at least one; the estimate of each does not depend on the others."""
         layout = self.identity.database.layout
         return estimate_vehicles(
             [vehicle.summary for vehicle in vehicles],
@@ -94,14 +94,14 @@ class FleetTask:
         )
 
     def calibrate(self, vehicles: Sequence[VehicleSummary]) -> dict[str, tuple[VehicleParameters, Array] | str]:
-        """Parameters of some vehicles and the evidence for them, by name, or why one has none.
+        """Return by name the parameters of some vehicles and the evidence for them, or why a vehicle has none.
 
-        If they cannot be estimated together, each is by itself: one bad vehicle never stops the others.
+        If they cannot be estimated together, each is estimated by itself: one bad vehicle never stops the others.
         """
         if not vehicles:
             return {}
         try:
-            with np.errstate(all="ignore"):  # numbers that are not finite are refused where they come out
+            with np.errstate(all="ignore"):  # results that are not finite are refused later
                 estimate = self.estimate(vehicles)
             return {vehicle.vehicle: self._written(vehicle, estimate, j) for j, vehicle in enumerate(vehicles)}
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
@@ -143,20 +143,20 @@ def learn_task(
     vehicles : sequence of VehicleSummary
         All to learn from, all that are trusted, and all that were checked on a bench.
     settings : CalibrationSettings
-        How.
+        The user's choices.
     bench : mapping
         Bench readings; those that the drives contradict are not used.
     branches : tuple of str
         Names of the K branches.
     identity : RunIdentity
-        Of the run.
+        Identity of the run.
     fleet_size : int
-        Vehicles of the fleet that can be used.
+        Number of vehicles of the fleet that can be used.
 
     Returns
     -------
     task : FleetTask
-        With which every vehicle can be calibrated.
+        Task with which every vehicle can be calibrated.
     notices : list of str
         What the user should know.
 
@@ -200,7 +200,7 @@ def learn_task(
 
 
 def _distrust(vehicles: Sequence[VehicleSummary], trusted: Mask, reference: FleetReference) -> list[str]:
-    """Which trusted vehicles contradict the trust in them, or are too few to carry the reference."""
+    """Say which trusted vehicles contradict the trust in them, and whether too few are left to carry the reference."""
     notices, names = [], [vehicle.vehicle for vehicle in vehicles]
     carriers = int(np.count_nonzero(trusted)) - len(reference.distrusted)
     if trusted.any() and carriers < FEWEST_TRUSTED:
@@ -221,7 +221,7 @@ def _distrust(vehicles: Sequence[VehicleSummary], trusted: Mask, reference: Flee
 
 
 def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: BenchTable) -> dict[tuple[str, str], str]:
-    """Bench readings that the drives contradict (of another vehicle, or a slip), and what to say of them."""
+    """Find bench readings that the drives contradict (a slip, or of another vehicle), with a notice for each."""
     named, branches = {vehicle for vehicle, _ in bench}, task.branches
     checked = [vehicle for vehicle in vehicles if vehicle.vehicle in named]
     if not checked:
@@ -231,7 +231,7 @@ def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: Be
     for j, vehicle in enumerate(checked):
         faults = np.array([explained_faults(each, branches) for each in found.explanations[j]])
         apart = np.abs(value[:, j] - faults) / np.hypot(sd[:, j], [found.drift_sd[j], found.offset_sd_a[j]])
-        near = ~(apart > CONTRADICTION).any(axis=1)  # what was not read is not far
+        near = ~(apart > CONTRADICTION).any(axis=1)  # NaN, not read, counts as near
         probability = np.array([each.probability for each in found.explanations[j]]) @ near
         wrong |= {(vehicle.vehicle, branches[k]) for k in np.flatnonzero(probability < LEAST_PROBABILITY)}
     return {
@@ -248,7 +248,7 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
     Parameters
     ----------
     bucket : int
-        Which.
+        Number of the bucket.
     store, task : SummaryStore, FleetTask
         The store, and what was learnt from it.
     previous : Path or None
@@ -257,7 +257,7 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
     Returns
     -------
     bytes
-        Part of the result: parameters, and who was left out and why.
+        Part of the result: parameters, and which vehicles were left out and why.
     """
     if previous is not None and not (previous / PARTS).is_dir():
         raise FleetError(
@@ -296,10 +296,10 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
 def _what_holds(
     records: Sequence[Record], earlier: VehicleParameters | None, task: FleetTask
 ) -> tuple[VehicleSummary, dict[str, str]]:
-    """Summary of all drives of a vehicle, or of the new ones alone if they show that sensors have moved, and which.
+    """Return the summary of all drives of a vehicle, or of the new ones alone if they show that sensors have moved.
 
-    Records stand in the order in which they came. Those before the first one that the earlier parameters were found
-    from are of a time before a sensor moved.
+    Return also which sensors have moved. Records are in the order in which they came. Those before the first one that
+    the earlier parameters were found from date from before a sensor moved.
     """
     drives = set() if earlier is None else set(earlier.provenance.drives)
     known = [place for place, record in enumerate(records) if record.drives and set(record.drives) <= drives]
@@ -315,7 +315,7 @@ def _what_holds(
 
 
 def _moved_sensors(before: VehicleParameters, now: FleetEstimate, task: FleetTask) -> dict[str, str]:
-    """Sensors that have moved, from where to where, by branch: no explanation of the new drives has the earlier faults.
+    """Say by branch how sensors have moved, if no explanation of the new drives has the earlier faults.
 
     ``now`` is the estimate of the vehicle from drives that came since ``before``, and from these alone.
     """

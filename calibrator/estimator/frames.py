@@ -1,4 +1,4 @@
-"""Data frames of a junction become drives, and those of a fleet a store of summaries as of ``calibrator summarise``.
+"""Turn data frames of a junction into drives, and those of a fleet into summaries as ``calibrator summarise`` does.
 
 Whatever cannot be a recording of such a fleet is refused, with the vehicle and the column: nothing is guessed.
 """
@@ -49,11 +49,11 @@ __all__ = [
 
 MOST_BRANCHES = 16
 MOST_MISSED, LEAST_AGE_S = 2.5, 0.5
-"""Rows of a data frame farther apart than so many periods, and than this, leave a gap. [1], [s]"""
+"""Rows of a data frame that are farther apart than this many periods, and than this time, leave a gap. [1], [s]"""
 FINEST_PERIOD_S = 0.1
-"""Time base of data frames without a layout: that of logs, or slower. [s]"""
+"""Shortest time base of data frames without a layout: that of logs. [s]"""
 LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
-"""Of full scale: currents that never reach the former, or go beyond the latter, are in another unit. [1]"""
+"""Currents that never reach the former share of full scale, or go beyond the latter, are in another unit. [1]"""
 OTHER_SPACING = 20.0
 """Row spacing of a frame over that of the fleet, or the reverse, from which on its time is in another unit. [1]"""
 OTHER_UNIT = 100.0
@@ -61,25 +61,25 @@ OTHER_UNIT = 100.0
 
 
 def require(good: Any, what: str, given: Any, expected: str) -> None:
-    """Refuse an argument, showing it if it is short."""
+    """Refuse an argument unless it is good; the message shows it if it is short."""
     if not good:
         shown = text if len(text := repr(given)) < 80 and "\n" not in text else f"of type {type(given).__name__}"
         raise FleetError(f"{what} {shown}: expected {expected}")
 
 
 def path_of(given: Any, what: str, expected: str = "the path of a layout (TOML)") -> Path:
-    """An argument that names a file or folder."""
+    """Return an argument that names a file or folder as a path; refuse any other."""
     require(isinstance(given, (str, os.PathLike)) and os.fspath(given), what, given, expected)
     return Path(given)
 
 
 def is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
-    """Whether an argument is a number within bounds."""
+    """Check whether an argument is a number within bounds."""
     return isinstance(given, kind) and not isinstance(given, bool) and low <= float(given) <= high
 
 
 def names_of(given: Any, what: str, *, sets: bool = False) -> tuple[str, ...]:
-    """Names of anything like a list, numbers as strings; a set has no order, so it does for some arguments only."""
+    """Return the names in anything like a list, numbers as strings; a set, which has no order, only where allowed."""
     no_list = (str, bytes, Mapping) if sets else (str, bytes, Mapping, set, frozenset)
     names: list[Any] = [None]
     with suppress(TypeError):
@@ -159,7 +159,7 @@ class Junction:
         return None if self.database is None else self.database.layout
 
     def as_database(self, inputs: Sequence[str], period_s: float) -> VehicleDatabase:
-        """Layout and DBC; without a layout one that stands for data frames, whose signals are on no bus."""
+        """Return layout and DBC; without a layout, make one that stands for data frames, with signals on no bus."""
         if self.database is not None:
             return self.database
 
@@ -268,7 +268,7 @@ class _Recording(NamedTuple):
 
 
 def _recordings(frames: Mapping[str, Any], *, fewest: int) -> list[_Recording]:
-    """Frames of so many vehicles at least, with at least one frame each."""
+    """List the frames of all vehicles; FleetError if there are too few vehicles, or one has no frame."""
     if not isinstance(frames, Mapping) or not frames:
         raise FleetError(f"{type(frames).__name__} without vehicles: expected data frames by vehicle, {{'V1': frame}}")
     found: dict[str, list[_Recording]] = {}
@@ -294,7 +294,7 @@ def _recordings(frames: Mapping[str, Any], *, fewest: int) -> list[_Recording]:
 def _chosen_inputs(
     recordings: Sequence[_Recording], junction: Junction, inputs: Sequence[str] | None
 ) -> tuple[str, ...]:
-    """Names of the inputs; every frame has the columns that it takes."""
+    """Choose the inputs, and check that every frame has the columns for them."""
     branches, layout, first = list(junction.branches), junction.layout, recordings[0]
     for each in recordings:
         require_columns(each.frame, branches, each.where)
@@ -328,7 +328,7 @@ def _chosen_inputs(
 
 
 def named_columns(frame: pd.DataFrame, where: str) -> pd.DataFrame:
-    """The same with the labels of its columns, which may be numbers, as strings; DriveError if it is no frame."""
+    """Return a frame with its column labels, which may be numbers, as strings; DriveError if it is no frame."""
     if not isinstance(frame, pd.DataFrame):
         raise DriveError(f"{where}: {type(frame).__name__} given; expected a DataFrame")
     return frame.set_axis([str(label) for label in frame.columns], axis=1)
@@ -341,7 +341,7 @@ def require_columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> No
 
 
 def _seconds(frame: pd.DataFrame, where: str) -> Array:
-    """Instants of a frame from 0, rising. [s]"""
+    """Return the instants of a frame, rising from 0; DriveError if its index is no such time. [s]"""
     index = frame.index
     if isinstance(index, pd.RangeIndex) or not (
         isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex)) or pd.api.types.is_any_real_numeric_dtype(index)
@@ -370,7 +370,7 @@ def _seconds(frame: pd.DataFrame, where: str) -> Array:
 
 
 def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: float) -> float:
-    """Time base of the fleet: that of the layout, or of the rows, which are about as far apart in every frame."""
+    """Return the time base: that of the layout, or the spacing of rows, which must be similar in all frames. [s]"""
     layout = junction.layout
     spacing_s = {where: float(np.median(np.diff(time_s))) for where, time_s in times.items()}
     usual_s = float(np.median([*spacing_s.values()]))
@@ -392,7 +392,7 @@ def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: flo
 
 
 def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
-    """Values of a column as floating-point numbers, NaN where there is none; DriveError if it has no numbers."""
+    """Return a column as floating-point numbers, NaN where there is none; DriveError if it does not hold numbers."""
     column = frame[name]
     if isinstance(column, pd.DataFrame):
         raise DriveError(f"{where}: column {name} is there twice")
@@ -407,14 +407,14 @@ def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
 def _drives(
     recordings: Sequence[_Recording], junction: Junction, columns: Sequence[str], inputs: Sequence[str] = ()
 ) -> tuple[dict[str, list[Drive]], VehicleDatabase]:
-    """Drives by vehicle, and their layout; a frame that two vehicles have, or one has twice, is refused."""
+    """Make drives by vehicle, and their layout; refuse a frame that two vehicles have, or one vehicle has twice."""
     times = {each.where: _seconds(each.frame, each.where) for each in recordings}
     coarsest_s = COARSEST_PERIOD_S if inputs else LONGEST_PERIOD_S
     database = junction.as_database(inputs, _period_s(times, junction, coarsest_s=coarsest_s))
     found, seen = dict[str, list[Drive]](), dict[bytes, str]()
     for each in recordings:
         where = each.where
-        # longer pauses are cut to those of logs whose clock was set, as time bases go through them
+        # longer pauses are cut, as in logs whose clock was set: the time base goes on through a pause
         pauses_s = np.maximum(np.diff(times[where]) - CLOCK_GAP_S, 0.0)
         time_s, channels = times[where] - np.append(0.0, np.cumsum(pauses_s)), dict[str, Channel]()
         for name in columns:
@@ -434,7 +434,7 @@ def _drives(
 
 
 def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction, *, alone: bool = False) -> None:
-    """Refuse values that cannot be amperes, and in a fleet branches that stand still; alone, a heater may be off."""
+    """Refuse values that cannot be amperes, and in a fleet constant branches; of one vehicle a heater may be off."""
     branches, scale_a = list(junction.branches), float(junction.full_scale_a)
     largest = np.zeros((len(drives), len(branches)))
     for j, (vehicle, parts) in enumerate(drives.items()):
@@ -461,7 +461,7 @@ def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction, 
 
 
 def _record(drives: Sequence[Drive], store: SummaryStore, database: VehicleDatabase) -> Record:
-    """Summary of a vehicle's drives, or why they cannot be used."""
+    """Summarise a vehicle's drives, or record why they cannot be used."""
     found, problem, names = None, "", tuple(drive.name for drive in drives)
     try:
         found = summarise_drives(drives, store.identity.equipment, database, bank=store.identity.bank)

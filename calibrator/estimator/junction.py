@@ -1,16 +1,16 @@
-"""One junction by itself: what its own recordings, and what is known of some of its sensors, say of the others.
+"""Estimate the sensors of one junction by itself, from its recordings and from what is known of some of its sensors.
 
 No fleet is needed. Every vehicle gives K - 1 gain ratios and one constant of the junction law (M8),
 
     log(-g_k) = lambda_1 - lambda_k,    c = o_1 - sum over k > 1 of g_k o_k + (1 + d_1) l,    lambda = log(1 + d),
 
-with the offsets o and the load l that no branch measures. They are linear in the unknowns (lambda, o, l), but for gains
-before a load or a charge, about which they are linearised again; so recordings of one car with different meters are one
-system of equations. Ratios have no scale: that comes from sensors that are known; offsets come from known ones,
-zero-current windows, a declared load, or a charge balance. As no fleet tells what is usual, the gain of a sensor that
-is not known is open: its prior is a wide Gaussian. Its offset is absent (a narrow Gaussian: no zero is exact) or
-present, of any size; each choice is one explanation. What they leave open is reported with its standard deviation, and
-is not corrected.
+with the offsets o and the load l that no branch measures. They are linear in the unknowns (lambda, o, l), except that
+gains multiply a load or a charge, where they are linearised again; so recordings of one car with different meters are
+one system of equations. Ratios do not give the scale of the gains: it comes from sensors that are known. Offsets come
+from known sensors, zero-current windows, a declared load, or a charge balance. As no fleet shows what is usual, the
+gain of a sensor that is not known is open: its prior is a wide Gaussian. Its offset is absent (a narrow Gaussian: no
+zero is exact) or present, of any size; each choice is one explanation. What stays open is reported with its standard
+deviation, and is not corrected.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,28 +37,28 @@ from ecu_node.parameters import Explanation, SensorFinding
 __all__ = ["SEEN", "JunctionKnowledge", "JunctionLaw", "estimate_junction", "named_ratios"]
 
 LAW_GAIN_SD, LAW_OFFSET_SD = 0.002, 0.0005
-"""What delays, noise and curvature of sensors leave in a gain ratio, and in the constant over full scale. [1]"""
+"""Standard deviation that delays, noise and curvature of sensors add to a gain ratio, and to c over full scale. [1]"""
 MOST_RATIO, SURE_SD = 3.0, 0.1
-"""Gain ratio that no two sensors have, and the standard deviation with which it counts as one. [1]"""
+"""Gain ratio that no two sensors have, and standard deviation below which a ratio is sure enough to be refused. [1]"""
 OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD = 0.3, 0.2, 0.04
 """Standard deviations before anything is known: of lambda, and over full scale of an offset and of a load. [1]"""
 FAULT_SHARE = 0.2
 """Probability of a gain error, and of an offset, before anything is known. [1]"""
 LEAST_FAULT = 0.02
-"""Size that "recovered" counts a fault with at least: gain error, and offset over full scale. [1]"""
+"""Least size with which "recovered" counts the faults: gain errors, and offsets over full scale. [1]"""
 KNOWN_GAIN_SD, KNOWN_OFFSET_SD = 0.03, 0.005
 """Standard deviations up to which a gain, and an offset over full scale, count as known. [1]"""
 OFFSET_SIZES = (0.0015, 0.005, 0.02, 0.2)
 """Standard deviations of an offset that is present, over full scale: each is as probable as the others. [1]"""
 MOST_OFFSETS, MARGIN = 3, 12.0
-"""Most offsets of one explanation, and the logarithm of the weight below the best from which on it is left out."""
+"""Most offsets of one explanation, and distance of its log weight below the best from which on it is left out."""
 DRAWS, FEWEST_DRAWS = 8192, 64
-"""Draws in all, by weight of the explanations, and of each at least: the harm limit is some of them."""
+"""Draws in all, shared by weight of the explanations, and fewest of one: the harm limit is still several of them."""
 USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
-"""What curvature of good sensors, and noise and switched loads, leave in the sum, over full scale, and by how much the
-logarithm of the latter's square differs between cars. [1]"""
+"""Usual misfit, due to curvature of good sensors, and usual residual of the sum, due to noise and switched loads, over
+full scale; and spread between cars of the logarithm of the latter's square. [1]"""
 STEPS = 2
-"""Gauss-Newton steps to the gains that charges and loads are seen through: ratios tell them after the first."""
+"""Gauss-Newton steps for the gains that multiply charges and loads: after the first one the ratios tell them."""
 STILL = 0.003
 """Standard deviation of all currents, over full scale, up to which the car stands still. [1]"""
 SOUND_GAIN_SD, SOUND_OFFSET_SD = 0.01, 0.0025
@@ -83,7 +83,7 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
     fit = junction_regression(stack_summaries([summary], order))
     K, others, mean_a = len(order), order[1:], summary.mean_a
     covariance = fit.influence.T @ fit.influence + fit.prior_covariance[0]
-    if summary.variance_a2.max() < (STILL * scale_a) ** 2:  # the ratios are open, and the sum tells the constant
+    if summary.variance_a2.max() < (STILL * scale_a) ** 2:  # ratios stay open, and the mean sum is the constant
         ratio: Array = np.ones(K - 1)
         constant_a = float(mean_a.sum())
         covariance = np.diag(np.append(np.ones(K - 1), covariance[-1, -1]))
@@ -113,8 +113,8 @@ class JunctionKnowledge(NamedTuple):
     """What is known beside the recordings of N vehicles with K branches."""
 
     read: Array
-    """Values and standard deviations of drifts [1] and offsets [A] by zero-current windows, bench and trust, shape
-    (3, 2, 2, N, K); NaN where there are none."""
+    """Readings by zero-current windows, bench and trust: value and standard deviation, each of drifts [1] and offsets
+    [A], shape (3, 2, 2, N, K); NaN where there are none."""
     load: UnmeasuredLoad | None
     charge_a: Mapping[str, tuple[float, float, float]]
     meter: str | None
@@ -123,19 +123,19 @@ class JunctionKnowledge(NamedTuple):
 class _System:
     """Rows y = design x + error of N recordings over x = (lambda of S sensors, their offsets, N loads).
 
-    The first rows are the junction laws, and the charges; the last ones what is known of single x. Offsets and loads
-    are in fractions of full scale. Before anything is known, all x are about 0 and open.
+    The first rows are the junction laws, then come the charges, and last what is known of single x. Offsets and loads
+    are in fractions of full scale. The prior of all x is wide and centred on 0.
 
     Attributes
     ----------
     places : ndarray of int of shape (N, K)
-        Number of the sensor of each vehicle and branch: vehicles share all but meters.
+        Number of the sensor of each vehicle and branch: vehicles have all sensors in common except the meters.
     names : list of S str
         Of the sensors.
     laws : list of N JunctionLaw
         The junction laws.
     known : list of (int, str)
-        Place in x, and name, of what each of the last rows tells.
+        Place in x, and name, of the unknown that each of the last rows gives.
     """
 
     def __init__(
@@ -202,11 +202,11 @@ class _System:
         return f"{what} {self.names[p % S]}" if what else "load that no branch measures"
 
     def is_known(self, p: int) -> bool:
-        """Whether anything tells x_p by itself."""
+        """Check whether a row gives x_p by itself."""
         return any(place == p for place, _ in self.known)
 
     def condition(self, sd: Array, without: int | None = None) -> tuple[Array, Array, float]:
-        """Mean (P,), covariance (P, P) and log evidence of x under a prior with these standard deviations (P,).
+        """Return mean (P,), covariance (P, P) and log evidence of x for a prior with these standard deviations (P,).
 
         ``without`` is a row that is left out.
         """
@@ -218,7 +218,7 @@ class _System:
         return gain @ y, prior - gain @ A @ prior, float(log_evidence)
 
     def contradictions(self) -> list[str]:
-        """What is known and all other rows deny, whatever the sensors that are not known do."""
+        """List known values that all other rows contradict, whatever the faults of the sensors that are not known."""
         found = []
         for row, (p, name) in enumerate(self.known, start=len(self.y) - len(self.known)):
             mean, covariance, _ = self.condition(self.open_sd, without=row)
@@ -232,7 +232,7 @@ class _System:
 
 
 class _Posterior(NamedTuple):
-    """Weighted draws of x (n, P), and the number of the explanation that each is of, the most probable one first."""
+    """Weighted draws of x (n, P), and the number of the explanation of each draw; 0 is the most probable one."""
 
     draws: Array
     weight: Array
@@ -240,11 +240,11 @@ class _Posterior(NamedTuple):
     mean: Array
     sd: Array
     offset_probability: Array
-    """That each of the S sensors has an offset. [1]"""
+    """Probability that each of the S sensors has an offset. [1]"""
 
 
 def _posterior(system: _System) -> _Posterior:
-    """Posterior over the explanations: which sensors have an offset, and of which size."""
+    """Compute the posterior over the explanations: which sensors have an offset, and of which size."""
     S = system.sensors
     may = [s for s in range(S) if not system.is_known(S + s)]
     found = []
@@ -282,9 +282,9 @@ def _posterior(system: _System) -> _Posterior:
 
 
 def _fault_probability(mean: Array, sd: Array, prior_sd: float, sound_sd: float) -> Array:
-    """Probability of a fault: an open prior against that of a sensor without one, on what the data alone say.
+    """Return the probability of a fault: the prior of a faulty sensor against that of a sound one, given the data.
 
-    The data's likelihood is the posterior over the prior: Gaussian, of precision 1 / sd^2 - 1 / prior_sd^2.
+    The data's likelihood is the posterior divided by the prior: Gaussian, of precision 1 / sd^2 - 1 / prior_sd^2.
     """
     precision = np.maximum(sd**-2.0 - prior_sd**-2.0, 1e-12)
     value, variance = mean / sd**2 / precision, 1.0 / precision
@@ -306,7 +306,7 @@ def estimate_junction(
     Parameters
     ----------
     vehicles : sequence of VehicleSummary
-        N recordings of the same sensors in K branches, all but the meter; without a meter one.
+        N recordings of the same sensors in K branches, except for the meter; one recording if there is no meter.
     branches : sequence of str
         Names of the K branches.
     known : JunctionKnowledge
@@ -319,13 +319,13 @@ def estimate_junction(
     Returns
     -------
     estimate : FleetEstimate
-        As of a fleet; drifts and offsets are the means of the posterior, also where no fault is suspected.
+        In the form of a fleet's; drifts and offsets are means of the posterior, also where no fault is suspected.
     laws : list of N JunctionLaw
         The junction laws.
     deciding : list of N str
-        What would decide the rest; empty if all is known.
+        What would decide what is still open; empty if all is known.
     contradictions : list of str
-        Where what is known contradicts itself.
+        Where known values contradict each other.
 
     Raises
     ------
@@ -354,7 +354,7 @@ def estimate_junction(
         harm[j] = harm_probability(points[j], estimate, *true)
         harm_of_gain[j] = harm_probability(points[j], np.append(drift[j], np.zeros(K)), *true)
         confidence[j] = recovery_probability(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
-    # Where it is open whose an offset is, the gain alone may be corrected.
+    # Where it is open which sensor has an offset, the gain alone may be corrected.
     gain_alone = (harm >= harm_limit) & (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED)
     harm, faulty = np.where(gain_alone, harm_of_gain, harm), fault > SUSPECTED
     findings = _misfits([each.summary for each in vehicles], branches, scale_a)
@@ -406,7 +406,7 @@ def estimate_junction(
 
 
 def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a: float) -> list[list[SensorFinding]]:
-    """What linear sensors do not explain, by current, time or temperature; whose it is, only a fleet tells."""
+    """Find what linear sensors do not explain, by current, time or temperature; only a fleet tells whose it is."""
     K = len(branches)
     usual = UsualMisfits(
         misfit_a=np.full(len(CAUSES), USUAL_MISFIT * scale_a),
@@ -422,7 +422,7 @@ def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a
 
 
 def named_ratios(law: JunctionLaw, branches: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Gain ratios "a / b" with a before b in the layout, whichever branch moves most, and standard deviations. [1]"""
+    """Return gain ratios with standard deviations by name "a / b", a before b in the layout, not by movement. [1]"""
     first, *others = law.order
     ratios, sds = np.exp(law.value[:-1]).tolist(), np.sqrt(np.diagonal(law.covariance)[:-1]).tolist()
     found = {}
@@ -433,7 +433,7 @@ def named_ratios(law: JunctionLaw, branches: Sequence[str]) -> dict[str, tuple[f
 
 
 def _explanations(points: Points, branches: Sequence[str], scale_a: float) -> list[Explanation]:
-    """Explanations by falling probability: those of their mean faults that are clear; what looks the same is one."""
+    """List explanations by falling probability, with their clear mean faults; those with the same ones are merged."""
     K, found = len(branches), dict[bytes, tuple[float, Array, Mask]]()
     for number in range(len(points.fit)):
         own = points.explanation == number
@@ -453,7 +453,7 @@ def _explanations(points: Points, branches: Sequence[str], scale_a: float) -> li
 
 
 def _deciding(branches: Sequence[str], gain_sd: Array, offset_sd: Array, *, scale: bool, load: bool) -> list[str]:
-    """What is not known of the sensors, and what would tell; by what is known."""
+    """Say what is not known of the sensors, and what would tell it; ``scale``, ``load``: whether these are known."""
     if not scale:
         return [
             f"only ratios of gains are known: name a sensor that you trust (--trusted {branches[0]}), or give bench "

@@ -1,6 +1,6 @@
-"""Single junctions from their recordings to a part of the result: what is read, what is known of them, what is said.
+"""Calibrate single junctions: read their recordings, collect what is known of them, and make a part of the result.
 
-The estimate is that of :mod:`calibrator.estimator.junction`.
+The estimate itself is made by :mod:`calibrator.estimator.junction`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -50,22 +50,22 @@ __all__ = ["calibrate_junctions", "read_junction", "summarise_junction"]
 _Made = TypeVar("_Made")
 
 LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
-"""Least valid data, shortest block, number of blocks of a short recording, and least number beyond that of branches:
-enough to tell how sure all is."""
+"""Least valid data, shortest block, number of blocks of a short recording, and least number of blocks beyond that of
+branches, so that uncertainties can be estimated. [s], [s]"""
 FULL_BLOCK = 10
-"""Samples that a block has where there are enough."""
+"""Number of samples of a block where there are enough."""
 MOST_MISSING = 0.05
 """Share of a recording without samples of a branch up to which its charge is integrated. [1]"""
 JUMP = 0.02
 """Change of a current within its largest possible delay, over full scale, that counts as a jump. [1]"""
 MOST_SHOWN = 5
-"""Vehicles whose gain ratios are shown one by one."""
+"""Largest number of vehicles whose gain ratios are shown one by one."""
 MOST_READ_HERE = 5
-"""Vehicles that are read in this process: others would take longer to start."""
+"""Largest number of vehicles that are read in this process: other processes would take longer to start."""
 
 
 def read_junction(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleSummary:
-    """Read the drives of one vehicle, see :func:`summarise_junction`."""
+    """Read the drives of one vehicle and summarise them, see :func:`summarise_junction`."""
     return summarise_junction([load_drive(entry, database) for entry in entries], equipment.branches, database)
 
 
@@ -121,9 +121,9 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
 
 
 def _without_jumps(drives: Sequence[Samples], unknown: Sequence[str], layout: Layout) -> list[Samples]:
-    """Leave out samples near a jump of a branch whose delay is not known: it would be the junction's sum.
+    """Leave out samples near a jump of a branch whose delay is not known: the jump would appear in the junction's sum.
 
-    Where that would leave less than half, as on a drive that is all jumps, they stay.
+    Where that would leave less than half of the samples, as on a drive that is all jumps, they stay.
     """
     kept = []
     width = 2 * round(MAX_DELAY_S / layout.period_s) + 1
@@ -140,7 +140,7 @@ def _without_jumps(drives: Sequence[Samples], unknown: Sequence[str], layout: La
 
 
 def _same_error(parameters: VehicleParameters, trusted: Collection[str]) -> list[str]:
-    """Say where all gains are wrong alike against one sensor that is trusted: then that one may be wrong."""
+    """Say so if all gains are wrong alike against the only trusted sensor: then that sensor may be the wrong one."""
     others = [branch for name, branch in parameters.branches.items() if name not in trusted]
     drifts = np.array([branch.drift for branch in others])
     sds = np.array([branch.drift_sd for branch in others], dtype=float)
@@ -168,20 +168,20 @@ def calibrate_junctions(
     fleet : FleetSource
         The recordings.
     identity : RunIdentity
-        For the parameter files.
+        Identity of the run, for the parameter files.
     settings : CalibrationSettings
-        How.
+        The user's choices.
     trusted : collection of str
         Branches whose sensor is right.
     workers : Workers
-        Where the drives are read, if they are many.
+        Processes or cluster that read the drives, if there are many.
 
     Returns
     -------
     equipment : Equipment
         Has the K branches.
     part : bytes
-        Of the result: parameters of every vehicle that could be used, and why the others could not.
+        Part of the result: parameters of every vehicle that could be used, and why the others could not.
     details : dict of str to JSON values
         Gain ratios and constants, for the record of the run.
     notices : list of str
@@ -190,7 +190,7 @@ def calibrate_junctions(
     Raises
     ------
     UserError
-        If no vehicle can be used, or something is said to be known that is not there.
+        If no vehicle can be used, or something is given as known of a branch or vehicle that is not there.
     """
     layout = identity.database.layout
     equipment, vehicles, left_out, drives = _read(fleet, identity.database, settings, workers)
@@ -250,7 +250,7 @@ def calibrate_junctions(
 def _read(
     fleet: FleetSource, database: VehicleDatabase, settings: CalibrationSettings, workers: Workers
 ) -> tuple[Equipment, list[VehicleSummary], dict[str, str], list[Sequence[Drive]]]:
-    """Branches; summaries of the vehicles that can be used, why the others cannot; drives of each, if they are few."""
+    """Return branches, summaries of usable vehicles, why others cannot be used, and the drives if there are few."""
     branches, limit_s = settings.branches, settings.time_limit_s
     if len(fleet.vehicles) > MOST_READ_HERE:
         equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False)
@@ -259,7 +259,7 @@ def _read(
     left_out = dict(fleet.left_out)
 
     def usable(make: Callable[[Any], _Made], items: Iterable[tuple[str, Any]]) -> dict[str, _Made]:
-        """What can be made of some vehicles; why it cannot of the others goes to those left out."""
+        """Apply ``make`` to the item of each vehicle; leave out those where it fails, with the reason."""
         found = dict[str, _Made]()
         for vehicle, item in items:
             try:
@@ -287,7 +287,7 @@ def _known_readings(
     trusted: Collection[str],
     left_out: Mapping[str, str],
 ) -> Array:
-    """What is known of sensors, see :class:`JunctionKnowledge`; FleetError if it is of something that is not there."""
+    """Collect what is known of sensors, see :class:`JunctionKnowledge`; FleetError if one of them is not there."""
     scale_a, names = layout.full_scale_a, [each.vehicle for each in vehicles]
     meter = [settings.meter] if settings.meter else []
     for option, given in {"--trusted": trusted, "--charge": settings.charge_ah, "--meter": meter}.items():
@@ -303,7 +303,7 @@ def _known_readings(
     right = np.full((2, 2, len(names), len(branches)), np.nan)
     for k, name in enumerate(branches):
         if name in trusted:
-            of = slice(None) if name == settings.meter or not meter else slice(1)  # once of each sensor
+            of = slice(None) if name == settings.meter or not meter else slice(1)  # once for each sensor
             right[0, :, of, k] = 0.0
             right[1, 0, of, k] = max(TRUSTED_DRIFT_SD, layout.find_branch(name).uncertainty)
             right[1, 1, of, k] = TRUSTED_OFFSET_SD * scale_a
@@ -313,7 +313,7 @@ def _known_readings(
 def _charges(
     drives: Sequence[Sequence[Drive]], settings: CalibrationSettings, fleet: FleetSource
 ) -> dict[str, tuple[float, float, float]]:
-    """Mean current of branches over all drives of one vehicle: as measured, by their charge, its deviation. [A]"""
+    """Return by branch the mean current over all drives: as measured, by its charge, and the latter's deviation. [A]"""
     if not settings.charge_ah:
         return {}
     if len(drives) != 1:

@@ -36,23 +36,23 @@ REASONS: dict[HeldBack, str] = {
 
 
 QUIET_SHARE = 0.25
-"""Share of the blocks, those with the least throughput, that tell how far sums are from what is expected at rest."""
+"""Share of the blocks, those with the least throughput, that show how far sums at rest are from what is expected."""
 STABILITY = 0.01
-"""By how much gains change with temperature between drives, at least: the node is not to take that for a fault. [1]"""
+"""Least change of gains with temperature between drives that is assumed: the node must not take it for a fault. [1]"""
 TINY_A2 = 1e-12
-"""Least throughput, squared. [A^2]"""
+"""Least squared throughput, so that it can be divided by. [A^2]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunIdentity:
-    """One run of the calibrator.
+    """Identity of one run of the calibrator, as parameter files record it.
 
     Attributes
     ----------
     database : VehicleDatabase
         DBC and layout that the parameters belong to.
     method : Method
-        How they are found.
+        Method by which they are found.
     fleet, created : str
         Name of the fleet; time, ISO 8601.
     """
@@ -78,7 +78,7 @@ class RunIdentity:
         return FileReference(name=self.database.layout.dbc_path.name, sha256=self.database.digest)
 
     def provenance(self, *, fleet_size: int, drives: Sequence[str], duration_s: float) -> Provenance:
-        """Where the parameters of one vehicle come from."""
+        """Describe where the parameters of one vehicle come from."""
         return Provenance(
             tool=self.tool,
             method=self.method.value,
@@ -91,7 +91,7 @@ class RunIdentity:
 
 
 def time_of_run() -> str:
-    """The time now, ISO 8601; that of SOURCE_DATE_EPOCH, if it is set, makes results alike to the bit.
+    """Return the time now in ISO 8601, or that of SOURCE_DATE_EPOCH if set, so that results are the same to the bit.
 
     Raises
     ------
@@ -106,12 +106,12 @@ def time_of_run() -> str:
 
 
 def by_branch(branches: Sequence[str], values: Array) -> dict[str, float]:
-    """Values of the branches by name."""
+    """Return the values of the branches by their names."""
     return dict(zip(branches, values.tolist(), strict=True))
 
 
 def current_moments(mean_a: Array, product_a2: Array) -> Array:
-    """Moments of the measured currents and of 1, of one block.
+    """Arrange the moments of the measured currents and of 1 as one block.
 
     Parameters
     ----------
@@ -130,18 +130,18 @@ def current_moments(mean_a: Array, product_a2: Array) -> Array:
 
 
 def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_a: float) -> JunctionResidual:
-    """What the Kirchhoff sum is before and after correction with given sensor faults.
+    """Compute the Kirchhoff sum before and after the correction of given sensor faults.
 
     Parameters
     ----------
     moments : ndarray of shape (B, K + 1, K + 1)
         Sums or means of products of (i_m,1 ... i_m,K, 1), of each block of the drives. [A^2]
     gain : ndarray of shape (B, K) or (1, K)
-        What each current is divided by, 1 where it is not corrected. [1]
+        Divisor of each current, 1 where it is not corrected. [1]
     offset_a : ndarray of shape (K,)
-        What is taken from it before. [A]
+        Offset that is subtracted before that. [A]
     expected_a : float
-        Mean sum that right sensors would show: the load that none of them sees. [A]
+        Mean sum that faultless sensors would show: the load that none of them sees. [A]
 
     Returns
     -------
@@ -173,10 +173,10 @@ def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_
 
 
 def _spread(moments: Array, sums: Array) -> tuple[float, float]:
-    """Standard deviation of single sums, at rest [A] and per ampere of throughput [1], from moments (B, K + 1, K + 1).
+    """Return the deviation of single sums at rest [A] and per ampere of throughput [1], from moments (B, K + 1, K + 1).
 
-    The quarter of the blocks with the least throughput gives that at rest; what others have more grows with it.
-    The square of the throughput is taken for half the sum of the squares of the currents, which is not more.
+    The quarter of the blocks with the least throughput gives that at rest; the excess of all blocks over it is taken to
+    grow with the throughput. Half the sum of the squared currents stands for the squared throughput and is not more.
     """
     share, weight = moments[:, -1, -1], sums[:, :-1]
     square_a2 = np.maximum(np.einsum("bk,bkl,bl->b", sums, moments, sums), 0.0)
@@ -185,11 +185,11 @@ def _spread(moments: Array, sums: Array) -> tuple[float, float]:
     quiet = level <= np.quantile(level, QUIET_SHARE)
     rest_a2 = float(square_a2[quiet].sum() / share[quiet].sum())
     growth = max(float(square_a2.sum()) - rest_a2, 0.0) / max(float(throughput_a2.sum()), TINY_A2)
-    return math.sqrt(rest_a2), min(math.hypot(math.sqrt(growth), STABILITY), 1.0)  # of a dead sensor it is all
+    return math.sqrt(rest_a2), min(math.hypot(math.sqrt(growth), STABILITY), 1.0)  # 1 with a dead sensor
 
 
 def held_back_lines(parameters: VehicleParameters) -> list[str]:
-    """Which faults that were found are not corrected, and why: a line per reason."""
+    """Say which faults that were found are not corrected, and why: a line per reason."""
     lines = []
     for reason, why in REASONS.items():
         held_back = {name: branch for name, branch in parameters.branches.items() if branch.held_back == reason}

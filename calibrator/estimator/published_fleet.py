@@ -32,18 +32,18 @@ from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParamete
 __all__ = ["calibrate_fleet_published", "read_vehicle_model"]
 
 EXPECTED = FaultSettings(sparsity=80.0, magnitude=(0.05, 0.25), balanced=True)
-"""Faults of the artificial fleet that the trees learn from: one of five parameters, as in the paper."""
+"""Faults of the artificial fleet that the trees learn from: one of five parameters is not zero, as in the paper."""
 MISFIT = 5.0
 """Simulation error over the fleet's median from which on a model is not one of the fleet. [1]"""
 SLOPE_SPREAD = 0.093
 """Standard deviation of the vehicles' slopes where one of five sensor and hardware drifts is not zero, with 5 to 25 %
 (S = 80, the default). [1]"""
 LEAST_VEHICLES = 20
-"""Below, the mean of the fleet is off by more than 2 %, nearly half of the smallest of these faults."""
+"""Fewest vehicles without a notice: of fewer the mean is off by more than 2 %, nearly half of the smallest fault."""
 
 
 def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleModel:
-    """Read the drives of one vehicle, for :func:`~calibrator.published.state_space.identify_vehicle`."""
+    """Read the drives of one vehicle, and identify its model from them."""
     read = (load_drive(entry, database) for entry in entries)
     drives = [align(drive, database.layout, equipment.branches, inputs=equipment.inputs) for drive in read]
     names = tuple(entry.name for entry in entries)
@@ -53,18 +53,18 @@ def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, datab
 def calibrate_fleet_published(
     fleet: FleetSource, identity: RunIdentity, settings: CalibrationSettings, *, workers: Workers
 ) -> tuple[Equipment, bytes, dict[str, object], tuple[str, ...]]:
-    """Calibrate a fleet as published.
+    """Calibrate a fleet by the published method.
 
     Parameters
     ----------
     fleet : FleetSource
         The fleet.
     identity : RunIdentity
-        For the parameter files.
+        Identity of the run, for the parameter files.
     settings : CalibrationSettings
-        How.
+        The user's choices.
     workers : Workers
-        Where the drives are read.
+        Processes or cluster that read the drives.
 
     Returns
     -------
@@ -125,7 +125,7 @@ def calibrate_fleet_published(
 def _without_misfits(
     vehicles: Sequence[VehicleModel], hold_out: frozenset[str], branches: Sequence[str], left_out: dict[str, str]
 ) -> list[VehicleModel]:
-    """Vehicles whose models hold on their own last 20 % about as well as the fleet's do; the others are named."""
+    """Keep vehicles whose models fit their last 20 % about as well as the fleet's do; add others to ``left_out``."""
     usual_a = _median_error_a([vehicle for vehicle in vehicles if vehicle.vehicle not in hold_out] or vehicles)
     kept: list[VehicleModel] = []
     for vehicle in vehicles:
@@ -141,7 +141,7 @@ def _without_misfits(
 
 
 def _median_error_a(vehicles: Sequence[VehicleModel]) -> Array:
-    """Median over vehicles of each branch's simulation error on held-out data, shape (K,). [A]"""
+    """Return the median over vehicles of each branch's simulation error on held-out data, shape (K,). [A]"""
     return np.asarray(np.median([vehicle.simulation_error_a for vehicle in vehicles], axis=0))
 
 

@@ -1,9 +1,9 @@
-"""Result of a calibration: a folder, written once and read by the commands that come after.
+"""Result of a calibration: a folder that is written once and read by later commands.
 
 ``run.json`` says how it was made (:class:`RunRecord`). ``results.parquet`` has one row per vehicle and branch, and one
-without branch for each vehicle that was left out. ``buckets/NNNNN.parquet`` has the same rows by bucket of the
-vehicle, and in the first of each vehicle the text of its parameter file; for up to :data:`MOST_FILES` vehicles each is
-also a file ``params/VEHICLE.json``, as a folder of a million files is of no use.
+without branch for each vehicle that was left out. ``buckets/NNNNN.parquet`` has the same rows by bucket of the vehicle,
+and in the first row of each vehicle the text of its parameter file. Up to :data:`MOST_FILES` vehicles also have a file
+``params/VEHICLE.json`` each; a folder of a million files would be of no use.
 """
 
 import io
@@ -53,16 +53,16 @@ __all__ = [
 ]
 
 MOST_FILES = 10_000
-"""Vehicles whose parameters are files of their own in one folder."""
+"""Largest number of vehicles whose parameters are files of their own in one folder."""
 MOST_SORTED = 100_000
-"""Rows of results that are put in the order of the vehicles."""
+"""Largest number of rows of results that are sorted by vehicle."""
 MOST_NAMED = 1000
-"""Vehicles that a report names one by one; all of them stand in ``results.parquet``."""
+"""Largest number of vehicles that a report names one by one; all of them are in ``results.parquet``."""
 CONFIDENT = 0.95
-"""Confidence below which a report adds it to what is corrected. [1]"""
+"""Confidence below which a report states it beside the branches that are corrected. [1]"""
 PARTS, FILES, ROWS = "buckets", "params", "results.parquet"
 LEFT_OUT = "left out"
-"""Stands for the verdict of a vehicle, or of a file of unclear vehicle, that has no parameters."""
+"""In place of the verdict of a vehicle without parameters, or of a file whose vehicle is unclear."""
 REMEDY = "name a folder that 'calibrator calibrate --out' wrote"
 Rows = list[dict[str, Any]]
 
@@ -97,7 +97,7 @@ def _column(name: str, unit: str | None) -> pa.Field:
 
 _NAMES = [pa.field(name, pa.string(), nullable=name == "branch") for name in ("vehicle", "branch", "verdict")]
 SCHEMA = pa.schema([*_NAMES, *(_column(name, unit) for name, unit in _UNITS.items())])
-"""Of ``results.parquet``."""
+"""Schema of ``results.parquet``."""
 _ONCE = {
     "drives": "digest of the drives' files",
     "parameters": "text of the parameter file",
@@ -115,7 +115,7 @@ PART_SCHEMA = pa.schema(
         ),
     ]
 )
-"""Of a part with the vehicles of one bucket; the last five only in the first row of each vehicle."""
+"""Schema of a part, the vehicles of one bucket; the last five columns have values only in a vehicle's first row."""
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -131,15 +131,15 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What the user chose: hold-out and trusted vehicles, harm limit, or the published method's classifier."""
     created: str
     details: dict[str, Any]
-    """What the method says of its run: unity drive and simulation SNR, or reference, delays and hyper-parameters."""
+    """What the method records of its run: unity drive and simulation SNR, or reference, delays and hyper-parameters."""
     vehicles: int
     buckets: int = 0
-    """Files that the parameters are spread over by the hash of the vehicle; 0: all are in the first."""
+    """Number of files that parameters are spread over by the hash of the vehicle; 0: all are in the first."""
     left_out: dict[str, str]
-    """Why vehicles have no parameters; of many the first ones."""
+    """Why vehicles have no parameters; if they are many, only the first ones."""
     left_out_count: int = 0
     full_scale_a: float = 0.0
-    """Of the junction; 0: not known. [A]"""
+    """Full scale of the junction; 0: not known. [A]"""
     layout_sha256: str = ""
     dbc_sha256: str = ""
     notices: list[str]
@@ -152,7 +152,7 @@ class WrittenVehicle(NamedTuple):
     """Digest of the drives' files; empty: not known."""
     text: bytes
     evidence: Array | None
-    """What they were found from, shape (3, 5K), see :func:`.reported_evidence`; None: not kept."""
+    """Evidence that they were found from, shape (3, 5K), see :func:`.reported_evidence`; None: not kept."""
 
 
 def encode_chunk(
@@ -163,7 +163,7 @@ def encode_chunk(
     drives: Mapping[str, str] = {},
     evidence: Mapping[str, Array] = {},
 ) -> bytes:
-    """Write down the result of some vehicles, in the order of their names.
+    """Encode the result of some vehicles, sorted by name, as a part of the result.
 
     Parameters
     ----------
@@ -172,11 +172,11 @@ def encode_chunk(
     left_out : mapping of str to str
         Why the other vehicles have none.
     moved : mapping of (str, str) to str
-        What has moved since an earlier result, by vehicle and branch.
+        How sensors have moved since an earlier result, by vehicle and branch.
     drives : mapping of str to str
         Digest of the drives' files by vehicle.
     evidence : mapping of str to ndarray of shape (3, 5K)
-        What the parameters were found from, by vehicle, see :func:`.reported_evidence`.
+        Evidence that the parameters were found from, by vehicle, see :func:`.reported_evidence`.
 
     Returns
     -------
@@ -202,10 +202,10 @@ def encode_chunk(
 
 
 def _rows_of(item: VehicleParameters) -> Rows:
-    """Rows of a vehicle, one per branch; keys that are no columns are not written."""
+    """Make the rows of a vehicle, one per branch; keys that are no columns are not written later."""
     hardware, residual = item.hardware_fault, item.junction_residual
     measured_a, corrected_a = residual.measured_a, residual.corrected_a
-    if item.provenance.fleet_size == 1:  # what is expected was declared; of a fleet it is a part of the estimate
+    if item.provenance.fleet_size == 1:  # the user declared the expected sum; in a fleet it is estimated
         measured_a, corrected_a = residual.about_expected()
     return [
         {
@@ -239,14 +239,14 @@ def _parquet(rows: pa.Table) -> bytes:
 
 
 def join_rows(folder: Path, left_out: Mapping[str, str]) -> int:
-    """Join the rows of all parts to ``results.parquet``; up to :data:`MOST_SORTED` rows in order of the vehicles.
+    """Join the rows of all parts to ``results.parquet``; up to :data:`MOST_SORTED` rows are sorted by vehicle.
 
     Parameters
     ----------
     folder : Path
-        Of the result, with its parts.
+        Folder of the result, with its parts.
     left_out : mapping of str to str
-        Vehicles, or files of unclear vehicle, and why; those that are in a part are not written twice.
+        Why vehicles, or files whose vehicle is unclear, were left out; those in a part are not written twice.
 
     Returns
     -------
@@ -271,9 +271,9 @@ def join_rows(folder: Path, left_out: Mapping[str, str]) -> int:
 
 
 def write_parameter_files(folder: Path, *, vehicles: int) -> str:
-    """Write a file for each of so many vehicles of a result, unless there are too many.
+    """Write a parameter file for each vehicle of a result, unless there are too many.
 
-    Returned is where the user finds the parameters within the folder: these files, or its parts.
+    Return the name of the subfolder that holds the parameters: that of these files, or that of the parts.
     """
     if vehicles > MOST_FILES:
         return PARTS
@@ -285,17 +285,17 @@ def write_parameter_files(folder: Path, *, vehicles: int) -> str:
 
 
 def parts_of(result: Path) -> dict[int, Path]:
-    """Parts of a result, by their buckets."""
+    """Find the part files of a result, by the numbers of their buckets."""
     return {int(path.stem): path for path in sorted((result / PARTS).glob(f"{'[0-9]' * 5}.parquet"))}
 
 
 def part_file(result: Path, number: int) -> Path:
-    """File of a result with the vehicles of a bucket."""
+    """Return the path of the part file that holds the vehicles of a bucket."""
     return result / PARTS / f"{number:05d}.parquet"
 
 
 def read_part(path: Path) -> dict[str, WrittenVehicle]:
-    """Parameters of a part by vehicle, none if there is no such file; FleetError if it is damaged."""
+    """Read the parameters in a part file by vehicle; none if there is no such file, FleetError if it is damaged."""
     try:
         rows = pq.ParquetFile(path).read(["vehicle", *_ONCE], use_threads=False)
         found = {}
@@ -311,7 +311,7 @@ def read_part(path: Path) -> dict[str, WrittenVehicle]:
 
 
 def written_of(result: Path, vehicle: str) -> WrittenVehicle:
-    """Parameters of one vehicle; FleetError if it is no result, or has none of this vehicle."""
+    """Read the parameters of one vehicle; FleetError if the folder is no result, or has none of this vehicle."""
     run = read_run(result)
     found = read_part(part_file(result, bucket_of(vehicle, run.buckets) if run.buckets else 0))
     if vehicle in found:
@@ -325,19 +325,19 @@ def written_of(result: Path, vehicle: str) -> WrittenVehicle:
 
 
 def left_out_of(result: Path) -> dict[str, str]:
-    """Vehicles of ``results.parquet`` that have no parameters, and why; FleetError if it is none."""
+    """Read from ``results.parquet`` which vehicles have no parameters, and why; FleetError if it is no result."""
     found = result_rows(result, ["vehicle", "branch", "reason"])
     return {row["vehicle"]: row["reason"] for row in found.filter(pc.field("branch").is_null()).to_pylist()}
 
 
 def read_results(result: Path) -> Rows:
-    """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
+    """Read the rows of ``results.parquet`` in a result folder; FleetError if it is no result."""
     rows: Rows = result_rows(result, SCHEMA.names).to_pylist()
     return rows
 
 
 def result_rows(result: Path, columns: list[str]) -> pa.Table:
-    """Columns of ``results.parquet`` of a result folder; FleetError if it is none."""
+    """Read some columns of ``results.parquet`` in a result folder; FleetError if it is no result."""
     path = result / ROWS
     try:
         found = pq.read_table(path, columns=columns, use_threads=False)
@@ -359,7 +359,7 @@ def write_run(folder: Path, run: RunRecord) -> None:
 
 
 def read_run(result: Path) -> RunRecord:
-    """``run.json`` of a result folder; FleetError if it is none."""
+    """Read ``run.json`` of a result folder; FleetError if it is no result."""
     path = result / "run.json"
     try:
         return msgspec.json.decode(path.read_bytes(), type=RunRecord)
@@ -370,14 +370,14 @@ def read_run(result: Path) -> RunRecord:
 
 
 def deployed_rms_a(applied: Mask, *, measured_a: Array, corrected_a: Array) -> Array:
-    """Root mean square of the Kirchhoff sum with what the node applies, shape (N,): as measured where it is nothing.
+    """Return the RMS of the Kirchhoff sum with what the node applies, shape (N,): as measured where it applies nothing.
 
     Parameters
     ----------
     applied : ndarray of bool, shape (N, K)
         Branches that the node corrects.
     measured_a, corrected_a : ndarray of shape (N,)
-        The same as measured, and with what is applied. [A]
+        RMS of the Kirchhoff sum as measured, and with what is applied. [A]
     """
     return np.where(applied.any(axis=1), corrected_a, measured_a)
 
@@ -393,21 +393,21 @@ class CalibrationReport:
     run: RunRecord
     verdicts: Mapping[str, int]
     undecided: Mapping[str, str]
-    """Vehicles of which it cannot be told what is faulty, and what would decide."""
+    """Vehicles with the verdict "cannot tell", and what would decide."""
     corrected: Mapping[str, str]
-    """Vehicles of which branches are corrected, and which."""
+    """Vehicles with corrected branches, and which these are."""
     hardware_suspected: Mapping[str, str]
     """Vehicles that are thought to differ from their fleet, and how probable that is."""
     hardware_count: int
     held_back: Mapping[str, int]
-    """Branches in which a fault was found that is not applied, by reason."""
+    """Number of branches in which a fault was found but is not corrected, by reason."""
     moved: Mapping[str, str]
     """Vehicles with sensors that have moved since an earlier result, and how."""
     moved_count: int
     junction_rms_measured_a: float
-    """Median over vehicles. [A]"""
+    """Median over vehicles of the RMS of the junction sum, as measured. [A]"""
     junction_rms_deployed_a: float
-    """The same with the parameters that the node applies. [A]"""
+    """Median over vehicles of the RMS of the junction sum, with the parameters that the node applies. [A]"""
 
     def as_json(self) -> str:
         """The report as JSON."""
@@ -452,7 +452,7 @@ class CalibrationReport:
 
 
 def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> CalibrationReport:
-    """Count what stands in a result.
+    """Summarise a result folder for the user.
 
     Parameters
     ----------
@@ -463,7 +463,7 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
     parameters : str
         Where in the folder the parameter files are.
     shown : Path
-        What the folder is called for the user.
+        Path of the folder as the user knows it.
 
     Returns
     -------
@@ -472,13 +472,13 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
     """
     rows = pd.read_parquet(result / ROWS, use_threads=False)
     rows = rows[rows["branch"].notna()].astype({"applied": bool, "hardware_fault": bool})
-    vehicles = rows[rows["branch"] == run.branches[0]]  # each has what is said of its vehicle as a whole
+    vehicles = rows[rows["branch"] == run.branches[0]]  # one row per vehicle, for what concerns all of it
     measured_a, corrected_a = (vehicles[f"junction_rms_{name}_a"].to_numpy() for name in ("measured", "corrected"))
     applied = rows["applied"].to_numpy().reshape(-1, len(run.branches))
     suspected, moved = vehicles[vehicles["hardware_fault"]], rows[rows["moved"].notna()]
 
     def said(rows: pd.DataFrame, text: Callable[[pd.DataFrame], str]) -> dict[str, str]:
-        """What is said of the first vehicles."""
+        """Return a text on each of the first vehicles."""
         return {str(name): text(mine) for name, mine in islice(rows.groupby("vehicle", sort=False), MOST_NAMED)}
 
     def corrected(mine: pd.DataFrame) -> str:
@@ -510,5 +510,5 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
 
 
 def _counts(column: "pd.Series[str]") -> dict[str, int]:
-    """How often each text stands there, in the order in which they come."""
+    """Count how often each text occurs, in order of first occurrence."""
     return {str(text): len(rows) for text, rows in column.groupby(column, sort=False)}

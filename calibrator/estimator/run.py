@@ -1,9 +1,9 @@
-"""One run of a calibration: from drives, or a store of their summaries, to a result folder.
+"""Run a calibration: from drives, or a store of their summaries, to a result folder.
 
-Drives are summarised first, into a store that goes when the run ends. The first pass over a store learns the
+Drives are summarised first, into a store that is deleted when the run ends. The first pass over a store learns the
 reference of the fleet from a fixed sample of the vehicles; the second estimates every vehicle by itself, bucket by
-bucket. With an earlier result (``since``), vehicles that have not driven since keep its parameters; of the others a
-sensor that has moved is calibrated from the new drives alone.
+bucket. With an earlier result (``since``), vehicles that have not driven since keep its parameters; one whose sensors
+have moved is calibrated from its new drives alone.
 
 Faults of the program in single vehicles (:mod:`calibrator.estimator.fleet_task`) end the command with exit code 70.
 """
@@ -57,16 +57,16 @@ from ecu_node.layout import Layout
 __all__ = ["Census", "calibrate_fleet", "read_sample", "require_fleet", "take_census"]
 
 MOST_LEARNT, MOST_BLOCKS = 2000, 50_000
-"""Vehicles that the reference is learnt from, and about how many blocks of their drives. With so many vehicles its
-centre is known to a fortieth of what faultless vehicles differ by, so more would not tell any vehicle's faults better;
+"""Most vehicles that the reference is learnt from, and about the most blocks of their drives. With so many vehicles its
+centre is known to a fortieth of the spread of faultless vehicles, so more would not tell any vehicle's faults better;
 so many blocks take about half a GiB, and are 200 vehicles with two hours of driving or more. [1]"""
 MOST_REASONS = 20
-"""Reasons of vehicles left out that are kept for messages."""
+"""Largest number of reasons for leaving vehicles out that are kept for messages."""
 WORTH_PROCESSES = 200
-"""Vehicles from which on `workers` are used. Other processes take 3 s to start; with 600 vehicles of two branches two
-of them are no faster yet, but with more branches each vehicle takes longer. [1]"""
+"""Number of vehicles from which on `workers` are used. Other processes take 3 s to start; with 600 vehicles of two
+branches two of them are no faster yet, but with more branches each vehicle takes longer. [1]"""
 Calibrate: TypeAlias = Callable[..., tuple[Equipment, bytes, dict[str, object], Sequence[str]]]
-"""Calibrates a fleet in one piece: branches, part of the result, details and notices of the run."""
+"""Function that calibrates a fleet in one piece; returns branches, part of the result, details and notices."""
 
 
 def calibrate_fleet(
@@ -90,9 +90,9 @@ def calibrate_fleet(
     out : Path
         Folder of the result, new or empty; it appears only when it is complete.
     settings : CalibrationSettings
-        How.
+        The user's choices.
     workers : Workers
-        Where it is computed.
+        Processes or cluster that compute it.
     since : Path or None
         Earlier result to go on from: vehicles without new drives keep its parameters. The fleet is then a store of
         summaries that holds the earlier drives as well.
@@ -100,7 +100,7 @@ def calibrate_fleet(
     Returns
     -------
     CalibrationReport
-        What was found; everything is on disk then.
+        What was found; everything is on disk by then.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def calibrate_fleet(
 
 
 def require_fleet(storage: Storage, place: str | Path, database: VehicleDatabase) -> StoreIdentity | None:
-    """Identity of the store of summaries at a place, None if there are drives; FleetError if it can be neither."""
+    """Return the identity of a store of summaries, None if the place has drives; FleetError if it can be neither."""
     path = Path(storage.url)
     if storage.is_local and path.is_file():
         return None
@@ -179,9 +179,9 @@ def _require_summaries_enough(storage: Storage, settings: CalibrationSettings, l
 
 
 def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) -> Calibrate | None:
-    """What calibrates a whole fleet in one piece: the published method, or one junction after the other; None: neither.
+    """Return the function that calibrates all in one piece: published method, or single junctions; None: neither.
 
-    Each vehicle is calibrated by itself if there is but one, or what is known is of branches.
+    Each vehicle is calibrated by itself if there is only one, or if what is known is about branches.
     """
     if settings.method is Method.PUBLISHED:
         from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second)
@@ -201,7 +201,7 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) 
 
 
 def _require_named(settings: CalibrationSettings, usable: Set[str], problems: Mapping[str, str], place: str) -> None:
-    """Refuse names of vehicles that there are not, or that cannot be used, with the reason if there is one."""
+    """Refuse names of vehicles that do not exist or cannot be used, with the reason if there is one."""
     for names, what in ((settings.hold_out - problems.keys(), "hold out"), (settings.trusted, "trust")):
         if missing := sorted(names - usable):
             reasons = few_reasons({name: problems[name] for name in missing if name in problems})
@@ -210,18 +210,18 @@ def _require_named(settings: CalibrationSettings, usable: Set[str], problems: Ma
 
 @dataclass(frozen=True, kw_only=True)
 class Census:
-    """Who there is in a store: hardly any names, as a fleet has millions of them.
+    """Which vehicles are in a store: counts and hardly any names, as a fleet may have millions of vehicles.
 
     Attributes
     ----------
     usable : mapping of int to int
-        How many vehicles can be calibrated, by bucket; of all buckets.
+        Number of vehicles that can be calibrated, by bucket; for all buckets.
     left_out : int
-        How many others there are.
+        Number of vehicles that cannot be calibrated.
     reasons : mapping of str to str
-        Why they cannot: of the first few, and of those that were asked for.
+        Why they cannot, for the first few and for those that were asked for.
     named : frozenset of str
-        Vehicles that can be calibrated, of those that were asked for, and of the first bucket.
+        Names of vehicles that can be calibrated, of those that were asked for and those of the first bucket.
     """
 
     usable: Mapping[int, int]
@@ -236,7 +236,7 @@ class Census:
 
 
 def take_census(store: SummaryStore, workers: Workers, asked: Collection[str] = ()) -> Census:
-    """Look at every bucket of a store; UserError if one cannot be read, or there is no vehicle."""
+    """Count the vehicles in every bucket of a store; UserError if one cannot be read, or there is no vehicle."""
     buckets, usable, reasons, named, seen = store.buckets(), dict[int, int](), dict[str, str](), set[str](), 0
     with progress_bar("look at vehicles", len(buckets), "chunks") as progress:
         found = run_many(store.outlines, buckets, workers)
@@ -262,7 +262,7 @@ def read_sample(
     Parameters
     ----------
     store, census : SummaryStore, Census
-        The store, and who there is in it.
+        The store, and which vehicles are in it.
     settings : CalibrationSettings
         Says which vehicles are held out, and which are trusted.
     checked : collection of str
@@ -271,8 +271,8 @@ def read_sample(
     Returns
     -------
     list of VehicleSummary
-        Trusted and checked ones, and others, by hash of their names, up to :data:`MOST_LEARNT` that may be learnt from,
-        or :data:`MOST_BLOCKS` of them.
+        Trusted and checked vehicles, and others by the hash of their names until :data:`MOST_LEARNT` may be learnt
+        from, or their drives have :data:`MOST_BLOCKS` blocks.
     """
     wanted = settings.trusted | frozenset(checked)
     apart = {store.bucket_of(name) for name in wanted}
@@ -305,21 +305,21 @@ class _Run:
     workers: Workers
 
     def workers_if(self, many: bool) -> Workers:
-        """Where to compute what belongs to many vehicles or to few; a cluster was asked for in any case."""
+        """Return the workers if there are many vehicles, or if they are a cluster, which was asked for; else none."""
         return self.workers if many or self.workers.scheduler else Workers()
 
     def bench_table(self, store: SummaryStore) -> BenchTable:
-        """Bench readings, if there are any."""
+        """Read the bench readings, if there are any."""
         given, scale_a = self.settings.readings, self.identity.database.layout.full_scale_a
         return {} if given is None else read_bench_table(given, store.identity.branches, full_scale_a=scale_a)
 
     def check(self, bench: BenchTable, vehicles: Collection[str], left_out: Mapping[str, str]) -> None:
-        """Refuse bench readings of vehicles that there are not, or against the trust in one."""
+        """Refuse bench readings of vehicles that do not exist, or that contradict the trust in one."""
         scale_a = self.identity.database.layout.full_scale_a
         check_bench_table(bench, vehicles, left_out=left_out, trusted=self.settings.trusted, full_scale_a=scale_a)
 
     def summaries(self, store: SummaryStore, others: Mapping[str, str], since: Path | None) -> CalibrationReport:
-        """Calibrate every vehicle of a store; ``others`` are not in it, and why."""
+        """Calibrate every vehicle of a store; ``others`` says which vehicles are not in it, and why."""
         previous = None if since is None else since.absolute()
         if since is not None:
             _require_previous(since, self.identity.database, store.identity)
@@ -330,7 +330,7 @@ class _Run:
         _require_named(settings, census.named, census.reasons, f"fleet {self.identity.fleet}")
         self.check(bench, census.named, census.reasons)
         first = "" if is_compiled("posterior") else " (compiled before its first use: half a minute more)"
-        with progress_bar(f"learn the fleet{first}", None), threadpool_limits(1):  # one thread: the same anywhere
+        with progress_bar(f"learn the fleet{first}", None), threadpool_limits(1):  # one thread: same result anywhere
             task, notices = learn_task(
                 read_sample(store, census, settings, checked),
                 settings,
@@ -341,7 +341,7 @@ class _Run:
             )
         where = self.workers_if(is_large or census.size >= WORTH_PROCESSES)
         calibrate, seen = partial(calibrate_bucket, store=store, task=task, previous=previous), 0
-        earlier = () if previous is None else parts_of(previous)  # also of those who are there no more
+        earlier = () if previous is None else parts_of(previous)  # also for vehicles that are gone
         buckets = sorted({*census.usable, *earlier})
         with progress_bar("calibrate", census.size, "vehicles") as progress:
             for bucket, part in zip(buckets, run_many(calibrate, buckets, where), strict=True):
@@ -367,7 +367,7 @@ class _Run:
         notices: Sequence[str],
         buckets: int = 0,
     ) -> CalibrationReport:
-        """Put the parts together to the result; ``others`` are in none of them."""
+        """Join the parts to the result; ``others`` says which vehicles are in none of them, and why."""
         identity, layout, folder = self.identity, self.identity.database.layout, self.result
         vehicles, left_out = join_rows(folder, others), left_out_of(folder)
         if not vehicles:
