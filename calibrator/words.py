@@ -33,7 +33,7 @@ def word_set(text: str) -> frozenset[str]:
 
 
 VOCABULARY: dict[str, Any] = tomllib.loads((Path(__file__).parent / "vocabulary.toml").read_text(encoding="utf-8"))
-"""Content of ``vocabulary.toml``: by meaning, the words that express it, as one text for :func:`word_set`."""
+"""Content of ``vocabulary.toml``: words by meaning, each list as one text for :func:`word_set`; and replacements."""
 PLACES = {place: word_set(words) for place, words in VOCABULARY["places"].items()}
 """Places where a current may flow (battery, motor, ...), each with the words for it."""
 POSITIONS = ("front", "rear", "left", "right")

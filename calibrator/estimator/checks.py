@@ -70,7 +70,7 @@ TINY = 1e-12
 LEAST_STRETCH = 0.1
 """Least gain of a transformed current that counts in its likelihood: a lower one means another, clipped sensor. [1]"""
 ALONE = 1e-6
-"""Least share of a column that gains and offsets do not explain. [1]"""
+"""Least share of a column that gains and offsets do not explain, for the column to be used. [1]"""
 WHITE_GAIN = 1.5
 """Variance of the second difference of white noise of variance 1."""
 SHARE_SD = 0.15

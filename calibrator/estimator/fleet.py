@@ -1,8 +1,8 @@
 """The calibrator in Python: a fleet of recordings, and :class:`FleetCalibrator`, which learns from them.
 
-What it learned stands in attributes that end in ``_``, as in scikit-learn. It goes the way of ``calibrator calibrate``:
-drives are summarised into a store, of which a run makes a result folder (:mod:`calibrator.estimator.run`); data frames
-become drives first (:mod:`calibrator.estimator.frames`).
+What it has learned is in attributes that end in ``_``, as in scikit-learn. It works as ``calibrator calibrate`` does:
+drives are summarised into a store, from which a run makes a result folder (:mod:`calibrator.estimator.run`); data
+frames become drives first (:mod:`calibrator.estimator.frames`).
 """
 
 import html
@@ -125,7 +125,7 @@ class Fleet:
 
     @classmethod
     def from_folder(cls, path: str | Path, layout: str | Path) -> "Fleet":
-        """Fleet of recorded drives, as ``calibrator calibrate`` takes it; none of them is read yet.
+        """Make a fleet of recorded drives, as ``calibrator calibrate`` takes it; none of them is read yet.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class Fleet:
         *,
         inputs: Sequence[str] | None = None,
     ) -> "Fleet":
-        """Fleet of data frames.
+        """Make a fleet of data frames.
 
         Parameters
         ----------
@@ -236,7 +236,7 @@ class CalibratedVehicle:
         ).set_axis(frame.columns, axis=1)
 
     def explain(self) -> str:
-        """What was found for each sensor and why, other explanations, findings, and what would decide."""
+        """Describe what was found for each sensor and why, other explanations, findings, and what would decide."""
         return _in_python(explained(self.parameters))
 
     def _repr_html_(self) -> str:
@@ -255,7 +255,7 @@ class _Calibrator:
     # scikit-learn's BaseEstimator does the next three as well, but takes more than a second to import
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:  # noqa: ARG002 (scikit-learn's signature)
-        """Parameters of the constructor by name."""
+        """Return the parameters of the constructor by name."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def set_params(self, **parameters: Any) -> Self:
@@ -332,7 +332,7 @@ class _Calibrator:
             raise FleetError(f"this {type(self).__name__} has learned nothing yet; call fit first")
 
     def summary(self) -> str:
-        """What was found, as ``calibrator calibrate`` prints it."""
+        """Describe what was found, as ``calibrator calibrate`` prints it."""
         self._require_fitted()
         return self._report.as_text()
 
@@ -549,12 +549,12 @@ class RecordedLog:
     layout: Layout
 
     def to_frame(self) -> pd.DataFrame:
-        """All signals on one time base, as :meth:`Fleet.from_frames` takes them.
+        """Return all signals on one time base, in the form that :meth:`Fleet.from_frames` takes.
 
         Returns
         -------
         DataFrame
-            Index: seconds since the start of the log, the period of the layout apart. Columns: branches [A], positive
+            Index: seconds since the start of the log, spaced by the layout's period. Columns: branches [A], positive
             into the junction, inputs, and derived inputs; NaN where any of them is missing.
 
         Raises

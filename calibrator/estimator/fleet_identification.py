@@ -44,7 +44,7 @@ FOLDS = 5
 FIRST_HELD_OUT = 2
 """Index of the first block that is held out: three blocks are enough to have one to judge by, amid the others."""
 ORDERS = (1, 2, 3, 4, 5, 6, 8)
-"""Of the pooled systems: a power train as seen at 10 Hz has few modes. [1]"""
+"""Orders of the pooled systems: a power train as seen at 10 Hz has few modes. [1]"""
 LOW_PASSES = (1, 2, 4, 6)
 """Numbers of evenly spaced low-passes. [1]"""
 SHORTEST_S, LONGEST_S = 0.05, 20.0
@@ -60,7 +60,7 @@ TOLERANCE_DB = 0.003
 """A bank is large enough if its simulation error, noise included, is this close to the best: at a signal-to-noise
 ratio of 20 dB a misfit of -52 dB. [dB]"""
 TINY = 1e-12
-"""Power of an error, over that of the signal, that counts as none. [1]"""
+"""Power of an error, over that of the signal, below which there is no error. [1]"""
 
 
 def held_out_snr_db(summaries: Sequence[DriveSummary]) -> Array:

@@ -189,7 +189,7 @@ def summarise_frames(
     folder : Path
         Empty folder for the store.
     frames, junction, inputs
-        As for :meth:`calibrator.Fleet.from_frames`.
+        As in :meth:`calibrator.Fleet.from_frames`.
 
     Returns
     -------

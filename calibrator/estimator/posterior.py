@@ -78,9 +78,9 @@ MOST_TURN = 3.0
 LOWEST, HIGHEST, STEP = -2.5, 1.2, 0.5
 """Range of the logarithm of a gain, and the longest step of one iteration: gains from 0.08 to 3.3. [1]"""
 MOST_STEPS, LAST_STEP = 7, 1e-7
-"""Gauss-Newton steps, and the size of a step that is the last one: far below what any row shows. [1]"""
+"""Most Gauss-Newton steps, and size below which a step is the last one: far below what any row shows. [1]"""
 DIFFERENCE = 1e-6
-"""Step by which residuals are differentiated: rounding and curvature leave 1e-9 of a derivative. [1]"""
+"""Step for derivatives of residuals by differences: rounding and curvature leave an error of 1e-9 of them. [1]"""
 DRAWS = 64
 """Number of draws from each explanation; half of them mirror the others."""
 OPEN_SD = 0.02
@@ -110,7 +110,7 @@ class Evidence(NamedTuple):
     shared : ndarray of shape (2K + 1,)
         What all sensors of a branch share: K offsets, in fractions of full scale, which the centre includes, and K
         logarithms of gains. The last entry is 1 if what a group of vehicles shares is an offset of the feeding sensor,
-        and 0 if it is a load: seen through a gain error an offset is another one, and a load is not (M16).
+        and 0 if it is a load: seen through a gain error an offset has another size, but a load has not (M16).
     precision, precision_relative : ndarray of shape (N, 5K, 5K)
         Inverse covariance of all rows, and of the relative rows alone; zero for the others.
     log_scale : ndarray of shape (N,)
@@ -286,7 +286,7 @@ def _fit_all(evidence: Evidence, log_prior: Array, best_ahead: Array, log_load: 
 def _normal_equations(
     evidence: Evidence, j: int, theta: Array, chosen: Integers, precision: Array
 ) -> tuple[Array, Array, float]:
-    """H and g of the Gauss-Newton step H step = g of the chosen parameters at theta, prior included; and chi2 there."""
+    """Return H and g of the Gauss-Newton step H step = g for the chosen parameters, prior included; and chi2."""
     n, e = len(chosen), np.empty(evidence.values.shape[1])
     A = np.empty((n, len(e)))  # minus the derivatives, a row per parameter
     residual(theta, evidence, j, e)
@@ -307,7 +307,7 @@ def _normal_equations(
 
 @inner
 def _without(H: Array, g: Array, i: int) -> tuple[Array, Array]:
-    """Normal equations of the parameters after number i once that one is fitted (Schur complement)."""
+    """Return the normal equations of the parameters after number i once that one is fitted (Schur complement)."""
     rest, right = H[i + 1 :, i + 1 :].copy(), g[i + 1 :].copy()
     for a in range(len(right)):
         share = H[i, i + 1 + a] / H[i, i]

@@ -125,7 +125,7 @@ TAIL_DENSITY, LOAD_DENSITY = _log_uniform(*TAIL_RANGE), _log_uniform(*LOAD_RANGE
 
 
 def first_prior(branches: int) -> Prior:
-    """Prior before anything is known of a fleet: few faults, of any size."""
+    """Make the prior to begin with, before anything is known of a fleet: few faults, of any size."""
     n = np.arange(3 * branches + 1)
     total = np.array([comb(3 * branches, i) for i in n]) * 0.2**n * 0.8 ** (3 * branches - n)
     counts = np.einsum("n,znhs->hs", total, _sparse(branches)) / 2.0

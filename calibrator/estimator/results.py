@@ -128,10 +128,11 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     branches: list[str]
     model_inputs: list[str]
     settings: dict[str, Any]
-    """What the user chose: hold-out and trusted vehicles, harm limit, or the published method's classifier."""
+    """What the user chose: branches and held-out vehicles; for the posterior method also harm limit, trust, loads"""
     created: str
     details: dict[str, Any]
-    """What the method records of its run: unity drive and simulation SNR, or reference, delays and hyper-parameters."""
+    """What the method records of its run: reference and hyper-parameters of a fleet, gain ratios and constants of
+    single junctions, or unity drive and simulation SNR of the published method."""
     vehicles: int
     buckets: int = 0
     """Number of files that parameters are spread over by the hash of the vehicle; 0: all are in the first."""

@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 MOST_REPORTED, LEAST_REPORTED = 3, 0.02
-"""Explanations that are reported, and the least probability of one after the first. [1]"""
+"""Largest number of explanations that are reported, and least probability of one after the first. [1]"""
 LEAST_RIVAL, LEAST_IN_THE_WAY = 0.02, 1e-4
 """Probability from which on another explanation is a rival, and from which on it can hold a correction back. [1]"""
 RESOLVED = 0.002
