@@ -1,1 +1,1 @@
-"""What of a user's layout and logs can be used, and what is wrong with it."""
+"""Examination of a user's layout and logs: what can be used, and what is wrong."""

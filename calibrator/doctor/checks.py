@@ -1,6 +1,6 @@
-"""What the doctor complains of beside the sum of the currents: checks, each a function from the facts to findings.
+"""Checks of the doctor, except those of the sum of the currents; each is a function from the facts to findings.
 
-A new check is one function more in :data:`CHECKS`; counts and values that it needs are in :class:`.Facts`. Those of
+To add a check, add a function to :data:`CHECKS`; the counts and values that it needs are in :class:`.Facts`. Checks of
 the sum are in :mod:`calibrator.kirchhoff.findings`.
 """
 
@@ -25,24 +25,25 @@ from ecu_node.summary import TIME_RESOLUTION_S
 __all__ = ["CHECKS", "findings_of", "readiness"]
 
 MOST_BAD, MANY_BAD, SOME_BAD = 0.5, 0.05, 0.001
-"""Shares of frames that cannot be used: what is left is no current; worth a warning; worth a hint. [1]"""
+"""Shares of unusable frames that give an error (the rest is not enough for a current), a warning, and a hint. [1]"""
 TIMEOUT_PERIODS = 5.0
 """A time-out of this many periods bridges some lost frames. [1]"""
 LEAST_V, GREATEST_V, USUAL_V = 30.0, 1500.0, 400.0
-"""From 48 V systems to the highest that road vehicles have; a slip is a power of ten that leads nearest to most. [V]"""
+"""Range of voltages from 48 V systems to the highest of road vehicles, and a usual one: a unit error is taken for the
+power of ten that brings the voltage nearest to it. [V]"""
 LEAST_OF_SCALE = 0.02
 """Greatest current seen, as a share of full scale, below which one of the two is probably wrong. [1]"""
 
 
 def findings_of(facts: Facts) -> list[Finding]:
-    """All findings, errors first; where the voltage is impossible, no branch is blamed for its unit."""
+    """Return all findings, errors first; if the voltage has a wrong unit, unit errors of branches are left out."""
     found, of_sum = [each for check in CHECKS for each in check(facts)], sum_findings(facts.junction)
     blamed = {each.code for each in found} & {"unit"}
     return worst_first([*found, *(each for each in of_sum if each.code not in blamed)])
 
 
 def logs_as_a_whole(facts: Facts) -> Findings:
-    """Logs of another vehicle; times, damage and other buses, in the words of 'import'."""
+    """Report logs without a branch of the layout, and what 'import' says of a log (times, damage, other buses)."""
     for log in facts.logs:
         if not isinstance(log.drive, Drive):
             what = log.drive.what.removeprefix(f"{log.name}: ")
@@ -53,7 +54,7 @@ def logs_as_a_whole(facts: Facts) -> Findings:
 
 
 def absent(facts: Facts) -> Findings:
-    """Branches and inputs that no log has, and branches that some logs lack."""
+    """Report branches and inputs that no log has, and branches that some logs lack."""
     what, where = "frame of", "record the bus that carries it"
     if not facts.database.layout.dbc_files:
         what, where = "column of numbers", "name the column that has it"
@@ -72,7 +73,7 @@ def absent(facts: Facts) -> Findings:
 
 
 def late(facts: Facts) -> Findings:
-    """Frames farther apart than the time-out of a branch."""
+    """Report branches whose frames are farther apart than the time-out."""
     for row in facts.channels[facts.channels.is_branch & (facts.channels.late > 0)].itertuples():
         timeout_s = facts.database.layout.find_branch(row.name).timeout_s
         if row.period_s > timeout_s + TIME_RESOLUTION_S:
@@ -101,7 +102,7 @@ BAD_ADVICE = {
 
 
 def bad_frames(facts: Facts) -> Findings:
-    """Frames that cannot be used."""
+    """Report branches and inputs with frames that cannot be used, and the reasons."""
     for row in facts.channels.itertuples():
         number = sum(row.bad.values())
         share = number / max(row.frames, 1)
@@ -117,7 +118,7 @@ def bad_frames(facts: Facts) -> Findings:
 
 
 def values(facts: Facts) -> Findings:
-    """Values at the end of what a signal can show, and those that never change."""
+    """Report branches with values at an end of the signal's range, and branches and inputs that never change."""
     for row in facts.channels[facts.channels.is_branch & (facts.channels.clipped > 0)].itertuples():
         stand = f"{row.clipped:,} of {row.frames:,} frames stand at the end of what {row.signal} can show"
         text = f"{stand}; it goes from {figure(row.low)} to {figure(row.high)} A"
@@ -132,7 +133,7 @@ def values(facts: Facts) -> Findings:
 
 
 def impossible_voltage(facts: Facts) -> Findings:
-    """A voltage that powers are divided by and that no vehicle has: a slip of its unit is every such branch's."""
+    """Report a junction voltage that no vehicle has: the error of its unit shows in every power divided by it."""
     value_v = np.abs(good_values(facts.drives, VOLTAGE))
     signal = next((item.signal for item in facts.junction.database.layout.input if item.name == VOLTAGE), "")
     if not value_v.any() or facts.logs[0].source.unit(signal) != "V":
@@ -146,7 +147,7 @@ def impossible_voltage(facts: Facts) -> Findings:
 
 
 def full_scale(facts: Facts) -> Findings:
-    """Currents beyond full scale, or far from it; of those with a slip of a unit what they are without it."""
+    """Report currents beyond full scale or far below it, after wrong units have been corrected."""
     scale_a, junction = facts.database.layout.full_scale_a, facts.junction
     right = dict(zip(junction.branches, np.abs(junction.multipliers).tolist(), strict=True))
     names = facts.database.layout.branch_names
@@ -173,10 +174,10 @@ CHECKS: Sequence[Callable[[Facts], Findings]] = (
 
 
 def readiness(facts: Facts, findings: Sequence[Finding]) -> dict[str, str]:
-    """Commands in the order in which they are used, and for each what is missing; empty where nothing is."""
+    """Return what each command still lacks, in the order of their use; an empty text if it is ready."""
     errors, junction = [finding.subject for finding in findings if finding.severity == "error"], facts.junction
     wrong = f"of the errors above ({', '.join(dict.fromkeys(errors))})" if errors else ""
-    single = () if junction.comparisons else facts.drives  # none has all branches, which one may do without
+    single = () if junction.comparisons else facts.drives  # no drive has all branches, but one may have enough
     refusals = [_refusal(partial(compare_kirchhoff, drive, junction.database)) for drive in single]
     together = "" if junction.comparisons or "" in refusals else next(iter(refusals), "no log has a branch")
     alone = partial(summarise_junction, junction.drives, junction.branches, facts.database)
@@ -191,7 +192,7 @@ def readiness(facts: Facts, findings: Sequence[Finding]) -> dict[str, str]:
 
 
 def _refusal(command: Callable[[], object]) -> str:
-    """What a command says of these drives."""
+    """Return the message with which a command refuses these drives; empty if it takes them."""
     try:
         command()
     except UserError as error_:

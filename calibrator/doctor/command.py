@@ -1,4 +1,4 @@
-"""``calibrator doctor``: what of a user's layout and logs can be used, what is wrong with it, and what to do."""
+"""``calibrator doctor``: what can be used of a layout and of logs, what is wrong with them, and what to do."""
 
 import math
 import shlex
@@ -47,7 +47,7 @@ def doctor(
 
 
 def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
-    """Tables of branches and inputs, findings, and what can be done next; long lines are for the terminal to fold."""
+    """Return tables of branches and inputs, findings, and next steps; the terminal is to wrap long lines."""
     seconds, frames = sum(log.duration_s for log in facts.logs), sum(log.report.frames for log in facts.logs)
     reasons: dict[str, list[str]] = {}
     for name, why in steps.items():
@@ -106,7 +106,7 @@ def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[st
 
 
 def _channels(what: str, facts: "Facts") -> str:
-    """Table of branches, or of inputs with their units; empty without any."""
+    """Return the table of the branches, or of the inputs with their units; empty if there are none."""
     header = [what, "frames", "Hz", "jitter ms", "gap s", "bad %", "least", "greatest", ""]
     channels, rows = facts.channels, []
     for row in channels[channels.is_branch == (what == "branch")].itertuples():

@@ -22,25 +22,25 @@ from ecu_node.summary import TIME_RESOLUTION_S
 __all__ = ["ExaminedLog", "Facts", "facts_of"]
 
 FEWEST_CLIPPED = 3
-"""In a row at the end of the range: one or two may be the true peak."""
+"""Values in a row at an end of the range that count as clipped; one or two may be the true peak."""
 NOTHING = Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
-"""Of a branch or input that a drive does not have."""
+"""Channel without samples, in place of a branch or input that a drive does not have."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExaminedLog:
-    """One log or table.
+    """One log or table, and what reading it gave.
 
     Attributes
     ----------
     name : str
-        Its file.
+        Path of the file.
     source : SignalSource
-        Look-ups of signals in it.
+        Finds signals in it.
     report : RecordingReport
-        Its account.
+        Counts of its frames, and what could not be used.
     drive : Drive or LogError
-        What it has of the layout, or that it has no branch of it.
+        Its branches and inputs of the layout, or the error that it has no branch.
     duration_s : float
         From the first to the last frame. [s]
     """
@@ -61,21 +61,21 @@ class Facts:
     database : VehicleDatabase
         DBC and layout.
     logs : sequence of ExaminedLog
-        What was looked at.
+        All logs and tables.
     drives : sequence of Drive
-        What they gave.
+        Drives of those that have a branch.
     channels : DataFrame
         A row for each branch and input, in the order of the layout:
 
         - ``name``; ``signal``, column or formula; ``unit`` of ``low`` and ``high``; whether it ``is_branch``, and
           whether it is an input that is ``needed`` for the model;
-        - ``frames``, or rows, that carry it, ``in_logs``: in how many of how many ``logs``;
+        - ``frames``: frames, or rows of a table, that carry it; ``in_logs``: how many of all ``logs`` have any;
         - ``period_s``, ``jitter_s``, ``gap_s``: median distance of frames, the 95th percentile of how far distances are
           from it, and the longest distance; NaN with fewer than two frames [s]; ``late``: distances longer than its
           time-out;
         - ``bad``: frames that cannot be used, by reason; ``good``: how many can be used;
         - ``low``, ``high``: least and greatest good value, of branches positive into the junction; NaN without any;
-        - ``clipped``: good values at an end of what the signal can show, several in a row.
+        - ``clipped``: good values at an end of the signal's range, several in a row.
     junction : RecordedJunction
         The sum of the branches.
     """
@@ -88,7 +88,7 @@ class Facts:
 
 
 def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
-    """Gather the facts of a layout, whose DBC is read, and of logs or tables of one vehicle.
+    """Read the DBC of a layout and the logs or tables of one vehicle, and gather the facts about them.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def _read(path: Path, database: VehicleDatabase) -> ExaminedLog:
 def _channel(
     item: Branch | Input, logs: Sequence[ExaminedLog], database: VehicleDatabase, needed: set[str]
 ) -> dict[str, Any]:
-    """Row of one branch [A], or of one input in the unit of its signal."""
+    """Return the row of ``Facts.channels`` for a branch [A], or for an input in the unit of its signal."""
     branch = item if isinstance(item, Branch) else None
     if isinstance(item, Branch):
         signal, timeout_s, unit = item.source, item.timeout_s, "A"
@@ -172,7 +172,7 @@ def _channel(
 
 
 def _clipped(signal: Signal, value: Array) -> int:
-    """Values at an end, other than 0, of what an integer signal can show and the DBC allows; some in a row each."""
+    """Count values at an end, other than 0, of an integer signal's range, :data:`FEWEST_CLIPPED` or more in a row."""
     if signal.is_float:
         return 0
     (low, high), span = bit_range(signal), signal_range(signal)

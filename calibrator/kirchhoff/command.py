@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 __all__ = ["kirchhoff"]
 
 PAGES, TABLES = (".html",), (".csv", ".parquet")
-"""Ends of the names of files that can be written."""
+"""File name endings of pages and tables that can be written."""
 USUAL_SCALE_A = 500.0
-"""Currents are plausible up to it where nothing tells full scale but the currents themselves. [A]"""
+"""Greatest plausible current where no layout states the full scale. [A]"""
 
 
 def kirchhoff(
@@ -102,7 +102,7 @@ def kirchhoff(
 
 
 def _next_step(log: Path, layout: Path | None, branches: str | None, database: "VehicleDatabase") -> str:
-    """How to have a correction of a log that has none; empty if there is no short way, as with formulas."""
+    """Return the command that leads to a correction of this log; empty if one command does not, as with formulas."""
     if layout is not None:
         return f"calibrate {quote(str(log))} --layout {quote(str(layout))} --trusted BRANCH --out result"
     if any(branch.computed for branch in database.layout.branch):

@@ -1,6 +1,6 @@
-"""What the sum of the currents complains of; the same for doctor and kirchhoff.
+"""Checks of the sum of the currents, used by both doctor and kirchhoff.
 
-A new check is one function more in :data:`CHECKS`, or in :data:`CHECKS_OF_MOVING` if currents must move for it.
+To add a check, add a function to :data:`CHECKS`, or to :data:`CHECKS_OF_MOVING` if it needs currents that move.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,43 +21,43 @@ from ecu_node.core.signals import AMPERE
 __all__ = ["CHECKS", "CHECKS_OF_MOVING", "sum_findings", "times"]
 
 ENOUGH_S = 60.0
-"""Shorter recordings tell neither delays nor gains. [s]"""
+"""Shorter recordings show neither delays nor gains. [s]"""
 NEAR_ZERO = 0.05
 """Share of full scale below which a current is near zero. [1]"""
 LEAST_DELAY_S, LONG_DELAY_S = 0.02, 0.1
-"""Shorter delays change no result: two frames of a fast message. 300 ms bend the gains of the junction law by 3 %; a
-third of that is worth a warning. [s]"""
+"""Delays from the first on are a hint: shorter ones, two frames of a fast message, change no result. From the second on
+they are a warning: 300 ms bend the gains of the junction law by 3 %, and this is a third of that. [s]"""
 LEAST_GAIN, LARGEST_GAIN, LEAST_SHARE = 0.02, 0.25, 0.5
-"""Gain errors that are worth a line, and those beyond what sensors drift; what they must explain of the sum about its
-mean, beside the rest. [1]"""
+"""Least gain error that is reported; largest one that sensors drift by; least share of the sum about its mean that gain
+errors must explain, relative to the unexplained rest. [1]"""
 LEAST_MEAN_A, LEAST_MEAN, LARGE_MEAN = 0.5, 0.001, 0.05
-"""Means of the sum below half an ampere, or the first share of full scale, are not worth a line; beyond the second they
-are more than loads without a sensor usually are. [A], [1]"""
+"""A mean of the sum below half an ampere, or below the first share of full scale, is not reported; beyond the second
+share it is more than loads without a sensor usually draw. [A], [1]"""
 LEAST_SUM_A, NO_SUM = 0.5, 0.3
-"""A sum that varies by less is right; share of the variation that is left in the sum, above which branches do not
-belong together. [A], [1]"""
+"""A sum that varies by less than the first is right. Branches do not belong together if the sum keeps more than the
+second as a share of their mean squares. [A], [1]"""
 SAME, CLEAR = 1.2, 2.0
-"""A sum that varies by less than so much more with the other sign of a branch does not tell it; by so much less it must
-vary with branches in each other's place, to be sure. [1]"""
+"""The sign of a branch is unknown if with the other sign the sum varies less than the first times as much. Two branches
+are surely exchanged if the sum varies more than the second times less with each in the other's place. [1]"""
 STUCK_S, STUCK_RANGE = 10.0, (0.1, 0.9)
-"""A current that is not zero holds its exact value for seconds at most; between these quantiles the others' sum must
-vary meanwhile. [s], [1]"""
+"""A current other than zero is stuck if it holds its exact value for so long; how much the others' sum varies meanwhile
+is taken between these quantiles. [s], [1]"""
 STUCK_MOVE, STUCK_VALUE, STUCK_ROUNDING = 0.02, 0.002, 1e-9
-"""Of full scale: by which the others' sum must vary meanwhile; near nothing a branch may well stand; what interpolation
-adds to values that are the same. [1]"""
+"""Shares of full scale: the others' sum must vary by more than the first meanwhile; a current below the second may well
+stand still; interpolation makes equal values differ by up to the third. [1]"""
 
 UNITS = {factor_a: unit for unit, factor_a in AMPERE.items()}
-"""Units of currents by what their values must be multiplied by."""
+"""Units of currents by the factor that turns their values into A."""
 
 
 def sum_findings(junction: RecordedJunction) -> list[Finding]:
-    """All findings of the sum, errors first."""
+    """Return all findings of the sum, errors first."""
     checks = [*CHECKS, *(CHECKS_OF_MOVING if junction.moves else ())]
     return worst_first(each for check in checks for each in check(junction))
 
 
 def enough(junction: RecordedJunction) -> Findings:
-    """Whether there is a sum, whether it is long enough, and whether anything moves in it."""
+    """Check whether there is a sum, whether it is long enough, and whether currents move."""
     names, record, valid_s = junction.branches, "record a minute of driving or more", junction.valid_s
     if len(names) < 2:
         text = f"usable frames of {', '.join(names) or 'no branch'} only, so there is no sum to look at"
@@ -84,12 +84,12 @@ def enough(junction: RecordedJunction) -> Findings:
 
 
 def times(factor: float) -> str:
-    """How a value is wrong that must be multiplied by a power of ten."""
+    """Say how wrong a value is that must be multiplied by this power of ten."""
     return f"{1.0 / factor:g} times too large" if factor < 1.0 else f"{factor:g} times too small"
 
 
 def signs_and_units(junction: RecordedJunction) -> Findings:
-    """Branches with the wrong sign, or a slip of a unit."""
+    """Report branches with a wrong sign or unit."""
     multipliers, bands, layout = junction.multipliers, junction.bands, junction.database.layout
     if _exchanged(junction):
         return
@@ -122,7 +122,7 @@ def signs_and_units(junction: RecordedJunction) -> Findings:
 
 
 def exchanged(junction: RecordedJunction) -> Findings:
-    """Branches of which each has the signal that the other is named after."""
+    """Report pairs of branches that each read the signal that the other is named after."""
     layout, bands = junction.database.layout, junction.bands
     for one, other in _exchanged(junction):
         first, second = layout.find_branch(one), layout.find_branch(other)
@@ -153,7 +153,7 @@ def _exchanged(junction: RecordedJunction) -> list[tuple[str, str]]:
 
 
 def sum_cancels(junction: RecordedJunction) -> Findings:
-    """Branches that do not belong to one junction."""
+    """Report branches that do not belong to one junction."""
     rest_a = junction.bands.rms_a(junction.multipliers)
     all_a, least_a = (float(np.linalg.norm(junction.multipliers * a)) for a in (junction.rms_a, junction.steps_a))
     if rest_a > max(LEAST_SUM_A, least_a) and (rest_a / all_a) ** 2 > NO_SUM:
@@ -169,7 +169,7 @@ def sum_cancels(junction: RecordedJunction) -> Findings:
 
 
 def cannot_tell(junction: RecordedJunction) -> Findings:
-    """Small branches of which another sign or unit would do nearly as well."""
+    """Report small branches for which the sum varies hardly more with the other sign."""
     rest_a = junction.bands.rms_a(junction.multipliers)
     for k, (name, rms_a) in enumerate(zip(junction.branches, junction.rms_a.tolist(), strict=True)):
         turned = np.where(np.arange(len(junction.branches)) == k, -1.0, 1.0) * junction.multipliers
@@ -181,7 +181,7 @@ def cannot_tell(junction: RecordedJunction) -> Findings:
 
 
 def delays(junction: RecordedJunction) -> Findings:
-    """Branches that come late."""
+    """Report branches whose frames come late or early, compared with most of the others."""
     found = junction.delays
     if found is None:
         return
@@ -203,7 +203,7 @@ def delays(junction: RecordedJunction) -> Findings:
 
 
 def gains(junction: RecordedJunction) -> Findings:
-    """The branch whose gain alone would explain most of how the sum varies, in the longest recording."""
+    """Report the branch whose gain error alone explains most of the sum's variation in the longest recording."""
     by_length = sorted(junction.comparisons, key=lambda each: each.valid.sum())
     for residual in filter(None, (comparison.residual["before"] for comparison in by_length[-1:])):
         alone: dict[str, dict[str, float]] = residual["alone"]
@@ -222,7 +222,7 @@ def gains(junction: RecordedJunction) -> Findings:
 
 
 def mean_of_sum(junction: RecordedJunction) -> Findings:
-    """What flows where no branch measures it."""
+    """Report a mean of the sum beyond the declared load: other loads without a sensor, or offsets of sensors."""
     load, scale_a = junction.database.layout.unmeasured_load, junction.database.layout.full_scale_a
     if not len(junction.sum_a) or (junction.moves and junction.changed):
         return
@@ -240,7 +240,7 @@ def mean_of_sum(junction: RecordedJunction) -> Findings:
 
 
 def stuck(junction: RecordedJunction) -> Findings:
-    """The longest stretch of each branch in which it stands still though the others move."""
+    """Report the longest stretch in which a branch holds its value though the others move."""
     scale_a, longest = junction.database.layout.full_scale_a, dict[str, Finding]()
     for currents_a in (comparison.stages["before"] for comparison in junction.comparisons):
         for name in junction.branches:
@@ -249,10 +249,10 @@ def stuck(junction: RecordedJunction) -> Findings:
             part = currents_a[run == run.mode()[0]]
             start_s, value_a = part.index[0], float(part[name].iloc[0])
             duration_s = float(part.index[-1] - start_s)
-            low_a, high_a = (part[SUM] - part[name]).quantile(STUCK_RANGE)  # not of a step at the end
+            low_a, high_a = (part[SUM] - part[name]).quantile(STUCK_RANGE)  # a step at the end does not count
             others_a = float(high_a - low_a)
             moves = others_a > STUCK_MOVE * scale_a and abs(value_a) > STUCK_VALUE * scale_a
-            if not moves or duration_s < STUCK_S or len(part) == len(currents_a):  # the last is told by itself
+            if not moves or duration_s < STUCK_S or len(part) == len(currents_a):  # never changes: found elsewhere
                 continue
             if name not in longest or duration_s > (longest[name].number or 0.0):
                 where = f"{figure(value_a)} A for {duration_s:.0f} s from {start_s:.0f} s on"
@@ -264,4 +264,4 @@ def stuck(junction: RecordedJunction) -> Findings:
 
 CHECKS: Sequence[Callable[[RecordedJunction], Findings]] = (enough, exchanged, mean_of_sum, stuck)
 CHECKS_OF_MOVING = (signs_and_units, sum_cancels, cannot_tell, delays, gains)
-"""What can be told only where currents move long enough."""
+"""Checks that are of use only if currents move long enough."""

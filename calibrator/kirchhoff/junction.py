@@ -1,7 +1,7 @@
-"""What recordings of one vehicle tell of the sum of its currents: signs, units, delays, whether anything moves.
+"""What recordings of one vehicle show about the sum of its currents: signs, units, delays, and whether currents move.
 
-Signs and units come first (:mod:`calibrator.kirchhoff.signs`); with these put right the delays as the calibrator
-estimates them, and without the delays signs and units once more.
+Signs and units are found first (:mod:`calibrator.kirchhoff.signs`). With these corrected, delays are estimated as the
+calibrator does; with the delays taken out, signs and units are found once more.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,35 +24,36 @@ from ecu_node.layout import Layout
 __all__ = ["RecordedJunction", "look_at_junction"]
 
 CHANGE_PRICE, UNIT_PRICE = 0.7, 0.3
-"""Each branch that is changed must halve V / N: its variation must then be above that of the sum's rest. The second is
-what a slip of a unit costs beyond a wrong sign: where both explain the same, the sign is wrong. [1]"""
+"""Price of each changed branch: it must halve V / N, so the branch must vary more than what is left of the sum. The
+second is the price of a wrong unit beyond that of a wrong sign: where both explain the same, the sign is wrong. [1]"""
 PLAUSIBLE_PRICE = 2.0
-"""For each branch whose current would be beyond what the layout calls full scale, or almost nothing of it. [1]"""
+"""Price of each branch whose current would be beyond full scale, and of currents that would all be near zero. [1]"""
 ORIENTATION_PRICE = 1.5
-"""For energy that would flow into a battery while its voltage falls: more than for one more change. [1]"""
+"""Price of signs by which energy flows into a battery while its voltage falls: more than that of one change. [1]"""
 LARGEST_SHARE, LEAST_SHARE = 1.2, 0.002
-"""Of full scale: beyond it, and almost nothing of it for the greatest current. [1]"""
+"""Shares of full scale: a current above the first is beyond it; if all are below the second, they are near zero. [1]"""
 PEAK_QUANTILE = 0.999
-"""Of the magnitudes: a few wild samples are no peak. [1]"""
+"""Quantile of the magnitudes that is taken as peak, so that a few wild samples do not count. [1]"""
 SMALL_SHARE = 0.05
-"""Of the greatest branch's variation; a smaller branch's gain is drawn to 0 by its noise. [1]"""
+"""A branch that varies by less than this share of the greatest is small: noise draws its gain to 0. [1]"""
 AVERAGED_S, FEWEST_AVERAGES = 2.0, 3
-"""Noise is averaged out over this long, to see whether currents move; fewer averages do not tell. [s], [1]"""
+"""Currents are averaged so long, against noise, to see whether they move; fewer averages do not tell. [s], [1]"""
 SHORT_S = 20.0
 """Shorter recordings tell no signs. [s]"""
 STILL_A, STILL_SHARE, STILL_STEPS = 0.5, 0.01, 0.5
-"""Currents that move by less than this [A], this share of full scale, or this many of their steps stand still. [1]"""
+"""Currents stand still if they move by no more than this [A] or this share of full scale, whichever is less, or by no
+more than this many of their steps. [1]"""
 STILL_SPEED = 0.5
 """Below this speed, in whatever unit, a car stands."""
 COARSEST = 0.01
-"""Share of full scale; a coarser step is a slip of a unit. [1]"""
+"""Coarsest step of a signal as a share of full scale; a coarser one comes from a wrong unit. [1]"""
 _SPEEDS, _SPEED_UNITS = ("speed", "velocity", "geschwindigkeit"), {"km/h", "kph", "kmh", "mph", "m/s", ""}
-"""Of the vehicle; columns of a table have no unit here, and a motor's speed never quite stands."""
+"""Words and units of a vehicle's speed. Columns of a table have no unit here; a motor's speed is never quite 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedJunction:
-    """The K branches with usable values, over recordings of one vehicle.
+    """Currents of the K branches with usable values in recordings of one vehicle, and what their sum shows.
 
     Attributes
     ----------
@@ -61,17 +62,17 @@ class RecordedJunction:
     branches : tuple of str
         The K branches.
     drives : tuple of Drive
-        Those with all of these branches.
+        Drives with all of these branches.
     comparisons : tuple of Comparison
-        Their currents, each on one time base; none with fewer than two branches.
+        Currents of each of these drives on one time base; none with fewer than two branches.
     steps_a : ndarray of shape (K,)
         Step of the signal of each branch, at most the share :data:`COARSEST` of full scale. [A]
     bands : Bands
-        Comparable currents as the layout has them, but for the delays; of no instant where too little was recorded.
+        Comparable currents with signs and units of the layout, without delays; no instant if too little was recorded.
     multipliers : ndarray of shape (K,)
-        +-10^n with which the sum varies least; 1 where nothing is wrong. [1]
+        Factors +-10^n of the branches with which the sum varies least; 1 where nothing is wrong. [1]
     delays : BranchDelays or None
-        With these signs and units; None where too little was recorded.
+        Delays found with these signs and units; None if too little was recorded.
     """
 
     database: VehicleDatabase
@@ -85,16 +86,16 @@ class RecordedJunction:
 
     @property
     def rms_a(self) -> Array:
-        """How much each branch varies, as the layout has it, shape (K,). [A]"""
+        """Root mean square variation of each branch with the layout's sign and unit, shape (K,). [A]"""
         return np.asarray(np.sqrt(np.mean(self.bands.current_a**2, axis=0)))
 
     @property
     def changed(self) -> list[int]:
-        """Numbers of the branches that are not as the layout has them."""
+        """Numbers of the branches whose sign or unit in the layout is wrong."""
         return [int(k) for k in np.flatnonzero(self.multipliers != 1.0)]
 
     def is_small(self, name: str) -> bool:
-        """Whether a branch varies too little beside the greatest for the sum to tell much of it."""
+        """Check whether a branch varies too little, compared with the greatest, for the sum to tell much about it."""
         right_a = self.rms_a * np.abs(self.multipliers)
         return bool(right_a[self.branches.index(name)] < SMALL_SHARE * np.max(right_a))
 
@@ -110,7 +111,7 @@ class RecordedJunction:
 
     @property
     def valid_s(self) -> float:
-        """How long the branches have values together. [s]"""
+        """Time for which all branches have values. [s]"""
         return self.database.layout.period_s * len(self.sum_a)
 
     @property
@@ -128,7 +129,7 @@ class RecordedJunction:
 
     @property
     def mean_a(self) -> float:
-        """Greatest magnitude of the mean of a branch. [A]"""
+        """Greatest magnitude that the mean of any branch has in a drive. [A]"""
         return float(max((np.abs(part[:, :-1].mean(axis=0)).max() for part in self.currents_a), default=0.0))
 
     @cached_property
@@ -145,7 +146,7 @@ class RecordedJunction:
 
     @cached_property
     def stands_still(self) -> bool:
-        """Whether no current varies by more than its sensor resolves; False if a speed moves, or of too little."""
+        """Whether no current varies by more than its sensor resolves; False if the car moves or the data are few."""
         if self.speed or not len(self.moves_a):
             return False
         least_a = min(STILL_A, STILL_SHARE * self.database.layout.full_scale_a)
@@ -165,11 +166,11 @@ def look_at_junction(
     Parameters
     ----------
     drives : sequence of Drive
-        Of one vehicle; those that lack a branch that others have do not count.
+        Drives of one vehicle; a drive that lacks a branch of the others does not count.
     database : VehicleDatabase
-        With the voltages, see :func:`.with_voltages`.
+        DBC and layout with the voltages, see :func:`.with_voltages`.
     full_scale_a : float, optional
-        What currents are plausible up to, if it is not that of the layout. [A]
+        Greatest plausible current, if it is not the full scale of the layout. [A]
     """
     layout = at_pace(database.layout, drives)
     database = replace(database, layout=layout)
@@ -210,7 +211,7 @@ def look_at_junction(
 
 
 def _multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
-    """A drive with its branch currents multiplied by a number."""
+    """Return a drive with its branch currents multiplied by the given numbers."""
     branches = {
         name: replace(drive.branches[name], value=m * drive.branches[name].value) for name, m in multipliers.items()
     }
@@ -218,7 +219,7 @@ def _multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
 
 
 def _multipliers(bands: Bands, price: Callable[[Array], float], least_a: float) -> Array:
-    """Likely multipliers of the branches; a sum that varies by no more than quantisation leaves is right."""
+    """Return likely multipliers of the branches; all are 1 if the sum varies by no more than quantisation explains."""
     ones = np.ones(bands.current_a.shape[1])
     return ones if bands.rms_a(ones) <= least_a else likely_multipliers(bands, price)
 
@@ -226,7 +227,7 @@ def _multipliers(bands: Bands, price: Callable[[Array], float], least_a: float) 
 def _price(
     drives: Sequence[Drive], names: Sequence[str], layout: Layout, full_scale_a: float
 ) -> Callable[[Array], float]:
-    """What is held against multipliers of the branches beside the sum."""
+    """Return the function that gives multipliers a price for changes, implausible currents and the battery's sign."""
     peak_share = (
         np.array([np.quantile(np.abs(good_values(drives, name)), PEAK_QUANTILE) for name in names]) / full_scale_a
     )

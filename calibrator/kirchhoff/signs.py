@@ -1,10 +1,10 @@
-"""Signs and slips of units that the sum of some currents tells.
+"""Find wrong signs and units of some currents by their sum.
 
-They come from currents without means and slow changes, and too smooth for a delay to matter: a load that no sensor
-sees, and offsets, would be taken for faults of a branch; fast changes because of a delay, too. With x_k such a band of
-the current of branch k and m_k = +-10^n, the sum V = mean (sum_k m_k x_k)^2 should be small beside
-N = sum_k m_k^2 mean x_k^2. Both scale alike, so the ratio V / N tells nothing of a factor that all branches share, and
-nothing of a sign that all share; what else is known of the branches must tell those.
+Means, slow changes and fast changes of the currents are filtered out first: otherwise offsets and loads without a
+sensor would be taken for faults of a branch, and so would fast changes that come late. With x_k the filtered current
+(band) of branch k and m_k = +-10^n, V = mean (sum_k m_k x_k)^2 should be small compared with
+N = sum_k m_k^2 mean x_k^2. Both scale alike, so the ratio V / N shows neither a factor nor a sign that all branches
+share; these must follow from something else that is known of the branches.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,25 +20,27 @@ from calibrator.drives.charge import Band, charge_curve, covered
 __all__ = ["SURE", "WELL_CORRELATED", "Bands", "bands_of", "likely_multipliers", "sag"]
 
 BAND = Band(short_s=0.75, long_s=10.0)
-"""Half widths of the averages: several times the delays of real cars, and as long as driving keeps its pace. [s]"""
+"""Half widths of the two moving averages: several times the delays of real cars, and as long as driving keeps its pace.
+[s]"""
 STEP_S = 0.25
 """Distance of the instants: a third of the shorter window. [s]"""
 BLOCK_S = 10.0
 """Blocks count as independent: as long as the longer window reaches. [s]"""
 FAST_S = 1.0
-"""Of frames farther apart than this all these are longer by as much. [s]"""
+"""If frames are farther apart than this, all times above are longer by the same factor. [s]"""
 FACTORS = (1.0, 1e-1, 1e-2, 1e-3, 1e1, 1e2, 1e3)
-"""Slips of units and scales. [1]"""
+"""Factors by which units and scales may be wrong. [1]"""
 LEAST_RATIO = 1e-4
-"""V / N below this is as good as nothing: sensors are not better than 1 %. [1]"""
+"""V / N below this counts as this: sensors are not better than 1 %. [1]"""
 SURE = 3.0
-"""So many standard errors, from block to block of time, a change must make the sum smaller. [1]"""
+"""A change must make the sum smaller by this many standard errors, found from the blocks of time. [1]"""
 OVERWHELMING = 3.0
-"""A price lower by this: V / N falls twentyfold, as where a branch that is rarely used drowns all others. [1]"""
+"""A change that lowers the price by this (V / N to a twentieth) is made even if blocks differ, as where a branch that is
+rarely used drowns all others. [1]"""
 FEWEST_BLOCKS = 4
-"""Fewer give no standard error worth the name: half a minute."""
+"""Fewer blocks, about half a minute, give no usable standard error."""
 WELL_CORRELATED = 0.5
-"""Of battery current and voltage, below which the sag of the voltage tells nothing. [1]"""
+"""Correlation of battery current and voltage below which the sag of the voltage tells nothing. [1]"""
 
 
 class Bands(NamedTuple):
@@ -60,7 +62,7 @@ class Bands(NamedTuple):
 
 
 def bands_of(recordings: Sequence[Sequence[Channel]]) -> Bands:
-    """Bands of the same K >= 1 channels in some recordings; of no instant where none is long enough."""
+    """Return the bands of the same K >= 1 channels of some recordings; no instants if no recording is long enough."""
     parts, blocks, count = [np.zeros((0, max(map(len, recordings), default=1)))], [np.zeros(0, np.intp)], 0
     for channels in recordings:
         curves = [curve for channel in channels if (curve := charge_curve(channel)) is not None]
@@ -82,18 +84,18 @@ def bands_of(recordings: Sequence[Sequence[Channel]]) -> Bands:
 def likely_multipliers(
     bands: Bands, price_besides: Callable[[Array], float], *, factors: Sequence[float] = FACTORS, sure: bool = True
 ) -> Array:
-    """Multipliers, shape (K,), with the least price: the logarithm of V / N, and what else is held against them.
+    """Return the multipliers, shape (K,), of the least price, which is log (V / N) and the price of other objections.
 
     Parameters
     ----------
     bands : Bands
-        Of the K currents.
+        Bands of the K currents.
     price_besides : callable
-        What is held against multipliers of shape (K,). [1]
+        Returns the price of all other objections to multipliers of shape (K,). [1]
     factors : sequence of float
-        Magnitudes that are tried, of one branch or two at a time. [1]
+        Magnitudes that are tried, for one branch or two at a time. [1]
     sure : bool
-        Whether only a change is made that makes the sum far smaller, or does so in one block of time after the other.
+        Whether a change is made only if the sum becomes far smaller, or consistently smaller from block to block.
     """
     moments = bands.moments
 
@@ -110,21 +112,21 @@ def likely_multipliers(
     while True:
         found = min(_neighbours(best, factors), key=price)
         fall = price(best) - price(found)
-        only_turned = np.array_equal(found, -best)  # of which the sum tells nothing
+        only_turned = np.array_equal(found, -best)  # makes no difference to the sum
         if fall <= 1e-9 or not (not sure or only_turned or is_sure(best, found, fall)):
             return best
         best = found
 
 
 def _ratios(moments: Array, multipliers: Array) -> Array:
-    """V / N of each block."""
+    """Return V / N of each block, at least :data:`LEAST_RATIO`."""
     power = np.einsum("bkk,k->b", moments, multipliers**2)
     values = np.einsum("bij,i,j->b", moments, multipliers, multipliers)
     return np.asarray(np.maximum(np.divide(values, power, out=np.ones(len(moments)), where=power > 0.0), LEAST_RATIO))
 
 
 def _neighbours(multipliers: Array, factors: Sequence[float]) -> Iterator[Array]:
-    """Multipliers that differ in one branch or two, and those with all signs turned."""
+    """Yield multipliers that differ in one branch or two, and those with all signs turned."""
     yield -multipliers
     alternatives = [sign * factor for sign, factor in product((1.0, -1.0), factors)]
     for group in combinations(range(len(multipliers)), min(2, len(multipliers))):
@@ -135,6 +137,6 @@ def _neighbours(multipliers: Array, factors: Sequence[float]) -> Iterator[Array]
 
 
 def sag(pairs: Sequence[tuple[Channel, Channel]]) -> float:
-    """Correlation of a battery's currents with its voltages [1]: -1 where these fall under load; 0 if nothing tells."""
+    """Return the correlation of a battery's currents and voltages [1]: -1 if these fall under load; 0 if unknown."""
     band = bands_of(pairs).current_a
     return float(np.corrcoef(band[:, 0], band[:, 1])[0, 1]) if len(band) and np.all(band.std(axis=0) > 0.0) else 0.0

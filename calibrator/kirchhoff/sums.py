@@ -1,6 +1,6 @@
 """Kirchhoff's current law before and after correction, in figures.
 
-Of a current x(t) over the valid instants of the common time base of :mod:`calibrator.drives.align`:
+For a current x(t) over the valid instants of the common time base of :mod:`calibrator.drives.align`:
 
     RMSE = sqrt(mean(x^2)),    maximum = max |x|,    mean,    sd = standard deviation
 
@@ -13,10 +13,10 @@ Right sensors do not sum to exactly 0 A either. The standard deviation that is e
     sd(t)^2 = max(n^2, sum_k q_k^2 / 12) + sum_k (i_k'(t) T_k)^2 / 12 + (sum_k i_k'(t) tau_k)^2
               + sum_k (u_k i_k(t))^2 + L^2
 
-with q_k the step of the signal of branch k, n the noise of S as fast changes of what gains and delays leave of it show
-it (:func:`_noise`), T_k the period of the frames of branch k (a value is up to T_k old; 0 at instants between frames
-that all branches have at the same times, as in a table), tau_k the delay of branch k as S shows it, u_k the uncertainty
-of a formula that gives branch k, and L the spread of the declared load.
+with q_k the step of the signal of branch k, n the noise of S, estimated from its fast changes after gain errors and
+delays are taken out (:func:`_noise`), T_k the period of the frames of branch k (a value is up to T_k old; 0 at instants
+between frames that all branches have at the same times, as in a table), tau_k the delay of branch k as S shows it, u_k
+the uncertainty of a formula that gives branch k, and L the spread of the declared load.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,11 +47,11 @@ SUM = "sum"
 BAND = 2.0
 """Half width of the band, in standard deviations: 19 of 20 instants of right sensors lie in it. [1]"""
 MOVES = 5.0
-"""A branch whose variation is less than this many times its noise has no share that could be told. [1]"""
+"""A branch whose variation is less than this many times its noise gets no share in the sum. [1]"""
 LEVELS = 10
 """Fewer different values do not show a step: a heater is on or off. [1]"""
 FEWEST = 50
-"""Valid instants, to divide the sum into shares."""
+"""Fewest valid instants from which the sum is divided into shares."""
 _AFTER = " (corrected)"
 """End of the name of a corrected current beside the measured one."""
 
@@ -67,9 +67,9 @@ class Comparison:
     left_out : tuple of str
         Branches of the layout without usable values: not in the sum.
     uncorrected : tuple of str
-        Branches that are not corrected, and enter the sum after with their measured values; empty without a sum after.
+        Branches that are not corrected, and enter the corrected sum with measured values; empty without such a sum.
     masked : mapping of str to int
-        How many instants are not valid for which reason.
+        Number of instants that are not valid, by reason.
     stages : mapping of str to DataFrame of shape (T, K + 1)
         ``before`` and, if something is corrected, ``after``: a column per branch and :data:`SUM`, positive into the
         junction, by the instant [s]; NaN where not valid. [A]
@@ -78,14 +78,14 @@ class Comparison:
     expected_sd_a : ndarray of shape (T,)
         Its standard deviation at each instant, see the top of this module. [A]
     parts_a : mapping of str to float
-        Each part of that in the median: ``quantisation``, ``noise``, ``sampling``, ``delays``, ``formulas``,
-        ``load``. [A]
+        Median of each part of that: ``quantisation``, ``noise``, ``sampling``, ``delays``, ``formulas``, ``load``. [A]
     residual : mapping of str to dict, or None
-        Shares in the mean square of the sum about what is expected, before and after: ``constant`` of its mean;
-        ``gains`` of what gain errors explain about the mean; ``delays`` of what delays explain of the rest; ``rest``.
-        They add up to 1. ``rest_a``: root mean square of the rest [A]. ``alone``: by branch, as if its gain alone were
-        wrong, ``gain_error`` and ``gain_share`` of the sum's variation; branches that move too little are absent.
-        None of few instants, or of a sum that is exact.
+        By stage, the shares in the mean square of the sum about its expected value, which add up to 1: ``constant``,
+        its mean; ``gains``, what gain errors explain of the variation about the mean; ``delays``, what delays explain
+        of what is then left; ``rest``. ``rest_a`` is the root mean square of the rest [A]. ``alone`` has for each
+        branch the ``gain_error`` that it would have if its gain alone were wrong, and ``gain_share``, the share of the
+        sum's variation that this explains; branches that move too little are absent. None if the instants are few or
+        the sum is exact.
     """
 
     full_scale_a: float
@@ -132,7 +132,7 @@ class Comparison:
         return {stage: float(np.mean(np.abs(sum_a - self.expected_a) <= far_a)) for stage, sum_a in sums_a.items()}
 
     def notices(self) -> list[str]:
-        """Return what a reader of the figures must know, one short text each."""
+        """Return short texts on what a reader of the figures must know."""
         unused, reasons = int(np.sum(~self.valid)), (f"{n:,} {reason}" for reason, n in self.masked.items() if n)
         texts = {
             f"no usable frames of {', '.join(self.left_out)}: left out of the sum": self.left_out,
@@ -165,18 +165,18 @@ def _figures(a: pd.DataFrame, expected_a: float) -> pd.DataFrame:
 
 
 def _noise(value: Array) -> float:
-    """Standard deviation of white noise as fast changes show it, in the unit of the values, shape (n,).
+    """Estimate the standard deviation of white noise from the fast changes of values, shape (n,), in their unit.
 
-    1.4826 / sqrt(20) times the median of the magnitudes of third differences: what changes smoothly drops out, and so
-    do rare jumps; 0 where most values repeat the one before.
+    It is 1.4826 / sqrt(20) times the median magnitude of third differences, in which smooth changes and rare jumps drop
+    out; 0 where most values repeat the one before.
     """
     return float(MAD_TO_SD / np.sqrt(DIFFERENCE_GAIN) * np.median(np.abs(np.diff(value, 3)))) if len(value) > 3 else 0.0
 
 
 def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
-    """The same with inputs more: voltages of branches that are powers, for :func:`step_of`, and :data:`VOLTAGE`.
+    """Return the database with more inputs: voltages of branches that are powers (:func:`step_of`) and :data:`VOLTAGE`.
 
-    The latter is the signal that powers are divided by, or else the first input in volts.
+    :data:`VOLTAGE` is the first signal by which powers are divided, or else the first input in volts.
     """
     layout = database.layout
     volts = [item.signal for item in layout.input if database.signal(item.signal)[1].unit == "V"]
@@ -188,10 +188,10 @@ def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
 
 
 def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
-    """Step of the current of a branch; 0 if nothing tells it. [A]
+    """Return the step in which the current of a branch is resolved; 0 if it is not known. [A]
 
-    It is the least distance of two values seen, or the scale of its signal if that is less; of a power the scale of the
-    power over the usual voltage, where that is recorded.
+    It is the least distance of two values seen, or the scale of its signal if that is less. For a power it is the scale
+    of the power over the median voltage, if the voltage is recorded.
     """
     branch, channel = database.layout.find_branch(name), drive.branches[name]
     if branch.power is not None and branch.voltage is not None:
@@ -228,7 +228,7 @@ def compare_kirchhoff(
     Raises
     ------
     LayoutError
-        If a branch is called as the sum.
+        If a branch has the name of the sum.
     DriveError
         If fewer than two branches have usable values, no instant is valid for all of them, or the parameters are of
         other branches.
@@ -282,7 +282,7 @@ def compare_kirchhoff(
 def _explained(
     frames: Mapping[str, pd.DataFrame], valid: Mask, database: VehicleDatabase, drive: Drive, expected_a: float
 ) -> tuple[Array, dict[str, float], dict[str, dict[str, Any] | None]]:
-    """Standard deviation of the sum by the formula at the top of this module, its parts, and the shares in the sum."""
+    """Return the expected standard deviation of the sum (formula at the top), its parts, and the shares in the sum."""
     time_s, measured_a = frames["before"].index.to_numpy(), frames["before"].to_numpy()
     channels = {name: drive.branches[name] for name in frames["before"]}
     good_s = [channel.time_s[channel.good] for channel in channels.values()]
@@ -290,8 +290,8 @@ def _explained(
     slope = np.gradient(measured_a, time_s, axis=0) if len(time_s) > 1 else np.zeros_like(measured_a)
     step_a = np.array([step_of(database, name, drive) for name in channels])
     noise_a = np.array([_noise(channel.value[channel.good]) for channel in channels.values()])
-    # The noise of each branch is in the sum. Of rows seconds apart a current itself looks like noise, the sum less so,
-    # and what gain errors and delays leave of the sum does not.
+    # The noise of each branch is in the sum, so none has more than that. In rows seconds apart a current itself looks
+    # like noise, the sum less so, and the sum without gain errors and delays does not.
     most_a = _noise(measured_a.sum(axis=1)[valid])
     for _ in range(2):
         noise_a = np.maximum(np.minimum(noise_a, most_a), step_a / np.sqrt(12.0))
@@ -314,7 +314,7 @@ def _explained(
 
 
 def _together(good_s: Sequence[Array], time_s: Array) -> Mask:
-    """Instants between, or at, good frames that have the same times in all channels."""
+    """Return the instants whose good frames before and after are at the same times in all channels, shape (T,)."""
     sides = []
     for each_s in good_s:
         known_s = np.concatenate([[-np.inf], each_s, [np.inf]])
@@ -326,10 +326,11 @@ def _together(good_s: Sequence[Array], time_s: Array) -> Mask:
 def _shares(
     currents_a: pd.DataFrame, slope: Array, noise_a: Array, mean_a: float
 ) -> tuple[dict[str, Any] | None, Array, Array]:
-    """Shares in the sum, the delays that it shows relative to the branch that moves most, shape (K,) [s], and the rest.
+    """Return shares in the sum, delays relative to the branch that moves most, shape (K,) [s], and the residual [A].
 
     The sum holds the noise of each branch, too: its variance is taken out of both sides of the regression on the gains.
-    The branch that moves most is left out of the regressions, since all gains together cannot be told from its own.
+    The branch that moves most is left out of the regressions, since an error of its gain cannot be told from the same
+    error of all others.
     """
     a = currents_a.to_numpy()
     x, total = a - a.mean(axis=0), a.sum(axis=1) - mean_a
@@ -359,6 +360,6 @@ def _shares(
 
 
 def _gone(before: Array, after: Array) -> float:
-    """Share of the power of a signal that is gone."""
+    """Return the share of a signal's power that was removed."""
     power = float(before @ before)
     return max(1.0 - float(after @ after) / power, 0.0) if power > 0.0 else 0.0

@@ -18,17 +18,17 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 _BAND_COLOUR = "#D9D9D9"
 _SUMS = {"before": "#882255", "after": "black"}
 STAGES = {"before": "measured", "after": "corrected"}
-"""What people call the stages of a comparison."""
+"""Names of the stages of a comparison for users."""
 SLIP = 0.5
-"""Magnitude of a gain error beyond which it is no sensor's but a slip of sign or unit. [1]"""
+"""A gain error of a larger magnitude is not that of a sensor, but a wrong sign or unit. [1]"""
 LEAST_SHARE = 0.005
-"""Of how the sum varies: less stands as 0 % and explains nothing. [1]"""
+"""Least share of the sum's variation that is shown: less is written as 0 % and explains nothing. [1]"""
 MOST_DRAWN = 50_000
-"""Instants: more make a page of tens of megabytes, and no line that could be seen. [1]"""
+"""Most instants of a picture: more make a page of tens of megabytes, and show nothing more. [1]"""
 
 
 def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
-    """Tables of 80 columns, notices, and the line that sums it up."""
+    """Return tables of 80 columns, the notices, and a line that sums it all up."""
     stages = {stage: found for stage, found in comparison.figures.items() if stage != "change"}
     rows = [
         [name, *(f"{value:z.2f}" for value in row)] for name, *row in pd.concat(stages.values(), axis=1).itertuples()
@@ -80,11 +80,11 @@ def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
     Parameters
     ----------
     comparison : Comparison
-        What is compared; one panel before and, where there are corrected currents, one after.
+        Currents to draw: a panel as measured and, where there are corrected currents, one as corrected.
     path : Path
         HTML page to write, which needs no other file.
     title : str
-        Stands above the panels.
+        Text above the panels.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def draw_kirchhoff(comparison: Comparison, path: Path, *, title: str) -> None:
     drawing.update_yaxes(title_text="current [A]")
     drawing.update_xaxes(title_text="time [s]", row=rows, col=1)
     heading, height = {"text": title.replace(": ", ":<br>", 1), "font_size": 15, "yref": "container"}, 220 + 280 * rows
-    # Title, then legend from above, so that it is seen without scrolling.
+    # The legend stands at the top, below the title, where it is seen without scrolling.
     heading |= {"y": 1.0 - 15 / height, "yanchor": "top"}
     legend = {"orientation": "h", "yref": "container", "y": 1.0 - 70 / height, "yanchor": "top"}
     drawing.update_layout(title=heading, template="plotly_white", hovermode="x unified", height=height)
@@ -140,10 +140,10 @@ def save_table(comparison: Comparison, path: Path) -> None:
     Parameters
     ----------
     comparison : Comparison
-        What is compared.
+        Currents to write.
     path : Path
         File to write, .csv or .parquet: time_s, a column per branch and the sum [A], the same with ``_corrected`` where
-        something is corrected, and the standard deviation expected of the sum; empty where not valid.
+        something is corrected, and the expected standard deviation of the sum [A]; empty where not valid.
 
     Raises
     ------

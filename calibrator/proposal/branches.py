@@ -1,4 +1,4 @@
-"""Which candidates are the branches of the junction: a score with its reasons for each, a choice, and the signs."""
+"""Find the branches of the junction among the candidates: score each with reasons, choose, and find the signs."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,31 +22,35 @@ NOT_MEASURED, LIMITS, ELSEWHERE, DCDC_ELSEWHERE, HIGH_VOLTAGE = (
 MAIN = ("battery", "motor")
 NAMED, NAMED_AROUND, HV, MEASURED, BESIDE = 35.0, 40.0, 15.0, 10.0, 20.0
 AGAINST, WEAK, STEADY, NEVER = -65.0, -30.0, -40.0, -150.0
-"""Points: for a place in the name, in message or sender, ...; against a word, a range, and for what decides alone."""
+"""Points for a place in the name or comment, one in these or in message or sender, a word for high voltage, a word or
+unit of a current, and a voltage in its message; points against a word or range that excludes it, one that makes it
+unlikely, a value that never changes, and what excludes it by itself."""
 UNITS, LEAST_OF_LOADS = {"current": "A", "power": "W"}, {"current": 3.0, "power": 500.0}
-"""Units, and ranges that a database gives to heaters, converters and chargers: valves and clutches have less. [A, W]"""
+"""Units, and least ranges of heaters, converters and chargers in a database; valves and clutches have less. [A, W]"""
 CELL_V, LOW_V, HIGH_V = 6.0, 40.0, 60.0
-"""A voltage beside a current is of a cell, of 12 or 24 V, of neither, or of a junction. [V]"""
+"""Bounds of a voltage in the message of a current: below the first it is of a cell, below the second of a network of 12
+or 24 V, and from the third on of a junction. [V]"""
 STEADY_SHARE = 0.1
-"""Of its peak: a current that varies by less is steady, and how the sum varies says little. [1]"""
+"""A current that varies by less than this share of its peak is steady; how the sum varies then says little. [1]"""
 ROUGH, ROUGH_POINTS = 0.5, -50.0
-"""Root mean square of steps over that of white noise of the same spread: beyond it no current jumps. [1]"""
+"""Root mean square of the steps, over that of white noise of the same spread, beyond which it is no current; and the
+points for that. [1]"""
 CLEAR = 2.0
-"""By so much more the sum must vary with the other sign. [1]"""
+"""A sign, or one more branch, is clear if the sum varies this many times more without it. [1]"""
 OWN_GAIN, FEWEST_BINS = 1.3, 20
-"""Gain errors that a load which closes the sum may leave to any branch, and means that it takes to tell. [1]"""
+"""A current closes the sum if all gains are within this factor of 1; fewer instants than the second cannot tell. [1]"""
 MOST_TOGETHER, MOST_TRIED = 2, 12
 """Currents without a place that are tried together, and that are tried at all, the best first. [1]"""
 MEANS = 50
-"""One row of means for so many instants: loads that no branch measures are in them."""
+"""Instants for which one row of means is added; no more, as loads that no branch measures are in the means."""
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
-"""Why a charger is no branch beside a motor, where no log is there."""
+"""Reason why a charger is not taken as a branch where there is a motor, but no log."""
 
 
 def _score(
     item: Candidate, place: str, everything: Sequence[Candidate], volts: Sequence[Candidate]
 ) -> tuple[float, str]:
-    """Score of a current or power as the branch at a place, and what speaks most against it, or for it."""
+    """Return the score of a current or power as the branch at a place, and the main reason for it or against it."""
     own, near, named = set(item.own), set(item.words), PLACES.get(place, frozenset())
     # "Iheat" of a table is a heater's current; in a database, or beside a motor, heat is a loss.
     allowed = named if item.message is None and places_of(near) == {place} else set()
@@ -96,7 +100,7 @@ def _of_recording(item: Candidate, channel: Channel) -> tuple[float, str]:
 def _of_voltage(
     item: Candidate, place: str, everything: Sequence[Candidate], volts: Sequence[Candidate]
 ) -> tuple[float, str]:
-    """What the greatest voltage of the same message says of it."""
+    """Return points and a reason by the greatest voltage in the same message."""
     beside = [v for v in volts if v.message is item.message and not {"cell", "brick", "ref"} & set(v.own)]
     rated = [(float(np.median(v.good)) if len(v.good) else v.reach, v.name) for v in beside]
     greatest_v, name = max(rated, default=(np.nan, ""))
@@ -116,7 +120,7 @@ def _of_voltage(
 
 
 def _names(item: Candidate) -> set[str]:
-    """Message and senders."""
+    """Return the names of its message and senders, without placeholders."""
     return {item.message.name, *item.message.senders} - {"XXX", "Vector__XXX"} if item.message is not None else set()
 
 
@@ -130,9 +134,9 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
     Parameters
     ----------
     found : sequence of Candidate
-        Of a database, of what a log holds of it, or of a table.
+        Candidates of a database, those of them that a log holds, or those of a table.
     everything : sequence of Candidate
-        Also what the log does not hold: it says whose signals these are.
+        All candidates, also those that the log does not hold: their words may tell what a message or sender is of.
 
     Returns
     -------
@@ -159,13 +163,13 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
 
 
 def _named_branches(judged: Sequence[Candidate]) -> dict[int, str]:
-    """The best candidate for each position that is named at a place, by number."""
+    """Return the names of the branches by number of the candidate: the best one for each position at each place."""
     taken: dict[int, str] = {}
     for place in PLACES:
         good = [k for k, item in enumerate(judged) if item.place == place and item.score >= TAKEN]
         positions = {k: "" if place == "battery" else _position(judged[k], judged) for k in good}
         if len({position for position in positions.values() if position}) > 1:
-            good = [k for k in good if positions[k]]  # one for all of them is no branch beside them
+            good = [k for k in good if positions[k]]  # without a position it is of all together: no branch
         best = {positions[k]: k for k in reversed(good)}
         for position, k in best.items():
             is_named = position and (len(best) > 1 or not position.isdigit())
@@ -174,7 +178,7 @@ def _named_branches(judged: Sequence[Candidate]) -> dict[int, str]:
 
 
 def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
-    """Front, rear, left, right or a number, as name, comment or message say; empty if none."""
+    """Return front, rear, left, right or a number if name, comment or message say so; else an empty text."""
     for words in (item.own, item.words):
         if found := [position for position in POSITIONS if position in words]:
             return found[0]
@@ -186,22 +190,22 @@ def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
 
 
 def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
-    """Take measured currents that no word places, alone or two at a time, where they close the sum of the others.
+    """Take measured currents of unknown place as branches, alone or in pairs, if they close the sum of the others.
 
-    The battery's current is fitted by the other branches, each with a gain: with the current, all gains must be near 1,
-    which those of copies are not, and the rest must be half of what it is without.
+    The battery's current is fitted by the other branches, each with a gain. With the added current all gains must be
+    near 1, which excludes copies of a branch, and the residual must be less than half of that without it.
 
     Parameters
     ----------
     judged : sequence of Candidate
-        The branches first, the battery first of them.
+        All candidates, the branches first, and of these the battery first.
     voltage : Candidate or None
-        What powers are divided by.
+        Voltage by which powers are divided.
 
     Returns
     -------
     list of Candidate
-        All, the branches first.
+        All candidates, the branches first.
     """
     result = list(judged)
     free = [
@@ -230,7 +234,7 @@ def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Ca
 
 
 def _with_usual_sign(item: Candidate) -> Candidate:
-    """The candidate with the sign that a comment tells, or that of convention: discharge and consumption positive."""
+    """Return the candidate with the sign that its comment states, or the usual one: discharge, consumption positive."""
     gives, words = item.place in {"battery", "charger"}, set(words_of(item.comment))
     out, into = ("discharge", "charge") if gives else ("recuperation", "consumption")
     if "positive" in words and (out in words) != (into in words):
@@ -242,7 +246,7 @@ def _with_usual_sign(item: Candidate) -> Candidate:
 
 
 def _channels(branches: Sequence[Candidate], voltage: Candidate | None) -> list[Channel]:
-    """Currents of some candidates, powers divided by the voltage [A]; empty if the recording does not have all."""
+    """Return the currents of the candidates, powers over voltage [A]; empty if the recording does not have all."""
     channels = []
     for item in branches:
         if (channel := item.channel) is None:
@@ -257,32 +261,32 @@ def _channels(branches: Sequence[Candidate], voltage: Candidate | None) -> list[
 
 
 def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
-    """Give branches the signs with which the sum of all varies least, and the battery's voltage sags under its load.
+    """Give branches the signs for which the sum varies least and the battery's voltage falls under load.
 
     Parameters
     ----------
     chosen : sequence of Candidate
         The branches.
     voltage : Candidate or None
-        The battery's.
+        Voltage of the battery.
 
     Returns
     -------
     list of Candidate
-        The same with signs and how they are known; the usual ones where the recording does not tell.
+        The branches with their signs and the reasons for these; usual signs where the recording does not tell.
     """
     chosen = [_with_usual_sign(item) for item in chosen]
     known, places = _channels(chosen, voltage), [item.place for item in chosen]
     if "battery" not in places or not known:
         return chosen
     current, battery = bands_of([known]).current_a, places.index("battery")
-    # Means for a share of the rows: they tell where the currents are steady.
+    # Some rows of means are added: they tell the signs where the currents are steady.
     mean = [float(channel.value[channel.good].mean()) for channel in known]
     current = np.concatenate([current, np.tile(mean, (len(current) // MEANS + 1, 1))])
     usual = np.array([item.sign for item in chosen], np.float64)
     falls = sag([(known[battery], voltage.channel)]) if voltage is not None and voltage.channel is not None else 0.0
     by_voltage = abs(falls) >= WELL_CORRELATED
-    sure = battery if by_voltage or "charger" not in places else places.index("charger")  # which only feeds
+    sure = battery if by_voltage or "charger" not in places else places.index("charger")  # only feeds
     usual[sure] = -np.sign(falls) if by_voltage else usual[sure]
     part = Bands(current * usual, np.zeros(len(current), np.intp))
 
@@ -304,7 +308,7 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
 
 
 def closure(chosen: Sequence[Candidate], voltage: Candidate | None) -> float:
-    """How much the sum of all varies, as a share of the greatest current [1]; NaN where no recording tells."""
+    """Return how much the sum varies, as a share of the greatest current's variation [1]; NaN without a recording."""
     if not (known := _channels(chosen, voltage)):
         return float("nan")
     current = bands_of([known]).current_a * np.array([item.sign for item in chosen])

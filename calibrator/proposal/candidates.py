@@ -1,4 +1,4 @@
-"""Signals of a database or columns of a table: what units, words and ranges say of them, and what a recording shows."""
+"""Signals of a database or columns of a table, described by units, words and ranges, and by what a recording shows."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +21,7 @@ from ecu_node.errors import DatabaseError
 __all__ = ["Candidate", "of_database", "of_table", "with_log", "with_table"]
 
 FLOWS = {"current": AMPERE, "power": WATT, "voltage": VOLT}
-"""Quantities of branches, with the units that the layout knows."""
+"""Quantities from which a branch current is made, with the units that the layout knows."""
 _OTHERS = {
     "torque": {"nm", "n.m", "n*m", "newtometer"},
     "speed": {"km/h", "kph", "kmh", "km/hr", "m/s", "mph", "rpm", "1/min", "kilometerperhour", "minutinver"},
@@ -29,45 +29,45 @@ _OTHERS = {
 }
 """Units as databases write them, in lower case and without blanks, by quantity."""
 _MEASURED = {"current": CURRENT, "voltage": VOLTAGE, "power": POWER}
-"""Words by which a signal without a unit is known, if its name ends with one or begins with a letter for it."""
+"""Words that give a signal without a unit its quantity, if its name ends with one or begins with i, u or p."""
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _FEWEST_BITS = 8
-"""Signals without a unit that are shorter are states."""
+"""A signal without a unit and with fewer bits is a state."""
 NO_RANGE = 1e-3
-"""A range below this share of what the bits can say is a slip, such as 0 to 1 for a voltage. [1]"""
+"""A range below this share of that of the bits is a mistake of the database, such as 0 to 1 for a voltage. [1]"""
 WRONG_RANGE, FEWEST_OUTSIDE = 0.01, 5
-"""Share of values, and how many different ones, outside the database's range, to call the range wrong: a code for
-"not available" is one value. [1]"""
+"""The range of the database is wrong if more than this share of the values, and at least so many different ones, are
+outside it; a code for "not available" is only one value. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """A signal or column, and what is thought of it as a branch.
+    """A signal or column, and how well it fits as a branch.
 
     Attributes
     ----------
     name : str
         ``Message.Signal``, or the header of a column.
     quantity : str
-        By its unit, or else by its name; empty for others.
+        Such as ``current``, by its unit or else by its name; empty for quantities that are of no use here.
     unit, comment : str
-        As written.
+        As written in the file.
     own, words : tuple of str
-        Words of its name and comment; these, and those of its message and sender.
+        Words of its name and comment; the same with those of its message and senders.
     factor : float
         Turns values as written into A, V or W; 1 for other quantities.
     low, high : float
         Least and greatest value that bits and range allow [A, V, W]; infinite for columns.
     message, signal : Message, Signal or None
-        Of the database; None for columns.
+        Message and signal of the database; None for columns.
     channel : Channel or None
-        What a recording has of it, in A, V or W, whatever range the database gives; None without one.
+        Its samples in a recording, in A, V or W, also those outside the range of the database; None without recording.
     formula : str
-        Of inputs, if it is computed; empty for what is measured.
+        Formula of inputs if it is computed; empty if it is measured.
     wrong : str
         What the recording shows to be wrong in the database: ``range`` or ``sign``; empty for nothing.
     place : str
-        Where it probably flows, of :data:`calibrator.words.PLACES`; empty if no word says it.
+        Where it probably flows, one of :data:`calibrator.words.PLACES`; empty if no word tells.
     score : float
         From 0 on it is worth looking at; from :data:`.TAKEN` on it can be a branch.
     why : str
@@ -75,9 +75,9 @@ class Candidate:
     branch : str
         Name of the branch that it is; empty if it is not taken.
     sign : int
-        1 if it is positive into the junction, -1 if out of it; of a branch.
+        Of a branch: 1 if it is positive into the junction, -1 if out of it.
     sign_reason : str
-        How that is known.
+        How the sign is known.
     """
 
     name: str
@@ -124,7 +124,7 @@ class Candidate:
 
     @property
     def peak(self) -> float:
-        """Greatest magnitude but for wild samples; 0 without any. [A, V, W]"""
+        """Greatest magnitude, wild samples excepted; 0 without good values. [A, V, W]"""
         return peak_of(self.good)
 
     def at(self, time_s: Array) -> Array:
@@ -135,9 +135,9 @@ class Candidate:
 
 
 def of_database(database: Database) -> list[Candidate]:
-    """All signals of a database that a layout can name, in its order.
+    """Return all signals of a database that a layout can name, in its order.
 
-    Signals that no control unit sends (``VECTOR__INDEPENDENT_SIG_MSG``) are none.
+    Signals that no control unit sends (``VECTOR__INDEPENDENT_SIG_MSG``) are left out.
     """
     return [
         _of_signal(message, signal)
@@ -171,7 +171,7 @@ def _of_signal(message: Message, signal: Signal) -> Candidate:
 
 
 def of_table(table: Table) -> list[Candidate]:
-    """The columns of a table, in its order."""
+    """Return the columns of a table, in its order."""
     found = []
     unknown = {name: np.full(len(table.time_s), np.nan) for name in table.texts}
     for name, value in (table.columns | unknown).items():
@@ -194,24 +194,24 @@ def _quantity(name: str, unit: str, factor_in: Callable[[Mapping[str, float], st
     for quantity, units in FLOWS.items():
         with suppress(DatabaseError):
             return quantity, factor_in(units, "")
-    plain = re.sub(r"^(unit_|\w+:)|\s", "", unit.lower()).partition("*0")[0]  # "Nm *0.5": as the scale has it
+    plain = re.sub(r"^(unit_|\w+:)|\s", "", unit.lower()).partition("*0")[0]  # "Nm *0.5" repeats the scale
     return next((quantity for quantity, units in _OTHERS.items() if plain in units), ""), 1.0
 
 
 def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
-    """Those of some signals that a log holds, with what it shows of them.
+    """Return those of the given signals that a log holds, with their values in it.
 
     Parameters
     ----------
     found : sequence of Candidate
         Signals of the database.
     frames : Frames
-        Of the log; of an identifier on several buses, the one with most frames counts.
+        Frames of the log. If several buses have an identifier, the one with most of its frames counts.
 
     Returns
     -------
     list of Candidate
-        Without those whose message, or multiplexed part of it, never comes.
+        Without signals that have no quantity, or whose message, or multiplexed part of it, never comes.
     """
     time = repaired_time(frames.time_ns)
     ordered, kept, parts = frames.take(time.order), list[Candidate](), dict[int, tuple[Array, Frames]]()
@@ -239,7 +239,7 @@ def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
 
 
 def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
-    """The candidate with its values; a range of the database that these show to be wrong is not applied to them."""
+    """Return the candidate with its values; those outside the range are good if they show the range to be wrong."""
     outside = channel.good & ~inside
     wrong = (
         outside.sum() > WRONG_RANGE * channel.good.sum() and len(np.unique(channel.value[outside])) >= FEWEST_OUTSIDE
@@ -249,7 +249,7 @@ def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
 
 
 def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
-    """Those of some signals that a table has as columns, called ``Message.Signal`` or ``Signal``, with their values.
+    """Return those of the given signals that are columns of a table, ``Message.Signal`` or ``Signal``, with values.
 
     Raises
     ------
@@ -273,7 +273,7 @@ def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
 
 
 def _signed(signal: Signal, frames: Frames, good: Mask) -> Array | None:
-    """Values as if the highest bit were a sign, if the codes jump between both ends without that; else None."""
+    """Return the values with the highest bit read as sign, if they jump between both ends without it; else None."""
     if signal.is_signed or signal.is_float or signal.length < _FEWEST_BITS or not good.any():
         return None
     raw = raw_values(signal, frames.data, frames.length)[0].astype(np.float64)

@@ -114,6 +114,6 @@ def _as_json(proposal: "Proposal", out: Path | None, text: str, problem: str) ->
 
 
 def _name_of(path: Path) -> str:
-    """Name of a layout, from that of its file: letters, digits and underscores."""
+    """Return the name of a layout, made from that of its file: letters, digits and underscores."""
     letters = "".join(char if char.isascii() and char.isalnum() else "_" for char in path.name.partition(".")[0])
     return letters if letters[:1].isalpha() else f"_{letters}"

@@ -1,4 +1,4 @@
-"""Which candidates are inputs that drive the currents, what is derived from them, and a motor's computed current."""
+"""Choose the candidates that are inputs, derive formulas from them, and compute the current of a motor."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -12,25 +12,25 @@ from calibrator.words import PLACES, POSITIONS, VOCABULARY, word_set
 __all__ = ["FOR_FLEETS", "computed_motor", "derive", "find_inputs"]
 
 LEAST_V, GREATEST_V, LEAST_REACH_V = 30.0, 1500.0, 60.0
-"""Of a junction's voltage: its median in a recording, and the range that a database gives it at least. [V]"""
+"""Bounds of the median of a junction's voltage in a recording, and what its range in a database must reach. [V]"""
 RPM = 0.10472
-"""Of 1/min. [rad/s]"""
+"""One revolution per minute. [rad/s]"""
 SAME_MESSAGE = 2.0
-"""Points of a voltage beside the battery's current."""
+"""Points for a voltage in the message of the battery's current."""
 _AGAINST = word_set(VOCABULARY["not_an_input"])
 
 
 class Role(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What an input is known by.
+    """How the input of one role is recognised among the candidates.
 
     Attributes
     ----------
     quantity : str
-        By its unit, or else by its name.
+        Quantity of the candidate, see :class:`.Candidate`.
     wanted, also : str
-        Words of which its own name or comment has one each; without `also` one of the first is enough.
+        Two lists of words; its own name or comment must have a word of each. Without `also`, one of `wanted` is enough.
     likely, against : str
-        Words of its message and sender for it, and against it.
+        Words that speak for it and against it, also in its message and sender.
     """
 
     quantity: str
@@ -49,10 +49,10 @@ _OF_TORQUE = {
     "stray_loss": "{torque} * {torque} * speed / voltage",
     "torque_current": "{torque} / voltage",
 }
-"""Mechanical power, losses of the motor, and a torque sensor at rest."""
+"""Mechanical power, losses of the motor, and the torque alone, for a torque sensor at rest."""
 _OF_SPEED = {"rotation_loss": "speed / voltage", "churning_loss": "speed * speed / voltage"}
 FOR_FLEETS = ("stray_loss", "torque_current", *_OF_SPEED)
-"""What the model of one vehicle cannot bear."""
+"""Beginnings of the names of formulas that only the model of a fleet uses; that of one vehicle cannot bear them."""
 
 
 def find_inputs(
@@ -67,11 +67,11 @@ def find_inputs(
     Parameters
     ----------
     found : sequence of Candidate
-        All.
+        Candidates to choose from.
     battery : Candidate, optional
-        The battery's current: its voltage is probably beside it.
+        Current of the battery; the voltage is probably in the same message.
     taken : collection of str
-        Names of those that are branches.
+        Names of candidates that are branches, and hence no inputs.
     roles : collection of str
         Which inputs are looked for: ``voltage``, ``torque``, ``speed``, ...
     """
@@ -111,9 +111,10 @@ def _points(item: Candidate, role: str, battery: Candidate | None) -> float:
 def computed_motor(
     found: Sequence[Candidate], voltage: Candidate | None
 ) -> tuple[Candidate, dict[str, Candidate]] | None:
-    """A motor's current by its torque, its speed and the voltage, and the inputs that its formula needs.
+    """Compute a motor's current from torque, speed and voltage; return it with the inputs of its formula.
 
-    None where one of them is not there. What it loses is not in it: some percent, more at small torques.
+    None if one of these is missing, or if there are several torques. The losses of the motor are not included: some
+    percent, more at small torques.
     """
     of_motor = [item for item in found if PLACES["motor"] & set(item.words)]
     turning = [item for item in of_motor if item.unit.lower().endswith(("rpm", "1/min"))]
@@ -139,7 +140,7 @@ def computed_motor(
 
 
 def derive(inputs: Mapping[str, Candidate]) -> dict[str, str]:
-    """Formulas of currents that physics expects of the inputs: power over voltage, losses, demands over voltage."""
+    """Return formulas of the currents that inputs cause by physics: power, losses and demands over voltage."""
     if "voltage" not in inputs:
         return {}
     formulas = dict[str, str]()

@@ -1,4 +1,4 @@
-"""A layout as it can be guessed from a database and a log, or from a table; and its text."""
+"""Guess a layout from a database and a log, or from a table, and write its text."""
 
 import difflib
 import json
@@ -32,36 +32,37 @@ from ecu_node.layout import Layout
 __all__ = ["Proposal", "candidate_lines", "layout_text", "look_at", "parsed_branches"]
 
 TYPICAL_A = 400.0
-"""Full scale of many cars' junctions, where neither database nor recording tells it. [A]"""
+"""Full scale of many cars' junctions, taken where neither database nor recording tells it. [A]"""
 LARGEST_A = 2000.0
-"""A range beyond it is that of the number of bits, not of a current. [A]"""
+"""A range beyond this comes from the number of bits, not from the current. [A]"""
 COMPUTED = 0.1
-"""Relative standard deviation of a current that is computed from torque and speed: the losses. [1]"""
+"""Relative standard deviation of a current computed from torque and speed, which leaves out the losses. [1]"""
 OPEN = 0.6
-"""Share of the greatest current that the sum still varies by, from which on a branch must be missing. [1]"""
+"""A branch must be missing if the sum varies by more than this share of the greatest current. [1]"""
 OTHER_UNIT = 100.0
-"""Times the battery's current that no other branch reaches in the same unit. [1]"""
+"""No branch in the same unit reaches this many times the battery's current. [1]"""
 TIMEOUT_PERIODS, GAP_TIMES = 5.0, 1.5
-"""A time-out bridges four lost frames, and the gaps that a recording shows. [1]"""
+"""A time-out is at least so many periods, to bridge four lost frames, and so many times the longest gap seen. [1]"""
 LEAST_TIMEOUT_S, USUAL_TIMEOUT_S, LONGEST_TIMEOUT_S = 0.1, 0.5, 2.0
-"""A time base of 0.1 s needs no less; where no rate is known; longer gaps are losses, unless frames are as rare. [s]"""
+"""Shortest time-out, as the time base is 0.1 s; the one for an unknown rate; and the longest, as longer gaps are lost
+frames unless all frames are that rare. [s]"""
 TIMEOUT_STEP_S = 0.05
 STATED = "as --branches says"
-"""Reason of a sign that is no guess."""
+"""Reason given for a sign that the user has stated."""
 SHOWN = 12
-"""Candidates in a list that nobody scrolls."""
+"""Candidates in a list that fits on a screen."""
 CHECKS = frozenset({"crc", "checksum", "crc8", "chk"})
-"""Words of the signal that protects a message."""
+"""Words in the name of a signal that protects its message."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Proposal:
-    """What was found to make a layout of.
+    """Candidates for the branches and inputs of a layout, and the files that they come from.
 
     Attributes
     ----------
     name : str
-        Of the layout.
+        Name of the layout.
     database : Path or None
         The DBC, KCD, SYM or ARXML; None for a table.
     recording : Path or None
@@ -71,9 +72,9 @@ class Proposal:
     everything : tuple of Candidate
         All signals or columns, of a database also those that are not in the log.
     found : tuple of Candidate
-        Those among which was chosen.
+        Those from which branches and inputs were chosen; with a log, those in it.
     voltage : Candidate or None
-        What powers are divided by.
+        Voltage by which powers are divided.
     """
 
     name: str
@@ -86,7 +87,7 @@ class Proposal:
 
     @property
     def branches(self) -> list[Candidate]:
-        """Those that are taken, in the order of a layout."""
+        """Candidates that are branches, in the order of a layout."""
         return [item for item in self.candidates if item.branch]
 
     @property
@@ -100,7 +101,7 @@ class Proposal:
         return " and ".join(path.name for path in (self.database, self.recording) if path is not None)
 
     def unready(self) -> str:
-        """Why the branches cannot be written; empty if they can."""
+        """Say why these branches cannot be written as a layout; empty if they can."""
         if len(self.branches) < 2:
             return "a junction has at least two branches"
         if self.voltage is None and any(item.quantity == "power" for item in self.branches):
@@ -110,7 +111,7 @@ class Proposal:
         return ""
 
     def problem(self) -> str:
-        """Why the branches make no layout that can be trusted without a look; empty if they do."""
+        """Say why the branches that were guessed make no plausible layout; empty if they do."""
         battery = self.battery
         if battery is None:
             return "no pack current found: no candidate is the current or power of a high-voltage battery"
@@ -130,7 +131,7 @@ class Proposal:
 
 
 def look_at(source: Path, log: Path | None, name: str) -> Proposal:
-    """Judge what a database, with a log, or a table has.
+    """Judge the signals of a database, with or without a log, or the columns of a table.
 
     Parameters
     ----------
@@ -138,19 +139,21 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
         A database (DBC, KCD, SYM, ARXML), or a table.
     log : Path or None
         Beside a database, one of the vehicle's logs or a table of its signals: only signals in it are then judged, and
-        by what it shows.
+        by their values in it.
     name : str
-        Of the layout.
+        Name of the layout.
 
     Returns
     -------
     Proposal
-        Whether its branches make a layout, :meth:`Proposal.problem` says.
+        :meth:`Proposal.problem` says whether its branches make a layout.
 
     Raises
     ------
     DatabaseError, LogError
         If one of the files cannot be used.
+    ProposalError
+        If a log is given beside a table.
     """
     database = None if is_table(source) else source
     if database is None:
@@ -195,7 +198,7 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
 
 
 def candidate_lines(proposal: Proposal) -> list[str]:
-    """Candidates with score and reason, the branches first; at most :data:`SHOWN` and all branches."""
+    """Return lines of candidates with score and reason: all branches first, then others up to :data:`SHOWN` in all."""
     shown, lines = proposal.candidates[: max(SHOWN, len(proposal.branches))], list[str]()
     for item in shown:
         taken = f"{item.branch} ({item.sign:+d})" if item.branch else "not taken"
@@ -206,15 +209,15 @@ def candidate_lines(proposal: Proposal) -> list[str]:
 
 
 def parsed_branches(text: str, proposal: Proposal) -> Proposal:
-    """The proposal with branches as ``battery=Ibat,-motor=Imot`` names them.
+    """Return the proposal with the branches that a text such as ``battery=Ibat,-motor=Imot`` names.
 
     Parameters
     ----------
     text : str
-        As :func:`.layout_from_branches` takes it, of columns or signals: ``Message.Signal``, or the signal alone where
-        that is clear.
+        Branches in the form of :func:`.layout_from_branches`, by columns or by signals: ``Message.Signal``, or the
+        signal alone where that is clear.
     proposal : Proposal
-        What was found.
+        Proposal with the candidates to choose from.
 
     Raises
     ------
@@ -248,19 +251,19 @@ def _named(wanted: str, proposal: Proposal) -> Candidate:
 
 
 def layout_text(proposal: Proposal, out: Path | None) -> str:
-    """Write a layout.
+    """Write the text of a layout.
 
     Parameters
     ----------
     proposal : Proposal
-        With at least two branches.
+        Proposal with at least two branches.
     out : Path or None
-        File that the text is for; the database is named relative to its folder. None: relative to this folder.
+        File that the text is for; the database is named relative to its folder. None: relative to the current folder.
 
     Returns
     -------
     str
-        A layout; its remarks ``# confirm:`` say what was guessed, and why.
+        Text of the layout; its remarks ``# confirm:`` say what was guessed, and why.
     """
     branches = proposal.branches
     inputs = find_inputs(proposal.found, battery=proposal.battery, taken={item.name for item in branches})
@@ -270,7 +273,7 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
     messages = {item.message.name: item.message for item in branches if item.message}
     folder = out.absolute().parent if out is not None else Path.cwd()
     environment = templates_of("calibrator.proposal")
-    # Texts of a database are kept from breaking a remark.
+    # A text from the database must not end the remark that it stands in.
     environment.filters["plain"] = lambda text: printable(" ".join(text.split()))
     environment.filters["toml"] = partial(json.dumps, ensure_ascii=False)
     text: str = environment.get_template("layout.toml.jinja").render(
@@ -301,7 +304,7 @@ def _full_scale(proposal: Proposal) -> tuple[float, str]:
 
 
 def _timeout_s(item: Candidate) -> float:
-    """From the cycle time, or from what a recording shows."""
+    """Return the time-out of a branch, from the cycle time in the database or the frames of a recording. [s]"""
     steps_s = np.diff(item.channel.time_s) if item.channel is not None else np.zeros(0)
     period_s = (item.message.cycle_time or 0) * 1e-3 if item.message is not None else 0.0
     wanted_s = min(TIMEOUT_PERIODS * period_s or USUAL_TIMEOUT_S, LONGEST_TIMEOUT_S)

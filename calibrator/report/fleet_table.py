@@ -35,22 +35,22 @@ __all__ = ["FleetTable", "ParameterDetails", "read_details", "read_fleet_table"]
 
 @dataclass(frozen=True, kw_only=True)
 class FleetTable:
-    """A result.
+    """Result of a calibration as columns over N vehicles and K branches.
 
     Attributes
     ----------
     folder : Path
-        Of the result.
+        Folder of the result.
     run : RunRecord
         How it was made.
     columns : mapping of str to ndarray of shape (N, K)
         Columns of ``results.parquet``, in its order of the vehicles that have parameters: numbers (NaN where the method
         gives none), flags, texts (empty where there is none). What belongs to the vehicle as a whole is the same in all
-        K places. Beside them the sensors that are ``faulty``: corrected, held back, or found without a probability;
-        their error at full scale ``error_a`` [A]; and those of which the gain (``open_gain``) or the offset
+        K places. Added are: whether a sensor is ``faulty``, that is corrected, held back, or found without a
+        probability; its error at full scale, ``error_a`` [A]; and whether its gain (``open_gain``) or its offset
         (``open_offset``) is as open as before the recordings.
     left_out : mapping of str to str
-        Vehicles, or files of unclear vehicle, without parameters, and why.
+        Vehicles without parameters, or files whose vehicle is unclear, with the reason.
     """
 
     folder: Path
@@ -87,7 +87,7 @@ class FleetTable:
 
     @property
     def corrected(self) -> Mask:
-        """Vehicles of which the node corrects a branch, shape (N,); a fault of size 0 corrects nothing."""
+        """Whether the node corrects a branch of the vehicle, shape (N,); a fault of size 0 corrects nothing."""
         return np.asarray((self["applied"] & self["faulty"]).any(axis=1))
 
     @property
@@ -134,22 +134,22 @@ class ParameterDetails(msgspec.Struct, frozen=True):
     branches: dict[str, _Identifiable]
     """Whether the gain of each could be estimated."""
     explanations: list[Explanation] = []
-    """Competing ones, the most probable first; none where one was left."""
+    """Competing explanations, the most probable first; empty where only one was left."""
     findings: list[SensorFinding] = []
-    """Of the check of fit."""
+    """Findings of the check of fit."""
 
 
 def read_details(table: FleetTable, listed: NDArray[np.int64]) -> tuple[dict[int, ParameterDetails], list[str], Array]:
-    """Read what the parameter files of n vehicles, given by their places in the table, add.
+    """Read what the parameter files of n vehicles, given by their places in the table, add to the table.
 
     Returns
     -------
     files : dict of int to ParameterDetails
-        By the vehicle's place in the table.
+        Details by the vehicle's place in the table.
     names : list of str
-        Of the R rows of evidence: ratios [1], then constants [A]; none if the method keeps no evidence.
+        Names of the R rows of evidence: ratios [1], then constants [A]; empty if the method keeps no evidence.
     rows : ndarray of shape (n, 3, R)
-        What was measured, its standard deviation, and what the estimate predicts; NaN where it is not known.
+        Measured value of each row, its standard deviation, and what the estimate predicts; NaN where not known.
 
     Raises
     ------

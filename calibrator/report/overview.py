@@ -1,4 +1,4 @@
-"""What a result says of a fleet as a whole: its numbers, what to do next, workshop list, the battery's margin."""
+"""Summary of a result for the whole fleet: its numbers, what to do next, workshop list, the battery's margin."""
 
 import hashlib
 import math
@@ -28,24 +28,24 @@ __all__ = [
 ]
 
 MOST_REASONS = 20
-"""Reasons of vehicles left out that are given one by one."""
+"""Most reasons for leaving out vehicles that are listed one by one."""
 _NOT_KNOWN = "not known"
 NO_DBC = hashlib.sha256(b"").hexdigest()
-"""Digest of the databases of a layout of a table."""
+"""Digest of the databases of a layout for tables, which names none."""
 IN_WORKSHOP = ("beyond the limits", "does not fit")
-"""Why a fault is not corrected, where the workshop list has it."""
+"""Reasons for not correcting a fault with which it is on the workshop list."""
 UNDECIDED = ("cannot tell", "not enough data")
 """Verdicts that leave a question."""
 NO_REASON = "more recordings, a reading at zero current or a bench check would decide"
 MOST_QUESTIONS = 3
-"""Questions of one kind that are asked one by one."""
+"""Most questions of one kind that are asked one by one."""
 SIGMAS = 3.0
 """Standard deviations that a margin covers; 1 in 370 is beyond if errors are Gaussian. [1]"""
 QUANTILE = 0.999
-"""Share of the fleet that one margin for all must cover; of fewer than a thousand vehicles all of them. [1]"""
+"""Share of the fleet that one margin for all must cover; of fewer than a thousand vehicles it must cover all. [1]"""
 MOST_LARGE = 5
 FLEET_CAUSES = ("load", "batch", "variant")
-"""Findings that many vehicles share and a workshop cannot mend: they come last in its list."""
+"""Causes of findings that many vehicles share and a workshop cannot mend; they come last in its list."""
 
 
 def overview_of(table: FleetTable) -> dict[str, Any]:
@@ -54,15 +54,14 @@ def overview_of(table: FleetTable) -> dict[str, Any]:
     Returns
     -------
     dict
-        Numbers of vehicles with parameters and without (``vehicles``, ``left_out``), per verdict, of those that are
-        corrected, and of those in which a hardware fault is suspected (None if the method cannot see one); of sensors
-        with a fault, of those of them that are corrected, of others by reason (``held_back``), and of those that
-        changed since the earlier result of ``calibrate --since``. The Kirchhoff sum per vehicle before and after what
-        is applied [A], the load that no branch measures: of a fleet as it shows it (``unmeasured_a``), of vehicles by
-        themselves as the user declared it (``declared_load_a``), and their sums are about it [A]; length of the drives
-        [h] and delay of each branch [ms], as median and the values between which the middle 90 % lie; of the
-        ``reference`` by branch the share of the vehicles that agree, and the spread of their slopes [1]; the most
-        frequent reasons of vehicles left out.
+        Numbers of vehicles: with parameters and without (``vehicles``, ``left_out``), by verdict, corrected, and with a
+        suspected hardware fault (None if the method cannot see one). Numbers of sensors: with a fault, with a fault
+        that is corrected, not corrected by reason (``held_back``), and changed since the earlier result of ``calibrate
+        --since``. Median, and values between which the middle 90 % lie, of the Kirchhoff sum of a vehicle before and
+        after what is applied [A], of the length of its drives [h], and of the delay of each branch [ms]. The load that
+        no branch measures [A]: as a fleet shows it (``unmeasured_a``), or as the user declared it for vehicles that are
+        calibrated by themselves (``declared_load_a``), whose sums are about it. ``reference``: by branch the share of
+        the vehicles that agree, and the spread of their slopes [1]. The most frequent reasons for leaving out vehicles.
     """
     reference = table.run.details.get("reference", {})
     spread = table.run.details.get("hyperparameters", {}).get("model_spread", {})
@@ -98,14 +97,14 @@ def overview_of(table: FleetTable) -> dict[str, Any]:
 
 
 def _spread(values: Array) -> dict[str, float]:
-    """Median, and the values between which the middle 90 % lie; NaN if nothing is known."""
+    """Return the median and the values between which the middle 90 % lie; NaN if nothing is known."""
     known = values[np.isfinite(values)]
     found = np.quantile(known, [0.5, 0.05, 0.95]).tolist() if len(known) else (np.nan,) * 3
     return dict(zip(("median", "p05", "p95"), found, strict=True))
 
 
 def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> list[dict[str, Any]]:
-    """List what parameters do not mend, by falling probability: hardware, sensors, what many vehicles share.
+    """List what parameters cannot mend: hardware, then sensors, then what many vehicles share; most probable first.
 
     Parameters
     ----------
@@ -143,7 +142,7 @@ def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> l
 
 
 def _changes(table: FleetTable, j: int) -> str:
-    """By how much a hardware fault changes the currents of a vehicle."""
+    """Say by how much a hardware fault changes the currents of a vehicle."""
     drift = table.of_vehicles("hardware_drift")[j]
     parts = [f"all {percent(drift, 2, sign=True)}"] if abs(drift) >= 5e-5 else []
     offset_a = zip(table.branches, table["hardware_offset_a"][j].tolist(), strict=True)
@@ -162,7 +161,7 @@ def steps_to_take(table: FleetTable, workshop: Sequence[Mapping[str, Any]]) -> l
             else f"Install the parameters of {few(corrected)} on their nodes: params/VEHICLE.json of the result, or "
             f"'calibrator params RESULT VEHICLE'."
         )
-    # What the workshop list has already is no question of evidence.
+    # A fault that is on the workshop list needs no more evidence.
     held, reason = table["held_back"], table.of_vehicles("reason")
     undecided = (held != "").any(axis=1) | (reason != "") | np.isin(table.of_vehicles("verdict"), UNDECIDED)
     mended = np.isin(held, IN_WORKSHOP).any(axis=1)
@@ -191,7 +190,7 @@ def steps_to_take(table: FleetTable, workshop: Sequence[Mapping[str, Any]]) -> l
 def battery_margin(
     table: FleetTable, branch: str, *, limit_a: float | None = None, voltage_v: float | None = None
 ) -> dict[str, Any] | None:
-    """Find what a controller must stay below the battery's limit by, as its sensor can be wrong: figure 1 of the paper.
+    """Find by how much a controller must stay below the battery's limit, as the sensor can be wrong (paper, figure 1).
 
     docs/report.md derives it.
 
@@ -200,18 +199,19 @@ def battery_margin(
     table : FleetTable
         The result.
     branch : str
-        The battery's.
+        Branch of the battery.
     limit_a, voltage_v : float or None
-        Current limit, without one full scale, and the voltage that makes kW of A. [A], [V]
+        Current limit, full scale if None, and the voltage with which A become kW. [A], [V]
 
     Returns
     -------
     dict or None
-        Numbers of ``vehicles`` of which the sensor is known, of others, which are not counted, and of the first those
-        that are corrected; one margin for all as measured and after correction, and the difference; what a margin per
-        vehicle gives back, in the median of those corrected (None if there is none); the ``largest``: vehicles that
-        keep the common margin large, as they are not corrected, and the margin that each needs [A]. None if the sensor
-        of no vehicle is known.
+        Number of ``vehicles`` whose sensor is known, of others, which do not count further (``not_known``), and of the
+        known ones that are corrected; one margin for all as measured (``common_before_a``) and after correction
+        (``common_after_a``), and the difference (``common_gain_a``); what a margin per vehicle gives back
+        (``own_gain_a``), as the median over those corrected (None if there is none); ``largest``: vehicles that keep
+        the common margin large, as they are not corrected, and the margin that each needs [A]. None if the sensor is
+        known in no vehicle.
     """
     k, limit_a = table.branches.index(branch), limit_a or table.run.full_scale_a
     known = np.flatnonzero(~(table["open_gain"] | table["open_offset"])[:, k])
@@ -249,7 +249,7 @@ def percent(value: float | None, digits: int, *, sign: bool = False) -> str:
 
 
 def share(part: int, whole: int) -> str:
-    """A share of vehicles in whole percent: neither none nor all where there is one that tells otherwise."""
+    """A share of vehicles in whole percent; never 0 % or 100 % if a single vehicle is an exception."""
     percents = 100.0 * part / whole
     return "< 1 %" if 0.0 < percents < 0.5 else "> 99 %" if 99.5 <= percents < 100.0 else f"{percents:.0f} %"
 

@@ -1,7 +1,7 @@
 """The page of a result: one HTML file of the whole fleet, or of one vehicle, that fetches nothing.
 
-Numbers of the fleet stand in the page as text (``assets/page.html``); those of single vehicles as compressed JSON, of
-which ``assets/page.js`` makes tables and figures, with plotly.js from the same file.
+Numbers of the fleet stand in the page as text (``assets/page.html``), those of single vehicles as compressed JSON.
+``assets/page.js`` makes tables and figures of these, with plotly.js, which is part of the page.
 """
 
 import base64
@@ -41,13 +41,13 @@ from ecu_node.parameters import decode_parameters
 __all__ = ["report_page"]
 
 MOST_SENSORS = 300_000
-"""Sensors of the vehicles that a page lists one by one: those of 100,000 vehicles with three branches."""
+"""Most sensors of vehicles that a page lists one by one: those of 100,000 vehicles with three branches."""
 MOST_DETAILED = 5_000
-"""Vehicles of which a page has explanations and evidence: with them it stays below 10 MB."""
+"""Most vehicles of which a page has explanations and evidence; with so many it stays below 10 MB."""
 MOST_WORKSHOP, MOST_MOVED = 500, 200
-"""Rows of the lists."""
+"""Most rows of the workshop list, and of the list of sensors that changed."""
 BATTERY = "battery"
-"""What a layout calls the branch of the battery, in this or another language, unless the user says otherwise."""
+"""Usual name of the battery's branch, for a message; :func:`.is_battery` also knows it in other languages."""
 METHOD_WITHOUT_SD = "published"
 """Method that gives no standard deviations: what it does not find is taken for 0."""
 DIGITS = {"drift": 6, "drift_sd": 4, "offset_a": 2, "offset_sd_a": 2, "fault_probability": 3, "harm_probability": 4}
@@ -57,9 +57,9 @@ DIGITS_OF_VEHICLE |= {"junction_rms_measured_a": 2, "duration_s": 1}
 MOST_POINTS = 1000
 """Sensors drawn one by one in each branch: those with the largest faults. A browser draws some thousand at once."""
 SMALLEST_A = 1e-3
-"""Below what any sensor resolves; where a logarithmic axis begins. [A]"""
+"""Start of a logarithmic axis, below what any sensor resolves. [A]"""
 LEAST_LOAD_A = 0.05
-"""Load without a sensor from which on it is worth a line. [A]"""
+"""Least load without a sensor that gets a line in the figure. [A]"""
 
 
 def report_page(
@@ -79,7 +79,7 @@ def report_page(
     vehicle : str or None
         Name of the vehicle; None: all. A result of one vehicle gives the page of this vehicle.
     battery : str or None
-        Branch of the battery; None: the one of such a name.
+        Branch of the battery; None: the first one whose name is that of a battery.
     limit_a, voltage_v : float or None
         Its current limit, and its voltage; None: full scale, and the margin in A alone. [A], [V]
 
@@ -160,7 +160,7 @@ def report_page(
 def _columns(
     table: FleetTable, listed: NDArray[np.int64], files: Mapping[int, ParameterDetails], reasons: Mapping[str, str]
 ) -> dict[str, list[Any]]:
-    """Columns of the vehicles that are listed; of sensors K values per vehicle, null for what is not known."""
+    """Return the columns of the listed vehicles, those of sensors with K values per vehicle; null where not known."""
     gain = np.array([[not files[j].branches[name].identifiable for name in table.branches] for j in listed])
     unknown = 1 * gain
     if table.run.method != METHOD_WITHOUT_SD:
@@ -186,8 +186,8 @@ def _columns(
 
 
 def _as_text(content: bytes) -> str:
-    """Base64 of gzip of some bytes; the same for the same bytes."""
-    # The highest level takes four times as long for a hundredth less.
+    """Compress bytes with gzip and write them as base64; the same bytes give the same text."""
+    # The highest level takes four times as long and saves one percent.
     return base64.b64encode(gzip.compress(content, compresslevel=6, mtime=0)).decode()
 
 
@@ -198,7 +198,7 @@ def _plotly() -> str:
 
 @cache
 def _template() -> Any:
-    """Template of the page: what is put into it is escaped, but for files of this package and base64."""
+    """Return the template of the page, which escapes all values but files of this package and base64."""
     environment = templates_of("calibrator.report", "assets", autoescape=True)
     environment.policies["json.dumps_function"] = lambda value, **_: msgspec.json.encode(value).decode()
     environment.globals |= {each.__name__: each for each in (amperes, counted, few, percent, probability, share)}
@@ -209,8 +209,8 @@ def _template() -> Any:
 def _junction_bins(before_a: Array, after_a: Array, *, expected_a: float | None) -> dict[str, Any]:
     """Distributions of the Kirchhoff sum's root mean square over vehicles: B + 1 edges [A], and counts in the B bins.
 
-    So a page holds no more for a million vehicles than for a hundred. The load without a sensor [A] lies between the
-    edges; None if it is not worth a line.
+    With these a page holds no more for a million vehicles than for a hundred. The load without a sensor [A] lies
+    between the edges; None if it is too small for a line.
     """
     before_a, after_a = (np.maximum(values[np.isfinite(values)], SMALLEST_A) for values in (before_a, after_a))
     load_a = abs(expected_a or 0.0)

@@ -17,14 +17,14 @@ from ecu_node.program import DEBUG_HINT, FAILED, drop_output, end_of, flush_outp
 __all__ = ["EXIT_CODES", "command_app", "example", "run_app", "run_tool"]
 
 _PACKAGES = ("calibrator", "ecu_node", "tools")
-"""In which a fault of the program itself is looked for."""
+"""Packages of the program: a fault of the program itself is reported with the last place in them."""
 EXIT_CODES = (
     f"Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted, 143 ended by SIGTERM. {DEBUG_HINT}"
 )
 INTERRUPTED = 130
 WRONG_USE = 2
 _UsageError: Any = typer.BadParameter.__base__
-"""What wrong use of any kind is derived from; typer gives it no public name."""
+"""Base class of all errors of wrong use; typer gives it no public name."""
 
 
 def command_app(**settings: Any) -> typer.Typer:
@@ -33,7 +33,7 @@ def command_app(**settings: Any) -> typer.Typer:
     Parameters
     ----------
     **settings
-        Of ``typer.Typer``, beside those that all command lines share.
+        Arguments of ``typer.Typer``, beside those that all command lines share.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def command_app(**settings: Any) -> typer.Typer:
 
 
 def example(*commands: str) -> str:
-    """What stands below the options of a command: how it is called.
+    """Return the text below the options in the help of a command, which shows how it is called.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
         return _end_of_wrong_use(program, error)
     except BrokenPipeError:
         raise
-    except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
+    except Exception as error:  # noqa: BLE001 (each is reported, and ends the program)
         flush_output()  # if it was standard output that failed, this says so
         code = end_of(program, error, debug=debug, packages=_PACKAGES)
         return WRONG_USE if isinstance(error, ContradictionError) else code
@@ -115,7 +115,7 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
 
 
 def _in_words(parameter: Any) -> None:
-    """Say in help what to give, as people call it: ``LOG`` and ``PATH``, not ``{log} <Path>``."""
+    """Let the help of a parameter say in plain words what to give: ``LOG`` and ``PATH``, not ``{log} <Path>``."""
     if parameter.param_type_name == "option":
         if parameter.multiple:
             parameter.help = f"{parameter.help} May be repeated."
@@ -147,14 +147,14 @@ def run_tool(app: typer.Typer, program: str) -> None:
 
 
 def _all_commands(command: Any) -> Iterator[Any]:
-    """A command, and the commands in it."""
+    """Yield a command, and the commands in it."""
     yield command
     for each in getattr(command, "commands", {}).values():
         yield from _all_commands(each)
 
 
 def _end_of_wrong_use(program: str, error: Any) -> int:
-    """Say what is wrong, and where help is; nothing at all but the program's name asks for help."""
+    """Say what is wrong and where help is; show the help if there is no argument at all. Return the exit code."""
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
         return WRONG_USE

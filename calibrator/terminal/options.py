@@ -38,9 +38,9 @@ MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
 MAX_WORKERS = 256
 FAR = 1e9
-"""Upper bounds from here on tell nobody anything, and do not stand in the help."""
+"""Upper bounds from here on are of no use to a reader, and are left out of the help."""
 TIME_LIMIT_S = 600.0
-"""A day's log is read in seconds; what takes so long never ends, or would hold up a fleet. [s]"""
+"""A day's log is read in seconds; a log that takes so long never ends, or would hold up a fleet. [s]"""
 SCHEDULER = re.compile(r"(tcp|tls)://([^\s/?#@:\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
 MAX_PORT = 65_535
 MAX_TIME_LIMIT_S = 86_400.0
@@ -48,18 +48,18 @@ MAX_TIME_LIMIT_S = 86_400.0
 
 
 def _bounded(kind: type[float], name: str, low: float, high: float, meaning: str) -> Any:
-    """Make an option that is a finite number between bounds; whatever else is given is named with what is expected.
+    """Make an option that is a finite number between bounds; other input is refused with what is expected.
 
     Parameters
     ----------
     kind : type
         ``float``, or ``int`` for whole numbers.
     name : str
-        Of the option, with its dashes.
+        Name of the option, with its dashes.
     low, high : float
         Smallest and largest number.
     meaning : str
-        What it is, with its unit, for the help; the bounds are added.
+        Meaning and unit of the number, for the help; the bounds are added.
 
     Returns
     -------
@@ -168,7 +168,7 @@ MagnitudeOption = Annotated[
 
 
 def given_options(context: typer.Context, names: Sequence[str]) -> list[str]:
-    """Those of some parameters that stand on the command line, as they are written there."""
+    """Return those of the named parameters that were given on the command line, as options (``--name``)."""
     sources = {name: context.get_parameter_source(name) for name in names}
     given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
     return [f"--{name.replace('_', '-')}" for name in given]

@@ -1,6 +1,6 @@
 """Progress on stderr: a bar with count and time left on a terminal, a line now and then elsewhere.
 
-A command of several passes says of each which one it is. Nothing of all this goes to standard output.
+A command of several passes says which of them each bar is. Nothing of this goes to standard output.
 """
 
 import math
@@ -20,14 +20,14 @@ __all__ = ["no_progress", "numbered_passes", "one_pass", "progress_bar", "shown"
 
 LINE_EVERY_S = 10.0
 WORTH_A_LINE_S = 1.0
-"""A step that is done sooner is not told in a log. [s]"""
+"""A shorter step gets no line in a log. [s]"""
 NARROW = 70
 """A terminal of fewer columns gets no units. [1]"""
 _Item = TypeVar("_Item")
 _active: ContextVar[Progress | None] = ContextVar("active", default=None)
 """The bars on the terminal; a step within a step adds its own to them."""
 _number: ContextVar[Callable[[], str]] = ContextVar("number", default=str)
-"""What stands before the label of the next pass; nothing outside of numbered passes."""
+"""Gives the text before the label of the next pass; an empty one outside of numbered passes."""
 _silent: ContextVar[bool] = ContextVar("silent", default=False)
 """Whether nothing is shown."""
 
@@ -66,16 +66,16 @@ def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Call
     label : str
         What is being done.
     total : int or None
-        How many units there are; None for a step of which nobody knows how long it is.
+        Number of units; None for a step of unknown length.
     unit : str
-        What is counted, in the plural.
+        Name of the units, in the plural.
 
     Yields
     ------
     callable
-        To be called with the number of units done.
+        Function to be called with the number of units done.
     """
-    if sys.stderr is None or _silent.get():  # closed by who started the program
+    if sys.stderr is None or _silent.get():  # None: closed by whoever started the program
         yield lambda _: None
         return
     label, console = f"{_number.get()()}{label}", Console(stderr=True)
@@ -91,7 +91,7 @@ def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Call
 
 @contextmanager
 def _bars(console: Console) -> Iterator[Progress]:
-    """The bars that are on the terminal, or new ones."""
+    """Yield the bars that are on the terminal, or new ones."""
     if (bars := _active.get()) is not None:
         yield bars
         return
@@ -106,7 +106,7 @@ def _bars(console: Console) -> Iterator[Progress]:
 
 
 def _moving(bars: Progress, label: str, total: int | None, unit: str) -> Callable[[float], None]:
-    """A bar on the terminal; a narrow terminal gets no unit."""
+    """Add a bar to the terminal, without units if that is narrow; return the function that moves it."""
     unit = "" if bars.console.width < NARROW else f" {unit}"
     task = bars.add_task(label, total=total, count="")
 
@@ -117,7 +117,7 @@ def _moving(bars: Progress, label: str, total: int | None, unit: str) -> Callabl
 
 
 def shown(items: Iterable[_Item], label: str, total: int, unit: str) -> Iterator[_Item]:
-    """Items as they come, with a bar that counts those that were dealt with; a single one needs no bar."""
+    """Yield items as they come, and show a bar that counts those that are done; a single one needs no bar."""
     if total <= 1:
         yield from items
         return
@@ -128,7 +128,7 @@ def shown(items: Iterable[_Item], label: str, total: int, unit: str) -> Iterator
 
 
 def _writing(label: str, total: int, unit: str) -> Callable[[float], None]:
-    """A line now and then, for a log."""
+    """Return a function that prints a line now and then, for a log."""
     started_s = printed_s = time.monotonic()
 
     def write(done: float) -> None:

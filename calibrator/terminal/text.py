@@ -28,9 +28,9 @@ __all__ = [
 ]
 
 MOST_NAMES = 6
-"""Names told on one line: half a line of a terminal."""
+"""Most names on one line: they take half a line of a terminal."""
 MOST_REASONS = 5
-"""Vehicles whose reasons are told in one message."""
+"""Most vehicles whose reasons are in one message."""
 
 
 def print_report(report: Any, *, json: bool) -> None:
@@ -44,7 +44,7 @@ def dumps(value: Any) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns of text: the first flush left, the others flush right."""
+    """Format columns of text: the first flush left, the others flush right."""
     lines = [header, *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
@@ -53,12 +53,12 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def told_once(texts: Iterable[tuple[str, str]]) -> list[str]:
-    """One line per text.
+    """Make one line of each text, however many names it is about.
 
     Parameters
     ----------
     texts : iterable of (str, str)
-        Name of a vehicle or drive, and what is to be said of it.
+        Name of a vehicle or drive, and a text about it.
 
     Returns
     -------
@@ -72,19 +72,19 @@ def told_once(texts: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def reasons_text(title: str, reasons: Mapping[str, str], most: int = 10) -> str:
-    """What is said of vehicles, one line per text with the vehicles that share it; empty if there is none."""
+    """Format the reasons of vehicles below a title, one line per reason with its vehicles; empty if there are none."""
     lines = told_once((name, reason or "no more is known") for name, reason in reasons.items())
     more = [f"and {len(lines) - most} other lines, see the parameter files"] if len(lines) > most else []
     return "\n  ".join([f"{title}:", *lines[:most], *more]) if lines else ""
 
 
 def left_out_text(left_out: Mapping[str, str]) -> str:
-    """One line per reason why things were left out; empty if nothing was."""
+    """Format the reasons for leaving things out, one line per reason; empty if there are none."""
     return reasons_text("left out", left_out, most=len(left_out))
 
 
 def end_if_internal(left_out: Mapping[str, str]) -> None:
-    """End a command with the exit code of internal errors if these are among the reasons; the first few are named."""
+    """End a command with the exit code of internal errors if some of the reasons are such; name the first few."""
     failed = {name: why.removeprefix(INTERNAL) for name, why in left_out.items() if why.startswith(INTERNAL)}
     if failed:
         lines = "; ".join(told_once(failed.items())[:MOST_REASONS])
@@ -149,14 +149,14 @@ def counted(number: int, what: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Notice:
-    """What a user should know of a drive.
+    """Something that a user should know about a drive.
 
     Attributes
     ----------
     text : str
-        With ``{}`` for every count; notices of one text are the same notice.
+        Text with ``{}`` for every count; notices with the same text are merged.
     counts : tuple of int
-        How many frames, lines, ...; over several drives they add up.
+        Numbers of frames, lines, ...; they add up over several drives.
     """
 
     text: str
@@ -168,12 +168,12 @@ class Notice:
 
 
 def merged_notices(notices: Mapping[tuple[str, str], Sequence[Notice]]) -> list[str]:
-    """Tell equal notices once.
+    """Merge notices with the same text.
 
     Parameters
     ----------
     notices : mapping of (vehicle, drive) to sequence of Notice
-        What is to be said of each drive.
+        Notices of each drive.
 
     Returns
     -------

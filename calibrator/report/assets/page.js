@@ -6,8 +6,8 @@
   const K = facts.branches.length, R = facts.evidence.length;
   const ROWS = 50, PRINT_WIDTH = 680, UNKNOWN = "not known";
   const LEAST_RIVAL = 0.02, RESOLVED = 0.002, FITS = 3, MISFITS = 4;
-  const BEFORE = "#D55E00", AFTER = "#0072B2", OTHER = "#767676", IDEAL = "#1b1f24"; // Okabe and Ito: for all eyes
-  const RIVALS = "what it may be instead", MOST_BESIDE = 4; // panels: more leave no room for their titles
+  const BEFORE = "#D55E00", AFTER = "#0072B2", OTHER = "#767676", IDEAL = "#1b1f24"; // Okabe and Ito: also for colour-blind readers
+  const RIVALS = "what it may be instead", MOST_BESIDE = 4; // panels in a row: more leave no room for titles
 
   // ---- compressed data -----------------------------------------------------------------------------------------
   async function unpack(id) {
@@ -23,7 +23,7 @@
   });
   const loadDetails = once(async () => (await unpack("details")).json());
 
-  // What is not known is null in JSON, and not a number here.
+  // Unknown numbers are null in JSON, and NaN here.
   async function loadColumns() {
     const columns = await (await unpack("columns")).json();
     for (const [name, values] of Object.entries(columns)) {
@@ -55,7 +55,7 @@
     return made;
   }
 
-  // A heading that begins with < is of a column of text; the last cell of a short row takes the columns that are left.
+  // A heading that begins with < marks a column of text; the last cell of a short row spans the remaining columns.
   function table(head, rows) {
     const cells = (tag, row) => row.map((cell, i) => element(tag, { class: head[i].startsWith("<") ? "wide" : null,
       colspan: i === row.length - 1 && row.length < head.length ? head.length - i : null }, cell));
@@ -101,7 +101,7 @@
     return { data, layout };
   }
 
-  // Gain error over offset of the largest faults, a panel for each branch, and what else those may be that are not corrected.
+  // Gain error and offset of the largest faults, a panel for each branch; for those not corrected also what else they may be.
   function sensorsFigure(columns, details) {
     const markers = { corrected: { color: AFTER }, "not corrected": { color: BEFORE }, [RIVALS]: { color: BEFORE, symbol: "circle-open" } };
     const data = [], rows = Math.ceil(K / MOST_BESIDE), inLegend = new Set(), known = (value) => value || 0;
@@ -172,7 +172,7 @@
     let shown = [], page = 0, sorted = heads.findIndex((head) => head.first), descending = true;
 
     for (const kind of new Set(columns.verdict)) $("verdict").append(element("option", { value: kind }, kind));
-    // A browser does not print buttons on the later pages of a table: there the same words stand as text.
+    // A browser does not print buttons on the later pages of a table, so the same words are there as text, too.
     const headers = heads.map((head, i) => element("th", { scope: "col", class: head.style ?? null }, ...(head.order
       ? [element("button", { type: "button", onclick: () => sortBy(i) }, head.title), element("span", { class: "printed", "aria-hidden": "true" }, head.title)] : [head.title])));
     $("table").tHead.append(element("tr", {}, ...headers));
@@ -287,13 +287,13 @@
   const grows = (j, columns) => (columns.deployed_a[j] > columns.junction_rms_measured_a[j]
     ? named(columns, j, (i) => columns.held_back[i]) : "");
 
-  // Gain error (part 1) or offset (part 2) of a sensor by an explanation, which holds those alone that it takes for faulty.
+  // Gain error (part 1) or offset (part 2) of a sensor in an explanation; 0 if it is not listed there, as it is not faulty.
   const faultOf = (rival, part, name) => (part === 1 ? rival.drift : rival.offset_a)?.[name] ?? 0;
 
   function sensorTable(j, columns, rivals, delays) {
     const quantity = (i, name, values, sds, part, factor) => {
       const value = values[i], sd = sds[i], unknown = columns.unknown[i] & part, written = (v) => (v ? fixed(factor * v, 2, "", true) : "none");
-      // Of one junction by itself the value is a mean over all explanations, and its deviation that of all of them.
+      // For one junction by itself, the value is the mean over all explanations, and sd their standard deviation.
       const mean = unknown || Number.isNaN(columns.hardware_probability[j]), resolved = RESOLVED * (part === 1 ? 1 : facts.full_scale_a);
       const near = mean ? resolved : Math.max(3 * (sd || 0), resolved), peaks = mean ? [] : [{ value, p: 0 }];
       for (const rival of rivals) {
@@ -329,7 +329,7 @@
     return table(["probability", ...facts.branches.map((name) => `<${name} sensor`), ...(fleet ? ["<the vehicle itself"] : [])], rows);
   }
 
-  // The posterior predictive check: how far is what was measured from what the estimate predicts?
+  // The posterior predictive check: how far are the measured values from what the estimate predicts?
   function fit(findings, evidence, detailed, plot) {
     const parts = [], misfit = findings.some(({ cause }) => !facts.fleet_causes.includes(cause));
     if (findings.length) {
