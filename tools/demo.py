@@ -2,7 +2,7 @@
 """The whole path on one screen: a fleet, its calibration, and one vehicle corrected live on a CAN bus.
 
 Every step is a command that a user could type; it is printed before it runs. The vehicle that drives at the end is
-calibrated, but the fleet learns nothing from it, and its drive is not among those that were calibrated on.
+calibrated, but the fleet learns nothing from it, and its drive is not one of those used for calibration.
 """
 
 import shlex
@@ -125,7 +125,7 @@ def import_recordings(folder: str, out: Path) -> str:
 
 
 def faulty_vehicles(truth: FleetTruth) -> list[str]:
-    """First vehicles with most faulty sensors."""
+    """Return the vehicles with most faulty sensors, :data:`HELD_OUT` of them."""
 
     def faulty_sensors(name: str) -> int:
         found = truth.vehicles[name]
@@ -135,7 +135,7 @@ def faulty_vehicles(truth: FleetTruth) -> list[str]:
 
 
 def corrected_vehicle(result: Path, held_out: list[str]) -> str:
-    """First of the vehicles held out that may be corrected, after what is said of those before it; else the first."""
+    """Return the first held-out vehicle that may be corrected, else the first of all; say why those before may not."""
     for name in held_out:
         found = read_parameters(result / "params" / f"{name}.json")
         if found.verdict == "corrected":
@@ -165,7 +165,7 @@ def record_live_drive(parameters: Path, vehicle: str, *, log: Path, recording: P
 
 @contextmanager
 def running_node(parameters: Path, vehicle: str) -> Iterator[None]:
-    """The node's own loop in a thread."""
+    """Run the node's own loop in a thread."""
     database = read_database(read_layout(ROOT / LAYOUT))
     in_force = choose_parameters(parameters, database, vehicle)
     if in_force.why_not is not None:
@@ -187,7 +187,7 @@ def running_node(parameters: Path, vehicle: str) -> Iterator[None]:
 
 
 def put_in(truth: FleetTruth, vehicle: str) -> str:
-    """Faults that were put into the sensors of a vehicle."""
+    """List the faults that were put into the sensors of a vehicle."""
     faults = truth.vehicles[vehicle]
     gains = [f"{name} gain error {100.0 * value:+.2f}%" for name, value in faults.drift.items() if value]
     return ", ".join(gains + [f"{name} offset {value:+.2f} A" for name, value in faults.offset_a.items() if value])

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Recordings of one BMW i3 (CSV, 10 Hz) as drives; each trip is a vehicle.
+"""Import recordings of one BMW i3 (CSV, 10 Hz) as drives; each trip becomes a vehicle.
 
 Source: Steinstraeter, Buberger, Trifonov, "Battery and Heating Data in Real Driving Cycles", IEEE DataPort,
 DOI 10.21227/6jr9-5235. The car measures the battery current and the powers of heater and air conditioning; there is no
@@ -70,10 +70,10 @@ LEAST_DCDC_W = 200.0
 IMPOSSIBLE_JUMP_KW = 3.0
 """No heater does this within one sample."""
 NEAR_DEFAULT_KW = 0.6
-"""One sample of an interpolation over one second, from the default to zero."""
+"""Reaches one sample of an interpolation over one second, from the default to zero."""
 _HEATER_CHANNELS = "auxiliary, motor and heater_demand"
 _MADE_OF = {"auxiliary": ("voltage", "heater_demand", "aircon_demand"), "motor": ("battery", "auxiliary")}
-"""Branches that are computed, in this order, and from what: good only where all of that is."""
+"""Branches that are computed, in this order, and the channels that they are made of: good where all of these are."""
 _JUDGED_SAMPLES = 100
 """10 s with the inverter idle suffice to judge the heater signal."""
 _SUFFIXES = (".csv", ".csv.gz")
@@ -145,7 +145,7 @@ class ImportedTrip:
 
 
 def _trips(arguments: Iterable[Path]) -> dict[str, list[Path]]:
-    """Files by the name of the trip; more than one file is an error of that trip."""
+    """Return the files by the name of their trip; more than one file is an error of that trip."""
     trips: dict[str, list[Path]] = {}
     for argument in arguments:
         found = sorted(p for p in argument.iterdir() if p.name.endswith(_SUFFIXES)) if argument.is_dir() else [argument]
@@ -235,7 +235,7 @@ def trip_from_table(table: Table, *, vehicle: str, name: str, ranges: Mapping[st
 
 
 def _heater_good(columns: Mapping[str, Array], notices: list[str]) -> Mask:
-    """Where the heater's power can be believed; adds to the notices why not."""
+    """Return where the heater's power is credible; add to the notices why it is not elsewhere."""
     default = _defaults(columns["heater"])
     spoilt = _with_ramps(default, columns["heater"])
     if default.any():
@@ -259,7 +259,7 @@ def _heater_good(columns: Mapping[str, Array], notices: list[str]) -> Mask:
 
 
 def _defaults(heater_kw: Array) -> Mask:
-    """Where the heater's power is its default, or a jump to nearly the default: interpolation cut it short."""
+    """Return where the heater's power is its default, or jumps to nearly that: interpolation cut the default short."""
     exact = np.abs(heater_kw - HEATER_DEFAULT_KW) < HEATER_RESOLUTION_KW
     jump = np.abs(np.diff(heater_kw)) > IMPOSSIBLE_JUMP_KW
     beside_jump = np.concatenate([jump, [False]]) | np.concatenate([[False], jump])
@@ -268,7 +268,7 @@ def _defaults(heater_kw: Array) -> Mask:
 
 
 def _with_ramps(default: Mask, heater_kw: Array) -> Mask:
-    """Defaults together with the straight lines that lead to or from them."""
+    """Return the defaults together with the straight lines that lead to or from them."""
     step = np.diff(heater_kw)
     bend = np.abs(np.diff(step, prepend=0.0)) > 4.2 * HEATER_RESOLUTION_KW
     line = np.cumsum(bend)
@@ -286,7 +286,7 @@ def _runs(mask: Mask) -> int:
 
 
 def signal_ranges(database: VehicleDatabase) -> dict[str, SignalRange]:
-    """Ranges of branches and inputs.
+    """Return the ranges that the DBC gives to branches and inputs.
 
     Parameters
     ----------

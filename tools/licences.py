@@ -1,18 +1,18 @@
 #!/usr/bin/env python3
-"""List what is installed with its licence; exit code 1 for one that does not go with Apache-2.0 or is not stated."""
+"""List installed packages with their licences; exit code 1 if one does not go with Apache-2.0 or is not stated."""
 
 import sys
 from importlib.metadata import Distribution, distributions
 
 GOOD = ("apache", "bsd", "mit", "isc", "psf", "python", "mpl", "mozilla", "lgpl", "lesser", "unlicense", "zlib", "cc0",
         "public domain", "0bsd")  # fmt: skip
-"""Words of licences that go with Apache-2.0 as those of a dependency; LGPL and MPL: see docs/dependencies.md."""
+"""Words of licences that a dependency may have beside Apache-2.0; for LGPL and MPL see docs/dependencies.md."""
 READ = {"docutils": "BSD-2-Clause AND public domain", "fastsim": "Apache-2.0"}
 """Licences read by hand, as their metadata mislead: COPYING.rst, LICENSE."""
 
 
 def licence_of(one: Distribution) -> str:
-    """Licence by the metadata, in one line; empty if they state none."""
+    """Return the licence stated in the metadata, in one line; empty if they state none."""
     name, found = one.metadata["Name"], one.metadata.get_all("License-Expression") or []
     classifiers = [text.rpartition(" :: ")[2] for text in one.metadata.get_all("Classifier") or [] if "License" in text]
     stated = [text for text in one.metadata.get_all("License") or [] if "\n" not in text and len(text) < 60]
@@ -21,7 +21,7 @@ def licence_of(one: Distribution) -> str:
 
 
 def is_good(licence: str) -> bool:
-    """Whether a licence goes with Apache-2.0."""
+    """Check whether a licence goes with Apache-2.0."""
     return any(word in licence.lower() for word in GOOD)
 
 

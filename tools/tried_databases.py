@@ -4,8 +4,8 @@
     tools/tried_databases.py FOLDER [--right right.csv]
 
 Prints one line of Markdown per database, and how many are right, none and wrong. The table --right has the columns
-``database`` (file without suffix) and ``battery`` (``Message.Signal``, empty where its authors name none); of one
-that is not in it, only what was found is told. A file NAME.log, .csv, ... beside NAME.dbc is taken as its log.
+``database`` (file without suffix) and ``battery`` (``Message.Signal``, empty where its authors name none); for a
+database that is not in it, only what was found is shown. A file NAME.log, .csv, ... beside NAME.dbc is its log.
 """
 
 import argparse
@@ -20,7 +20,7 @@ DATABASES = (".dbc", ".kcd", ".sym", ".arxml")
 
 
 def found_in(database: Path) -> tuple[str, str]:
-    """The battery current that is proposed, and what is said of the rest."""
+    """Return the battery current that is proposed, and the problem or the other branches."""
     logs = [path for path in sorted(database.parent.glob(f"{database.stem}.*")) if path.suffix not in DATABASES]
     try:
         proposal = look_at(database, logs[0] if logs else None, "tried")

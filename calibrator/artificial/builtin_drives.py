@@ -80,7 +80,7 @@ class GroundTruth:
 
     @classmethod
     def joined(cls, trips: Sequence["GroundTruth"], name: str) -> "GroundTruth":
-        """Trips one after the other, with the inputs that all of them have."""
+        """Join trips one after the other, with the inputs that all of them have."""
         first = trips[0]
         common = [key for key in first.inputs if all(key in trip.inputs for trip in trips)]
         return cls(
@@ -91,7 +91,7 @@ class GroundTruth:
         )
 
     def part(self, start: int, stop: int) -> "GroundTruth":
-        """Samples start to stop (excluded) as a trip of its own."""
+        """Return the samples from start to stop (excluded) as a trip of its own."""
         return GroundTruth(
             name=self.name,
             period_s=self.period_s,
@@ -223,7 +223,7 @@ def _lag(demand: Array, time_constant_s: float) -> Array:
 
 
 def _fastsim() -> ModuleType:
-    """The fastsim package, or one line that says how to get it."""
+    """Return the fastsim package; FleetError says how to get it."""
     try:
         import fastsim  # noqa: PLC0415
     except ImportError:

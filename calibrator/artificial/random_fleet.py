@@ -1,4 +1,4 @@
-"""Chance of artificial fleets: independent streams of it from one seed, and random faults, section IV-B of [1]_.
+"""Randomness of artificial fleets: independent random streams from one seed, and random faults, section IV-B of [1]_.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -16,7 +16,7 @@ __all__ = ["FaultSettings", "Purpose", "nonzero_count", "random_stream"]
 
 
 class Purpose(IntEnum):
-    """What chance is for.
+    """What a random stream is used for.
 
     numpy pads seeds with zeros, so [7], [7, 0] and [7, 0, 0] give the same numbers. In :func:`random_stream` purpose
     and count stand in front, so that no two purposes ever share a stream.
@@ -40,9 +40,9 @@ def random_stream(purpose: Purpose, *numbers: int) -> np.random.Generator:
     Parameters
     ----------
     purpose : Purpose
-        What it is for.
+        What the stream is used for.
     *numbers : int
-        Seed, and what tells the streams of one purpose apart, such as the number of the vehicle; not negative.
+        Seed, and numbers that distinguish the streams of one purpose, such as that of the vehicle; not negative.
 
     Returns
     -------
@@ -53,7 +53,7 @@ def random_stream(purpose: Purpose, *numbers: int) -> np.random.Generator:
 
 
 def nonzero_count(branches: int, sparsity: float) -> int:
-    """How many of the fault parameters of one vehicle are not zero.
+    """Return how many of the fault parameters of one vehicle are not zero.
 
     The paper counts 3K + 1 parameters in its example (K = 3, S = 60: 4 of 10) but draws the 3K that its footnote 1
     keeps; a share of these 3K gives the same 4. With K = 2, S = 60 these are 2 of 6. The 3 of 6 that a share of
@@ -116,7 +116,7 @@ class FaultSettings:
         ------
         FleetError
             If a symmetric fleet is wanted whose size is no multiple of 4, or whose faults have a preferred sign; or if
-            no probability belongs to the bias.
+            the sign bias is not between 0 and 0.5.
         """
         if not 0.0 <= self.sign_bias <= 0.5 or (self.symmetric and self.sign_bias):
             raise FleetError(f"a sign bias of {self.sign_bias:g}: expected 0 to 0.5, and 0 for a symmetric fleet")

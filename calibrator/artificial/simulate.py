@@ -37,7 +37,7 @@ from ecu_node.layout import Branch, Layout, split_signal
 __all__ = ["FleetPlan", "Vehicle", "simulate_fleet", "vehicle_drive", "vehicle_frames"]
 
 WRITTEN_DOWN = ("seed", "sparsity", "magnitude", "balanced", "symmetric", "common_drive", "noise")
-"""Fields of the plan that stand in the truth, too."""
+"""Fields of the plan that are also written into the truth."""
 JITTER = 0.02
 """Standard deviation of a frame's instant in cycle times: a lightly loaded bus. [1]"""
 DEFAULT_CYCLE_MS = 100
@@ -55,11 +55,11 @@ class Vehicle:
     branches : tuple of str
         K branches.
     faults : Faults
-        Of this vehicle alone (no leading N).
+        Faults of this vehicle alone (no leading N).
     noise_a : float
         Standard deviation of each sensor sample. [A]
     delay_s : ndarray of shape (K,)
-        How much later than it flowed each current is seen. [s]
+        Delay with which each current is seen. [s]
     unmeasured_a : float
         Load that no branch measures; the first branch (the source) carries it. [A]
     """
@@ -75,7 +75,7 @@ class Vehicle:
 def vehicle_frames(
     rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth
 ) -> list[FrameSeries]:
-    """Frames that a vehicle sends on one trip.
+    """Make the frames that a vehicle sends on one trip.
 
     Parameters
     ----------
@@ -100,12 +100,12 @@ def vehicle_frames(
 
 
 def vehicle_drive(rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth) -> Drive:
-    """Drive that the frames of a vehicle would be read as, without making the frames.
+    """Make the drive that reading the frames of a vehicle would give, without making the frames.
 
     Parameters
     ----------
     rng, database, vehicle, trip
-        As in :func:`vehicle_frames`; with the same chance the values are the same.
+        As in :func:`vehicle_frames`; a generator in the same state gives the same values.
 
     Returns
     -------
@@ -124,10 +124,10 @@ def vehicle_drive(rng: np.random.Generator, database: VehicleDatabase, vehicle: 
 def _sent_messages(
     rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth
 ) -> Iterator[tuple[str, Array, list[tuple[str, str, Array, float]]]]:
-    """What a vehicle puts into each message on one trip, before it is encoded.
+    """Yield what a vehicle puts into each message on one trip, before it is encoded.
 
-    Yields the message's name, its instants [s], and of each signal its name, that of the branch or input, its values in
-    the unit of the DBC, and the factor from there to ampere into the junction.
+    An item holds the message's name, its instants [s], and for each signal its name, the name of the branch or input,
+    the values in the unit of the DBC, and the factor that turns these into A into the junction (1 for inputs).
     """
     i, layout = _true_currents(vehicle, trip), database.layout
     messages: dict[str, list[tuple[str, str]]] = {}
@@ -180,7 +180,7 @@ def _write_vehicle(
 
 
 def _true_currents(vehicle: Vehicle, trip: GroundTruth) -> Array:
-    """True currents of the vehicle's branches, with what the unmeasured load draws from the first. [A]"""
+    """True currents of the vehicle's branches; the first also supplies the unmeasured load. [A]"""
     i = true_currents(trip.matrix_a(), vehicle.faults)
     i[:, 0] += vehicle.unmeasured_a
     return i
@@ -204,7 +204,7 @@ def _current_signal(branch: Branch) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class FleetPlan(FaultSettings):
-    """What an artificial fleet is like, beside how its faults are drawn.
+    """Size, drives and sensors of an artificial fleet, besides how its faults are drawn.
 
     Attributes
     ----------
@@ -257,7 +257,7 @@ def simulate_fleet(
     Returns
     -------
     FleetTruth
-        What stands in ``truth.json``.
+        Content of ``truth.json``.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def simulate_fleet(
 
 
 def _draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -> list[Vehicle]:
-    """Draw the vehicles of a fleet, each with what is wrong with it; of a plan, a layout, and the names of branches."""
+    """Draw the vehicles of a fleet, each with its faults, delays and unmeasured load."""
     rng = random_stream(Purpose.FAULTS, plan.seed)
     faults = plan.draw(rng, vehicles=plan.vehicles, branches=len(branches), full_scale_a=layout.full_scale_a)
     digits = max(3, len(str(plan.vehicles)))
@@ -302,6 +302,6 @@ def _draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -
 
 
 def _trip_of(trips: TripSource, vehicle: Vehicle, number: int, purpose: TripPurpose, layout: Layout) -> GroundTruth:
-    """Trip of vehicle ``number``, with its branches alone; the layout says which of them takes the balance."""
+    """Return the trip of vehicle ``number`` with only its branches; the layout says which of them takes the balance."""
     branches = vehicle.branches
     return with_branches(trips.trip(number, purpose), branches, balance_branch(layout, branches))

@@ -75,7 +75,7 @@ def with_branches(trip: GroundTruth, branches: Sequence[str], balance: str) -> G
 
 
 def balance_branch(layout: Layout, branches: Sequence[str]) -> str:
-    """The branch that is minus the sum of the others: the layout's, or the last one as in (19) of the paper."""
+    """Return the branch that is minus the sum of the others: the layout's, or the last one as in (19) of the paper."""
     return next((branch.name for branch in layout.branch if branch.balance and branch.name in branches), branches[-1])
 
 
@@ -159,7 +159,7 @@ TripPurpose = Literal["calibration", "unseen"]
 """A trip to learn from, or one to test on."""
 _STREAM: dict[TripPurpose, Purpose] = {"calibration": Purpose.CALIBRATION_TRIP, "unseen": Purpose.UNSEEN_TRIP}
 LEARNT_SHARE = 0.75
-"""Share of a single recording that trips to learn from are made of; the rest is for unseen ones. [1]"""
+"""Share of a single recording from which trips to learn from are made; unseen trips are made from the rest. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +199,7 @@ class BuiltinTrips:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedTrips:
-    """Recorded trips: one each while they last, then pieces of them joined anew; unseen trips are joined anew.
+    """Recorded trips: one for each vehicle if there are enough, else joined from pieces, as unseen trips always are.
 
     No piece of a recording is in both trips of a vehicle; a single recording is cut in time.
 
@@ -325,7 +325,7 @@ def choose_trips(
     Raises
     ------
     FleetError
-        If no drive of the store is usable, or the built-in vehicle has not what the layout names.
+        If no drive of the store is usable, or the built-in vehicle lacks what the layout names.
     """
     if drives == "builtin":
         notices = _builtin_notices(layout)
@@ -337,7 +337,7 @@ def choose_trips(
 
 
 def _builtin_notices(layout: Layout) -> tuple[str, ...]:
-    """What the built-in vehicle lacks of the layout's model inputs; refused if it lacks all, or has no junction."""
+    """Say which model inputs the built-in vehicle lacks; FleetError if it lacks all, or has fewer than two branches."""
     inputs, missing = choose_inputs(layout, BUILTIN_INPUTS)
     common = [name for name in layout.branch_names if name in BUILTIN_BRANCHES]
     if len(common) < 2 or not inputs:

@@ -1,10 +1,10 @@
-"""Worlds of an attack: what the estimator does not expect, put on some vehicles of a fleet of recorded trips.
+"""Worlds of an attack: effects that the estimator does not expect, in some vehicles of a fleet of recorded trips.
 
-A world is a row of :data:`WORLDS`. It may change the truth of the vehicles that have it (what stays linear), their true
-currents (loads without a sensor), or the measured current of one of their sensors. The sensor is that of the battery or
-the motor: the other branches of a recorded trip hardly move, and there nothing of this would show. Disturbances of a
-recording (spikes, interference) are not on the drive on which corrections are judged; what a sensor or a vehicle is
-like, is: there a step or a ramp is over, and the temperature is another one.
+A world is a row of :data:`WORLDS`. In the vehicles that it affects it may change the true faults (sensors stay linear),
+the true currents (loads without a sensor), or the measured current of one sensor. That is the sensor of the battery or
+the motor: the other branches of a recorded trip hardly move, so the effect would not show there. Disturbances (spikes,
+interference) appear only in the recording, not on the drive on which corrections are judged. What belongs to a sensor
+or a vehicle is on both; on the latter drive a step or a ramp is over, and the temperature is another one.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from calibrator.faults import Faults
 __all__ = ["WORLDS", "Attack", "World", "draw_attack"]
 
 MOVING = 2
-"""Branches that move: battery and motor, the first of the layout."""
+"""Number of branches that move: battery and motor, the first two of the layout."""
 HZ = 10.0
 """Samples per second of recorded trips; lengths of bursts and switching loads are counted in them. [1/s]"""
 REFERENCE_C = 25.0
@@ -35,13 +35,13 @@ class Scene:
     Attributes
     ----------
     size : float
-        Of what it does; signed for the faults of sensors.
+        Size of the effect; signed for effects on sensors.
     full_scale_a, peak_a : float
         Full scale of the junction, and the sensor's largest current on the drive to learn from. [A]
     progress, temperature_c : ndarray of shape (T,)
         Time since the start over the drive's length [1], 1 on the unseen drive; temperature of the sensors [degC].
     rng : numpy.random.Generator
-        Of this vehicle and drive.
+        Random generator of this vehicle and drive.
     """
 
     size: float
@@ -54,28 +54,28 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """One world.
+    """One effect that the estimator does not expect; each callable says how it changes a vehicle or a sensor.
 
     Attributes
     ----------
     share : float
-        Of the vehicles that have it. [1]
+        Share of the vehicles that it affects. [1]
     size : tuple of float
         Range of its size over vehicles.
     causes : tuple of str
-        Names under which a finding names it; empty: no cause is to be named.
+        Causes by which a finding names it correctly; empty: findings are not judged.
     magnitude : tuple of float or None
-        Of the faults of all vehicles, where the world is about them.
+        Range of the fault magnitudes of all vehicles, if the world is about these.
     truth : callable or None
-        New drift, offset [A] of the affected sensor, from the old ones and the size; sensors stay linear.
+        Returns new drift and offset [A] of the affected sensor, from the old ones and the size; sensors stay linear.
     hardware : callable or None
-        New hardware drift from the old one and the size.
+        Returns the new hardware drift, from the old one and the size.
     load : callable or None
-        What it adds to the first branch (the source), shape (T,), from the true currents (T, K). [A]
+        Returns what is added to the first branch (the source), shape (T,), from the true currents (T, K). [A]
     sensor : callable or None
-        New measured current of the affected sensor, shape (T,). [A]
+        Returns the new measured current of the affected sensor, shape (T,). [A]
     disturbance : callable or None
-        What it adds to the affected sensor in a recording alone, shape (T,). [A]
+        Returns what is added to the affected sensor in the recording only, shape (T,). [A]
     battery : bool
         Whether the sensor is always the battery's.
     """
@@ -94,22 +94,22 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class Attack:
-    """A world drawn for N vehicles.
+    """A world, and which of N vehicles it affects how much.
 
     Attributes
     ----------
     world : World
         The world.
     has : ndarray of bool of shape (N,)
-        Vehicles that have it.
+        Vehicles that it affects.
     branch : ndarray of int of shape (N,)
-        Their affected sensor.
+        Number of the branch whose sensor is affected.
     size : ndarray of shape (N,)
-        Signed size.
+        Size of the effect; signed for effects on sensors.
     full_scale_a : float
         Full scale of the junction. [A]
     seed : int
-        Of this repetition.
+        Seed of this repetition.
     """
 
     world: World
@@ -120,7 +120,7 @@ class Attack:
     seed: int
 
     def truth(self, faults: Faults) -> Faults:
-        """Faults of the fleet in this world, as far as they are linear."""
+        """Return the faults of the fleet in this world, as far as they are linear."""
         drift, offset_a, hardware = faults.drift.copy(), faults.offset_a.copy(), faults.hardware_drift
         j = np.flatnonzero(self.has)
         at = (j, self.branch[j])
@@ -131,14 +131,14 @@ class Attack:
         return replace(faults, drift=drift, offset_a=offset_a, hardware_drift=hardware)
 
     def true_a(self, vehicle: int, i: Array, *, unseen: bool) -> Array:
-        """True currents of a vehicle in this world, shape (T, K), from those without it. [A]"""
+        """Return the true currents of a vehicle in this world, shape (T, K), from those without it. [A]"""
         if not self.has[vehicle] or self.world.load is None:
             return i
         load_a = self.world.load(i, self._scene(vehicle, len(i), unseen=unseen))
         return np.column_stack([i[:, 0] + load_a, i[:, 1:]])
 
     def measured_a(self, vehicle: int, i_m: Array, *, unseen: bool, peak_a: Array) -> Array:
-        """Measured currents of a vehicle in this world, shape (T, K), from those of linear sensors. [A]"""
+        """Return the measured currents of a vehicle in this world, shape (T, K), from those of linear sensors. [A]"""
         k, changed = int(self.branch[vehicle]), i_m.copy()
         scene = self._scene(vehicle, len(i_m), unseen=unseen, peak_a=float(peak_a[k]))
         if self.has[vehicle] and self.world.sensor is not None:
@@ -161,23 +161,23 @@ class Attack:
 
 
 def draw_attack(name: str, vehicles: int, *, full_scale_a: float, seed: int) -> Attack:
-    """Draw which vehicles of a fleet have what a world does, and how much of it.
+    """Draw which vehicles of a fleet a world affects, and how much.
 
     Parameters
     ----------
     name : str
-        Of :data:`WORLDS`.
+        Name of the world in :data:`WORLDS`.
     vehicles : int
         Fleet size N.
     full_scale_a : float
         Full scale of the junction. [A]
     seed : int
-        Of this repetition.
+        Seed of this repetition.
 
     Returns
     -------
     Attack
-        Of the N vehicles.
+        The world with what was drawn for the N vehicles.
     """
     world, rng = WORLDS[name], random_stream(Purpose.ATTACK, seed, vehicles, *name.encode())
     signed = world.sensor is not None or world.disturbance is not None
@@ -193,7 +193,7 @@ def draw_attack(name: str, vehicles: int, *, full_scale_a: float, seed: int) -> 
 
 
 def _on_off(scene: Scene, samples: int, seconds: tuple[float, float], duty: float = 0.5) -> Array:
-    """1 and 0 by turns, for random times on, and off as long as the duty asks for; shape (T,)."""
+    """Switch between 1 and 0, shape (T,): on for random times, off for times that make the duty cycle."""
     lengths_s = scene.rng.uniform(*seconds, (2 * int(samples / HZ / seconds[0]) + 2,))
     state = np.arange(len(lengths_s)) % 2 == int(scene.rng.random() < duty)
     lengths_s[~state] *= (1.0 - duty) / duty
@@ -210,23 +210,23 @@ def _one_more_gain(d: Array, o: Array, size: Array) -> tuple[Array, Array]:
 
 
 def _low_pass(x: Array, time_constant_s: float) -> Array:
-    """A current behind a filter of first order."""
+    """Filter a current by a low-pass of first order."""
     kept = np.exp(-1.0 / (HZ * time_constant_s))
     return np.asarray(lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0])
 
 
 def _wander(x: Array, scene: Scene) -> Array:
-    """A current whose zero goes at random, so far in a drive (one standard deviation)."""
+    """Let the zero of a current walk at random; the size is its standard deviation at the end of a drive. [A]"""
     return np.asarray(x + scene.size * np.cumsum(scene.rng.standard_normal(len(x))) / np.sqrt(len(x)))
 
 
 def _later_gain(d: Array, o: Array, size: Array) -> tuple[Array, Array]:
-    """What a gain that has stepped or drifted away is at the end."""
+    """Return drift and offset after the whole step or ramp of the gain."""
     return (1.0 + d) * (1.0 + size) - 1.0, o * (1.0 + size)
 
 
 def _earlier(x: Array, scene: Scene, part: Array) -> Array:
-    """Current of a sensor whose gain has reached only a part of its change, from that with all of it."""
+    """Return the current measured when the gain has made only a part of its change, from that after all of it."""
     return x * (1.0 + scene.size * part) / (1.0 + scene.size)
 
 
@@ -234,28 +234,28 @@ Change = Callable[[Array, Scene], Array]
 
 
 def _load(share: float, size: tuple[float, float], load: Change, *causes: str) -> World:
-    """A load without a sensor, which the source carries."""
+    """Make the world of a load without a sensor, which the source carries."""
     return World(share=share, size=size, causes=("load", *causes), battery=True, load=load)
 
 
 def _sensor(size: tuple[float, float], sensor: Change, *causes: str, **more: Any) -> World:
-    """A sensor that is not linear."""
+    """Make the world of a sensor that is not linear."""
     return World(size=size, causes=causes, sensor=sensor, **more)
 
 
 def _disturbed(size: tuple[float, float], added: Callable[[Scene, int], Array], *causes: str) -> World:
-    """Something added to the samples of a recording alone."""
+    """Make the world of a disturbance that is only in the recording, not on the drive that judges corrections."""
     return World(size=size, causes=causes, disturbance=added)
 
 
 def _batch(share: float, offset_a: float) -> World:
-    """A batch of battery sensors with one more offset."""
+    """Make the world of a batch of battery sensors that have one more offset."""
     size = (offset_a, offset_a)
     return World(share=share, size=size, causes=("batch",), battery=True, truth=lambda d, o, s: (d, o + s))
 
 
 def _gain_batch(share: float, drift: float) -> World:
-    """A batch of battery sensors with one more gain error."""
+    """Make the world of a batch of battery sensors that have one more gain error."""
     return World(share=share, size=(drift, drift), battery=True, truth=_one_more_gain)
 
 
@@ -300,4 +300,4 @@ WORLDS = {
         share=0.5, size=(0.1, 0.1), causes=("variant",), hardware=lambda d_h, size: (1.0 + d_h) * (1.0 + size) - 1.0
     ),
 }
-"""By the names that the table shows; shares of vehicles where they are not 30 %."""
+"""Worlds by the names that the tables show; the share of the vehicles is in the name where it is not 30 %."""

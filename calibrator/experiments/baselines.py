@@ -35,11 +35,11 @@ from calibrator.faults import Faults
 __all__ = ["BASELINES"]
 
 PENALTY = float(np.log(10_000.0))
-"""Of a parameter in the Bayesian information criterion: log of the samples of a quarter of an hour at 10 Hz."""
+"""Price of a parameter in the Bayesian information criterion: log of the samples of a quarter of an hour at 10 Hz."""
 WIDER = 3.0
-"""Variance of the rows over that of the densest cluster: the factor with which the best subset recovers most. [1]"""
+"""Factor on the variance of the rows and of their densest cluster: the best subset recovers most with it. [1]"""
 ROUNDS = 4
-"""Of least squares: the constant rows depend on the gains of the sensors, so they are solved by turns. [1]"""
+"""Rounds of least squares: the constant rows depend on the gains of the sensors, so both are solved in turn. [1]"""
 BEYOND = 3.0
 """Robust standard deviations from the median from which on a slope or an intercept counts as faulty. [1]"""
 ACCURACY = 0.01
@@ -49,7 +49,7 @@ LEAST_WEIGHT = 0.2
 
 
 def best_subset(trial: Trial) -> Faults:
-    """The support with the least Bayesian information criterion, of all."""
+    """Take the support with the least Bayesian information criterion of all."""
     linear = _Linear(trial)
     N, P = len(linear.rows), linear.design.shape[1]
     supports = np.array([bits for bits in itertools.product((False, True), repeat=P) if sum(bits) < P], bool)
@@ -58,20 +58,20 @@ def best_subset(trial: Trial) -> Faults:
 
 
 def lasso(trial: Trial) -> Faults:
-    """Support of the LASSO path with the least criterion, fitted anew without shrinkage."""
+    """Take the support on the LASSO path with the least Bayesian information criterion, fitted without shrinkage."""
     linear = _Linear(trial)
     y = linear.values(np.zeros((len(linear.rows), linear.design.shape[1])))
     support = np.zeros((len(y), linear.design.shape[1]), bool)
     for j, whiten in enumerate(linear.whiten):
         path = LassoLarsIC(criterion="bic", fit_intercept=False, noise_variance=1.0)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # gains are open by a common factor
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a common factor of gains is open
             support[j] = path.fit(whiten @ linear.design, whiten @ y[j]).coef_ != 0.0
     return linear.faults(support)
 
 
 def fleet_median(trial: Trial) -> Faults:
-    """Slopes and intercepts that differ from the fleet's median; all of it is the sensor's."""
+    """Take deviations of slopes and intercepts from the fleet's median as faults of the sensors."""
     rows, order = _evidence_rows(trial)
 
     def apart(values: Array) -> Array:
@@ -84,18 +84,18 @@ def fleet_median(trial: Trial) -> Faults:
 
 
 def total_least_squares(trial: Trial) -> Faults:
-    """Direction in which a vehicle's currents vary least: weights 1 / (1 + d) of the junction law, median 1."""
+    """Take the direction in which currents vary least as weights 1 / (1 + d) of the junction law, with median 1."""
     mean_a, covariance_a2 = _measured_moments(trial)
     w = np.linalg.eigh(covariance_a2)[1][:, :, 0]
     w = w / np.median(w, axis=1, keepdims=True)
     w = np.where(w > LEAST_WEIGHT, w, 1.0)
-    # sum_k w_k (mean_k - o_k) = 0 leaves the offsets open: the smallest ones
+    # sum_k w_k (mean_k - o_k) = 0 leaves the offsets open: take the smallest ones
     offset_a = w * (np.sum(w * mean_a, axis=1) / np.sum(w**2, axis=1))[:, None]
     return _sensors_alone(1.0 / w - 1.0, offset_a)
 
 
 def reconciliation(trial: Trial) -> Faults:
-    """Measured over reconciled currents: those nearest to the measured ones that sum to zero, all as accurate."""
+    """Fit measured over reconciled currents: the nearest ones that sum to zero, all sensors being equally accurate."""
     mean_a, covariance_a2 = _measured_moments(trial)
     K = mean_a.shape[1]
     project = np.eye(K) - 1.0 / K
@@ -115,11 +115,11 @@ BASELINES = {
     "total least squares": total_least_squares,
     "VDI 2048": reconciliation,
 }
-"""By name: what finds the faults of the vehicles of a trial."""
+"""Functions by name; each finds the faults of the vehicles of a trial."""
 
 
 def _sensors_alone(drift: Array, offset_a: Array) -> Faults:
-    """Faults without any of the hardware."""
+    """Return faults of the sensors alone, without hardware faults."""
     nothing = np.zeros_like(drift)
     return Faults(hardware_drift=nothing[:, 0], hardware_offset_a=nothing, drift=drift, offset_a=offset_a)
 

@@ -1,6 +1,6 @@
 """Trials in which all vehicles make one drive, sections IV-A to IV-D of [1]_.
 
-The evidence rows of the default are made of simulations over the fleet reference, and of the junction law. The
+The evidence rows of the default come from simulations over the fleet reference, and from the junction law. The
 reference is not the mean r of the fleet (3), which an asymmetric fleet shifts, but c_0 r + c_1 with the densest cluster
 of slopes and of intercepts as c_0 and c_1, branch by branch. Slopes and intercepts a, b over r become
 
@@ -36,16 +36,16 @@ TRAIN_SHARE = 0.8
 FULL_SCALE_A = 400.0
 """Nominal maximum current of the built-in vehicle's junction, as in its layout. [A]"""
 GAIN_VARIANCE, CONSTANT_VARIANCE = 1e-10, 1e-12
-"""Of the exact junction law: above rounding, far below any fault. [1]"""
+"""Variances given to the exact junction law: above rounding, far below any fault. [1]"""
 ROUNDS = 3
-"""Over a better reference, vehicles agree more closely; more rounds change nothing. [1]"""
+"""Times that the reference is improved, as vehicles agree more closely over a better one; more change nothing. [1]"""
 LEAST_SD = 1e-6
-"""Of slopes [1] and intercepts [A] of simulations without noise."""
+"""Least standard deviation of slopes [1] and intercepts [A], for simulations without noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonDrive:
-    """Ideal currents and inputs of the one drive.
+    """Ideal currents and inputs of the drive that all vehicles make.
 
     Attributes
     ----------
@@ -75,12 +75,12 @@ class CommonDrive:
             raise DriveError(f"drive {self.name}: ideal currents must sum to zero; the worst sum is {worst:.3g} A")
 
     def with_branches(self, count: int) -> "CommonDrive":
-        """First K branches, of which the second one, the motor, takes the balance (19).
+        """Return the drive with its first K branches, of which the second, the motor, takes the balance (19).
 
         Raises
         ------
         FleetError
-            If there are not so many.
+            If it has fewer branches.
         """
         K = self.i_s.shape[1]
         if not 2 <= count <= K:
@@ -153,7 +153,7 @@ class CommonCase(FaultSettings):
     training_vehicles : int
         Size of the artificial fleet that trees learn from; 3,000 in section V-B.
     snr_db : float
-        Of the artificial simulation (26). [dB]
+        Signal-to-noise ratio of the artificial simulation (26). [dB]
     state_space : bool
         Simulate by a state-space model of each vehicle (2), trained on 80 % of the drive, instead of artificially (23).
     """
@@ -169,7 +169,7 @@ class CommonCase(FaultSettings):
 
 
 def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
-    """Evidence of N vehicles on the unity drive; the same for the same seed."""
+    """Make the trial of N vehicles on the unity drive; the same seed gives the same trial."""
     drive = drive.with_branches(case.branches)
     junction: dict[str, Any] = {"branches": case.branches, "full_scale_a": drive.full_scale_a}
     truth = case.draw(random_stream(Purpose.FAULTS, seed), vehicles=case.vehicles, **junction)
@@ -185,7 +185,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         return CommonEvidence(rows=rows, mean_a=mean_a, covariance_a2=covariance_a2)
 
     def training() -> tuple[FleetEvidence, Faults]:
-        """Evidence and truth of another fleet, for the trees."""
+        """Return evidence and truth of another fleet, from which the trees learn."""
         other = case.draw(random_stream(Purpose.TRAINING_FAULTS, seed), vehicles=case.training_vehicles, **junction)
         simulate_other = _simulation(drive, other, case, Purpose.TRAINING_ERROR, seed)
         return collect_evidence(simulate_other(), fleet_mean(simulate_other()), _junction_a2(drive, other)), other
@@ -205,7 +205,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
 def _simulation(
     drive: CommonDrive, truth: Faults, case: CommonCase, purpose: Purpose, seed: int
 ) -> Callable[[], Iterable[Array]]:
-    """Measured currents with white noise (23), made anew by each call instead of kept in memory."""
+    """Return a function that makes the measured currents with white noise (23) anew at each call, to save memory."""
     noise_a = np.sqrt(10.0 ** (-case.snr_db / 10.0) * np.mean(drive.unity[:, 0] ** 2))  # (26), with the power of i_s,1
 
     def simulate() -> Iterator[Array]:
@@ -216,7 +216,7 @@ def _simulation(
 
 
 def _state_space_simulations(drive: CommonDrive, truth: Faults) -> Iterator[Array]:
-    """Simulations by state-space models (2); identical vehicles have the same order, chosen on the first."""
+    """Yield simulations by state-space models (2); all have the order of the first, as vehicles are identical."""
     start, order = drive.unity_start, None
     for measured in _measured(drive.i_s, truth):
         if order is None:
@@ -226,7 +226,7 @@ def _state_space_simulations(drive: CommonDrive, truth: Faults) -> Iterator[Arra
 
 
 def _measured(i_s: Array, truth: Faults) -> Iterator[Array]:
-    """Measured currents (21) of one vehicle after the other."""
+    """Yield the measured currents (21) of one vehicle after the other."""
     for slope, intercept in zip(*slopes_and_intercepts(truth), strict=True):
         yield slope * i_s + intercept
 
@@ -255,7 +255,7 @@ def measured_moments(i_s: Array, truth: Faults) -> tuple[Array, Array]:
 def common_rows(
     evidence: FleetEvidence, reference_mean_a: Array, mean_a: Array, covariance_a2: Array, *, full_scale_a: float
 ) -> EvidenceRows:
-    """Evidence rows of a fleet on its common drive, without bench readings.
+    """Make the evidence rows of a fleet on its common drive, without bench readings.
 
     Parameters
     ----------

@@ -1,8 +1,7 @@
 """The table of experiments, those of the paper [1]_ and ours, and the record of a result.
 
-An experiment is a row of ``TABLE`` (by name: :data:`EXPERIMENTS`).
-It has settings (a case of how fleets are made, and where it stands in the
-table), the methods that are compared on them, and how it is shown. A new one is a new row;
+An experiment is a row of ``TABLE`` (by name: :data:`EXPERIMENTS`). It has settings (how fleets are made, and the place
+in the tables), the methods that are compared, and how the result is shown. To add an experiment, add a row;
 :func:`~calibrator.experiments.runner.run_experiment` runs them all.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
@@ -32,13 +31,13 @@ __all__ = [
 ]  # fmt: skip
 
 KEYS = ["series", "x", "method"]
-"""Columns of a result that say what a row is of."""
+"""Columns of a result that say to which setting and method a row belongs."""
 
 BUILTIN_TRIPS, BUILTIN_DURATION_S = 27, 1500.0
 """As many trips as a summer of recordings has [1], each as long as recorded ones are in the median [s]."""
 QUICK_VEHICLES, QUICK_TRAINING_VEHICLES, QUICK_TRIPS, QUICK_DURATION_S = 20, 400, 8, 300.0
 DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
-"""Of the examples that come with the source; it fits the built-in vehicle."""
+"""Layout of the examples that come with the source; it fits the built-in vehicle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,11 +49,11 @@ class Setting:
     x : float
         Value of what the experiment varies.
     series : str
-        What else it varies.
+        Value of what else it varies, as text.
     case : CommonCase or RecordedCase
         How the fleets are made.
     methods : tuple of ComparedMethod
-        What is run on them instead of the methods of the experiment; empty: those.
+        Methods that are run instead of those of the experiment; empty: those of the experiment.
     """
 
     x: float
@@ -74,17 +73,17 @@ class Experiment:
     x_label, series_label : str
         What it varies, with units.
     methods : tuple of ComparedMethod
-        What it compares.
+        Methods that it compares.
     settings : tuple of Setting
-        All on the common drive, or all on recorded trips; none where it pools what others have found.
+        All on the common drive, or all on recorded trips; none for an experiment that pools the results of others.
     quick : mapping of str to collection of float
-        Series and values of x to which ``--quick`` keeps; empty: all.
+        Values of x by series that ``--quick`` keeps; empty: all.
     drive_s : float
         Length of the common drive; an hour has 7,200 samples of unity drive at 10 Hz, the paper does not say. [s]
     paper : mapping
         Figures of the paper by (x, method) and name; the best by x stands in the tables.
     note : str
-        What is to be known of the settings.
+        Remark on the settings.
     picture : str
         Kind of its picture, see :mod:`calibrator.experiments.pages`.
     shown : tuple of str
@@ -93,7 +92,7 @@ class Experiment:
     panels : tuple of str
         Figures that its picture shows.
     pooled : bool
-        Whether its confidences are among those that ``calibration`` pools: not of worlds that the estimator does not
+        Whether ``calibration`` pools its confidences; it does not where a world is one that the estimator does not
         expect.
     """
 
@@ -114,11 +113,11 @@ class Experiment:
 
     @property
     def recorded(self) -> bool:
-        """Whether it is on recorded trips."""
+        """Whether its vehicles drive recorded trips."""
         return any(isinstance(setting.case, RecordedCase) for setting in self.settings)
 
     def small(self, vehicles: int = QUICK_VEHICLES) -> "Experiment":
-        """The same with small fleets on the common drive, and few settings: shows that it runs, not the figures."""
+        """Return the experiment with few settings, and small fleets on the common drive, only to show that it runs."""
         kept = []
         for each in self.settings:
             case = each.case
@@ -144,7 +143,7 @@ QUICK_LEVELS = {"": (60.0, 80.0), "3 of 6": (60.0,)}
 
 
 def _paper(method: ComparedMethod, names: str, *rows: tuple[float, ...]) -> dict[tuple[float, str], dict[str, float]]:
-    """Figures of the paper: rows of the value of x and of what is named."""
+    """Build the figures of the paper for a method; each row holds x and the values of the named figures."""
     return {(x, method.name): dict(zip(names.split(), values, strict=True)) for x, *values in rows}
 
 
@@ -153,7 +152,7 @@ def _sizes(magnitude: tuple[float, float]) -> str:
 
 
 def _named(case: RecordedCase) -> Setting:
-    """Setting by sparsity, with branches, sizes of faults and whatever is unusual as series."""
+    """Make a setting over the sparsity, whose series names branches, sizes of faults and whatever is unusual."""
     load = "" if not any(case.unmeasured_a) else ", load {:g}+-{:g} A".format(*case.unmeasured_a)
     hardware = "" if case.balanced else ", any vehicle"
     named = "own prior" if case.own_prior is not None else f"{_sizes(case.magnitude)} %{hardware}{load}"
@@ -162,7 +161,7 @@ def _named(case: RecordedCase) -> Setting:
 
 MAIN = tuple(RecordedCase(branches=K, sparsity=S) for K in (2, 3) for S in (80.0, 60.0))
 LOAD_A = (3.0, 1.0)
-"""Control units and the like take 1 to 4 A that no branch measures. [A]"""
+"""Mean and standard deviation of a load: control units and the like take 1 to 4 A that no branch measures. [A]"""
 REAL = tuple(
     map(
         _named,
@@ -368,7 +367,7 @@ CALIBRATION = Experiment(
     picture="reliability",
     pooled=False,
 )
-"""Of the vehicles with a confidence of 0.9, is a share of 0.9 recovered? Pools what the others have found."""
+"""Of the vehicles with a confidence of 0.9, is a share of 0.9 recovered? Pools the results of the other experiments."""
 EXPERIMENTS = {experiment.name: experiment for experiment in (*TABLE, CALIBRATION)}
 """The table by name."""
 
@@ -376,14 +375,14 @@ EXPERIMENTS = {experiment.name: experiment for experiment in (*TABLE, CALIBRATIO
 def fleet_for(
     experiment: Experiment, *, quick: bool = False, drives: Path | None = None, layout: Path | None = None
 ) -> CommonDrive | RecordedFleet:
-    """Drives of an experiment: those of the built-in vehicle, or of a store for an experiment on recorded trips.
+    """Return the drives of an experiment: the built-in vehicle's, or those of a store if it is on recorded trips.
 
     Parameters
     ----------
     experiment : Experiment
         The experiment.
     quick : bool
-        Short ones, and few.
+        Whether few and short drives are enough.
     drives : Path or None
         Drive store with recorded trips; None: the built-in vehicle.
     layout : Path or None
@@ -411,7 +410,7 @@ def fleet_for(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExperimentResult:
-    """What was found, and what is needed to repeat it.
+    """Figures of an experiment, and what is needed to repeat it.
 
     Attributes
     ----------
@@ -455,7 +454,7 @@ class ExperimentResult:
 
 
 class _Record(msgspec.Struct):
-    """What is read back of NAME.json; titles and labels stand in it for other readers."""
+    """The parts of NAME.json that are read back; its titles and labels are for other readers."""
 
     settings: dict[str, bool | int | float | str]
     made: str

@@ -1,4 +1,4 @@
-"""Figures of merit: what a method says of a trial beside the truth, and the table of what they are and how they pool.
+"""Figures of merit, which compare what a method says of a trial with the truth, and the table of their meanings.
 
 Every figure is one number made of many values, mostly their mean: :func:`judge` gives the values of one trial,
 :func:`figure_rows` the figures of several trials together. The expected calibration error is that of [1]_, intervals
@@ -26,11 +26,11 @@ __all__ = [
 ]  # fmt: skip
 
 ALL = "all together"
-"""Series of what several experiments have found."""
+"""Name of the series that pools several experiments."""
 SURE = 0.95
 """Confidence from which on a vehicle counts as sure. [1]"""
 LEAST_GAIN = 1e-9
-"""Corrections divide by 1 + d; nearer to zero there is none. [1]"""
+"""Least magnitude of 1 + d, by which corrections divide; nearer to zero there is no correction. [1]"""
 TAIL = 0.025
 """Probability on either side of the 95 % intervals. [1]"""
 TENTHS = np.arange(10) / 10.0
@@ -41,7 +41,7 @@ Values = Mapping[str, NDArray[Any]]
 
 
 class FigureKind(NamedTuple):
-    """What a figure is, how values become it, and whether it is rare (counts stand beside)."""
+    """Meaning of a figure, how its values are merged, and whether it is rare, so that counts are shown with it."""
 
     meaning: str
     merged: Callable[[NDArray[Any]], Any] = np.mean
@@ -81,7 +81,7 @@ FIGURES = {
     ),
     "failed": FigureKind("share of vehicles whose optimisation failed"),
 }
-"""In the order of the columns; pages name them by the same words."""
+"""Figures in the order of the columns; pages explain them by the same words."""
 
 
 def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
@@ -92,7 +92,7 @@ def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
     estimate : Estimate
         What a method found.
     trial : Trial
-        With the truth.
+        Trial, with the truth.
 
     Returns
     -------
@@ -141,7 +141,7 @@ def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
 
 
 def _worsening_a(estimate: Estimate, trial: Trial) -> Array:
-    """By how much the corrected branches (N, K) get worse; full scale where the gain is 0, which has no inverse. [A]"""
+    """Return by how much corrected branches (N, K) get worse; full scale if the gain is 0, which has no inverse. [A]"""
     drift, offset_a = (np.where(estimate.corrected, x, 0.0) for x in (estimate.faults.drift, estimate.faults.offset_a))
     impossible, zero = np.abs(1.0 + drift) < LEAST_GAIN, np.zeros_like(drift)
     worsening = trial.unseen.rms_a(np.where(impossible, 0.0, drift), offset_a) - trial.unseen.rms_a(zero, zero)
@@ -154,7 +154,7 @@ def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
     Parameters
     ----------
     trials : sequence of mapping
-        From :func:`judge`.
+        Values of each trial, from :func:`judge`.
 
     Returns
     -------
@@ -179,10 +179,10 @@ def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _with_intervals(figures: pd.DataFrame) -> pd.DataFrame:
-    """Figures with the 95 % intervals of those that are shares."""
+    """Add the 95 % intervals of those figures that are shares."""
     hits, share = np.rint(figures["value"] * figures["of"]), figures["share"].astype(bool)
     misses = figures["of"] - hits
-    low = np.nan_to_num(beta.ppf(TAIL, hits, misses + 1), nan=0.0)  # no distribution has 0 hits, nor 0 misses
+    low = np.nan_to_num(beta.ppf(TAIL, hits, misses + 1), nan=0.0)  # beta needs hits and misses above 0
     high = np.nan_to_num(beta.ppf(1.0 - TAIL, hits + 1, misses), nan=1.0)
     return figures.assign(low=np.where(share, low, np.nan), high=np.where(share, high, np.nan)).drop(columns="share")
 
@@ -204,7 +204,7 @@ def tenths_of(values: Values) -> pd.DataFrame:
 
 
 def pool_tenths(tenths: pd.DataFrame) -> pd.DataFrame:
-    """Tenths of several settings together, without those that hold no vehicle."""
+    """Pool the tenths of several settings; leave out those that hold no vehicle."""
     means = ["confidence", "recovered"]
     weighed = tenths[["low", "vehicles", *means]].astype(float)
     weighed[means] = weighed[means].mul(weighed["vehicles"], axis=0)
@@ -214,7 +214,7 @@ def pool_tenths(tenths: pd.DataFrame) -> pd.DataFrame:
 
 
 def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
-    """Expected calibration error, and what chance alone makes of it; NaN without vehicles."""
+    """Return the expected calibration error, and what it would be by chance alone; NaN without vehicles."""
     vehicles, confidence = tenths["vehicles"].to_numpy(float), tenths["confidence"].to_numpy(float)
     if not vehicles.sum():
         return float("nan"), float("nan")
@@ -224,7 +224,7 @@ def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
 
 
 def pool_figures(figures: pd.DataFrame) -> pd.DataFrame:
-    """Figures that are means, each over the values of several settings together; without standard deviations."""
+    """Pool those figures that are means over the values of several settings; standard deviations are set to 0."""
     means = figures[[FIGURES[name].merged is np.mean for name in figures["figure"]]]
     weighed = means.assign(value=means["value"] * means["of"], share=means["low"].notna())
     pooled = weighed.groupby("figure", sort=False)[["value", "of", "share"]].sum().reset_index()

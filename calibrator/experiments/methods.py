@@ -27,7 +27,7 @@ __all__ = [
 ]  # fmt: skip
 
 ROUNDING = 1e-9
-"""By which a probability may leave 0 to 1. [1]"""
+"""Amount by which a probability may lie outside 0 to 1. [1]"""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class MethodRow:
 
 
 def _posterior(trial: Trial, *, known: bool = False) -> Estimate:
-    """The default, which corrects the branches that are hardly ever made worse; told how faults were drawn, or not."""
+    """Run the default, which corrects branches that this hardly ever makes worse; if `known`, with the true prior."""
     prior = None
     if known:
         if trial.drawn_from is None:
@@ -66,7 +66,7 @@ def _posterior(trial: Trial, *, known: bool = False) -> Estimate:
 
 
 def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float) -> Estimate:
-    """The same for vehicles that all make one drive: their rows are at hand, and nothing is checked."""
+    """Run the default for vehicles that all make one drive: from their rows, and without a check of fit."""
     feed = int(np.argmax(np.median(recorded.mean_a, axis=0)))
     models = learn_fault_models(recorded.rows, feed=feed, known=known)
     mean = recorded.mean_a / full_scale_a
@@ -99,13 +99,13 @@ def _estimated(found: decision.SensorEstimate, corrected: Mask, prior: Prior) ->
 
 
 def _all_corrected(faults: Faults, hardware: Mask, failed: int = 0) -> Estimate:
-    """Estimate of a method that corrects whatever it finds, and does not say how sure it is."""
+    """Return the estimate of a method that corrects whatever it finds, and does not say how sure it is."""
     corrected = (faults.drift != 0.0) | (faults.offset_a != 0.0)
     return Estimate(faults=faults, hardware=hardware, corrected=corrected, confidence=None, failed=failed)
 
 
 def _published(trial: Trial, *, classify: Callable[[Trial], Classification]) -> Estimate:
-    """The published method: classify, then recover by the four cases."""
+    """Run the published method: classify, then recover by the four cases."""
     recovery = recover_fleet(trial.evidence, classify(trial), full_scale_a=trial.full_scale_a)
     return _all_corrected(recovery.faults, recovery.classification.hardware, len(recovery.failed))
 
@@ -140,12 +140,12 @@ BASELINES = tuple(MethodRow(name, partial(_baseline, solve=solve)) for name, sol
 
 
 def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
-    """Return what a method gave for the N vehicles with K branches of a truth, if it can be judged.
+    """Check that what a method returned for N vehicles with K branches can be judged, and return it.
 
     Raises
     ------
     FleetError
-        If it is no estimate, or an array has another shape or type, or values that are not finite.
+        If it is no estimate, or an array has another shape or type, or values that are not finite or out of range.
     """
     N, K = truth.drift.shape
 

@@ -26,9 +26,9 @@ CONSOLE = {"recovery_rate", "confidence", "harmed"}
 
 
 def headline(result: ExperimentResult) -> pd.DataFrame:
-    """Recovery of the paper and of all methods side by side, and how honest the default is, as texts.
+    """Return a table of texts: recovery of the paper and of all methods side by side, then figures of the default.
 
-    Returns a row per setting. Figures besides the recovery are of the default, or where it was not run of the first
+    It has a row per setting. Where the default was not run, the figures after the recovery are those of the first
     method with a confidence.
     """
     figures, experiment = result.figures.assign(text=_texts(result)), result.experiment
@@ -47,7 +47,7 @@ def headline(result: ExperimentResult) -> pd.DataFrame:
 
 
 def figure_table(result: ExperimentResult, names: Iterable[str], *, intervals: bool = True) -> pd.DataFrame:
-    """Figures of all methods as texts, a row per setting and method; after a stroke those of the paper."""
+    """Return figures of all methods as texts, a row per setting and method; those of the paper follow a slash."""
     figures = result.figures.assign(text=_texts(result, intervals=intervals))
     paper = (_of_paper(result.experiment, row) for row in figures.itertuples())
     figures["text"] += [f" / {value:.2f}" if np.isfinite(value) else "" for value in paper]
@@ -57,7 +57,7 @@ def figure_table(result: ExperimentResult, names: Iterable[str], *, intervals: b
 
 
 def _texts(result: ExperimentResult, *, intervals: bool = True) -> list[str]:
-    """Figures, a share with its interval, a rare one with its counts too."""
+    """Format the figures: a share with its interval, a rare one with its counts, too."""
     texts = []
     for row in result.figures.itertuples():
         count = f"; {round(row.value * row.of)} of {row.of:.0f}" if FIGURES[row.figure].rare else ""
@@ -67,12 +67,12 @@ def _texts(result: ExperimentResult, *, intervals: bool = True) -> list[str]:
 
 
 def _of_paper(experiment: Experiment, row: Any) -> float:
-    """What the paper prints for a row of figures; NaN for nothing."""
+    """Return the value that the paper prints for a row of figures; NaN if there is none."""
     return experiment.paper.get((row.x, row.method), {}).get(row.figure, float("nan"))
 
 
 def _labelled(table: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
-    """Table whose index, what is varied, has become columns with labels; without series, if there are none."""
+    """Turn the index of a table, which is what is varied, into labelled columns; drop the series if there are none."""
     table = table.astype(object).fillna("-").reset_index()
     table["x"] = ["" if np.isnan(x) else f"{x:g}" for x in table["x"]]
     table = table if experiment.series_label else table.drop(columns="series")
@@ -81,19 +81,19 @@ def _labelled(table: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
 
 
 def _owner(result: ExperimentResult) -> str:
-    """The method whose honesty the headline shows: the default, else the first with a confidence; empty for none."""
+    """Return the method whose confidence is shown: the default, else the first that has one; empty if none has."""
     confident = result.figures.loc[result.figures["figure"] == "confidence", "method"].tolist()
     return POSTERIOR.name if POSTERIOR.name in confident else next(iter(confident), "")
 
 
 def _names(result: ExperimentResult) -> list[str]:
-    """Figures that it has, in the order of the columns; failures only if there are any."""
+    """Return the names of a result's figures, in the order of the columns; failures only if there are any."""
     there = result.figures[(result.figures["figure"] != "failed") | (result.figures["value"] > 0.0)]["figure"]
     return [name for name in FIGURES if (there == name).any()]
 
 
 def _notes(result: ExperimentResult) -> str:
-    """What is to be known of the settings."""
+    """Return remarks on the settings."""
     branch = result.settings.get("balance_branch")
     balance = f"In every trip the current of {branch} is minus the sum of the others, so it depends on their sensors."
     return f"{result.experiment.note} {balance if branch else ''}".strip()
@@ -111,7 +111,7 @@ def _explained(names: Iterable[str]) -> str:
 
 
 def result_table(result: ExperimentResult) -> Group:
-    """Main figures of all methods for the console: title, table and what its columns are."""
+    """Return the main figures of all methods for the console: title, table and what its columns mean."""
     names = [name for name in _names(result) if name in CONSOLE | {*result.experiment.panels}]
     table, cells = Table(box=None, pad_edge=False, collapse_padding=True), figure_table(result, names, intervals=False)
     for heading in cells.columns:
@@ -129,7 +129,7 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
     Parameters
     ----------
     result : ExperimentResult
-        Of one experiment.
+        Result of one experiment.
     picture : str
         File of its picture, as the page is to link it; empty: there is none.
     """
@@ -222,14 +222,14 @@ def draw_result(result: ExperimentResult) -> Figure:
 
 
 def _style(number: int) -> dict[str, Any]:
-    """How a curve is told from others, also without colours."""
+    """Return colour and marker of a curve; it differs from others without colours, too."""
     return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 
 def _draw_points(
     axes: Axes, experiment: Experiment, rows: pd.DataFrame, places: Sequence[float], *, label: str, number: int, of: int
 ) -> None:
-    """One curve of several side by side; of settings that are no numbers dots from the top down."""
+    """Draw one of several curves side by side; where settings are no numbers, draw dots from top to bottom."""
     across = experiment.picture == "dots"
     place = np.array(places) + (0.6 if across else 0.2) * ((number + 0.5) / of - 0.5)
     lengths = np.maximum(np.nan_to_num([rows["value"] - rows["low"], rows["high"] - rows["value"]]), 0.0)
@@ -245,7 +245,7 @@ def _draw_points(
 
 
 def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
-    """A line of dots per setting and a panel per figure, where settings are no numbers."""
+    """Draw a line of dots per setting and a panel per figure, for settings that are no numbers."""
     table, experiment = result.figures, result.experiment
     keys = list(dict.fromkeys(zip(table["series"], table["x"], strict=True)))
     figure.set_size_inches(11.0, 2.0 + max(3.0, 0.3 * len(keys)))
@@ -264,7 +264,7 @@ def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
 
 
 def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
-    """Figures over what is varied: a curve per method; with several series a panel per method, a curve per series."""
+    """Draw figures over what is varied: a curve per method, or for several series a panel per method."""
     table, experiment = result.figures, result.experiment
     several, values = table["series"].nunique() > 1, sorted(set(table["x"]))
     groups = [[method] for method in result.methods] if several else [list(result.methods)]
@@ -290,7 +290,7 @@ def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
 
 
 def _draw_map(figure: Figure, result: ExperimentResult) -> None:
-    """A map of the recovery rate per method."""
+    """Draw a map of the recovery rate for each method."""
     table, experiment = result.figures, result.experiment
     all_axes = np.atleast_1d(figure.subplots(1, len(result.methods)))
     for axes, method in zip(all_axes, result.methods, strict=True):
@@ -305,7 +305,7 @@ def _draw_map(figure: Figure, result: ExperimentResult) -> None:
 
 
 def _draw_reliability(figure: Figure, result: ExperimentResult) -> None:
-    """Share recovered over confidence, experiment by experiment and all together, with the numbers of vehicles."""
+    """Draw the share recovered over the confidence, by experiment and all together, with the numbers of vehicles."""
     reliability, counts = figure.subplots(1, 2)
     reliability.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=1.0)
     errors = result.figures[result.figures["figure"] == "ece"].set_index("series")["value"]

@@ -43,14 +43,14 @@ FEWEST_TRIPS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedFleet:
-    """Trips of the ideal vehicle.
+    """Trips of the ideal vehicle, from which the vehicles of a fleet are made.
 
     Attributes
     ----------
     name : str
         Where they come from, for the record.
     trips : tuple of GroundTruth
-        All with the same branches and inputs.
+        Trips, all with the same branches and inputs.
     database : VehicleDatabase
         DBC and layout.
     """
@@ -95,13 +95,13 @@ class RecordedFleet:
         }
 
     def take(self, trips: int, *, duration_s: float) -> "RecordedFleet":
-        """First trips, cut to their beginnings."""
+        """Return the first trips, each cut to its first seconds."""
         samples = int(duration_s / self.period_s)
         taken = tuple(trip.part(0, samples) for trip in self.trips[:trips])
         return replace(self, name=f"the first {duration_s:g} s of {len(taken)} of {self.name}", trips=taken)
 
     def with_branches(self, count: int) -> tuple[GroundTruth, ...]:
-        """Trips of a fleet of K currents that sum to zero, as one of them takes the balance (19).
+        """Return trips with K currents that sum to zero, as one of them takes the balance (19).
 
         Raises
         ------
@@ -112,13 +112,13 @@ class RecordedFleet:
         return tuple(with_branches(trip, names, balance_branch(self.database.layout, names)) for trip in self.trips)
 
     def input_names(self, available: Mapping[str, object]) -> tuple[str, ...]:
-        """Those of the inputs of the vehicles' and of the fleet's model that a trip with these inputs has."""
+        """Return the inputs of the vehicle model and the fleet model that can be made from the available inputs."""
         layout = self.database.layout
         names = tuple(dict.fromkeys([*layout.model_inputs, *layout.fleet_inputs]))
         return choose_inputs(layout, tuple(available), names=names)[0]
 
     def inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
-        """The same with their values, each of shape (T,)."""
+        """Return these model inputs of a trip by name, each of shape (T,)."""
         layout, values = self.database.layout, dict(trip.inputs)
         for item in layout.derived:
             if layout.base_inputs([item.name]) <= values.keys():
@@ -127,7 +127,7 @@ class RecordedFleet:
 
 
 def read_fleet(store: Path, database: VehicleDatabase) -> RecordedFleet:
-    """Trips of a drive store; drives without good samples of some channel are left out.
+    """Read the trips of a drive store; drives without good samples of some channel are left out.
 
     Parameters
     ----------
@@ -147,14 +147,14 @@ def read_fleet(store: Path, database: VehicleDatabase) -> RecordedFleet:
 
 
 def builtin_fleet(database: VehicleDatabase, *, trips: int, duration_s: float) -> RecordedFleet:
-    """Trips of the built-in vehicle, for where there are no recordings; the layout must have its names.
+    """Make trips of the built-in vehicle, in place of recordings; the layout must use its names.
 
     Parameters
     ----------
     database : VehicleDatabase
         DBC and layout.
     trips : int
-        How many.
+        Number of trips.
     duration_s : float
         Least duration of each. [s]
     """
@@ -167,7 +167,7 @@ def builtin_fleet(database: VehicleDatabase, *, trips: int, duration_s: float) -
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedCase(FaultSettings):
-    """How vehicles are made of trips, beside how their faults are drawn.
+    """How vehicles are made from trips, besides how their faults are drawn.
 
     Attributes
     ----------
@@ -176,12 +176,12 @@ class RecordedCase(FaultSettings):
     unmeasured_a : tuple of float
         Mean and standard deviation over vehicles of a load that no branch measures, never negative. [A]
     world : str
-        What else befalls some vehicles, of :data:`~calibrator.experiments.attacks.WORLDS`; empty: nothing.
+        World that affects some vehicles, of :data:`~calibrator.experiments.attacks.WORLDS`; empty: none.
     own_prior : ComparedMethod or None
-        Draw the faults from the prior that this method learns of this very fleet: its prior is then right.
+        Method from whose prior, learnt from this very fleet, the faults are drawn, so that its prior is right.
     vehicles, minutes : int or None, float or None
-        Number of vehicles, each of which starts at a random instant of the trips and drives so long, from trip to
-        trip; None: each trip is a vehicle.
+        Number of vehicles and length of their drives, each of which starts at a random instant of the trips and goes
+        on from trip to trip; None: each trip is a vehicle.
     delay_max_s : float or None
         Record through asynchronous frames at 100 Hz, each branch late by a uniform delay of 0 to this. [s]
     delays_left_in : bool
@@ -208,16 +208,16 @@ class RecordedCase(FaultSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleSamples:
-    """What the vehicles of a trial are and record.
+    """Vehicles of a trial: their faults, and the samples that they record.
 
     Attributes
     ----------
     truth : Faults
-        Of N vehicles.
+        Faults of N vehicles.
     unmeasured_a : ndarray of shape (N,)
         Load that no branch measures. [A]
     attack : Attack or None
-        What befalls some of them.
+        World that affects some of them.
     samples : sequence of N Samples
         One drive of each.
     delay_error_s : ndarray of shape (N, K - 1) or None
@@ -231,7 +231,7 @@ class VehicleSamples:
     delay_error_s: Array | None = None
 
     def currents_a(self, vehicle: int, own: Array, following: Array | None = None) -> tuple[Array, Array]:
-        """True and measured currents of a vehicle, without noise, each of shape (T, K). [A]
+        """Return true and measured currents of a vehicle, without noise, each of shape (T, K). [A]
 
         Parameters
         ----------
@@ -260,7 +260,7 @@ class VehicleSamples:
 
 
 def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial:
-    """Trial of one vehicle per trip, or of as many as the case says; the same for the same seed.
+    """Make the trial of one vehicle per trip, or of as many as the case says; the same seed gives the same trial.
 
     Corrections are judged on the trip of the next vehicle.
     """
@@ -290,7 +290,7 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
 
 
 def _runs(fleet: RecordedFleet, minutes: float, vehicles: int, seed: int) -> tuple[GroundTruth, ...]:
-    """Drives of so many minutes, each from a random start on; vehicles may share trips, but hardly ever a start."""
+    """Make drives of so many minutes, each from a random start; vehicles may share trips, but hardly ever a start."""
     trips, samples, runs = fleet.trips, int(60.0 * minutes / fleet.period_s), []
     for number in range(vehicles):
         rng = random_stream(Purpose.START_OF_RUN, seed, number)
@@ -311,13 +311,13 @@ def record_vehicles(
     Parameters
     ----------
     fleet : RecordedFleet
-        Says full scale and signals.
+        Gives full scale and signals.
     case : RecordedCase
         What is put on top of the trips.
     trips : sequence of N GroundTruth
         Ideal currents of each vehicle.
     seed : int
-        Of this repetition.
+        Seed of this repetition.
     truth : Faults or None
         Faults of the vehicles; None: drawn as the case says.
     """
@@ -337,10 +337,10 @@ def record_vehicles(
 
 
 def _sampled(fleet: RecordedFleet, vehicles: VehicleSamples, trip: GroundTruth, seed: tuple[int, int]) -> Samples:
-    """What a vehicle records at the instants of its trip, with noise, in the steps of its signals."""
+    """Return what a vehicle records at the instants of its trip, with noise, in the steps of its signals."""
     _, i_m = vehicles.currents_a(seed[1], trip.matrix_a())
     seen = i_m + NOISE * fleet.full_scale_a * random_stream(Purpose.FRAMES, *seed).standard_normal(i_m.shape)
-    steps_a = np.array([fleet.database.current_step_a(name) for name in trip.currents_a])  # 0: it has none
+    steps_a = np.array([fleet.database.current_step_a(name) for name in trip.currents_a])  # 0: no step
     safe, inputs = np.where(steps_a > 0.0, steps_a, 1.0), fleet.inputs(trip)
     return Samples(
         branch_names=tuple(trip.currents_a),
@@ -355,7 +355,7 @@ def _sampled(fleet: RecordedFleet, vehicles: VehicleSamples, trip: GroundTruth, 
 def _through_frames(
     fleet: RecordedFleet, case: RecordedCase, vehicles: VehicleSamples, trip: GroundTruth, seed: tuple[int, int]
 ) -> tuple[Samples, Array]:
-    """Aligned samples of a vehicle, whose branches are late, and the error of its delays, shape (K - 1,). [s]"""
+    """Return aligned samples of a vehicle with late branches, and the error of the delays found, shape (K - 1,). [s]"""
     assert case.delay_max_s is not None
     rng, j = random_stream(Purpose.FRAMES, *seed), seed[1]
     delay_s = rng.uniform(0.0, 1.0, size=case.branches) * case.delay_max_s
@@ -382,7 +382,7 @@ def _summaries(samples: Sequence[Samples], fleet: RecordedFleet) -> list[DriveSu
 
 
 def _published_evidence(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetEvidence:
-    """A model per vehicle, simulated on the longest held-out drive (2)."""
+    """Identify a model (2) of each vehicle, and return the evidence of its simulation on the longest held-out drive."""
     vehicles = [
         identify_vehicle(
             [drive.with_inputs(fleet.database.layout.model_inputs)],

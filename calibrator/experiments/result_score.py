@@ -23,7 +23,7 @@ WORDS = {
     "deployed_rate": "with parameters to apply",
     "hardware_f2": "f2 of the hardware suspicion",
 }
-"""What the figures of a score are."""
+"""Meanings of the figures of a score."""
 
 
 def score_result(result: Path, truth_file: Path) -> dict[str, float]:
@@ -39,10 +39,10 @@ def score_result(result: Path, truth_file: Path) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        How many vehicles the truth has, and how many of them have no parameters; of all, the shares whose sensor faults
-        were found within 10 % and 25 % (without parameters they were not), of which some branch is farther from the
-        truth after correction on an unseen drive, and to which the node applies parameters; the f2 score of the
-        hardware suspicion. Names are those of :data:`WORDS`.
+        Number of vehicles in the truth, and of those without parameters. Shares of all vehicles: those whose sensor
+        faults were found within 10 % and 25 % (without parameters they were not), those in which some branch is farther
+        from the truth after correction on an unseen drive, and those to which the node applies parameters. The f2 score
+        of the hardware suspicion. Names are those of :data:`WORDS`.
 
     Raises
     ------

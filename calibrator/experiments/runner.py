@@ -1,4 +1,4 @@
-"""The one runner of all experiments, and the pool of what they have found.
+"""Run any experiment, and pool the confidences of several.
 
 Every setting is run with the same seeds; all methods of a setting see the same trials.
 """
@@ -47,7 +47,7 @@ def run_experiment(
     fleet : CommonDrive or RecordedFleet
         What the vehicles drive, see :func:`~calibrator.experiments.experiments.fleet_for`.
     methods : sequence of ComparedMethod or None
-        What to compare; None: what the row says.
+        Methods to compare; None: those of the row.
     repetitions, seed : int
         Trials per setting, and the seed of the first; the others follow.
     workers : int
@@ -56,13 +56,13 @@ def run_experiment(
     Returns
     -------
     ExperimentResult
-        By setting, then method.
+        Figures by setting, then by method.
 
     Raises
     ------
     FleetError
-        If there is no repetition, methods share a name or settings their place in the table, or a method returns what
-        cannot be judged.
+        If there is no repetition, two methods share a name, two settings share a place in the table, or a method
+        returns what cannot be judged.
     """
     if repetitions < 1:
         raise FleetError(f"an experiment needs at least 1 repetition, not {repetitions}")
@@ -71,7 +71,7 @@ def run_experiment(
     if twice := [name for name in names if names.count(name) > 1]:
         raise FleetError(f"{len(twice)} methods are called '{twice[0]}'; give each method a name of its own")
     for case in (setting.case for setting in experiment.settings):
-        fleet.with_branches(case.branches)  # too few are said before anything is run
+        fleet.with_branches(case.branches)  # raises before anything is run if there are too few
     rows = [(setting, setting.methods or usual) for setting in experiment.settings]
     keys = [(setting.series, setting.x, method.name) for setting, own in rows for method in own]
     if not keys or len({*keys}) < len(keys):
@@ -107,13 +107,13 @@ def _run_trial(
 
 
 def _keyed(tables: Iterable[pd.DataFrame], series: str, x: float, method: str) -> list[pd.DataFrame]:
-    """Tables of one method under one setting, with columns that say so in front."""
+    """Put columns that name setting and method in front of the tables."""
     keys = dict(zip(KEYS, (series, float(x), method), strict=True))
     return [table.assign(**keys)[[*KEYS, *table.columns]] for table in tables]
 
 
 def _common(settings: Sequence[Setting]) -> dict[str, Any]:
-    """What all cases have in common, without what is not used."""
+    """Return what the cases of all settings have in common, without empty values."""
     cases = [vars(setting.case) for setting in settings]
     common = {key: value for key, value in cases[0].items() if all(case[key] == value for case in cases)}
     mean_and_sd = {"unmeasured_a"}  # the other pairs are ranges
@@ -135,7 +135,7 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
     Parameters
     ----------
     results : sequence of ExperimentResult
-        Of other experiments; those in which the default has no confidence add nothing.
+        Results of other experiments; those in which the default has no confidence add nothing.
 
     Returns
     -------
@@ -182,7 +182,7 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
 
 
 def _pooled(series: str, figures: pd.DataFrame, tenths: pd.DataFrame) -> list[pd.DataFrame]:
-    """Row of an experiment: what tells whether its confidences are right."""
+    """Make the rows of an experiment that show whether its confidences are right."""
     pooled, means = pool_tenths(tenths), pool_figures(figures)
     kept = means[means["figure"].isin(["recovery_rate", "confidence"]) | means["figure"].str.startswith("sure")]
     vehicles = pooled["vehicles"].sum()

@@ -98,24 +98,24 @@ class Trial:
     full_scale_a : float
         Full scale of the junction. [A]
     truth : Faults
-        Of N vehicles; only the perfect classifier may look.
+        Faults of N vehicles; only the perfect classifier may look at them.
     unseen : UnseenDrive
-        Where corrections are judged.
+        Drive on which corrections are judged.
     record : callable
         Makes what the default is given: the drive summaries of the N vehicles, or the evidence of their common drive.
     collect : callable
         Makes the evidence of the published method.
     drawn_from : FaultDistribution or None
-        What the faults were drawn from; only the method that is to show the ceiling may look.
+        Distribution of the faults; only the method that is to show the ceiling may look at it.
     training : callable or None
         Makes evidence and truth of an artificial fleet that the published method's trees learn from; None: there is
         none, and trees cannot be used.
     delay_error_s : ndarray of shape (N, K - 1) or None
         Error of the delays that were estimated and taken out, if they were. [s]
     attacked : ndarray of bool of shape (N,) or None
-        Vehicles that have what the world of an attack does to them; None: there is no attack.
+        Vehicles that the world of an attack affects; None: there is no attack.
     causes : tuple of str
-        Names by which a finding may name this.
+        Causes by which a finding names the attack correctly.
     """
 
     smallest_fault: float
@@ -132,7 +132,7 @@ class Trial:
 
     @cached_property
     def recorded(self) -> Sequence[DriveSummary] | CommonEvidence:
-        """What the default is given, made once."""
+        """Summaries or evidence that the default is given, made once."""
         return self.record()
 
     @cached_property
@@ -148,7 +148,7 @@ class Estimate:
     Attributes
     ----------
     faults : Faults
-        Estimate.
+        Estimated faults.
     hardware : ndarray of bool of shape (N,)
         Vehicles held to have a hardware fault.
     corrected : ndarray of bool of shape (N, K)
@@ -181,7 +181,7 @@ class Estimate:
 
 
 class ComparedMethod(Protocol):
-    """Anything that recovers a fleet."""
+    """Anything that estimates the faults of a fleet."""
 
     @property
     def name(self) -> str:

@@ -20,7 +20,7 @@ from calibrator.drives.charge import Band, charge_curve, covered
 __all__ = ["SURE", "WELL_CORRELATED", "Bands", "bands_of", "likely_multipliers", "sag"]
 
 BAND = Band(short_s=0.75, long_s=10.0)
-"""Half widths of the two moving averages: several times the delays of real cars, and as long as driving keeps its pace.
+"""Half widths of the moving averages: several times the delays of real cars, and as long as driving keeps its pace.
 [s]"""
 STEP_S = 0.25
 """Distance of the instants: a third of the shorter window. [s]"""
@@ -35,8 +35,8 @@ LEAST_RATIO = 1e-4
 SURE = 3.0
 """A change must make the sum smaller by this many standard errors, found from the blocks of time. [1]"""
 OVERWHELMING = 3.0
-"""A change that lowers the price by this (V / N to a twentieth) is made even if blocks differ, as where a branch that is
-rarely used drowns all others. [1]"""
+"""A change that lowers the price by this (V / N to a twentieth) is made even if blocks differ, as where a rarely used
+branch drowns all others. [1]"""
 FEWEST_BLOCKS = 4
 """Fewer blocks, about half a minute, give no usable standard error."""
 WELL_CORRELATED = 0.5

@@ -25,7 +25,7 @@ def main(group: Annotated[Group | None, typer.Argument()] = None, *, quick: bool
     for name in [group] if group is not None else get_args(Group):
         print(f"bench: {name}", file=sys.stderr, flush=True)
         found += import_module(f"bench.{name}").rows(quick=quick)
-        out.write_text(json.dumps([vars(row) for row in found], indent=2) + "\n")  # as far as rows have come
+        out.write_text(json.dumps([vars(row) for row in found], indent=2) + "\n")  # the rows so far
     show(found)
 
 

@@ -32,15 +32,15 @@ from ecu_node.parameters import BranchParameters
 CORE = Path(ecu_node.__file__).parent / "c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
 RECORD = Struct("<IBB64s")
-"""A frame: identifier (bit 31: of 29 bits), length, result (0 as it was, 1 changed, 2 held back), payload."""
+"""A frame: identifier (bit 31 set: it has 29 bits), length, result (0 as it was, 1 changed, 2 held back), payload."""
 
 _HERE = Path(__file__).parent
 SILENCE = 255
-"""As a length: all messages were silent for so long that counters and voltages are forgotten."""
+"""Length that stands for a silence of all messages so long that counters and voltages are forgotten."""
 
 
 def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
-    """A vehicle with a fault of each sensor but one; by default one with all that the core knows."""
+    """Make a vehicle with faults in all sensors but one; the default layout uses everything that the core can do."""
     database, rng = read_database(read_layout(layout)), Random(1)
     limit, offset_a = database.layout.limits.drift, 0.1 * database.layout.full_scale_a
     faults = {
@@ -54,7 +54,7 @@ def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
 
 
 def frames(database: VehicleDatabase, rng: Random, count: int) -> Iterator[tuple[int, bytes | None]]:
-    """Frames as a bus might have them, and worse: jumps of counters, changed bits, cut payloads, silences (None)."""
+    """Yield frames as on a bus, and worse: jumps of counters, changed bits, cut payloads, silences (None)."""
     messages = []
     for key, message in received(database).items():
         protection = protection_of(database, message)
@@ -83,7 +83,7 @@ def frames(database: VehicleDatabase, rng: Random, count: int) -> Iterator[tuple
 
 
 def _put_edge(place: BitPlace, payload: bytearray, rng: Random) -> None:
-    """A code at the ends of the width, around 0, or small."""
+    """Put a code near either end of the signal's width, or near 0, into a payload."""
     edge = (place.lowest, place.highest, 0)[int(rng.random() * 3)] + int(rng.random() * 9) - 4
     place.put(payload, min(max(edge, place.lowest), place.highest))
 
@@ -93,7 +93,7 @@ def record(identifier: int, payload: bytes | None) -> bytes:
 
 
 def build(checked: Checked, folder: Path, *, compiler: str = "gcc", flags: tuple[str, ...] = ("-O2",)) -> Path:
-    """Compile core, exported data and driver with all warnings as errors; the program."""
+    """Compile core, exported data and driver with all warnings as errors, and return the path of the program."""
     (folder / "hv_calibration.c").write_text(c_text(checked))
     driver, objects = _HERE / "c_core_driver.c", []
     for source in (CORE / "hv_correction.c", folder / "hv_calibration.c", driver):
@@ -110,7 +110,7 @@ def run(program: Path, given: bytes, *words: str) -> bytes:
 
 
 def measure(folder: Path, count: int = 10_000, flags: Sequence[str] = ("-Os", "-O2")) -> Iterator[Row]:
-    """Bytes of code, and instructions of a frame of the project's own battery message, with and without E2E."""
+    """Measure bytes of code, and instructions per frame of the project's battery message, with and without E2E."""
     (folder / "bare.toml").write_text(LAYOUT.read_text().split("[e2e]")[0])
     (folder / "hv_powertrain.dbc").write_bytes(LAYOUT.with_suffix(".dbc").read_bytes())
     for flag, (path, what) in product(flags, ((LAYOUT, "with E2E P01"), (folder / "bare.toml", "without E2E"))):
@@ -130,7 +130,7 @@ def measure(folder: Path, count: int = 10_000, flags: Sequence[str] = ("-Os", "-
 
 
 def fuzz(folder: Path, seconds: int) -> None:
-    """Any calibration and any frames, until the time is over or something is wrong."""
+    """Fuzz the core with any calibration and any frames, until the time is over or something goes wrong."""
     (folder / "hv_calibration.c").write_text(c_text(vehicle()))
     sources = [CORE / "hv_correction.c", folder / "hv_calibration.c", _HERE / "c_core_fuzz.c"]
     flags = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all", f"-I{CORE}")

@@ -1,8 +1,8 @@
-"""How many workers of a cluster the process that is started, and the Dask scheduler, can keep busy.
+"""How many workers of a cluster the started process and the Dask scheduler can keep busy.
 
-The workers are those of Dask, all in one process, and only wait: each item brings back a record of the usual size.
-Of the two processes at the top the time on a core per item is measured: the slower one limits a fleet, and both have a
-core of their own in a real cluster.
+The workers are those of Dask, all in one process, and only wait: each item brings back a record of the usual size. What
+is measured is the time on a core per item of the two processes at the top: the slower one limits a fleet, and both have
+a core of their own in a real cluster.
 """
 
 import asyncio
@@ -24,9 +24,9 @@ __all__ = ["rows"]
 
 WORKERS, QUICK_WORKERS, ITEMS_PER_WORKER = 1000, 20, 5
 READING_S = 10.0
-"""Of one item; a vehicle with ten hours of driving takes 2.5 s, but here one process is all workers. [s]"""
+"""Time for one item; a vehicle with ten hours of driving takes 2.5 s, but here one process holds all workers. [s]"""
 TASK_BYTES, RECORD_BYTES = 4_000, 16_000
-"""What goes to a worker: names and versions of a vehicle's drives; what comes back. [byte]"""
+"""Size of what goes to a worker (names and versions of a vehicle's drives), and of what comes back. [byte]"""
 IDLE = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.interval": "1h",
@@ -36,7 +36,7 @@ IDLE = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
 }
-"""A thousand workers in one process shall not spend it on watching themselves."""
+"""Settings by which a thousand workers in one process do not spend its time on watching themselves."""
 
 
 def read(_: bytes, seconds: float) -> bytes:
@@ -57,7 +57,7 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def core_seconds(workers: int) -> tuple[float, float]:
-    """Time on a core, per item, of the process that was started and of the scheduler. [s]"""
+    """Return the time on a core, per item, of the process that was started and of the scheduler. [s]"""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

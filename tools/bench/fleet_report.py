@@ -41,7 +41,7 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def ready_times_s(page: Path) -> list[float]:
-    """From opening the page in Chromium to its table and first figures being ready, as the page itself tells. [s]"""
+    """Measure the time from opening the page in Chromium until table and first figures are ready, as it tells. [s]"""
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
         raise SystemExit("bench: no chromium and chromedriver here (Debian: apt-get install chromium chromium-driver)")

@@ -24,7 +24,7 @@ WATCH_EVERY_S = 0.2
 
 
 def rows(*, quick: bool) -> list[Row]:
-    """Time and peak memory of a run per size of the fleet, the memory beside that of the smallest fleet."""
+    """Measure time and peak memory of a run for each size of the fleet, and compare memory with the smallest fleet."""
     found, first = list[Row](), 0.0
     for vehicles in QUICK_FLEETS if quick else FLEETS:
         with tempfile.TemporaryDirectory(prefix="bench-") as name:
@@ -41,7 +41,7 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def calibrated(given: Path, out: Path, command: str = "calibrate") -> tuple[float, float]:
-    """Run a command of the calibrator: how long it took [s], and the most resident memory of its processes [byte]."""
+    """Run a command of the calibrator; return its duration [s] and the peak resident memory of its processes [byte]."""
     words = calibrator(command, given, "--layout", LAYOUT, "--workers", WORKERS, "--out", out)
     start_s, peak = time.monotonic(), 0.0
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
@@ -55,7 +55,7 @@ def calibrated(given: Path, out: Path, command: str = "calibrate") -> tuple[floa
 
 
 def resident_bytes(process: int) -> float:
-    """Resident memory of a process and all that descend from it; a page that several share counts once. [byte]"""
+    """Return the resident memory of a process and its descendants; a page that several share counts once. [byte]"""
     kibibytes = 0
     with suppress(psutil.NoSuchProcess):
         root = psutil.Process(process)

@@ -1,7 +1,7 @@
-"""Fleets of the benchmarks: simulated ones, and large ones that are made of few simulated vehicles.
+"""Fleets of the benchmarks: simulated ones, and large ones that are made from few simulated vehicles.
 
-What faults do to currents, (11) and (13) of the paper, is linear. So the summaries of vehicles without faults become
-those of any number of vehicles with faults, and no drive is read for them.
+Faults change currents linearly, (11) and (13) of the paper. So the summaries of a few vehicles without faults can be
+turned into those of any number of vehicles with faults, without reading a drive.
 """
 
 import subprocess
@@ -39,16 +39,16 @@ WORKERS = 2
 SUMMARISED, SUMMARISED_MINUTES = 16, 6.0
 """Vehicles whose summaries stand for those of a large fleet, and the least length of their trips. [min]"""
 DRIVES, DRIVE_MINUTES, STEP_A = 20, 10.0, 0.1
-"""Different drives of a large fleet, their length [min], and the step of the noise that makes each its own [A]."""
+"""Different drives of a large fleet, their length [min], and the step of the noise that makes copies differ [A]."""
 
 
 def calibrator(*words: object) -> list[str]:
-    """Command line of the calibrator."""
+    """Return a command line of the calibrator."""
     return [sys.executable, "-m", "calibrator", *map(str, words)]
 
 
 def simulated_fleet(folder: Path, *, vehicles: int, minutes: float, currents: int = 3, sparsity: float = 80.0) -> Path:
-    """Logs of a fleet with the faults of the paper and delays up to 0.1 s; the folder of the fleet, which is new."""
+    """Write logs of a fleet with the paper's faults and delays up to 0.1 s into a new folder, and return the folder."""
     plan = FleetPlan(vehicles=vehicles, currents=currents, sparsity=sparsity, delay_max_s=0.1)
     trips = BuiltinTrips(seed=0, duration_s=60.0 * minutes, unseen_s=60.0)
     simulate_fleet(plan, trips, read_database(read_layout(LAYOUT)), folder, workers=WORKERS)
@@ -57,7 +57,7 @@ def simulated_fleet(folder: Path, *, vehicles: int, minutes: float, currents: in
 
 @cache
 def _summaries(branches: int) -> tuple[Equipment, list[VehicleSummary]]:
-    """Equipment and summaries of simulated vehicles without faults."""
+    """Return equipment and summaries of simulated vehicles without faults."""
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         fleet, store = Path(name) / "fleet", Path(name) / "store"
         simulated_fleet(fleet, vehicles=SUMMARISED, minutes=SUMMARISED_MINUTES, currents=branches, sparsity=100.0)
@@ -69,7 +69,7 @@ def _summaries(branches: int) -> tuple[Equipment, list[VehicleSummary]]:
 
 
 def make_store(folder: Path, *, vehicles: int, branches: int = 2) -> None:
-    """Write a store of summaries of so many vehicles with the faults of the paper, half of them without hardware's."""
+    """Write a store of summaries of vehicles with the paper's faults, half of them without hardware faults."""
     database, (equipment, summaries) = read_database(read_layout(LAYOUT)), _summaries(branches)
     identity = store_identity(equipment, database, vehicles=vehicles, fleet="synthetic")
     store = SummaryStore(storage=open_storage(folder), identity=identity)
@@ -83,7 +83,7 @@ def make_store(folder: Path, *, vehicles: int, branches: int = 2) -> None:
 def _write_bucket(
     bucket: tuple[int, Sequence[str]], *, store: SummaryStore, summaries: Sequence[VehicleSummary], full_scale_a: float
 ) -> None:
-    """Write vehicles that have the summaries in turn, and faults of their own."""
+    """Write the vehicles of a bucket: they take the summaries in turn, each with faults of its own."""
     (number, names), K = bucket, len(store.identity.branches)
     settings, rng = FaultSettings(sparsity=80.0, balanced=True), np.random.default_rng(number)
     faults = settings.draw(rng, vehicles=len(names), branches=K, full_scale_a=full_scale_a)
@@ -95,7 +95,7 @@ def _write_bucket(
 
 
 def _with_faults(found: VehicleSummary, faults: Faults) -> VehicleSummary:
-    """A vehicle's summary as it is measured with these faults; it saw no zero-current window."""
+    """Return a vehicle's summary as measured with these faults, and without any zero-current window."""
     summary, unknown = found.summary, np.full(found.summary.branches, np.nan)
     gain = (1.0 + faults.drift) * (1.0 + faults.hardware_drift)
     own = np.arange(summary.branches) + summary.inputs
@@ -111,7 +111,7 @@ def _with_faults(found: VehicleSummary, faults: Faults) -> VehicleSummary:
 
 
 def write_drives(folder: Path, drives: int, *, per_vehicle: int = 10) -> float:
-    """Write drives of ten minutes with frames at 10 and 20 Hz into a store; how long they are together. [h]"""
+    """Write drives of ten minutes with frames at 10 and 20 Hz into a store, and return their total length. [h]"""
     database, rng, seconds = read_database(read_layout(LAYOUT)), np.random.default_rng(0), 0.0
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         fleet = simulated_fleet(Path(name) / "fleet", vehicles=DRIVES, minutes=DRIVE_MINUTES, currents=2)
@@ -131,7 +131,7 @@ def write_drives(folder: Path, drives: int, *, per_vehicle: int = 10) -> float:
 
 
 def _thinned(channels: Mapping[str, Channel]) -> dict[str, Channel]:
-    """Every fifth sample of channels, which are sent at 50 or 100 Hz, with the time stamps of a logger of 0.1 ms."""
+    """Keep every fifth sample of channels sent at 50 or 100 Hz, with time stamps of a logger that resolves 0.1 ms."""
     return {
         name: Channel(time_s=channel.time_s[::5].round(4), value=channel.value[::5], good=channel.good[::5])
         for name, channel in channels.items()

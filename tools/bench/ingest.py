@@ -1,8 +1,8 @@
 """How fast logs become drives and summaries, beside python-can and cantools message by message.
 
 The log is that of an artificial vehicle with three branches, 250 frames a second. Both ways read the same file in one
-thread, make the same channels (compared value by value), and the best of several readings counts, in time of the
-processor, that of helping processes included: a machine that does other things as well does not change the ratio.
+thread and make the same channels (compared value by value). The best of several readings counts, in processor time that
+includes helping processes, so that other work of the machine does not change the ratio.
 """
 
 import gzip
@@ -33,13 +33,13 @@ __all__ = ["rows"]
 
 Result = TypeVar("Result")
 MINUTES, QUICK_MINUTES = 10.0, 3.0
-"""Of the log. [min]"""
+"""Length of the log. [min]"""
 READINGS = 5
-"""Of which the best counts; of the peer, which takes longer and differs less, one is made."""
+"""Number of readings, of which the best counts; the peer, which takes longer and varies less, reads once."""
 TIME_STAMP_S = 1e-5
-"""Log formats differ by less. [s]"""
+"""Time stamps of log formats differ by less than this. [s]"""
 STORE_PERIOD_S = 0.1
-"""Of the samples in the drive store. [s]"""
+"""Period of the samples in the drive store. [s]"""
 
 
 def rows(*, quick: bool) -> list[Row]:
@@ -76,23 +76,23 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def _as(log: Path, suffix: str) -> Path:
-    """The same log in another format."""
+    """Write a log in another format, and return its path."""
     path = log.with_suffix(suffix)
     with can.LogReader(log) as messages, can.Logger(path) as writer:
         for message in messages:
-            message.channel, message.is_rx = 0, True  # these formats have numbers
+            message.channel, message.is_rx = 0, True  # these formats number channels
             writer.on_message_received(message)
     return path
 
 
 def _thinned(channel: Channel) -> Channel:
-    """Ten samples a second."""
+    """Keep ten samples a second."""
     step = max(round(STORE_PERIOD_S / float(np.median(np.diff(channel.time_s)))), 1)
     return Channel(time_s=channel.time_s[::step], value=channel.value[::step], good=channel.good[::step])
 
 
 def _log_row(name: str, path: Path, database: VehicleDatabase) -> Row:
-    """Frames per second of a log file; refused if both ways give different results."""
+    """Measure frames per second of a log file; raises if both ways give different results."""
     recording, seconds = _best(lambda: read_recording(path, database, vehicle="V", name="d"), READINGS)
     others, peer_seconds = _best(lambda: _message_by_message(path, database), 1)
     for channel_name, channel in {**recording.drive.branches, **recording.drive.inputs}.items():
@@ -107,7 +107,7 @@ def _log_row(name: str, path: Path, database: VehicleDatabase) -> Row:
 
 
 def _message_by_message(path: Path, database: VehicleDatabase) -> dict[str, tuple[Any, Any]]:
-    """Times [s] and values of the same channels as most programs make them."""
+    """Read times [s] and values of the same channels as most programs do."""
     layout = database.layout
     signals: dict[str, tuple[str, int]] = {branch.name: (branch.source, branch.sign) for branch in layout.branch}
     signals |= {item.name: (item.signal, 1) for item in layout.input}
@@ -135,7 +135,7 @@ def _message_by_message(path: Path, database: VehicleDatabase) -> dict[str, tupl
 
 
 def _summary_row(name: str, entry: DriveFile, branches: tuple[str, ...], database: VehicleDatabase) -> Row:
-    """Hours of driving per second from a file to a vehicle's summary."""
+    """Measure hours of driving per second, from a file to a vehicle's summary."""
     drive = load_drive(entry, database)
     inputs = choose_inputs(database.layout, set(drive.inputs), names=database.layout.fleet_inputs)[0]
     equipment = Equipment(branches=branches, inputs=inputs, fleet_inputs=inputs, notices=())
@@ -144,7 +144,7 @@ def _summary_row(name: str, entry: DriveFile, branches: tuple[str, ...], databas
 
 
 def _best(measured: Callable[[], Result], repetitions: int) -> tuple[Result, float]:
-    """Result of a call and the least processor time it took, of those that it waited for too. [s]"""
+    """Return the result of a call and its least processor time, helping processes included. [s]"""
     seconds = []
     for _ in range(repetitions):
         start = _processor_s()

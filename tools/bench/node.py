@@ -1,7 +1,7 @@
 """The node: time per frame, start and memory of its process, beside its peers in the same run.
 
-Work per frame is measured without a bus. ``ecu-node run`` runs in a process of its own on the virtual bus, whose thread
-beside it is :mod:`bench.node_child`. Rates and latencies on SocketCAN: :mod:`bench.node_socketcan`.
+Work per frame is measured without a bus. ``ecu-node run`` runs in a process of its own on the virtual bus, beside a
+thread that sends to it, see :mod:`bench.node_child`. Rates and latencies on SocketCAN: :mod:`bench.node_socketcan`.
 """
 
 import json
@@ -29,13 +29,13 @@ ONE_CODE_A = 0.1
 """cantools rounds halves to even codes, the node upwards. [A]"""
 PATIENCE_S = 60.0
 STARTS = 5
-"""Of which the median counts."""
+"""Number of starts, of which the median counts."""
 SHORT, ROUND = 15, 150
-"""Frames that are enough to see the start; and until they come round again in a process."""
+"""Number of frames that is enough to measure a start, and of different frames that a process is sent in a cycle."""
 
 
 def rows(*, quick: bool) -> list[Row]:
-    """Measure; figures of SocketCAN are left out where there is none, which is said on standard error."""
+    """Measure all figures; those of SocketCAN are left out where there is none, with a line on standard error."""
     found = core_rows(20 if quick else 100) + process_rows(100_000 if quick else 10_000_000)
     words = ("-m", "bench.node_socketcan", "--frames", "1000" if quick else "10000", "--as-json")
     command: list[str | Path] = [ROOT / "tools" / "with_vcan", sys.executable, *words]
@@ -49,7 +49,7 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def core_rows(repeats: int) -> list[Row]:
-    """What the node computes for one frame of a branch, in both modes, beside the same work with cantools.
+    """Measure what the node computes for one frame of a branch, in both modes, beside the same work with cantools.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def _require_equal(vehicle: BenchVehicle, mode: Mode) -> None:
 
 
 def process_rows(frames: int) -> list[Row]:
-    """Time until a real ``ecu-node run`` is ready, and its memory after so many frames."""
+    """Measure the time until a real ``ecu-node run`` is ready, and its memory after so many frames."""
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         vehicle = make_vehicle(Path(folder))
         ready_s = median(_run_node(vehicle, SHORT)[0] for _ in range(STARTS))

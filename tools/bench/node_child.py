@@ -1,7 +1,7 @@
 """A real ``ecu-node run`` on the virtual bus, with a thread beside it that sends to it; started by :mod:`bench.node`.
 
-The thread waits for a line on standard input, sends frames, compares what comes of them, and ends the node; what it saw
-is printed as JSON. Imports nothing that the node itself does not: the memory measured here is the node's.
+The thread waits for a line on standard input, sends frames, compares the answers, and ends the node; it prints what it
+measured as JSON. It imports nothing that the node itself does not, so the memory measured here is the node's.
 """
 
 import json
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 _BLOCK = 100
-"""Frames that are sent before it is waited for them."""
+"""Frames that are sent before waiting for their answers."""
 _PATIENCE_S = 5.0
 
 

@@ -4,9 +4,8 @@
 
 Compared are ``ecu-node run --gateway``, a program in C that does the same, a python-can loop that only receives and
 sends, and the plain version with Notifier and cantools. One raw socket sends, another one receives and compares each
-frame, both many frames at a time, so that what is measured is what is between them. Where this runs on user-mode-linux
-a system call costs ten times more than on a bare machine, and all share one processor: the ratios count there, not the
-rates.
+frame, both many frames at a time, so that the time measured is spent between them. On user-mode-linux a system call
+costs ten times more than on a bare machine, and all share one processor: there the ratios count, not the rates.
 """
 
 import json
@@ -38,16 +37,16 @@ __all__ = ["rows"]
 
 IN, OUT = "vcan0", "vcan1"
 ROUNDS = 3
-"""In which all take their turns; the best counts."""
+"""Number of rounds, in which all ways take turns; the best one counts."""
 WINDOW = 64
-"""Frames that are on their way at most: a socket's buffer holds some hundreds."""
+"""Most frames that are on their way at once: a socket's buffer holds some hundreds."""
 PATIENCE_S = 60.0
 FIGURES = {"rate": "frames/s", "latency, median": "us", "latency, 99.9 %": "us"}
-"""Of each way, with their units."""
+"""Figures of each way, with their units."""
 QUIET_S = 0.5
-"""When no frame comes for this long none is on its way. [s]"""
+"""If no frame comes for this long, none is on its way. [s]"""
 LATENCY_SHARE = 10
-"""Every so many-th frame is sent alone, for its latency."""
+"""Frames that measure the rate for each one that is then sent alone, to measure its latency."""
 
 
 def rows(frames: int) -> list[Row]:
@@ -77,7 +76,7 @@ def rows(frames: int) -> list[Row]:
 
 
 def _measured(command: list[str], expected: list[bytes], vehicle: BenchVehicle, frames: int) -> dict[str, float]:
-    """Rate and latencies of a process between the two buses; frames must arrive in order and all."""
+    """Measure rate and latencies of a process between the two buses; all frames must arrive, and in order."""
     kind, quiet = (socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW), subprocess.DEVNULL
     with socket.socket(*kind) as near, socket.socket(*kind) as far:
         near.bind((IN,))
@@ -104,7 +103,7 @@ class _Line:
         self._sent = 0
 
     def send(self, count: int = 1) -> None:
-        """The next frames."""
+        """Send the next frames."""
         numbers = range(self._sent, self._sent + count)
         some = [self._frames[number % len(self._frames)] for number in numbers]
         done = 0
@@ -113,7 +112,7 @@ class _Line:
         self._sent += count
 
     def receive(self, timeout_s: float) -> int | None:
-        """Number of the frame that arrives next, once it is compared; None if none does in time."""
+        """Receive and compare the next frame, and return its number; None if none arrives in time."""
         message = self._far.receive(timeout_s)
         if message is None:
             return None
@@ -135,7 +134,7 @@ class _Line:
                 raise RuntimeError("nothing passes the frames on")
 
     def measured(self, frames: int) -> dict[str, float]:
-        """Rate and latencies; frames must arrive in order and all."""
+        """Measure rate and latencies; all frames must arrive, and in order."""
         received = first = self._sent
         start_s, latencies_s = time.monotonic(), []
         while received < first + frames:
@@ -160,7 +159,7 @@ class _Line:
 
 
 def _compiled_gateway(vehicle: BenchVehicle, folder: Path) -> Path:
-    """The program in C, ``gateway CHANNEL_IN CHANNEL_OUT``: the C core with the vehicle's calibration."""
+    """Compile the program in C, ``gateway CHANNEL_IN CHANNEL_OUT``: the C core with the vehicle's calibration."""
     checked = Checked(name="params", digest="0" * 64, parameters=vehicle.parameters, database=vehicle.database)
     (folder / "hv_calibration.c").write_text(c_text(checked))
     sources = [Path(__file__).with_name("node_gateway.c"), folder / "hv_calibration.c", CORE / "hv_correction.c"]
@@ -169,7 +168,7 @@ def _compiled_gateway(vehicle: BenchVehicle, folder: Path) -> Path:
 
 
 def _pass_on(kind: str) -> None:
-    """The loop that receives and sends, or the plain version."""
+    """Run the bare loop, which only receives and sends, or the plain version."""
     with (
         can.Bus(IN, "socketcan", ignore_config=True) as receiving,
         can.Bus(OUT, "socketcan", ignore_config=True) as sending,

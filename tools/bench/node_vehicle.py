@@ -1,6 +1,6 @@
-"""The vehicle of the node's benchmarks: a message with two currents of 16 bits and E2E profile P01, sent in a circle.
+"""The vehicle of the node's benchmarks: a message with two currents of 16 bits and E2E profile P01, sent in a cycle.
 
-Beside it the node's work as most programs would do it: cantools decodes the message, cantools encodes it again.
+Also here is the node's work as most programs would do it: cantools decodes the message and encodes it again.
 
 The true currents sum to zero and the parameters are those of the sensors' faults, so that the node has no reason to
 doubt its corrections, however long it runs.
@@ -24,14 +24,14 @@ from ecu_node.parameters import BranchParameters, VehicleParameters, write_param
 __all__ = ["IDENTIFIER", "BenchVehicle", "make_vehicle", "plain_job"]
 
 IDENTIFIER = 0x100
-"""Of the message with the currents."""
+"""Identifier of the message with the currents."""
 NUMBERS = 1500
-"""Frames until they come round again: a multiple of the 15 codes of the counter."""
+"""Number of different frames, after which they repeat: a multiple of the 15 codes of the counter."""
 FAULTS = {"battery": (0.02, 3.0), "motor": (-0.03, 1.0)}
 """Drift [1] and offset [A] of the sensors, positive into the junction."""
 _AMPLITUDE_A = 200.0
 _A_PER_CODE = {"battery": 0.1, "motor": 0.05}
-"""Into the junction."""
+"""Current of one code of each signal, positive into the junction. [A]"""
 
 _LAYOUT = """schema = 1
 name = "bench"
@@ -84,11 +84,11 @@ class BenchVehicle:
     frames: list[bytearray]
 
     def corrector(self, mode: Mode) -> Corrector:
-        """A node's core that corrects this vehicle."""
+        """Return a node's core that corrects this vehicle."""
         return wire(self.database, InForce(parameters=self.parameters), 0.0, mode=mode)
 
     def corrected(self, mode: Mode) -> list[bytes]:
-        """What the node makes of one round of frames."""
+        """Return the payloads that the node makes of one round of frames."""
         source = self.corrector(mode).sources[IDENTIFIER, False]
         if mode is Mode.OVERLAY:
             return [bytes(target.data) for frame in self.frames for target in source.answer(frame, 0.0)]
@@ -96,12 +96,12 @@ class BenchVehicle:
         return [bytes(payload) for payload in found if payload is not None]
 
     def command(self, *options: str) -> list[str]:
-        """Arguments of ``ecu-node`` for it."""
+        """Return the arguments with which ``ecu-node`` runs for this vehicle."""
         layout = self.database.layout.path
         return ["run", "--unsigned", "--params", f"{layout.parent}/params.json", "--layout", str(layout), *options]
 
     def protection(self, name: str) -> Protection:
-        """End-to-end protection of a message."""
+        """Return the end-to-end protection of a message."""
         found = protection_of(self.database, self.database.message(name))
         assert found is not None
         return found
@@ -130,14 +130,14 @@ def make_vehicle(folder: Path) -> BenchVehicle:
 
 
 def plain_job(vehicle: BenchVehicle, mode: Mode) -> Callable[[bytearray], bytearray | None]:
-    """The work of one mode with cantools, and with the node's own end-to-end protection.
+    """Return a function that does the node's work with cantools, and with the node's own end-to-end protection.
 
     Parameters
     ----------
     vehicle : BenchVehicle
-        Whose currents are corrected.
+        Vehicle whose currents are corrected.
     mode : Mode
-        In a gateway the message is rewritten; else another one is filled.
+        Mode of the node: a gateway rewrites the message, an overlay fills another one.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What a node's own summaries cost: the drives of an artificial fleet, 230 frames a second, are replayed to them."""
+"""Cost of a node's own summaries: the drives of an artificial fleet, 230 frames a second, are replayed to them."""
 
 import tempfile
 import time
@@ -18,7 +18,7 @@ __all__ = ["rows"]
 
 
 def rows(*, quick: bool) -> list[Row]:
-    """Measure share of a core and size."""
+    """Measure the share of a processor core that summaries take, and their size."""
     vehicles, minutes = (1, 10.0) if quick else (2, 60.0)
     with tempfile.TemporaryDirectory() as place:
         simulated_fleet(Path(place) / "fleet", vehicles=vehicles, minutes=minutes)
@@ -26,7 +26,7 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def _replayed(folder: Path) -> list[Row]:
-    """Cost of the summaries of all vehicles, with the delays that their logs tell."""
+    """Return the cost of the summaries of all vehicles, made with the delays that their logs show."""
     database, fleet = read_database(read_layout(LAYOUT)), find_fleet(folder / "fleet")
     equipment = probe_equipment(fleet, database, None)
     spent_s = driven_s = 0.0

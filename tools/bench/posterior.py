@@ -1,9 +1,9 @@
 """How long the explanations of one vehicle take: the posterior beside basis pursuit, the convex problem of the paper.
 
 Fleets are simulated with the paper's faults (5 to 25 % of full scale, balanced fleets) and the errors of good drives.
-The peer solves the quadratic basis pursuit of the same vehicles: built once, with parameters. The posterior is that of
-known hyper-parameters, estimated from the same fleet before: explanations, estimate and probability of harm. All is
-measured in seconds of processor time on one thread, the best of some runs.
+The peer solves the quadratic basis pursuit of the same vehicles; its problem is built once, with the vehicle's values
+as parameters. The posterior comprises explanations, estimate and probability of harm, by hyperparameters that were
+learnt from the same fleet before. Measured is the processor time on one thread, the best of some runs.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,13 +24,13 @@ from calibrator.published.recovery import BasisPursuit
 __all__ = ["rows"]
 
 VEHICLES, QUICK_VEHICLES = {2: 300, 3: 300, 4: 150, 6: 16, 8: 8}, 4
-"""Of a fleet, by number of branches."""
+"""Vehicles of a fleet, by number of branches."""
 SOLVED, QUICK_SOLVED = 40, 2
 """Vehicles that the peer solves."""
 SPARSITIES = (80.0, 60.0)
-"""Typical, and worst. [%]"""
+"""Typical and worst sparsity of faults. [%]"""
 SLOPE_SD, RATIO_SD, INTERCEPT_SD, JUNCTION_SD = 0.002, 0.0005, 0.001, 0.0005
-"""Of the simulated rows; those of good drives. [1]"""
+"""Standard deviations of the simulated rows; those of good drives. [1]"""
 MEAN, MEAN_SQUARE = 0.05, 0.02
 """Moments of the currents, in fractions of full scale and their squares. [1]"""
 RESIDUAL = 0.25
@@ -39,7 +39,7 @@ RUNS = 3
 
 
 def rows(*, quick: bool) -> list[Row]:
-    """Measure the time per vehicle; if ``quick`` of few vehicles, which shows that all works."""
+    """Measure the time per vehicle; if ``quick``, with few vehicles, which only shows that it works."""
     found = []
     with threadpool_limits(1):
         for branches, vehicles in VEHICLES.items():
@@ -55,7 +55,7 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def _best_s(measured: Callable[[], object]) -> float:
-    """Processor time of the best of some runs; the first one, which may compile, does not count. [s]"""
+    """Return the processor time of the best of some runs; the first one, which may compile, does not count. [s]"""
     times = []
     for _ in range(1 + RUNS):
         start = process_time()
@@ -65,7 +65,7 @@ def _best_s(measured: Callable[[], object]) -> float:
 
 
 def _basis_pursuit_s(fleet: EvidenceRows, vehicles: int) -> float:
-    """Time per vehicle. [s]"""
+    """Return the time that basis pursuit takes per vehicle. [s]"""
     K = fleet.branches
     slopes, intercepts = np.exp(fleet.values[:, fleet.places.slopes]), fleet.values[:, fleet.places.intercepts]
     pairs = list(zip(slopes, intercepts, strict=True))[:vehicles]

@@ -1,4 +1,4 @@
-"""A repository of signed parameters whose keys lie in memory."""
+"""A repository of signed parameters whose private keys are kept in memory."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +11,7 @@ __all__ = ["Publisher"]
 
 
 class Publisher:
-    """People who all sign, with a key for each role, and their repository in a folder that is new or empty."""
+    """People who all sign, each with a key for every role, and their repository in a folder that is new or empty."""
 
     def __init__(self, folder: Path, people: int = 1) -> None:
         self.folder, self.root = folder, folder / "metadata" / "1.root.json"
@@ -32,5 +32,5 @@ class Publisher:
         repository.publish(self._signers)
 
     def bundle(self, vehicle: str) -> bytes:
-        """What one vehicle needs of the repository."""
+        """Return what one vehicle needs of the repository."""
         return Repository(self.folder).bundle(vehicle)

@@ -30,11 +30,11 @@ from ecu_node.parameters import BranchParameters, encode_parameters
 from ecu_node.update.client import provision, update
 
 UPDATES = 20
-"""Of which the quickest counts: others on the machine make it longer, nothing makes it shorter."""
+"""Number of updates, of which the quickest counts: other work on the machine can only make them longer."""
 
 
 def one_bin(vehicles: int) -> list[int]:
-    """The vehicles of one bin, and one of each other bin: bundle and snapshot are those of the whole fleet."""
+    """Return the vehicles of one bin and one of each other; bundle and snapshot are then as for the whole fleet."""
     bins, found = SuccinctRoles([], 1, BIN_BITS, "bins"), dict[str, list[int]]()
     for number in range(vehicles):
         found.setdefault(bins.get_role_for_target(f"V{number:07d}.json"), []).append(number)
@@ -85,7 +85,7 @@ def measured(folder: Path, vehicles: Iterable[int]) -> list[Row]:
 
 
 def verify_times_s(state: Path, bundle: Path, database: VehicleDatabase) -> tuple[float, float]:
-    """Processor time of the quickest update, and how much of it went into signatures. [s]"""
+    """Return the processor time of the quickest update, and the part of it that went into signatures. [s]"""
     times_s, signatures_s, verify = [], list[float](), SSlibKey.verify_signature
 
     def timed(*arguments: Any) -> None:

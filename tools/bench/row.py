@@ -21,9 +21,9 @@ class Row:
     name : str
         What was measured.
     value : float
-        Figure.
+        Value of the figure.
     unit : str
-        Of the figure; "1" for a pure number.
+        Unit of the figure; "1" for a pure number.
     peer : str or None
         What it was compared with in the same run, and the peer's own figure in words.
     ratio : float or None

@@ -1,4 +1,4 @@
-"""Parameters that are known, for vehicles of the benchmarks that were made up."""
+"""True parameters of the made-up vehicles of the benchmarks."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -13,7 +13,7 @@ __all__ = ["true_parameters"]
 
 
 def true_parameters(database: VehicleDatabase, branches: Mapping[str, BranchParameters]) -> VehicleParameters:
-    """Parameters that fit a layout and its DBC, with what is wrong with each sensor.
+    """Make parameters that fit a layout and its DBC, with the given fault of each sensor.
 
     The corrected sum is expected to be no worse than the measured one.
     """

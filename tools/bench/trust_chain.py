@@ -1,10 +1,10 @@
-"""From a fleet to corrected vehicles: drives are calibrated, signed, activated and tried, and what comes out is judged.
+"""The whole chain from a fleet to corrected vehicles: calibrate, sign, activate and try parameters, and judge them.
 
     python -m bench.trust_chain --vehicles 500        (in tools/)
 
 Vehicles with known faults drive; the calibrator learns from their drives, two people sign what it found, each vehicle's
-node takes its signed file, tries it, and corrects a drive that nobody has seen. Beside each right set two wrong ones
-are on trial: with signs turned, and of another vehicle. Prints how many vehicles came how far, as JSON.
+node takes its signed file, tries it, and corrects an unseen drive. Beside each right set two wrong ones are on trial:
+one with its signs turned, and that of another vehicle. Prints how many vehicles came how far, as JSON.
 """
 
 import json
@@ -43,9 +43,9 @@ from ecu_node.update.store import ParameterStore
 from ecu_node.update.trial import ParameterTrial
 
 LEAST_DIFFERENCE_A = 0.02
-"""Errors that differ by less are the same: rounding to the codes of the corrected signal. [A]"""
+"""Errors that differ by less count as equal, because of the rounding to codes of the corrected signal. [A]"""
 LOOK_EVERY_S = 0.1
-"""As often the node looks at the junction. [s]"""
+"""Time between two looks of the node at the junction. [s]"""
 WRONG = ("signs_turned", "of_another_vehicle")
 """Kinds of wrong sets."""
 
@@ -89,7 +89,7 @@ def main(
 
 
 def score(outcomes: pd.DataFrame) -> dict[str, float]:
-    """How many vehicles came how far, how many wrong sets passed; and the largest errors, median and worst. [A]"""
+    """Count how far vehicles came and how many wrong sets passed; add median and worst of their largest errors. [A]"""
     corrected = outcomes[outcomes["corrected"]]
     tried = corrected[corrected["passed"]]
     found: dict[str, float] = {
@@ -111,21 +111,21 @@ def score(outcomes: pd.DataFrame) -> dict[str, float]:
 
 
 def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
-    """Update a vehicle, and let it drive with its set on trial, and with those that are wrong for it beside it.
+    """Update a vehicle, and let it drive with its own set on trial and two wrong ones beside it.
 
     Parameters
     ----------
     folder : Path
-        With fleet, result and repository; for the state of the vehicle.
+        Folder with fleet, result and repository, in which the state of the vehicle is kept, too.
     layout : Path
-        Of the fleet.
+        Layout of the fleet.
     names : tuple of str
-        Of the vehicle, and of another one.
+        Names of the vehicle, and of another one.
 
     Returns
     -------
     dict of str
-        What became of it; errors are the largest of its branches on the drive after the trial. [A]
+        What became of it; errors are the largest over its branches on the drive after the trial. [A]
     """
     name, database, now = names[0], read_database(read_layout(layout)), datetime.now(UTC)
     own, others = (read_parameters(folder / "result" / "params" / f"{each}.json") for each in names)
@@ -155,7 +155,7 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
     sets = dict(zip(WRONG, (replace(own, branches=turned), replace(others, vehicle=name)), strict=True))
     trials = {kind: ParameterTrial(found, database, corrector.branches) for kind, found in sets.items()}
     passed_s: dict[str, float] = {}
-    """When a set came into force, or passed its trial."""
+    """Instant at which the own set came into force, or a wrong one passed its trial. [s]"""
 
     def look(time_s: float) -> None:
         corrector.look(time_s)
@@ -201,7 +201,7 @@ def _replay(drive: Path, corrector: Corrector, look: Callable[[float], None], ou
 
 
 def _traces(driven: Recording, truth: VehicleTruth) -> dict[str, pd.DataFrame]:
-    """Of each branch measured, published and true current, that of its known fault [A], over the time [s]."""
+    """Return each branch's measured, published and true current, the last by its known fault [A], over time [s]."""
     traces = {}
     for branch, measured in driven.drive.branches.items():
         both = {"measured": measured, "published": driven.corrected[branch]}
@@ -211,19 +211,19 @@ def _traces(driven: Recording, truth: VehicleTruth) -> dict[str, pd.DataFrame]:
 
 
 def _errors_a(trace: pd.DataFrame, since_s: float = 0.0) -> dict[str, float]:
-    """Root mean square errors of means of one second, from a time on [s]; the sensor's noise apart. [A]"""
+    """Return root mean square errors of means of one second, without the sensor's noise, from a time on [s]. [A]"""
     part = trace.loc[since_s:].dropna()
     means = part.groupby(part.index.astype(int)).mean()
     return {what: float(((means[what] - means["true"]) ** 2).mean() ** 0.5) for what in ("measured", "published")}
 
 
 def _is_worse(errors_a: Mapping[str, float]) -> bool:
-    """Whether what is published is worse, by more than the rounding to its codes."""
+    """Check whether the published current is worse by more than the rounding to its codes."""
     return errors_a["published"] > errors_a["measured"] + LEAST_DIFFERENCE_A
 
 
 def _makes_worse(parameters: VehicleParameters, traces: Mapping[str, pd.DataFrame]) -> bool:
-    """Whether a set would make a branch worse."""
+    """Check whether a set would make any branch worse."""
     for name, trace in traces.items():
         fault = parameters.fault(name)
         published = (trace["measured"] - fault.offset_a) / (1.0 + fault.drift)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 
 class GalleryOrder:
-    """Order of the examples, as a newcomer reads them; made by sphinx-gallery for each folder of examples."""
+    """Order in which a newcomer reads the examples; sphinx-gallery makes one for each folder of examples."""
 
     FIRST = ("one_car.py", "from_a_spreadsheet.py", "two_chargers.py", "twelve_vehicles.py", "replay_and_node.py")
 

@@ -25,22 +25,22 @@ PROGRAMS: dict[str, Callable[[], int]] = {
     "calibrator": calibrator_cli.run_calibrator,
     "ecu-node": node_cli.run_ecu_node,
 }
-"""What runs each program with the arguments of the process."""
+"""Function that runs each program with the arguments of the process."""
 _WIDTH = "80"
-"""Of the terminal for which the help is written. [characters]"""
+"""Width of the terminal for which the help is written. [characters]"""
 _COMMANDS = re.compile(r"(?mi)^commands\b[^\n]*:\n((?:[ ]+.*\n)+)")
 _NAME = re.compile(r"(?m)^ {2,4}([a-z][a-z-]*)")
 
 
 def command_help(program: str, *path: str) -> Iterator[tuple[str, str]]:
-    """What a program prints for ``--help``, and what each of its commands does.
+    """Yield what a program prints for ``--help``, then what each of its commands prints.
 
     Parameters
     ----------
     program : str
         One of :data:`PROGRAMS`.
     *path : str
-        Command of it, and command of that; none: the program itself.
+        Command of the program, and command of that command; none: the program itself.
 
     Yields
     ------
@@ -62,7 +62,7 @@ def _printed(program: str, arguments: list[str]) -> str:
 
 
 class _CommandReference(SphinxDirective):
-    """The section of a program, with those of its commands."""
+    """Directive for the section of a program, with those of its commands."""
 
     required_arguments = 1
 

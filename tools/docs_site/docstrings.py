@@ -1,7 +1,7 @@
-"""Docstrings as they are meant.
+"""Make Sphinx show docstrings as they are meant.
 
-What a module's docstring indents are formulas, to be shown line by line. In the text under a constant or an attribute a
-colon is a colon, where napoleon would take what stands before it for a type.
+Indented parts of a module's docstring are formulas, to be shown line by line. In the text under a constant or an
+attribute a colon is only a colon, but napoleon would take the words before it for a type.
 """
 
 import re
@@ -24,12 +24,12 @@ def with_formulas(lines: list[str]) -> list[str]:
     Parameters
     ----------
     lines : list of str
-        Of a docstring.
+        Lines of a docstring.
 
     Returns
     -------
     list of str
-        The same with ``::`` before every indented paragraph that follows one that is not indented, or a list item.
+        The lines with ``::`` before every indented paragraph that follows one that is not indented, or a list item.
     """
     found, literal = lines[:1], False
     for before, line in pairwise(lines):
@@ -42,7 +42,7 @@ def with_formulas(lines: list[str]) -> list[str]:
 
 
 class _Docstrings:
-    """Hooks around napoleon's."""
+    """Hooks that run before and after those of napoleon."""
 
     def __init__(self) -> None:
         self.as_written: list[str] = []
@@ -57,7 +57,7 @@ class _Docstrings:
         self.as_written = list(lines)
 
     def after(self, _: Sphinx, what: str, *about: Any) -> None:
-        """Take back what napoleon made of the text of constants and attributes."""
+        """Undo what napoleon did to the text of constants and attributes."""
         if what in {"attribute", "data", "property"}:
             about[-1][:] = self.as_written
 

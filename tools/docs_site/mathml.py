@@ -20,7 +20,7 @@ _CONVERTER = LatexToMathML(fancy_error=False)
 
 
 def inline_equation(latex: str) -> str:
-    """HTML of a formula in a line of text.
+    """Return the HTML of a formula in a line of text.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def inline_equation(latex: str) -> str:
 
 
 def block_equation(latex: str) -> str:
-    r"""HTML of an equation on lines of its own; raises as :func:`inline_equation` does.
+    r"""Return the HTML of an equation on lines of its own; raises as :func:`inline_equation` does.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def block_equation(latex: str) -> str:
     Returns
     -------
     str
-        The equation, and beside it its number, which links to itself.
+        The equation with its number beside it, which links to itself.
     """
     formula = _mathml(_TAG.sub("", latex), block=True)
     numbers = [escape(number) for number in _TAG.findall(latex)]
