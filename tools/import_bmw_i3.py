@@ -180,7 +180,7 @@ def trip_from_table(table: Table, *, vehicle: str, name: str, ranges: Mapping[st
     vehicle, name : str
         Identity of vehicle and drive.
     ranges : mapping of str to SignalRange
-        What the DBC allows, by branch and input; a channel without one may have any value.
+        Ranges that the DBC allows, by branch and input; a channel without a range may have any value.
 
     Returns
     -------

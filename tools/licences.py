@@ -6,7 +6,7 @@ from importlib.metadata import Distribution, distributions
 
 GOOD = ("apache", "bsd", "mit", "isc", "psf", "python", "mpl", "mozilla", "lgpl", "lesser", "unlicense", "zlib", "cc0",
         "public domain", "0bsd")  # fmt: skip
-"""Words of licences that a dependency may have beside Apache-2.0; for LGPL and MPL see docs/dependencies.md."""
+"""Words of licences that a dependency of Apache-2.0 software may have; for LGPL and MPL see docs/dependencies.md."""
 READ = {"docutils": "BSD-2-Clause AND public domain", "fastsim": "Apache-2.0"}
 """Licences read by hand, as their metadata mislead: COPYING.rst, LICENSE."""
 

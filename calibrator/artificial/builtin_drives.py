@@ -1,7 +1,7 @@
 """Drives without any recording: a fastsim vehicle on its own cycles, cut and joined into different trips.
 
 fastsim (NREL) gives speed and mechanical and electrical motor power at 1 Hz for a battery-electric car on the UDDS and
-HWFET cycles. This module adds what the junction of such a car carries besides: heater, air conditioning, the converter
+HWFET cycles. This module adds what else the junction of such a car carries: heater, air conditioning, the converter
 to the low-voltage net, a rear motor that takes a share of the torque, and the battery that carries the sum.
 
 Currents are positive into the junction.

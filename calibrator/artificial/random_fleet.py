@@ -47,7 +47,7 @@ def random_stream(purpose: Purpose, *numbers: int) -> np.random.Generator:
     Returns
     -------
     numpy.random.Generator
-        The same for the same arguments, independent of all others.
+        Equal for equal arguments, and independent of all other streams.
     """
     return np.random.default_rng([int(purpose), len(numbers), *numbers])
 

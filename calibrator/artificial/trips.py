@@ -1,7 +1,7 @@
 """Trips of the ideal vehicle, from which artificial vehicles are made: of the built-in vehicle, or recorded drives.
 
-Recorded currents do not sum to zero, so one branch is set to minus the sum of the others, (19) of [1]_. What is
-said about that branch afterwards is therefore not independent of the other sensors of the recording.
+Recorded currents do not sum to zero, so one branch is set to minus the sum of the others, (19) of [1]_. Results for
+that branch are therefore not independent of the other sensors of the recording.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """

@@ -1,4 +1,4 @@
-"""What logs or tables hold of the branches and inputs of a layout: the facts that the doctor's checks look at."""
+"""Facts for the doctor's checks: what logs or tables contain of the branches and inputs of a layout."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -41,7 +41,7 @@ WIDER = 3.0
 ROUNDS = 4
 """Rounds of least squares: the constant rows depend on the gains of the sensors, so both are solved in turn. [1]"""
 BEYOND = 3.0
-"""Robust standard deviations from the median from which on a slope or an intercept counts as faulty. [1]"""
+"""A slope or an intercept is faulty if it is this many robust standard deviations from the median. [1]"""
 ACCURACY = 0.01
 """Standard deviation that the class of a current sensor promises, in fractions of full scale. [1]"""
 LEAST_WEIGHT = 0.2
@@ -167,7 +167,7 @@ class _Linear:
         self.whiten = np.linalg.inv(np.linalg.cholesky(whole))
 
     def values(self, theta: Array) -> Array:
-        """Rows (N, 3K) less their centre, as they would be if the gains were those of theta (N, 3K)."""
+        """Return rows minus their centre, shape (N, 3K), with constants taken at the gains of theta, shape (N, 3K)."""
         without_load = np.pad(theta, ((0, 0), (0, 1)))
         left = row_residuals(self.evidence, without_load[:, None])[:, 0, self.rows.places.measured]
         return np.asarray(left + theta @ self.design.T)

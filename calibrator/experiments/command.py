@@ -81,7 +81,7 @@ def experiment(
     if out is not None:
         require_possible_folder(out)
         require_possible_folder(out.absolute().parent)
-    # recorded trips are read before anything is run, and once
+    # recorded trips are read only once, before anything is run
     trips = fleet_for(recorded[0], quick=quick, drives=drives, layout=layout) if recorded else None
     count = repetitions or (QUICK_REPETITIONS if quick else REPETITIONS)
     done: dict[str, ExperimentResult] = {}

@@ -50,7 +50,7 @@ class CommonDrive:
     Attributes
     ----------
     name : str
-        What it is, for the record.
+        Description, for the record.
     i_s : ndarray of shape (T, K)
         Ideal currents, positive into the junction; each row sums to zero. [A]
     inputs : ndarray of shape (T, M)

@@ -90,7 +90,7 @@ def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
     Parameters
     ----------
     estimate : Estimate
-        What a method found.
+        Estimate of a method.
     trial : Trial
         Trial, with the truth.
 

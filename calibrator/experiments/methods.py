@@ -1,4 +1,4 @@
-"""Methods that experiments compare: the default, the published one with its classifiers, and what is simpler.
+"""Methods that experiments compare: the default, the published one with its classifiers, and simpler ones.
 
 A method is a row: a name, and a function from a trial to an estimate.
 """

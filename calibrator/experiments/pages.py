@@ -40,7 +40,7 @@ def headline(result: ExperimentResult) -> pd.DataFrame:
     ]
     parts += [figures[own].pivot(index=["series", "x"], columns="figure", values="text")[shown]]
     table = pd.concat(parts, axis=1).reindex(settings)
-    if experiment.paper:  # its best figure, whatever methods were run
+    if experiment.paper:  # the paper's best figure, whichever methods were run
         best = dict(sorted((x, found["recovery_rate"]) for (x, _), found in experiment.paper.items()))
         table.insert(0, "paper", [f"{best[x]:.2f}" if x in best else None for _, x in table.index])
     return _labelled(table, experiment)

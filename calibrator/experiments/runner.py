@@ -205,5 +205,5 @@ def _commit() -> str:
     if git is None or not (root / ".git").exists():
         return ""
     command = [git, "-C", str(root), "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty"]
-    described = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - nothing of a user in it
+    described = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - no input of a user in it
     return f" of commit {described.stdout.strip()}" if described.returncode == 0 else ""

@@ -72,7 +72,7 @@ def drawn_distribution(settings: FaultSettings, branches: int) -> FaultDistribut
 
 @dataclass(frozen=True, kw_only=True)
 class CommonEvidence:
-    """What the default is given where all vehicles make one simulated drive, of which there are no summaries.
+    """Evidence that the default is given where all vehicles make one simulated drive, for which there are no summaries.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """What a method says of N vehicles with K branches.
+    """Result of a method for N vehicles with K branches.
 
     Attributes
     ----------

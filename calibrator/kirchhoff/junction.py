@@ -39,7 +39,7 @@ SMALL_SHARE = 0.05
 AVERAGED_S, FEWEST_AVERAGES = 2.0, 3
 """Currents are averaged so long, against noise, to see whether they move; fewer averages do not tell. [s], [1]"""
 SHORT_S = 20.0
-"""Shorter recordings tell no signs. [s]"""
+"""Shorter recordings do not show signs. [s]"""
 STILL_A, STILL_SHARE, STILL_STEPS = 0.5, 0.01, 0.5
 """Currents stand still if they move by no more than this [A] or this share of full scale, whichever is less, or by no
 more than this many of their steps. [1]"""
@@ -58,7 +58,7 @@ class RecordedJunction:
     Attributes
     ----------
     database : VehicleDatabase
-        With the voltages as inputs, see :func:`.with_voltages`; its period is at least that of the recordings.
+        DBC and layout with the voltages as inputs, see :func:`.with_voltages`; its period is at least the recordings'.
     branches : tuple of str
         The K branches.
     drives : tuple of Drive
@@ -154,7 +154,7 @@ class RecordedJunction:
 
     @property
     def moves(self) -> bool:
-        """Whether currents move, and long enough, to tell signs, units, delays and gains."""
+        """Whether currents move, and for long enough, to show signs, units, delays and gains."""
         return len(self.bands.block) > 0 and not self.stands_still
 
 
@@ -251,8 +251,9 @@ def _price(
 def _orientation(drives: Sequence[Drive], battery: str) -> float:
     """Tell from the battery's voltage whether its current is positive into the junction.
 
-    Near 1 if the voltage falls when the current rises, near -1 if it rises; without a voltage that follows the current,
-    a third of that by the sign of the mean current, since driving takes energy out of a battery; 0 if nothing tells.
+    Near 1 if the voltage falls when the current rises, near -1 if it rises. Without a voltage that follows the current
+    it is a third of the mean current over its root mean square, since driving takes energy out of a battery; 0 if the
+    current is 0, too.
     """
     both = [drive for drive in drives if battery in drive.branches and VOLTAGE in drive.inputs]
     correlation = sag([(drive.branches[battery], drive.inputs[VOLTAGE]) for drive in both])

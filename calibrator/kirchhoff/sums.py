@@ -43,7 +43,7 @@ __all__ = ["BAND", "SUM", "VOLTAGE", "Comparison", "compare_kirchhoff", "step_of
 VOLTAGE = "_junction_voltage"
 """Input that is the battery's voltage; drives may lack it."""
 SUM = "sum"
-"""Name of the sum among the branches."""
+"""Name of the sum in tables of the branches."""
 BAND = 2.0
 """Half width of the band, in standard deviations: 19 of 20 instants of right sensors lie in it. [1]"""
 MOVES = 5.0
@@ -76,7 +76,7 @@ class Comparison:
     expected_a : float
         Sum that right sensors show: the load that the parameters expect or the layout declares, or 0. [A]
     expected_sd_a : ndarray of shape (T,)
-        Its standard deviation at each instant, see the top of this module. [A]
+        Standard deviation expected of the sum at each instant, see the top of this module. [A]
     parts_a : mapping of str to float
         Median of each part of that: ``quantisation``, ``noise``, ``sampling``, ``delays``, ``formulas``, ``load``. [A]
     residual : mapping of str to dict, or None

@@ -34,7 +34,7 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _FEWEST_BITS = 8
 """A signal without a unit and with fewer bits is a state."""
 NO_RANGE = 1e-3
-"""A range below this share of that of the bits is a mistake of the database, such as 0 to 1 for a voltage. [1]"""
+"""A range below this share of what the bits can show is a mistake of the database, such as 0 to 1 for a voltage. [1]"""
 WRONG_RANGE, FEWEST_OUTSIDE = 0.01, 5
 """The range of the database is wrong if more than this share of the values, and at least so many different ones, are
 outside it; a code for "not available" is only one value. [1]"""
@@ -65,7 +65,7 @@ class Candidate:
     formula : str
         Formula of inputs if it is computed; empty if it is measured.
     wrong : str
-        What the recording shows to be wrong in the database: ``range`` or ``sign``; empty for nothing.
+        What the recording shows to be wrong in the database: ``range`` or ``sign``; empty if nothing is.
     place : str
         Where it probably flows, one of :data:`calibrator.words.PLACES`; empty if no word tells.
     score : float

@@ -98,7 +98,7 @@ class FleetTable:
 
 
 def read_fleet_table(result: Path) -> FleetTable:
-    """Read the folder that ``calibrator calibrate`` wrote; FleetError if it is no result, or not a whole one."""
+    """Read the folder that ``calibrator calibrate`` wrote; FleetError if it is no result, or not a complete one."""
     run, frame = read_run(result), result_rows(result, SCHEMA.names).to_pandas()
     if not run.full_scale_a:
         raise FleetError(f"{result / 'run.json'}: no full_scale_a, it is of an older version; calibrate again")
@@ -129,7 +129,7 @@ class _Identifiable(msgspec.Struct, frozen=True):
 
 
 class ParameterDetails(msgspec.Struct, frozen=True):
-    """What a parameter file has beyond the columns."""
+    """Contents of a parameter file that the columns do not have."""
 
     branches: dict[str, _Identifiable]
     """Whether the gain of each could be estimated."""

@@ -87,7 +87,7 @@ def overview_of(table: FleetTable) -> dict[str, Any]:
             for name, delay_s in zip(table.branches, table["delay_s"].T, strict=True)
             if np.isfinite(delay_s).any()
         },
-        "reference": {  # a share of exactly 0 stands for a branch that no vehicle shows
+        "reference": {  # a share of exactly 0 means that no vehicle shows the branch
             name: {"agreeing_share": agreeing.get(name) or None, "model_spread": spread.get(name)}
             for name in (table.branches if reference and spread else ())
         },
@@ -111,7 +111,7 @@ def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> l
     table : FleetTable
         The result.
     files : mapping of int to ParameterDetails
-        What the parameter files add, by the vehicle's place in the table.
+        Details from the parameter files, by the vehicle's place in the table.
 
     Returns
     -------

@@ -93,7 +93,7 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
     command = typer.main.get_command(app)
     for each in _all_commands(command):
         each.epilog = f"{each.epilog}\n\n{EXIT_CODES}" if each.epilog else EXIT_CODES
-        each.short_help = (each.help or "").partition("\n\n")[0]  # whole in the list of commands, not cut
+        each.short_help = (each.help or "").partition("\n\n")[0]  # the list of commands shows all of it, not cut
         for parameter in each.params:
             _in_words(parameter)
     try:

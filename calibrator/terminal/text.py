@@ -120,7 +120,7 @@ def few_reasons(reasons: Mapping[str, str], *, count: int | None = None) -> str:
 
 
 def figure(value: float, digits: int = 3) -> str:
-    """A number as people write it: ``50``, ``2.4``, ``0.035``, ``4,096``; a dash for what is no number.
+    """A number as people write it: ``50``, ``2.4``, ``0.035``, ``4,096``; a dash for NaN and infinity.
 
     Parameters
     ----------

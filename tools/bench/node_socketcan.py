@@ -50,7 +50,7 @@ LATENCY_SHARE = 10
 
 
 def rows(frames: int) -> list[Row]:
-    """Measure rate and latencies of each of the ways, by so many frames in each of the rounds."""
+    """Measure rate and latencies of each way, with the given number of frames in each round."""
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         vehicle, python = make_vehicle(Path(folder)), [sys.executable, "-m"]
         corrected = vehicle.corrected(Mode.GATEWAY)

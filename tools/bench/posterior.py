@@ -79,7 +79,7 @@ def _estimate(fleet: EvidenceRows, models: Sequence[FaultModel]) -> None:
 
 
 def _simulated(branches: int, vehicles: int, sparsity: float) -> EvidenceRows:
-    """Rows of vehicles with random faults and errors, the same in each run."""
+    """Make rows of vehicles with random faults and errors, the same in each run."""
     K, rng, at = branches, np.random.default_rng(branches), RowPlaces(branches)
     faults = FaultSettings(sparsity=sparsity, balanced=True).draw(rng, vehicles=vehicles, branches=K, full_scale_a=1.0)
     factor = 1.0 + faults.drift
