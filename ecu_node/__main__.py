@@ -1,4 +1,4 @@
-"""``python -m ecu_node`` and the console command."""
+"""Entry point of ``python -m ecu_node`` and of the console command."""
 
 import sys
 from contextlib import suppress
@@ -7,7 +7,7 @@ __all__ = ["ecu_node_program"]
 
 
 def ecu_node_program() -> int:
-    """Run the command line; Ctrl-C while it is imported ends it in one line, too."""
+    """Run the command line; Ctrl-C ends it in one line even while its modules are being imported."""
     try:
         from ecu_node.cli import run_ecu_node  # noqa: PLC0415
     except KeyboardInterrupt:

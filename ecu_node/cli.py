@@ -1,6 +1,6 @@
 """Command line of the node: ``ecu-node run``, ``ecu-node monitor``, ``ecu-node check``, ``ecu-node template``.
 
-Results go to standard output, what happens to standard error. Exit code 0: done, 1: failed, 2: wrong use,
+Results go to standard output, events to standard error. Exit code 0: done, 1: failed, 2: wrong use,
 70: a fault of the program itself, 130: interrupted by Ctrl-C before the node was at work (at work, Ctrl-C and SIGTERM
 end it with 0). Errors are one line; ``--debug``, anywhere, shows the traceback as well.
 """
@@ -57,7 +57,7 @@ def _main(arguments: list[str]) -> int:
 
 
 def _option(read: Callable[[str], Any], is_right: Callable[[Any], Any], refusal: str) -> Callable[[str], Any]:
-    """Make a type for argparse: what `read` makes of a text, if that is right; else it is refused, and shown."""
+    """Make a type for argparse: it returns `read(text)` if `is_right` accepts that, and else refuses the text."""
 
     def value_of(text: str) -> Any:
         with suppress(ValueError):
@@ -80,7 +80,7 @@ _VEHICLE = _option(
 
 
 def _read_target(text: str) -> Path | tuple[str, int] | None:
-    """File, or host and port, of ``--telemetry``; None if it is neither."""
+    """Return the file, or host and port, of ``--telemetry``; None if the text is neither."""
     if "://" not in text:
         return Path(text) if text.strip() else None
     found = urlsplit(text)
@@ -139,7 +139,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "--state": {"type": Path, "required": True, "metavar": "FOLDER", "help": "state of this vehicle"},
     "--params": {"type": Path, "required": True, "metavar": "FILE", "help": "parameter file of this vehicle"},
 }
-"""Of all commands; what a command says otherwise stands with it."""
+"""Options that commands share; options of a single command are added where the command is."""
 _BUS = "--interface --channel --fd --bitrate --data-bitrate --listen-only"
 
 
@@ -229,7 +229,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-# The commands import what stands on python-can, after load_python_can.
+# The commands themselves import what needs python-can, as load_python_can must come first.
 
 
 def _bus_settings(options: argparse.Namespace) -> dict[str, Any]:
@@ -299,16 +299,16 @@ def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> s
     database : VehicleDatabase
         Layout and DBC of the vehicle.
     vehicle : str
-        Its identity.
+        Identity of the vehicle.
     now : datetime
         Time of day.
 
     Returns
     -------
     str
-        JSON without what can be left out. The sum that right sensors show is the layout's unmeasured load: it takes
-        current out of the junction, so what the branches measure sums to as much above 0 A. The verdict is that of a
-        file that corrects, as it is to be once it is filled in.
+        JSON without the keys that may be left out. The sum expected of right sensors is the layout's unmeasured load:
+        it takes current out of the junction, so the measured branches sum to as much above 0 A. The verdict is
+        "corrected", which holds once the file is filled in.
     """
     layout = database.layout
     expected_a = layout.unmeasured_load.mean_a if layout.unmeasured_load is not None else 0.0

@@ -1,4 +1,4 @@
-"""The DBC as the layout uses it: every named signal found, with its unit turned into A, V or W."""
+"""The DBC as the layout uses it: every signal that the layout names is looked up, and its unit is checked."""
 
 import re
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 _MAX_DBC_BYTES = 16_000_000
-"""The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""
+"""Largest DBC that is read: real ones have some megabytes, and reading takes a hundred times that in memory."""
 
 
 _NOT_AVAILABLE = re.compile(
@@ -40,21 +40,21 @@ class VehicleDatabase:
 
     layout: Layout
     databases: Mapping[str, Database]
-    """By name of the bus, ``""`` where the layout names none; empty where it has no DBC."""
+    """Loaded DBCs by name of the bus, ``""`` if the layout names no buses; empty if it has no DBC."""
     digest: str
     """SHA-256 of the DBC file; see :attr:`.Layout.dbc_digest`."""
 
     def message(self, name: str, place: str = "") -> Message:
-        """Return the message of this name, which stands at this place of the layout, or raise DatabaseError."""
+        """Return the message of this name, or raise DatabaseError; ``place`` is where the layout names it."""
         return self._found(name, place)[1]
 
     def channel_of(self, name: str) -> str | None:
-        """Channel that a message ``Message`` or ``bus:Message`` comes on; None where the layout names no buses."""
+        """Return the channel that ``Message`` or ``bus:Message`` comes on; None if the layout names no buses."""
         bus = self._found(name)[0]
         return next((item.channel for item in self.layout.bus if item.name == bus), None)
 
     def _found(self, name: str, place: str = "") -> tuple[str, Message]:
-        """Bus and message of this name."""
+        """Return bus and message for ``Message`` or ``bus:Message``."""
         layout, paths = self.layout, self.layout.dbc_paths
         if not paths:
             raise DatabaseError(f"{layout.path}: no 'dbc', so that it fits tables only; give the DBC of the frames")
@@ -81,7 +81,7 @@ class VehicleDatabase:
     def signal(self, name: str) -> tuple[Message, Signal]:
         """Return message and signal of ``Message.Signal``, or raise :class:`DatabaseError`.
 
-        Without a DBC the name is that of a column, and its signal any number in the unit that the layout gives.
+        Without a DBC the name is that of a column; its signal is then a float in the unit that the layout gives.
         """
         if not self.layout.dbc_files:
             unit = next((item.unit for item in self.layout.branch if item.source == name), None)
@@ -102,7 +102,7 @@ class VehicleDatabase:
         )
 
     def current_step_a(self, branch: str) -> float:
-        """Resolution of a branch's signal [A]; 0 if its current is computed from others, or the signal is a float."""
+        """Return the resolution of a branch's current [A]; 0 if that is computed from other signals, or is a float."""
         name = self.layout.find_branch(branch).signal
         if name is None:
             return 0.0
@@ -111,7 +111,7 @@ class VehicleDatabase:
 
 
 def read_database(layout: Layout) -> VehicleDatabase:
-    """Load the DBC of a layout, or those of its buses, and look every signal up that the layout names.
+    """Load the DBC of a layout, or those of its buses, and look up every signal that the layout names.
 
     Parameters
     ----------
@@ -121,14 +121,14 @@ def read_database(layout: Layout) -> VehicleDatabase:
     Returns
     -------
     VehicleDatabase
-        The database, with all names of the layout known to exist; without a DBC names are those of columns.
+        The database; all names in the layout exist in it. Without a DBC, names are those of columns.
 
     Raises
     ------
     DatabaseError
         If the file cannot be read or parsed, or lacks messages or a signal that the layout names.
     LayoutError
-        If the layout names a value of an input that its signal can never have, or what is no ``Message.Signal``.
+        If the layout names a value that an input's signal can never have, or a name is not ``Message.Signal``.
     """
     loaded = {bus: _load(layout, file) for bus, file in layout.dbc_files.items()}
     vehicle = VehicleDatabase(
@@ -148,7 +148,7 @@ def read_database(layout: Layout) -> VehicleDatabase:
 
 
 def node_database(path: Path) -> VehicleDatabase:
-    """Read a layout and its DBC for a node, which corrects the signals of one bus; raises as both readers do.
+    """Read a layout and its DBC for a node, which corrects the signals of one bus.
 
     Parameters
     ----------
@@ -163,7 +163,9 @@ def node_database(path: Path) -> VehicleDatabase:
     Raises
     ------
     LayoutError
-        If the layout is one for tables, for several buses, or has a branch that no signal carries.
+        If the layout cannot be read, is one for tables or for several buses, or has a branch that no signal carries.
+    DatabaseError
+        If the DBC cannot be read, or lacks what the layout names.
     """
     layout = read_layout(path)
     computed = [branch.name for branch in layout.branch if branch.computed]
@@ -179,7 +181,7 @@ def node_database(path: Path) -> VehicleDatabase:
 
 
 def _load(layout: Layout, file: str) -> tuple[Database, str]:
-    """Messages of a DBC, and its digest."""
+    """Load a DBC; return its messages and its digest."""
     path = layout.path.parent / file
     try:
         content = read_user_file(path, largest_bytes=_MAX_DBC_BYTES)
@@ -200,10 +202,10 @@ def _load(layout: Layout, file: str) -> tuple[Database, str]:
 
 
 def _complete_multiplexers(message: Message) -> None:
-    """Give the multiplexer of each signal its whole name.
+    """Replace shortened names of multiplexers by the full ones.
 
-    DBCs keep names of more than 32 characters in an attribute; cantools takes the signals' from it, and leaves those of
-    their multiplexers cut.
+    DBCs keep names of more than 32 characters in an attribute. cantools takes the names of signals from there, but
+    leaves each signal's reference to its multiplexer shortened.
     """
     names = {signal.name for signal in message.signals}
     wanted = {signal.multiplexer_signal for signal in message.signals if signal.multiplexer_signal is not None} - names
@@ -217,15 +219,15 @@ def _complete_multiplexers(message: Message) -> None:
 
 
 _ENCODINGS = {"dbc": "cp1252", "sym": "cp1252", "arxml": "utf-8", "kcd": "utf-8", "cdd": "utf-8"}
-"""Formats by suffix and their encodings, as cantools has them."""
+"""Encodings of the formats, by suffix, as in cantools."""
 _EXTENDED = 1 << 31
 _OF_MESSAGE = re.compile(r'(\s*(?:BO_|VAL_|BO_TX_BU_|CM_ (?:BO_|SG_)|SIG_VALTYPE_|BA_ "\w+" (?:BO_|SG_)) )(\d+)')
 
 
 def _parsed(content: bytes, suffix: str) -> object:
-    """What cantools makes of a file; two slips that many public DBCs have are put right.
+    """Parse a file with cantools, and correct two slips that many public DBCs have.
 
-    Identifiers of 29 bits that are not marked as extended, and names for values of signals that are not there.
+    These are 29-bit identifiers that are not marked as extended, and value tables for signals that do not exist.
     """
     kind = suffix.removeprefix(".")
     text = content.decode(_ENCODINGS.get(kind, "utf-8"), errors="replace")
@@ -250,7 +252,7 @@ def _parsed(content: bytes, suffix: str) -> object:
 
 
 def _look_everything_up(vehicle: VehicleDatabase) -> None:
-    """Look every signal up that the layout names; raises as :func:`read_database` does."""
+    """Look up every signal that the layout names; errors are those of :func:`read_database`."""
     layout = vehicle.layout
     for branch in layout.branch:
         where = f"{layout.path}: branch {branch.name}"
@@ -270,7 +272,7 @@ def _look_everything_up(vehicle: VehicleDatabase) -> None:
     for item in layout.input:
         _, signal = vehicle.signal(item.signal)
         for key, name, values in waited:
-            if name == item.name and (never := impossible_values(signal, values)):  # one would wait for ever
+            if name == item.name and (never := impossible_values(signal, values)):  # waited for in vain
                 raise LayoutError(
                     f"{layout.path}: {key}: {', '.join(f'{value:g}' for value in never)} is no value of {item.signal}, "
                     f"which has {signal.length} bits, scale {signal.scale:g} and offset {signal.offset:g}"
@@ -284,7 +286,7 @@ def _look_everything_up(vehicle: VehicleDatabase) -> None:
 
 
 def means_not_available(name: str) -> bool:
-    """Whether a name of a value table says that the value is not one.
+    """Whether a name in a value table says that there is no value.
 
     Such names are SNA, "Signal not available", "Invalid", "Error", "Not_Defined" or "Init", in any spelling, with or
     without "signal", "value" or "data". Names that only contain such words ("No error") are values.
@@ -299,7 +301,7 @@ def means_not_available(name: str) -> bool:
 
 
 def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[int]:
-    """Raw codes of a signal that are no values.
+    """Return the raw codes of a signal that are no values.
 
     Parameters
     ----------
@@ -311,9 +313,9 @@ def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[
     Returns
     -------
     frozenset of int
-        Of a branch's current, power, voltage or corrected signal: every code with a name and, of the measured one, its
-        ``no_value``, as :mod:`ecu_node.core.signals` has it. Of other signals with named values (a gear selector):
-        codes with a name that :func:`means_not_available`.
+        For a branch's current, power, voltage or corrected signal: every code with a name, as in
+        :mod:`ecu_node.core.signals`, and for the measured one also the branch's ``no_value``. For other signals (a gear
+        selector), whose names may stand for values: only codes with a name that :func:`means_not_available`.
     """
     named: Mapping[int, object] = database.signal(name)[1].choices or {}
     branches = [item for item in database.layout.branch if name in {item.source, item.voltage, item.corrected}]

@@ -1,6 +1,6 @@
-"""Files that a user names: read if they are regular and not too large, written whole, and what is wrong in them.
+"""Files that a user names: they are read if regular and not too large, written whole, and their errors located.
 
-msgspec decides whether a document has the structure that it should have; :func:`field_error` says where it has not.
+msgspec decides whether a document has the right structure; :func:`field_error` says where it has not.
 """
 
 import difflib
@@ -19,7 +19,7 @@ import msgspec
 
 
 class UnsuitableFileError(OSError):
-    """What a name leads to is no regular file, or too large; its text is to stand behind that name."""
+    """A path leads to something that is no regular file, or too large; the text is made to follow the path."""
 
     def __str__(self) -> str:
         return str(self.strerror)
@@ -30,14 +30,14 @@ _KINDS = {"d": "a folder", "p": "a pipe", "s": "a socket", "c": "a device", "b":
 
 
 def read_user_file(path: Path, *, largest_bytes: int) -> bytes:
-    """Read a file; what is no regular one is not opened: a pipe would keep the reader waiting, a device never ends.
+    """Read a regular file; anything else is refused, as a pipe would keep the reader waiting and a device never ends.
 
     Parameters
     ----------
     path : Path
         As the user wrote it.
     largest_bytes : int
-        Size that is still accepted. [byte]
+        Largest size that is accepted. [byte]
 
     Returns
     -------
@@ -65,7 +65,7 @@ def _require_regular(found: os.stat_result) -> None:
 
 
 def signature(path: Path) -> tuple[int, int, int, int] | None:
-    """Times of change, size and number of a file, which tell whether it was changed; None if there is none."""
+    """Return times of change, size and inode of a file, which tell whether it was changed; None if there is none."""
     try:
         found = path.stat()
     except OSError:
@@ -74,12 +74,12 @@ def signature(path: Path) -> tuple[int, int, int, int] | None:
 
 
 def text_digest(content: bytes) -> str:
-    """SHA-256 of a text, the same for LF and CRLF line ends."""
+    """Return the SHA-256 of a text, the same for LF and CRLF line ends."""
     return hashlib.sha256(content.replace(b"\r\n", b"\n")).hexdigest()
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by new content; after a power cut either the old or the new one stands there."""
+    """Replace a file by new content; after a power cut either the old or the new content is there."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -99,18 +99,18 @@ def field_error(error: Exception, document: Any, schema: Any) -> tuple[list[str]
     Parameters
     ----------
     error : Exception
-        With which msgspec refused it; its text is used where no field is found to be wrong.
+        Error with which msgspec refused it; its text is used if no field is found to be wrong.
     document : object
         The document as plain dicts, lists, texts and numbers.
     schema : type
-        What it should be, a structure of msgspec.
+        Structure of msgspec that it should have.
 
     Returns
     -------
     list of str
-        Where: keys, and names or numbers of entries of lists, such as ``branch``, ``'heater'``, ``timeout_s``.
+        Where it is wrong: keys, and names or numbers of list entries, such as ``branch``, ``'heater'``, ``timeout_s``.
     str
-        What: in msgspec's words, or which key is missing or unknown, and what was found.
+        What is wrong, in msgspec's words, or which key is missing or unknown; and what was found.
     """
     return _problem(document, schema) or ([], str(error))
 
@@ -155,7 +155,7 @@ def _problem(value: Any, kind: Any) -> tuple[list[str], str] | None:
 
 
 def _alternatives(kind: Any) -> tuple[list[Any], list[msgspec.Meta]]:
-    """What a value of some kind may be, and the limits of it."""
+    """Return the types that a value of this type may have, and the limits that are set for it."""
     if get_origin(kind) is Annotated:
         kinds, limits = _alternatives(kind.__origin__)
         return kinds, [*limits, *kind.__metadata__]
@@ -166,7 +166,7 @@ def _alternatives(kind: Any) -> tuple[list[Any], list[msgspec.Meta]]:
 
 
 def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Parts of a table or list: what each is called, what it is, and of which kind it should be."""
+    """Yield the parts of a table or list: the name of each, its value, and the type that it should have."""
     if get_origin(kind) is list and isinstance(value, list):
         for number, part in enumerate(value, start=1):
             name = part.get("name") if isinstance(part, dict) else None

@@ -30,10 +30,10 @@ class BusError(UserError):
 
 
 def printable(text: str) -> str:
-    """A text of a stranger's file without characters that would break the line or move the cursor."""
+    """Escape the characters of an untrusted text that would break the line or move the cursor."""
     return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
 
 
 def shown_name(name: str) -> str:
-    """A name that a stranger's file gives to something, such that it stays within a line."""
+    """Shorten a name from an untrusted file, and escape it, so that it stays within a line."""
     return printable(name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}...")

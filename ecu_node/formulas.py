@@ -38,7 +38,7 @@ FUNCTIONS: Mapping[str, Callable[..., float]] = {
     "abs": abs,
     "sqrt": lambda x: math.sqrt(x) if x >= 0.0 else math.nan,
 }
-"""What a formula is made of, on numbers; NaN where there is no value."""
+"""Operations and functions of formulas, for numbers; the result is NaN where there is no value."""
 _SIGNS: dict[type[ast.operator], str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 
 
@@ -63,7 +63,7 @@ def parse_formula(text: str) -> ast.expr:
     """
     try:
         tree = ast.parse(text, mode="eval").body
-        formula_value(tree, dict.fromkeys(formula_names(tree), 1.0))  # which refuses all else
+        formula_value(tree, dict.fromkeys(formula_names(tree), 1.0))  # refuses all else
     except LayoutError as error:
         raise LayoutError(f"formula {text!r}: {error}") from None
     except (SyntaxError, ValueError, OverflowError, MemoryError):
@@ -88,11 +88,11 @@ def formula_value(
     Parameters
     ----------
     node : ast.expr
-        From :func:`parse_formula`.
+        Syntax tree of :func:`parse_formula`.
     values : mapping of str to float, or to arrays
-        Inputs by name; all that the formula names.
+        Values of all inputs that the formula names.
     functions : mapping of str to callable
-        As :data:`FUNCTIONS`; others for arrays.
+        Operations and functions by the names in :data:`FUNCTIONS`; give others for arrays.
 
     Returns
     -------

@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 Name = Annotated[str, msgspec.Meta(pattern=r"^[_A-Za-z][_A-Za-z0-9]*\Z", description="a name of letters, digits and _")]
-"""A name without blanks."""
+"""A name of letters, digits and underscores."""
 SignalName = Annotated[
     str,
     msgspec.Meta(
@@ -56,17 +56,17 @@ SignalName = Annotated[
 
 
 def split_signal(name: SignalName) -> tuple[str, str]:
-    """Split ``Message.Signal`` into its two names; a bus stays with the message."""
+    """Split ``Message.Signal`` into its two names; a prefix ``bus:`` stays with the message."""
     message, _, signal = name.partition(".")
     return message, signal
 
 
 LONGEST_PERIOD_S = 900.0
-"""Loggers of plants write a row every quarter of an hour. [s]"""
+"""Longest period that is accepted: loggers of solar plants write a row every quarter of an hour. [s]"""
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of the file."""
+    """A table of the layout file; unknown keys are refused."""
 
 
 _MAX_LAYOUT_BYTES = 1_000_000
@@ -88,7 +88,7 @@ class Bus(_Table, frozen=True, kw_only=True):
 
     name: Name
     channel: str
-    """As the log calls it, such as ``can0``."""
+    """Name of its channel in the log, such as ``can0``."""
     dbc: str
     """Path of its DBC, relative to the layout file."""
 
@@ -103,38 +103,38 @@ class Branch(_Table, frozen=True, kw_only=True):
     power: SignalName | None = None
     voltage: SignalName | None = None
     formula: str | None = None
-    """Of inputs and derived inputs, and without a DBC of columns; its value is the current [A]. The calibrator reads
-    formulas; the node needs none."""
+    """Formula that gives the current [A] from inputs and derived inputs, or from columns if there is no DBC. Only the
+    calibrator reads formulas; the node needs none."""
     unit: str | None = None
-    """Of the current or power, where DBC or header do not say it or are wrong."""
+    """Unit of the current or power, if DBC or header do not give it or give a wrong one."""
     uncertainty: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
     """Relative standard deviation of what a formula gives. [1]"""
     timeout_s: _Positive = 0.5
     """Without a frame for this long the branch is stale. [s]"""
     balance: bool = False
-    """In ground truth made from recordings, this branch is minus the sum of the others, (19) of the paper."""
+    """In ground truth made from recordings, this branch is set to minus the sum of the others, (19) of the paper."""
     corrected: SignalName | None = None
     quality: SignalName | None = None
     vss: _VssName | None = None
     """Its name in the COVESA Vehicle Signal Specification, used in telemetry."""
     no_value: list[int] = []
-    """Raw codes of the signal that are no values, beyond those that the DBC names."""
+    """Raw codes of the signal that are no values, besides those that the DBC names."""
 
     @property
     def computed(self) -> bool:
-        """Whether a formula gives the current: a poor reference for sensors."""
+        """Whether a formula gives the current, which makes it a poor reference for sensors."""
         return self.formula is not None
 
     @property
     def source(self) -> SignalName:
-        """The signal whose frames carry this branch; of a computed one the formula."""
+        """The signal whose frames carry this branch; the formula if the branch is computed."""
         source = self.signal or self.power or self.formula
         assert source is not None
         return source
 
 
 class Input(_Table, frozen=True, kw_only=True):
-    """One signal beside the currents: it may drive the vehicle model, or tell contactors, temperature or a watch."""
+    """One signal besides the currents: an input of the vehicle model, a contactor state, a temperature ..."""
 
     name: Name
     signal: SignalName
@@ -148,7 +148,7 @@ class Derived(_Table, frozen=True, kw_only=True):
 
 
 class Contactor(_Table, frozen=True, kw_only=True):
-    """Which input tells that the contactors are open, so that no HV current flows."""
+    """The input that shows when the contactors are open, so that no HV current flows."""
 
     input: Name
     open: Annotated[list[_Finite], msgspec.Meta(min_length=1)]
@@ -165,7 +165,7 @@ class Limits(_Table, frozen=True, kw_only=True):
 
 
 class UnmeasuredLoad(_Table, frozen=True, kw_only=True):
-    """What flows out of the junction where no branch measures it, as control units take it."""
+    """Current that flows out of the junction where no branch measures it, such as that of control units."""
 
     mean_a: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
     """Mean over vehicles. [A]"""
@@ -182,42 +182,42 @@ class StatusMessage(_Table, frozen=True, kw_only=True):
     reason: Name
     parameter_set: Name | None = None
     alive_counter: Name | None = None
-    """Counts the status messages; for those without a counter by [e2e]."""
+    """Signal that counts the status messages, for a message that has no counter by [e2e]."""
     sum_measured: Name | None = None
     sum_corrected: Name | None = None
 
     @property
     def signals(self) -> dict[str, SignalName]:
-        """Those that it has, as ``Message.Signal``, by the keys from ``state`` on."""
+        """The signals that it has, as ``Message.Signal``, by the keys ``state`` to ``sum_corrected``."""
         keys = ("state", "reason", "parameter_set", "alive_counter", "sum_measured", "sum_corrected")
         names = {key: getattr(self, key) for key in keys}
         return {key: f"{self.message}.{name}" for key, name in names.items() if name is not None}
 
 
 class Watch(_Table, frozen=True, kw_only=True):
-    """When the node holds its own corrections for wrong."""
+    """When the node takes its own corrections to be wrong."""
 
     window_s: Annotated[float, msgspec.Meta(ge=1.0, le=3600.0)] = 10.0
     """Over this long the sums are compared. [s]"""
     margin_a: _Positive | None = None
     """By how much the corrected sum must be worse (RMS) [A]; 0.25 % of full scale where not given."""
     start_s: Annotated[float, msgspec.Meta(ge=0.0, le=60.0)] = 3.0
-    """So long after the bus has woken up the first frame of a branch may come, if its timeout is shorter. [s]"""
+    """Time that the first frame of a branch may take after the bus has woken up, if its timeout is shorter. [s]"""
     sleep_s: Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)] = 5.0
-    """The bus sleeps once all branches have been silent for so long; shorter gaps release nothing. [s]"""
+    """The bus sleeps once all branches have been silent for this long; shorter gaps release nothing. [s]"""
     input: Name | None = None
-    """Input that tells whether all currents of the junction are measured, as they may not be while it is charged."""
+    """Input that shows whether all currents of the junction are measured, as may not be so during charging."""
     valid: list[_Finite] = []
-    """Its values with which they are; the sums of other times are not judged."""
+    """Its values while all currents are measured; at other times the sums are not judged."""
 
 
 class Activation(_Table, frozen=True, kw_only=True):
     """What it takes until signed parameters are in force."""
 
     trial_s: Annotated[float, msgspec.Meta(ge=1.0, le=86400.0)] = 300.0
-    """So long the Kirchhoff sum is watched, while currents flow. [s]"""
+    """Length of the trial: time for which the Kirchhoff sum is watched while currents flow. [s]"""
     tolerance: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
-    """By so much the share of the corrections that were errors may be below what the calibrator saw. [1]"""
+    """How far the share of the correction that removes an error may fall below what the calibrator saw. [1]"""
     step_drift: Annotated[float, msgspec.Meta(gt=0.0, le=2.0)] = 0.2
     """Largest difference from the drift that is in force. [1]"""
     step_offset_a: _Positive | None = None
@@ -230,10 +230,10 @@ _Offset = Annotated[int, msgspec.Meta(ge=0, le=60)]
 
 
 class E2EWindow(_Table, frozen=True, kw_only=True):
-    """When a message is VALID, by the last frames of it."""
+    """Condition on the last frames of a message under which it is VALID."""
 
     window: Annotated[int, msgspec.Meta(ge=1, le=64)]
-    """Frames that are looked at."""
+    """Number of last frames that are looked at."""
     min_ok: Annotated[int, msgspec.Meta(ge=0, le=64)]
     """Fewest of them that must be intact and new."""
     max_error: Annotated[int, msgspec.Meta(ge=0, le=64)]
@@ -243,17 +243,17 @@ class E2EWindow(_Table, frozen=True, kw_only=True):
 class _Protected(_Table, frozen=True, kw_only=True):
     messages: Annotated[list[Name], msgspec.Meta(min_length=1)]
     init: E2EWindow = E2EWindow(window=1, min_ok=1, max_error=0)
-    """To become VALID at the start."""
+    """Condition to become VALID at the start."""
     valid: E2EWindow = E2EWindow(window=10, min_ok=1, max_error=3)
-    """To stay VALID."""
+    """Condition to stay VALID."""
     invalid: E2EWindow = E2EWindow(window=10, min_ok=3, max_error=1)
-    """To become VALID again, also after a silence."""
+    """Condition to become VALID again, also after a silence."""
     max_delta_counter: Annotated[int, msgspec.Meta(ge=1, le=255)] = 3
     """Largest step of the counter between two frames that is used: one more than the frames that may be lost."""
 
     @property
     def profile(self) -> str:
-        """Which one it is, as the file says."""
+        """Name of the profile, as in the file."""
         return str(self.__struct_config__.tag)
 
 
@@ -273,7 +273,7 @@ class ProfileP01(_WithHeader, frozen=True, kw_only=True, tag_field="profile", ta
     """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
 
     data_id_mode: Literal["both", "alternating", "low", "nibble"] = "both"
-    """Which bytes of the data identifier the CRC covers: profile 1A, 1B, the low one only, 1C."""
+    """Which bytes of the data identifier the CRC covers, in this order: profile 1A, 1B, the low byte only, 1C."""
 
 
 class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P02"):
@@ -314,15 +314,15 @@ class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", ta
     counter: Name
     crc: Name
     algorithm: str = "sae_j1850"
-    """As fastcrc names it."""
+    """Name of the CRC-8 in fastcrc."""
     counter_modulus: Annotated[int, msgspec.Meta(ge=2, le=65536)] | None = None
-    """Number of codes of the counter, which runs from 0; all that fit the signal where not given."""
+    """Number of codes of the counter, which runs from 0; all that fit into the signal if not given."""
     data_id: dict[str, _DataId] = {}
     """Data identifier per message; the message's own identifier where not given."""
     data_id_bytes: Literal[0, 1, 2] = 0
-    """How many of its bytes the CRC covers too, the low one first."""
+    """How many bytes of the data identifier the CRC covers too, the low one first."""
     data_id_at: Literal["before", "after"] = "before"
-    """Whether they come before or after the payload."""
+    """Whether the CRC takes these bytes before or after the payload."""
 
 
 AutosarProfile = ProfileP01 | ProfileP02 | ProfileP04 | ProfileP05 | ProfileP06 | ProfileP07 | ProfileP11
@@ -339,7 +339,7 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
     dbc: str | None = None
     """Path of the DBC, relative to the layout file; not given where the recordings are tables."""
     bus: list[Bus] = []
-    """In place of the DBC, where logs hold several buses."""
+    """Buses, each with its DBC, in place of ``dbc`` if logs hold several buses."""
     full_scale_a: _Positive
     branch: Annotated[list[Branch], msgspec.Meta(min_length=2, max_length=16)]
     period_s: Annotated[float, msgspec.Meta(gt=0.0, le=LONGEST_PERIOD_S)] = 0.1
@@ -353,15 +353,15 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
     contactor: Contactor | None = None
     derived: list[Derived] = []
     model_inputs: list[str] = []
-    """What the model of one vehicle is driven by."""
+    """Inputs of the model of one vehicle."""
     fleet_inputs: list[str] = []
-    """What the model of the whole fleet is driven by; the model inputs where not given."""
+    """Inputs of the model of the whole fleet; ``model_inputs`` if not given."""
     unmeasured_load: UnmeasuredLoad | None = None
-    """If it is known; where not given, it is estimated from the fleet."""
+    """Current that no branch measures, if it is known; if not given, it is estimated from the fleet."""
     limits: Limits = Limits()
     status: StatusMessage | None = None
     e2e: EndToEnd | list[EndToEnd] = []
-    """One profile is a table, several are a list of tables."""
+    """How messages are protected: one profile is a table, several are a list of tables."""
     watch: Watch = Watch()
     activation: Activation = Activation()
 
@@ -392,12 +392,12 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
 
     @property
     def watch_margin_a(self) -> float:
-        """By how much the corrected sum must be worse than the measured one. [A]"""
+        """By how much the corrected sum must be worse than the measured one for the node to stop correcting. [A]"""
         return self.watch.margin_a or 0.0025 * self.full_scale_a
 
     @property
     def protections(self) -> list[tuple[str, EndToEnd]]:
-        """All entries of how messages are protected, each with its place in the file."""
+        """All entries of ``e2e``, each with its place in the file."""
         if not isinstance(self.e2e, list):
             return [("[e2e]", self.e2e)]
         return [(f"[[e2e]] entry number {number}", entry) for number, entry in enumerate(self.e2e, start=1)]
@@ -407,7 +407,7 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
         return next((entry for _, entry in self.protections if message in entry.messages), None)
 
     def base_inputs(self, names: Collection[str]) -> set[str]:
-        """Recorded inputs that inputs and derived inputs of these names are made of."""
+        """Return the recorded inputs from which the inputs and derived inputs of these names are computed."""
         found = set(names)
         for item in reversed(self.derived):
             if item.name in found:
@@ -420,13 +420,13 @@ class Layout(LayoutKeys, frozen=True, kw_only=True):
     """A whole layout file, checked."""
 
     path: Path
-    """Where it was read from."""
+    """File that it was read from."""
     digest: str
     """SHA-256 of the file."""
 
     @property
     def dbc_path(self) -> Path:
-        """Path of the DBC file, of several the first; no file's name where there is none."""
+        """Path of the DBC file, the first if there are several; a path that is no file if there is none."""
         return next(iter(self.dbc_paths.values()), Path("no DBC"))
 
     @property
@@ -485,11 +485,11 @@ def layout_of(document: dict[str, Any], path: Path, digest: str | None = None) -
     Parameters
     ----------
     document : dict
-        What a layout file says.
+        Content of a layout file.
     path : Path
-        Where it stands, for messages and for the DBC.
+        Path of the file, for messages and to find the DBC.
     digest : str, optional
-        Of the file; of the document where it stands in none.
+        Digest of the file; that of the document is used if not given.
 
     Returns
     -------
@@ -515,7 +515,7 @@ def layout_of(document: dict[str, Any], path: Path, digest: str | None = None) -
 
 
 def _toml_place(document: dict[str, Any], steps: list[str]) -> str:
-    """Table and key as they stand in the file: ``[[branch]] 'heater', timeout_s``."""
+    """Name a table and key as they stand in the file: ``[[branch]] 'heater', timeout_s``."""
     first, *others = steps
     if isinstance(document[first], dict):
         first = f"[{first}]"
@@ -530,12 +530,12 @@ def file_digest(path: Path) -> str:
 
 
 def joint_digest(digests: Sequence[str]) -> str:
-    """One digest for several files, or for none: that of their digests one after the other; of one file its own."""
+    """Return one digest for several files, or none: that of their joined digests; for one file it is its own."""
     return digests[0] if len(digests) == 1 else text_digest("".join(digests).encode())
 
 
 def _contradictions(layout: LayoutKeys) -> Iterator[str]:
-    """Keys that are right by themselves, but contradict each other or name what the layout does not have."""
+    """Yield errors of keys that are right by themselves, but contradict each other or name what is not there."""
     branches, inputs = layout.branch, [item.name for item in layout.input]
     known = [*inputs, *(item.name for item in layout.derived)]
     outputs = [name for branch in branches for name in (branch.corrected, branch.quality) if name is not None]

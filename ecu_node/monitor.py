@@ -1,8 +1,8 @@
 """``ecu-node monitor``: what a listener sees of the junction and of the node. It listens, and never sends.
 
-Nothing of the node is asked: measured and corrected currents, their sums, rates, faults and the node's latency are
-worked out from what is on the bus. An answer counts at the time of the frame that it answers, so that sums are of one
-instant of the junction. The calibrated delays of the branches are in the parameter file alone, and not known here.
+The node is asked nothing: measured and corrected currents, their sums, rates, faults and the node's latency are worked
+out from the frames on the bus. An answer counts at the time of the frame that it answers, so that sums are of one
+instant of the junction. The calibrated delays of the branches are only in the parameter file, and not known here.
 Currents are positive into the junction. Times are those of one steady clock. [s]
 """
 
@@ -33,27 +33,27 @@ from ecu_node.layout import Branch, SignalName
 from ecu_node.program import say_error, write_output
 
 View = dict[str, Any]
-"""What is shown of one instant; its keys are those of ``monitor --json``, see :meth:`BusMonitor.look`."""
+"""What is shown at one instant; its keys are those of ``monitor --json``, see :meth:`BusMonitor.look`."""
 
 _RATE_WINDOW_S = 2.0
 """Frame rates are means over about this long. [s]"""
 _LONGEST_LATENCY_S = 1.0
-"""A frame that was not answered within this time never will be. [s]"""
+"""A frame that was not answered within this time counts as never answered. [s]"""
 _FAULTS = {Check.CORRUPT: "corrupt", Check.REPEATED: "repeated", Check.LOST: "lost", Check.JUMPED: "lost"}
 
 
 class _HeardMessage:
-    """A message of the DBC: its frames, whether they are intact, and how many come."""
+    """A message of the DBC as it is heard: its intact frames, its faults, and its rate."""
 
     def __init__(self, protection: Protection | None, start_s: float) -> None:
         self._check = Receiver(protection).check if protection is not None else lambda _: Check.OK
         self._count, self._counts = 0, deque([(start_s, 0)])
         self.frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
-        """Times [s] and payloads of the last intact ones."""
+        """Times [s] and payloads of the last intact frames."""
         self.faults = dict.fromkeys(_FAULTS.values(), 0)
         self.answered_by: list[_HeardMessage] = []
         self.unanswered: deque[tuple[float, _HeardMessage]] = deque(maxlen=REMEMBERED_FRAMES)
-        """Frames that this message has not answered yet."""
+        """Frames that this message has not answered yet: when each came [s], and its message."""
 
     def take(self, payload: bytearray, time_s: float) -> bool:
         """Take a frame; like the node, use it only if it is intact, new, and not after a jump of its counter."""
@@ -67,7 +67,7 @@ class _HeardMessage:
         return True
 
     def rate_hz(self, now_s: float) -> float:
-        """Rate of its frames, intact or not, since it was asked for the last time two seconds ago or more. [1/s]"""
+        """Return the mean rate of its frames, intact or not, since the last call two seconds ago or more. [1/s]"""
         counts = self._counts
         while len(counts) > 1 and counts[1][0] <= now_s - _RATE_WINDOW_S:
             counts.popleft()
@@ -77,11 +77,11 @@ class _HeardMessage:
 
 
 _Heard = Mapping[tuple[int, bool], _HeardMessage]
-"""Messages by identifier, and whether that has 29 bits."""
+"""Messages by identifier and whether it has 29 bits."""
 
 
 class BusMonitor:
-    """Listens; the pure core of ``ecu-node monitor``: frames and times in, a view out.
+    """Pure core of ``ecu-node monitor``: it takes frames and times, and returns a view.
 
     Parameters
     ----------
@@ -110,9 +110,9 @@ class BusMonitor:
         Parameters
         ----------
         key : tuple of int and bool
-            Its identifier, and whether that has 29 bits; others than those of the layout are left alone.
+            Its identifier, and whether that has 29 bits; frames that the layout does not name are ignored.
         payload : bytearray
-            Its data; not changed, now or later.
+            Its data; it is kept, and must not be changed later.
         time_s : float
             When it came. [s]
         """
@@ -132,7 +132,7 @@ class BusMonitor:
                 branch.answers.append((asked_s, payload))
 
     def look(self, now_s: float) -> View:
-        """Work out what is to be shown now [s], and begin a new step of the frame rates.
+        """Work out what is to be shown now [s], and note the frame counts for the next rates.
 
         Returns
         -------
@@ -145,7 +145,7 @@ class BusMonitor:
             ``sums`` : ``measured_a`` and ``corrected_a`` of one instant.
             ``node`` : what its last intact status says, or None: ``state`` and ``reason`` (codes that have no name stay
             numbers), ``parameter_set``, ``sums``, ``age_s``, ``is_silent`` (it must be gone), ``faults``.
-            ``latency_us`` : from a frame to its answer, as they stand on the bus: ``p50``, ``p99.9``, ``max``; None if
+            ``latency_us`` : time from a frame to its answer, as seen on the bus: ``p50``, ``p99.9``, ``max``; None if
             none was answered.
             ``has_status``, ``publishes_corrected``, ``is_bus_open`` [bool].
             What is not known is None.
@@ -163,7 +163,7 @@ class BusMonitor:
 
 
 class _BranchOnBus:
-    """One branch: the measured current, and the corrected one, of which nothing comes if the layout has none."""
+    """One branch: its measured current, and the corrected one, which stays without frames if the layout has none."""
 
     def __init__(self, database: VehicleDatabase, branch: Branch, heard: _Heard) -> None:
 
@@ -180,7 +180,7 @@ class _BranchOnBus:
         make = partial(LiveBranch, name=branch.name, sign=branch.sign, timeout_s=branch.timeout_s, voltage=voltage)
         self.measured, self.corrected = make(codes=signals.source), make(codes=signals.target)
         self.answers: Frames = deque(maxlen=REMEMBERED_FRAMES)
-        """Intact corrected frames, at the times of those that they answer."""
+        """Intact corrected frames, with the times of the frames that they answer."""
         self.asking = follow(self.measured, branch.source)
         self.answering = follow(self.corrected, branch.corrected, self.answers) if branch.corrected else None
         if self.answering is not None and self.answering not in self.asking.answered_by:
@@ -189,11 +189,11 @@ class _BranchOnBus:
 
     @property
     def shown(self) -> LiveBranch:
-        """What counts in the corrected sum: the measured current where the layout publishes no corrected one."""
+        """The current that counts in the corrected sum: the measured one if the layout publishes no corrected one."""
         return self.corrected if self.answering is not None else self.measured
 
     def view(self, now_s: float) -> View:
-        """What is to be shown: the measured current that the corrected one was made of, while answers come."""
+        """Return what is to be shown; while answers come, the measured current is that of the last answered frame."""
         measured, corrected, answering = self.measured, self.corrected, self.answering
         measured_a = _current_at(measured, measured.time_s if corrected.is_old(now_s) else corrected.time_s)
         corrected_a = _current_at(corrected, corrected.time_s)
@@ -218,7 +218,7 @@ class _BranchOnBus:
 
 
 def _current_at(branch: LiveBranch, time_s: float) -> float | None:
-    """Measured current at a time [A]; None if no value is known of then."""
+    """Return the current of a signal at a time [A], without a correction; None if it is not known for that time."""
     return (branch.currents_at(time_s) or (None,))[0]
 
 
@@ -231,7 +231,7 @@ def _name(names: type[Quality | Reason | State], code: int | None) -> str | int 
 
 
 def _sums(branches: Sequence[_BranchOnBus], now_s: float, *, publishes: bool) -> View:
-    """Sums in the newest instant that all have reached; None while a branch is stale or has no value. [A]"""
+    """Return sums at the newest instant that all branches have reached; None while one is stale or has no value. [A]"""
     measured, shown = [branch.measured for branch in branches], [branch.shown for branch in branches]
     is_published = publishes and all(branch.seen for branch in shown)
     after = aligned_currents(shown, {}, now_s) if is_published else None
@@ -244,11 +244,11 @@ def _sums(branches: Sequence[_BranchOnBus], now_s: float, *, publishes: bool) ->
 
 
 _SILENT_PERIODS, _LEAST_SILENCE_S = 5.0, 1.0
-"""Without a status for so many of its periods, and at least so long [s], the node is taken for gone."""
+"""After this many status periods, and at least this long [s], without a status message the node counts as gone."""
 
 
 def _status_view(database: VehicleDatabase, heard: _Heard, now_s: float) -> View | None:
-    """What the node's last intact status says; None if none ever came."""
+    """Return what the node's last intact status message says; None if none ever came."""
     status = database.layout.status
     message = heard[key_of(database.message(status.message))] if status is not None else None
     if status is None or message is None or not message.frames:
@@ -284,25 +284,25 @@ _COLUMNS = {
     "age": "[s]",
     "faults": "",
 }
-"""Names and units: "rate" of the measured frames, "answers" of the corrected ones; words stand at the left."""
+"""Names and units: "rate" is that of measured frames, "answers" of corrected ones. Words stand at the left."""
 
 
 def view_lines(view: View, where: str, counters: Counters) -> list[str]:
-    """Say what is seen: node, a table with a row per branch and the sums, and what else a reader should know.
+    """Return the lines to show: the node, a table with a row per branch and the sums, and what else one should know.
 
     Parameters
     ----------
     view : dict
-        Of :meth:`BusMonitor.look`.
+        View of :meth:`BusMonitor.look`.
     where : str
         Name of the bus.
     counters : Counters
-        Error frames, and frames that were not read in time.
+        Counters of error frames, and of frames that were not read in time.
 
     Returns
     -------
     list of str
-        A number that is not known is "-".
+        Lines; a number that is not known is "-".
     """
     node = view["node"]
     table = [[name if unit else "" for name, unit in _COLUMNS.items()]]
@@ -335,7 +335,7 @@ def view_lines(view: View, where: str, counters: Counters) -> list[str]:
 
 
 def _node_text(view: View) -> str:
-    """What the node does, and why; or that the bus cannot be listened to."""
+    """Say what the node does, and why; or that the bus cannot be listened to."""
     node = view["node"]
     if not view["is_bus_open"]:
         return "this computer's interface failed or is down; trying to open it again; what is shown was heard before"
@@ -392,9 +392,9 @@ def _number(value_a: float | None) -> str:
 
 
 _LIVE_PERIOD_S, _PLAIN_PERIOD_S = 0.25, 1.0
-"""Between two pictures. [s]"""
+"""Time between two views, live in a terminal and as plain text. [s]"""
 _LONGEST_WAIT_S = 0.25
-"""A wake-up at least this often, so that a request to stop is seen. [s]"""
+"""The monitor wakes up at least this often, so that a request to stop is seen. [s]"""
 _CLEAR_SCREEN, _HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[2J", "\x1b[H", "\x1b[K", "\x1b[J"
 
 
@@ -408,14 +408,14 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
     bus : mapping
         The bus, as the arguments of :func:`ecu_node.bus.adapters.bus_config`.
     once_s : float or None
-        Listen this long, and print once what was seen [s]; None: until interrupted.
+        Listen for this long [s], and print once what was seen; None: until interrupted.
     as_json : bool
         Print it as JSON.
 
     Returns
     -------
     int
-        Exit code: 0, or 1 if it was to listen once and no branch was seen.
+        Exit code: 0, or 1 if `once_s` was given and no branch was seen.
 
     Raises
     ------
@@ -442,7 +442,7 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
             lines = view_lines(view, where, counters)
             if is_live:
                 width, height = shutil.get_terminal_size()
-                # each line is cleared before it is written: behind a full one the cursor stands on its last character
+                # clear each line before writing it: after a full line the cursor stays on its last character
                 shown = [f"{_CLEAR_LINE}{line[:width]}\n" for line in lines[: height - 1]]
                 write_output("".join([_HOME, *shown, _CLEAR_BELOW]), end="")
             elif as_json:
@@ -456,7 +456,7 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
 
 
 def _listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[], bool]) -> None:
-    """Take what comes until a time of the steady clock [s], or until told to stop."""
+    """Take frames until a time of the steady clock [s], or until told to stop."""
     while (now_s := time.monotonic()) < until_s and not stop():
         ahead_s = time.time() - now_s
         turn_end_s = min(until_s, now_s + _LONGEST_WAIT_S)

@@ -1,7 +1,7 @@
-"""Parameter file: what the calibrator found for one vehicle, and the contract with the node.
+"""Parameter file: the result of the calibrator for one vehicle, and its contract with the node.
 
 JSON, UTF-8, one file per vehicle. The structures below are the schema: ``ecu-node schema`` prints the JSON Schema
-made from them, which stands in ``ecu_node/parameters.schema.json``. Currents are positive into the junction.
+made from them, which is also in ``ecu_node/parameters.schema.json``. Currents are positive into the junction.
 :func:`check_fit` says whether parameters may be applied here.
 """
 
@@ -42,21 +42,21 @@ __all__ = [
 ]
 
 MAX_FILE_BYTES = 1_000_000
-"""A parameter file has some kilobytes; a larger one is not one."""
+"""A parameter file has some kilobytes; a larger file cannot be one."""
 
 Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough data"]
-"""What was found of the sensors of one vehicle."""
+"""What the calibration concluded about the sensors of one vehicle."""
 
 HeldBack = Literal["beyond the limits", "does not fit", "reference in doubt", "moved too little", "harm limit"]
-"""Why a branch in which a fault was found is passed through; "does not fit": no gain error and offset explain it."""
+"""Why a branch with a fault is passed through; "does not fit": no gain error and offset explain its recordings."""
 
 _Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="SHA-256: 64 digits 0-9 and a-f")]
 _Text64 = Annotated[str, Meta(min_length=1, max_length=64)]
 _Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 _NotNegative = Annotated[float, Meta(ge=0.0)]
-_MeanSum = Annotated[float, Meta(ge=-1e6, le=1e6)]  # no vehicle has such currents, and squares are still finite
+_MeanSum = Annotated[float, Meta(ge=-1e6, le=1e6)]  # beyond any vehicle's currents, yet its square is finite
 _RmsSum = Annotated[float, Meta(ge=0.0, le=1e6)]
-_Number = Annotated[int, Meta(ge=1, le=(1 << 53) - 1)]  # beyond it readers of JSON differ
+_Number = Annotated[int, Meta(ge=1, le=(1 << 53) - 1)]  # beyond it readers of JSON disagree
 
 
 class BranchParameters(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -121,7 +121,7 @@ class JunctionResidual(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     corrected_sd_per_a: Annotated[_Share | None, Meta(description="how much of it grows with the current [1]")] = None
 
     def about_expected(self) -> tuple[float, float]:
-        """Root mean squares of measured and corrected sum less what is expected; as they are if no means are known."""
+        """Return the RMS of measured and corrected sum about the expected one; about 0 if their means are not known."""
         if self.measured_mean_a is None or self.corrected_mean_a is None:
             return self.measured_a, self.corrected_a
 
@@ -169,7 +169,7 @@ class VehicleParameters(Struct, frozen=True, kw_only=True, forbid_unknown_fields
     provenance: Provenance
 
     def fault(self, branch: str) -> SensorFault:
-        """What is corrected on one branch; NO_FAULT where nothing is applied."""
+        """Return the fault that is corrected on one branch; NO_FAULT if nothing is applied."""
         found = self.branches.get(branch)
         return (
             SensorFault(drift=found.drift, offset_a=found.offset_a) if found is not None and found.apply else NO_FAULT
@@ -198,7 +198,7 @@ def read_parameters(path: Path) -> VehicleParameters:
 
 
 def parameter_bytes(path: Path) -> bytes:
-    """Text of a parameter file, for :func:`decode_parameters`; raises as :func:`read_parameters`."""
+    """Read the bytes of a parameter file for :func:`decode_parameters`; errors are those of :func:`read_parameters`."""
     try:
         return read_user_file(path, largest_bytes=MAX_FILE_BYTES)
     except FileNotFoundError:
@@ -211,7 +211,7 @@ def parameter_bytes(path: Path) -> bytes:
 
 
 def decode_parameters(content: bytes, where: str) -> VehicleParameters:
-    """Read the text of a parameter file; `where` it is from, for messages.
+    """Read parameters from the bytes of a parameter file; `where` names its origin in messages.
 
     Raises
     ------
@@ -243,24 +243,24 @@ def _malformed(where: str, why: str) -> UnfitError:
 
 
 def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:
-    """Text of a parameter file.
+    """Encode parameters as the content of a parameter file.
 
     Parameters
     ----------
     parameters : VehicleParameters
-        What it says.
+        Parameters to encode.
     where : str
-        Where it is to stand, for messages.
+        Name of the file, for messages.
 
     Returns
     -------
     bytes
-        JSON.
+        JSON, indented.
 
     Raises
     ------
     ParameterError
-        If it could not be read back: a number is not finite, which JSON cannot say, or a field is outside the schema.
+        If it could not be read back: a number is not finite, which JSON cannot hold, or a field is outside the schema.
     """
     content = msgspec.json.encode(parameters)
     try:
@@ -290,7 +290,7 @@ def write_parameters(parameters: VehicleParameters, path: Path) -> None:
     Raises
     ------
     ParameterError
-        As :func:`encode_parameters`; nothing is written.
+        If the parameters cannot be read back, see :func:`encode_parameters`; nothing is written.
     """
     write_atomically(path, encode_parameters(parameters, str(path)))
 
@@ -302,14 +302,14 @@ def parameter_schema() -> dict[str, Any]:
 
 
 _LARGEST_DELAY_S = 5.0
-"""Branches of one vehicle do not lag each other by more. [s]"""
+"""Largest delay that is plausible between branches of one vehicle. [s]"""
 
 
 def check_fit(parameters: VehicleParameters, database: "VehicleDatabase", vehicle: str | None) -> None:
-    """Check that parameters were made for this vehicle, layout and DBC, decided on, and within the layout's limits.
+    """Check that parameters are for this vehicle, layout and DBC, fit their verdict, and keep to the layout's limits.
 
-    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Limits are those of
-    what is applied.
+    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Limits on drift and
+    offset hold for applied branches, those on delays and on the expected sum always.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def check_fit(parameters: VehicleParameters, database: "VehicleDatabase", vehicl
     database : VehicleDatabase
         Layout and DBC in use.
     vehicle : str or None
-        Identity of the vehicle that the node rides in; None: not checked.
+        Identity of the vehicle that the node runs on; None: not checked.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""How a program starts, prints, fails and ends, the same for the node and whoever builds on it.
+"""How a program starts, prints, fails and ends; shared by the node and the programs that build on it.
 
-Results go to standard output, which may be closed, full, or read no more; what happens goes to standard error, one line
-each. Errors of a user say what to do. Any other exception is a fault of the
-program itself: its line names the place, for a report.
+Results go to standard output, which may be closed, on a full disk, or without a reader; events go to standard error,
+one line each. Errors of a user say what to do. Any other exception is a fault of the program itself: its line names the
+place in the code, for a report.
 """
 
 import argparse
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def write_result(document: Any, text: str, *, as_json: bool) -> None:
-    """Print what was found: as JSON, or as a text for people; errors as for :func:`write_output`."""
+    """Print a result, as JSON or as a text for people; errors are those of :func:`write_output`."""
     if as_json:
         write_output(json.dumps(document, indent=2))
     else:
@@ -33,21 +33,21 @@ def write_result(document: Any, text: str, *, as_json: bool) -> None:
 
 
 def write_output(text: str, end: str = "\n") -> None:
-    """Print a text as it is, and see that it is written.
+    """Print a text, and make sure that it is written.
 
     Parameters
     ----------
     text : str
         What to print; nothing happens where standard output is closed.
     end : str
-        What stands behind it.
+        Text that is printed after it.
 
     Raises
     ------
     UserError
-        If it cannot be written, as on a full disk; what is not written is dropped.
+        If it cannot be written, as on a full disk; the rest of it is dropped.
     BrokenPipeError
-        If its reader has left.
+        If the reader of standard output has gone.
     """
     try:
         print(text, end=end, flush=True)
@@ -61,12 +61,12 @@ def write_output(text: str, end: str = "\n") -> None:
 
 
 def flush_output() -> None:
-    """See that all that was printed is written; raises as :func:`write_output` does."""
+    """Make sure that all printed text is written; errors are those of :func:`write_output`."""
     write_output("", end="")
 
 
 def drop_output() -> None:
-    """Forget what was printed and cannot be written, now and at the interpreter's end."""
+    """Discard printed text that cannot be written, so that the interpreter does not try again at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -84,14 +84,14 @@ def split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
     Parameters
     ----------
     arguments : sequence of str
-        Without the program's name; what stands behind ``--`` is no option.
+        Arguments without the program's name; what follows ``--`` is no option.
 
     Returns
     -------
     arguments : list of str
-        The others.
+        The other arguments.
     debug : bool
-        Whether it was there.
+        Whether ``--debug`` was among them.
     """
     end = arguments.index("--") if "--" in arguments else len(arguments)
     others = [argument for argument in arguments[:end] if argument != _DEBUG]
@@ -110,7 +110,7 @@ def end_of(program: str, error: Exception, *, debug: bool, packages: Sequence[st
     debug : bool
         Whether the traceback is shown before the line.
     packages : sequence of str
-        The program's own, side by side with this one: a fault is reported with the last place in them.
+        The program's own packages, beside this one: a fault is reported with the last place in their code.
 
     Returns
     -------
@@ -136,13 +136,13 @@ def end_of(program: str, error: Exception, *, debug: bool, packages: Sequence[st
 
 def say_error(text: str) -> None:
     """Say something on standard error in one line."""
-    with suppress(OSError):  # a disk that is full, or a reader that has left
-        if sys.stderr is not None:  # closed by who started the program
+    with suppress(OSError):  # a full disk, or a reader that has gone
+        if sys.stderr is not None:  # None if whoever started the program closed it
             print(printable(" ".join(text.splitlines())), file=sys.stderr, flush=True)
 
 
 def _place(error: Exception, packages: Sequence[str]) -> str:
-    """Type and text of an error, and the last place in the program's own files."""
+    """Return type and text of an error, and its last place in the program's own files."""
     own = tuple(f"{Path(__file__).resolve().parents[1] / name}{os.sep}" for name in packages)
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(own)]
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
@@ -150,14 +150,14 @@ def _place(error: Exception, packages: Sequence[str]) -> str:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Says wrong use in one line, and that help cannot be written, where argparse would end as if it were.
+    """Parser that reports wrong use in one line, and an error if its help cannot be written, unlike argparse.
 
     Parameters
     ----------
     done, failed : str
         What the exit codes 0 and 1 of the command mean; its help ends with them.
     **settings
-        Of ``argparse.ArgumentParser``.
+        Other arguments of ``argparse.ArgumentParser``.
     """
 
     def __init__(self, *, done: str = "done", failed: str = "failed", **settings: Any) -> None:
@@ -165,7 +165,7 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(epilog=f"{codes} {DEBUG_HINT}", **settings)
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong, and where help is."""
+        """Say what is wrong and where to find help, and end with exit code 2."""
         say_error(f"{self.prog}: {message}; see '{self.prog} --help'")
         self.exit(2)
 
@@ -174,17 +174,17 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence[str]) -> int:
-    """Run a program; any error is one line on standard error, but a closed output pipe, which is silent.
+    """Run a program; any error becomes one line on standard error, except for a closed output pipe, which is silent.
 
     Parameters
     ----------
     name : str
-        Of the program.
+        Name of the program.
     work : callable
-        Takes the arguments less ``--debug``, and returns the exit code; Ctrl-C in it ends the process with 130, until
-        it handles SIGINT itself.
+        Takes the arguments without ``--debug``, and returns the exit code; Ctrl-C in it ends the process with 130,
+        unless it handles SIGINT itself.
     arguments : sequence of str
-        Without the program's name.
+        Arguments without the program's name.
 
     Returns
     -------
@@ -193,7 +193,7 @@ def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence
     """
     others, debug = split_debug(arguments)
     if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be no text, or not that of the terminal
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may be no text, or not the terminal's
     try:
         with ending_at_interrupt(f"{name}: interrupted"):
             try:
@@ -203,7 +203,7 @@ def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence
     except BrokenPipeError:
         drop_output()
         return FAILED
-    except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
+    except Exception as error:  # noqa: BLE001 (each is reported, and ends the program)
         return end_of(name, error, debug=debug)
 
 
@@ -216,7 +216,7 @@ def ending_at_interrupt(message: str) -> Iterator[None]:
     """Within the block SIGINT ends the process with one line and :data:`INTERRUPTED`, unless it is ignored."""
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-        with suppress(AttributeError, OSError):  # closed, or taken by nobody
+        with suppress(AttributeError, OSError):  # closed, or without a reader
             os.write(sys.stderr.fileno(), f"{message}\n".encode())
         os._exit(INTERRUPTED)
 
@@ -230,9 +230,9 @@ def ending_at_interrupt(message: str) -> Iterator[None]:
 
 
 def load_python_can() -> None:
-    """Import python-can without asammdf, which stays importable; for programs, as python-can then reads no MF4.
+    """Import python-can without letting it import asammdf; python-can then reads no MF4 files in this process.
 
-    Does nothing where one of both has been imported before.
+    asammdf stays importable for others. Do nothing if either has been imported before.
     """
     if "can" in sys.modules or "asammdf" in sys.modules:
         return

@@ -1,9 +1,9 @@
-"""What is kept of a drive: what a block is, for the calibrator and for a node that sums on board, and the node's file.
+"""What is kept of a drive: blocks, as the calibrator and a node that sums on board form them, and the node's file.
 
 Branches and inputs are taken at whole multiples of the layout's period since the start of the drive, each interpolated
-between its good samples. Of every :data:`BLOCK_S` the sums of the products of (inputs, measured currents, 1) are kept,
-without spikes, which are looked for in :data:`BATCH_SAMPLES` at a time. A block of which less than
-:data:`LEAST_SHARE` is valid does not count. :mod:`calibrator.summaries` does so with arrays, and
+between its good samples. Of every block of :data:`BLOCK_S` the sums of the products of (inputs, measured currents, 1)
+are kept, without spikes, which are looked for in :data:`BATCH_SAMPLES` at a time. A block of which less than
+:data:`LEAST_SHARE` is valid does not count. :mod:`calibrator.summaries` computes this with arrays, and
 :mod:`ecu_node.bus.on_board_summary` in plain Python; a test compares them.
 """
 
@@ -18,51 +18,51 @@ import msgspec
 BLOCK_S = 30.0
 """Length of a block: model errors of different blocks hardly depend on each other. [s]"""
 BATCH_SAMPLES = 1500
-"""Samples in which spikes are looked for together, in whole blocks: as many as a processor's cache holds. [1]"""
+"""Samples, in whole blocks, that are searched for spikes together: as many as a processor's cache holds. [1]"""
 LEAST_SHARE = 0.2
 """Least share of valid samples of a block that is used. [1]"""
 TIME_RESOLUTION_S = 1e-3
-"""Logs round time stamps up to this; samples exactly one limit apart must pass. [s]"""
+"""Rounding of time stamps in logs, added to limits so that samples exactly one limit apart pass. [s]"""
 INSTANT_SLACK = 1e-3
-"""Of a period or limit: an instant that is no farther from a sample, or from the grid, is there. [1]"""
+"""An instant within this share of a period or limit from a sample, or from the grid, coincides with it. [1]"""
 RANGE_SLACK = 1e-6
-"""Rounding of decimal scales must not push a value out of its range. [steps of the signal]"""
+"""Tolerance of ranges, so that rounding of decimal scales pushes no value out. [steps of the signal]"""
 
 LEVELS_A = (2, 5, 10, 20, 30, 45, 65, 90, 120, 160, 210, 280, 370, 500, 700, 1000)
-"""Positive edges of the levels of a measured current; those below zero are alike. [A]"""
+"""Positive edges of the levels of a measured current; the negative edges mirror them. [A]"""
 DIFFERENCE_GAIN = 20.0
 """Variance of the third difference of white noise of variance 1."""
 NORMAL_MEDIAN = 0.6745
 """Median magnitude of a standard normal variable."""
 MEDIAN_EXCESS = 3.8
-"""The squared median of n third differences of white noise is too large by this over n (simulated, n = 9 to 300)."""
+"""The squared median of n third differences of white noise is too large by this / n (simulated, n = 9 to 300)."""
 
 SPIKE_SDS = 8.0
 """Distance from the running median, in robust standard deviations, from which a sample may be a spike. [1]"""
 STEP_OF_SPIKE = 6.0
-"""Least change from sample to sample at a spike, over the median change. [1]"""
+"""Least change from sample to sample at a spike, in median changes. [1]"""
 LEAST_SPIKE_A = 2.5
-"""Spikes below this do no harm; where there is no noise, the steps of a signal are none. [A]"""
+"""Smaller spikes do no harm, and without noise the steps of a signal must not pass for spikes. [A]"""
 OTHERS_MOVE = 0.4
-"""Largest change of the other branches around a spike, as a share of it: a current that really flows, and a delay
-that is left, show in two branches. [1]"""
+"""Largest change of the other branches around a spike, as a share of it: a current that really flows, or a remaining
+delay, shows in two branches. [1]"""
 LEAST_EDGE = 0.6
-"""Least step up to a spike, and down from it, as a share of it: the peak of a current has none. [1]"""
+"""Least step up to a spike, and down from it, as a share of it: a true peak of a current has no such steps. [1]"""
 SPIKE_WINDOW = 9
-"""Samples of the running median: spikes of up to four samples are found. [1]"""
+"""Number of samples of the running median, which finds spikes of up to four samples. [1]"""
 FEWEST_FOR_GAINS = 10
-"""Samples per branch that tell the gains. [1]"""
+"""Least number of samples per branch from which gains can be estimated. [1]"""
 MAD_TO_SD = 1.4826
-"""Standard deviation of a Gaussian over its median absolute value. [1]"""
+"""Ratio of the standard deviation of a Gaussian to its median absolute value. [1]"""
 
 ZERO_SETTLING_S = 2.0
-"""After the contactors open and before they close, capacitors still charge and discharge. [s]"""
+"""Time left out after the contactors open and before they close, as capacitors charge and discharge then. [s]"""
 FEWEST_ZERO_SAMPLES = 10
-"""Of a branch in windows with open contactors, for its reading to count."""
+"""Least number of samples of a branch in windows with open contactors for its offset reading to count."""
 ZERO_RESOLUTION_A = 0.02
-"""Least standard deviation of such a reading: sensors drift within a window by about so much. [A]"""
+"""Least standard deviation of such a reading: sensors drift by about this much within a window. [A]"""
 ZERO_PIECE_S = 5.0
-"""Of a window: what wanders within it moves the medians of its pieces. [s]"""
+"""Length of the pieces of a window: an offset that wanders within it shows in their medians. [s]"""
 
 # ---- on board
 
@@ -71,10 +71,10 @@ SCHEMA_VERSION = 2
 
 
 class SummaryFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A record: B batches of K branches and M inputs, p = M + K + 1 columns. Numbers are little-endian float32.
+    """Content of a summary file: B batches of K branches and M inputs, p = M + K + 1 columns.
 
-    Moments of a batch are kept as mean and covariance, which lose nothing in short numbers: the sums of products are
-    n (covariance + mean mean'), those of a column n mean.
+    Numbers in bytes are little-endian float32. Moments of a batch of n samples are kept as mean and covariance, which
+    lose nothing in short numbers: the sums of products are n (covariance + mean mean'), that of a column is n mean.
     """
 
     schema_version: int
@@ -84,19 +84,19 @@ class SummaryFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     branches: list[str]
     inputs: list[str]
     recorded: list[str]
-    """Inputs that were recorded, of which ``inputs`` are made."""
+    """Recorded inputs, from which ``inputs`` are computed."""
     period_s: float
     block_s: float
     delay_s: list[float]
-    """That were taken out, by branch. [s]"""
+    """Delays that were taken out, by branch. [s]"""
     delay_sd_s: list[float | None]
-    """Null: not known. [s]"""
+    """Standard deviations of the delays, by branch; null: not known. [s]"""
     zero_offset_a: list[float | None]
     zero_sd_a: list[float | None]
     starts: list[bool]
-    """Whether a drive starts with the batch."""
+    """Whether a drive starts with each batch."""
     count: list[int]
-    """Samples of each batch."""
+    """Number of samples of each batch."""
     mean: bytes
     """(B, p - 1)"""
     covariance: bytes
@@ -110,18 +110,18 @@ class SummaryFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     temperature_c: bytes
     """(B,)"""
     levels: list[list[int]]
-    """By branch the levels that were visited, see ``level_sums``."""
+    """Levels of its current that each branch visited, see ``level_sums``."""
     level_sums: bytes
-    """Of each of these: sums of (inputs, currents, 1) and of the square of the branch's own current, p + 1 numbers."""
+    """For each of these levels p + 1 numbers: sums of (inputs, currents, 1) and of the branch's own current squared."""
 
 
 def encode_summary(record: SummaryFile) -> bytes:
-    """Content of a file."""
+    """Return the content of a summary file."""
     return zlib.compress(msgspec.msgpack.encode(record), 9)
 
 
 def decode_summary(content: bytes) -> SummaryFile:
-    """Record of a file; ValueError if it is damaged, or of another version."""
+    """Return the record in a summary file; raise ValueError if it is damaged, or of another version."""
     try:
         unpacker = zlib.decompressobj()
         plain = unpacker.decompress(content, 1 << 24)
@@ -136,10 +136,10 @@ def decode_summary(content: bytes) -> SummaryFile:
 
 
 def packed(values: Sequence[float]) -> bytes:
-    """Numbers as float32."""
+    """Pack numbers as float32."""
     return array("f", values).tobytes()
 
 
 def unpacked(content: bytes) -> "array[float]":
-    """Numbers of :func:`packed`; ValueError if it is none."""
+    """Return the numbers that :func:`packed` has packed; raise ValueError if the length is wrong."""
     return array("f", content)

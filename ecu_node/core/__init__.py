@@ -1,1 +1,1 @@
-"""The node's arithmetic and judgement, without input or output: frames and times in, frames and states out."""
+"""Pure core of the node, without input or output: it takes frames and times, and returns frames and states."""

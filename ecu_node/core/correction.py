@@ -1,6 +1,6 @@
 """Integer correction plan: multiply, add and shift from the measured code to the corrected one.
 
-A sensor shows i_m = (1 + d) i + o, positive into the junction; its true current is, (25) in [1]_,
+A sensor shows i_m = (1 + d) i + o, positive into the junction; the true current is, by (25) in [1]_,
 
     i = (i_m - o) / (1 + d).
 
@@ -13,9 +13,9 @@ The plan holds G, H and B as integers over 2^shift:
 
 clamped into the values of the target.
 
-Rounding rule: the exact line, rounded to the nearest code, halves up. The integers approach the exact line from above,
-by less than :data:`LARGEST_ERROR` of a code, so that an exact half is never rounded down; an exact result that lies
-less than that below a half is rounded up. Where 64 bits allow it, the approach is closer by far.
+Rounding rule: the exact line, rounded to the nearest code, halves up. The integers approximate the exact line from
+above, by less than :data:`LARGEST_ERROR` of a code: an exact half is never rounded down, but an exact result less than
+that below a half is rounded up. Where 64 bits allow it, the approximation is much closer.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -31,14 +31,14 @@ __all__ = ["AS_IT_IS", "LARGEST_ERROR", "NO_FAULT", "IntegerPlan", "SensorFault"
 
 @dataclass(frozen=True, kw_only=True)
 class SensorFault:
-    """What is corrected on one branch.
+    """Sensor fault that is corrected on one branch: i_m = (1 + d) i + o.
 
     Attributes
     ----------
     drift : float
-        d. [1]
+        d, the gain error. [1]
     offset_a : float
-        o, positive into the junction. [A]
+        o, the offset, positive into the junction. [A]
     """
 
     drift: float = 0.0
@@ -50,35 +50,35 @@ class SensorFault:
         return bool(self.drift or self.offset_a)
 
     def true_current(self, i_m: float) -> float:
-        """Correct one current, (25) in [1]_; both are positive into the junction. [A]"""
+        """Return the true current for a measured one, (25) in [1]_; both are positive into the junction. [A]"""
         return (i_m - self.offset_a) / (1.0 + self.drift)
 
 
 NO_FAULT = SensorFault()
-"""Nothing is corrected."""
+"""A sensor without a fault: nothing is corrected."""
 
 
 _ERROR_BITS = 10
 LARGEST_ERROR = Fraction(1, 1 << _ERROR_BITS)
-"""The integers lie less than this above the exact line. [code]"""
+"""The integer result lies less than this above the exact line. [code]"""
 
 _WORD_BITS = 59
-"""Products and sums stay below 2^59 where the wanted error allows it: C with int64_t gives the same bits, and Python's
-integers have two digits."""
+"""Products and sums stay below 2^59 where the required accuracy allows it, so that C with int64_t gives the same bits
+and Python's integers need only two digits."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Signals:
-    """What a branch is read from and written to.
+    """Signals that a branch is read from and written to.
 
     Attributes
     ----------
     source, target : Codes
-        Measured and corrected signal, both counting in the branch's own direction. [A], or both [W]
+        Measured and corrected signal; ``sign`` holds for both. [both A, or both W]
     sign : 1 or -1
         +1 if the signals are positive into the junction.
     voltage : Codes or None
-        Of a branch that is a power. [V]
+        Voltage of a branch that is measured as a power; None for a current. [V]
     """
 
     source: Codes
@@ -116,13 +116,13 @@ class IntegerPlan:
         return min(max(self.unbounded(code, voltage_code), self.lowest), self.highest)
 
     def unbounded(self, code: int, voltage_code: int = 0) -> int:
-        """The same without clipping."""
+        """Correct one code, without clipping the result."""
         return (code * self.gain + voltage_code * self.voltage_gain + self.bias + (1 << (self.shift - 1))) >> self.shift
 
 
 _EVERYTHING = 1 << 64
 AS_IT_IS = IntegerPlan(gain=2, bias=0, shift=1, lowest=-_EVERYTHING, highest=_EVERYTHING)
-"""Writes every value as it was measured."""
+"""Plan that writes every value as it was measured."""
 
 
 def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
@@ -131,15 +131,16 @@ def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
     Parameters
     ----------
     signals : Signals
-        What is read and written.
+        Signals that are read and written.
     fault : SensorFault
-        What is corrected; :data:`~ecu_node.core.correction.NO_FAULT` to pass through.
+        Fault to correct; :data:`~ecu_node.core.correction.NO_FAULT` to pass through.
 
     Returns
     -------
     IntegerPlan
-        For every valid code its error is at most half a code + 2^-10: it is never below the exact line, and above it by
-        less than :data:`LARGEST_ERROR`. Beyond that its shift is as large as 64-bit words allow.
+        Plan whose error is at most half a code + 2^-10 for every valid code: before rounding it is never below the
+        exact line, and above it by less than :data:`LARGEST_ERROR`. Its shift is as large as 64-bit words allow, or as
+        large as this accuracy needs, if that is more.
 
     Raises
     ------
@@ -149,7 +150,7 @@ def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
     source, target, voltage = signals.source, signals.target, signals.voltage
     per_unit = 1 / (1 + as_written(fault.drift)) / target.scale
     offset_a = signals.sign * as_written(fault.offset_a)
-    # a current is a power at 1 V, which needs no code
+    # a current is treated as a power at a constant 1 V, for which there is no code
     volts_per_code, volts_at_0 = (Fraction(0), Fraction(1)) if voltage is None else (voltage.scale, voltage.offset)
     terms = [(source.scale * per_unit, source)]
     if voltage is not None and offset_a:

@@ -5,10 +5,10 @@ Gateway: a branch's frame goes on to the other bus with its current rewritten in
 its counter stays, so that a receiver sees every frame that was lost or repeated. A frame whose CRC is wrong is never
 given a right one. Times are those of one steady clock. [s]
 
-A payload is read as one integer in which each signal is a shift and a mask. An answer is the target's last message with
-the branches of the frame written anew; a gateway's frame is the frame itself with its branches written anew: one way
-for both. What does not change from frame to frame is looked up once per length of payload, and again whenever a branch
-is corrected otherwise.
+A payload is read as one integer, from which each signal is taken with a shift and a mask. Both modes write in the same
+way: the branches of the frame are written anew, into a copy of the target's last message (overlay) or of the frame
+itself (gateway). What does not change from frame to frame is looked up once per payload length, and again whenever the
+correction of a branch changes.
 """
 
 from collections import deque
@@ -26,17 +26,17 @@ __all__ = ["OF_ONE_DRIVE", "Corrector", "StatusFields"]
 _OK, _LAST_USABLE = Check.OK, Check.LOST  # looking up members of an enumeration is slow
 _INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
 _LEAST_SILENCE_S = 1.0
-"""After a silence of this long, or of a branch's timeout, a message's counter begins anew. [s]"""
+"""A message's counter may start anywhere after a silence of this, or of its branches' timeout if longer. [s]"""
 
 _Rewrite = Callable[[bytearray, bytearray, float], bytearray]
-"""Takes the payload of a frame, the outgoing payload as it was before, and when the frame came [s]; makes a new
-outgoing one with what becomes of the branches."""
+"""Function of the payload of a frame, the previous outgoing payload, and the time at which the frame came [s]; returns
+a new outgoing payload, with the branches written into it."""
 
 
 def _signal_by_signal(
     branches: Mapping[LiveBranch, Written], inside: Collection[LiveBranch], counters: Counters
 ) -> _Rewrite:
-    """Write each branch by itself; those that are not inside the payloads, or not now, with what is known of them."""
+    """Return a function that writes each branch by itself; one that the payload lacks gets its last known value."""
 
     def rewrite(payload: bytearray, before: bytearray, now_s: float) -> bytearray:
         made = bytearray(before)
@@ -58,9 +58,10 @@ def _in_one_word(
     made_length: int,
     otherwise: _Rewrite,
 ) -> _Rewrite:
-    """Write all branches at once, if they are in every payload of this length and results are ordinary; else otherwise.
+    """Return a function that writes all branches at once, or `otherwise` if payloads of this length may lack a branch.
 
-    Numbers are unsigned: sign bits of two's complements are turned over, in the payload and in the outgoing one.
+    It falls back to `otherwise` for a frame with a code that is not ordinary. Two's complements are handled as unsigned
+    numbers: their sign bits are inverted, in the payload and in the outgoing one.
     """
     orders = {(branch.signal.place.order, written.place.order) for branch, written in branches.items()}
     if len(orders) != 1 or any(branch.signal.above or branch not in inside for branch in branches):
@@ -109,7 +110,7 @@ class OwnMessage:
     length : int
         Bytes of the message.
     fd : bool
-        Whether the DBC sends it as CAN FD.
+        Whether it is a CAN FD message by the DBC.
     protection : Protection or None
         End-to-end protection.
 
@@ -118,7 +119,7 @@ class OwnMessage:
     key, fd, protection
         As given.
     data : bytearray
-        The message as it was made last; a new one each time.
+        Payload of the message as it was made last; each one is a new object.
     branches : dict of LiveBranch to Written
         The branches that are written into it.
     """
@@ -147,20 +148,20 @@ class Source:
     protection : Protection or None
         End-to-end protection.
     readers : sequence of tuple
-        Who reads which signal.
+        Pairs of a reader (branch, voltage or input of the watch) and the signal that it reads.
     targets : sequence of OwnMessage
         Messages that answer it.
     counters : Counters
-        Where it is counted what happened.
+        Counters to add to.
 
     Attributes
     ----------
     targets : tuple of OwnMessage
         As given.
     branches : list of LiveBranch
-        That are read from it.
+        Branches that are read from it.
     timeout_s : float
-        Frames that are older when they are read are of no use; infinity for a message without branches. [s]
+        Frames that are older than this when they are read are not used; infinity for a message without branches. [s]
     """
 
     def __init__(
@@ -180,7 +181,7 @@ class Source:
         self._silent_from_s = float("inf")
         self._frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
         self.ways: dict[int, _Ways] = {}
-        """By length of the payload; to be cleared when a branch is corrected otherwise."""
+        """By length of the payload; must be cleared when the correction of a branch changes."""
         for part, signal in readers:
             part.follow(signal, self._frames)
 
@@ -195,14 +196,14 @@ class Source:
         Parameters
         ----------
         payload : bytearray
-            Not to be changed, now or later.
+            Data of the frame; it is kept, and must not be changed later.
         now_s : float
             When it came. [s]
 
         Returns
         -------
         sequence of OwnMessage
-            To be sent.
+            Messages to be sent.
         """
         ways = self.ways.get(len(payload)) or self._find(len(payload))
         if self._take(payload, now_s, ways) > _LAST_USABLE:
@@ -220,20 +221,20 @@ class Source:
         return self.targets
 
     def forward(self, payload: bytearray, now_s: float) -> bytearray | None:
-        """Gateway: take a frame, and write what the branches make of it in the place of what was measured.
+        """Gateway: take a frame, and write the corrected currents in place of the measured ones.
 
         Parameters
         ----------
         payload : bytearray
-            Not to be changed, now or later.
+            Data of the frame; it is kept, and must not be changed later.
         now_s : float
             When it came. [s]
 
         Returns
         -------
         bytearray or None
-            To be sent on, protected with the counter that the frame came with; None if it is held back. A receiver of
-            it judges for itself whether so many frames fail their check that it cannot rely on the message.
+            Payload to be sent on, protected with the counter that the frame came with; None if the frame is held back.
+            The receivers judge for themselves whether too many frames fail their check to rely on the message.
         """
         ways = self.ways.get(len(payload)) or self._find(len(payload))
         if self._take(payload, now_s, ways) > _LAST_USABLE:
@@ -272,7 +273,7 @@ class Source:
         return check
 
     def _find(self, length: int) -> _Ways:
-        """Find out what is done with payloads of some length. [byte]"""
+        """Prepare what is done with payloads of this length [byte], and remember it."""
         inside = {item: Written(item.signal.place) for item in self.branches if item.signal.end <= length}
 
         def way(branches: Mapping[LiveBranch, Written], made_length: int) -> _Rewrite:
@@ -288,17 +289,17 @@ class Source:
 
 
 OF_ONE_DRIVE = frozenset((Reason.BRANCH_STALE, Reason.BRANCH_STUCK))
-"""What is tried anew after the bus has slept."""
+"""Reasons that no longer count once the bus has slept: the node then tries to correct again."""
 _FOREIGN_S = 10.0
-"""For so long after the last frame the status says that another node sends what only a gateway may. [s]"""
+"""The status reports FOREIGN_FRAMES for this long after the last such frame. [s]"""
 
 
 class StatusFields(NamedTuple):
-    """The status message, with the fields that the layout has."""
+    """The status message, and where its fields stand; only those that the layout names."""
 
     message: OwnMessage
     places: Mapping[str, BitPlace]
-    """By their keys in the layout."""
+    """Places of the integer fields, by their keys in the layout."""
     sums: Mapping[str, tuple[Codes, int]]
     """Signals of ``sum_measured`` and ``sum_corrected``, each with its code for "no value"."""
 
@@ -309,15 +310,15 @@ class Corrector:
     Parameters
     ----------
     sources : mapping of FrameKey to Source
-        What is received; no other frame is looked at.
+        Incoming messages by identifier; no other frame is looked at.
     branches : sequence of LiveBranch
         All branches of the layout.
     status_fields : StatusFields or None
         Status message, if the layout has one.
     watch : JunctionWatch
-        Of these branches.
+        Watch of these branches.
     counters : Counters
-        The same that the sources count in.
+        Counters, the same object that the sources count in.
     shadow : bool
         Compute and report, change nothing.
     sleep_s : float
@@ -338,14 +339,14 @@ class Corrector:
         self.branches, self.shadow, self.watch, self._sleep_s = branches, shadow, watch, sleep_s
         self.counters = counters
         self.reason = Reason.NO_PARAMETERS
-        """Why measured values are passed through, of the parameters; NONE where they fit."""
+        """Why the parameters cannot be applied and measured values are passed through; NONE if they can."""
         self.latched = Reason.NONE
-        """Why the node has fallen back to passing through, until parameters are put in force or :meth:`release`; what a
-        branch did, or did not, also until the bus has slept."""
+        """Why the node has fallen back to passing through. That lasts until parameters are put in force or
+        :meth:`release` is called; for a branch that was silent or stuck, only until the bus has slept."""
         self.latched_branches: tuple[str, ...] = ()
         self.parameter_set = 0
         self.sources: dict[tuple[int, bool], Source] = dict(sources.items())
-        """Who takes which frames, by identifier and whether it has 29 bits; no other frame is looked at."""
+        """Which source takes which frames, by identifier and whether it has 29 bits."""
         self.branch_keys = {key for key, source in self.sources.items() if source.branches}
         """Identifiers of the messages that carry branches, which a gateway rewrites."""
         self.own_keys = {target.key for source in self.sources.values() for target in source.targets}
@@ -358,23 +359,23 @@ class Corrector:
             self.own_keys.add(status_fields.message.key)
 
     def begin(self, *, reason: Reason, parameter_set: int, expected: JunctionResidual | None = None) -> None:
-        """Begin with what the branches were just given; what was latched is released.
+        """Begin to work with the parameters that the branches were just given; release what was latched.
 
         Parameters
         ----------
         reason : Reason
-            NONE if there are parameters that fit.
+            Why there are no parameters that fit; NONE if there are.
         parameter_set : int
-            Its number as it is published; 0 where there is none.
+            Number of the parameter set as it is published; 0 if there is none.
         expected : JunctionResidual, optional
-            What they say of the junction's sum.
+            What the parameters say about the junction's sum.
         """
         self.reason, self.parameter_set = reason, parameter_set
         self.watch.restart(expected)
         self.latch(Reason.NONE)
 
     def look(self, now_s: float) -> None:
-        """Look at the whole junction; to be called every 20 ms, or a jump is seen later than within 0.1 s."""
+        """Look at the whole junction; must be called every 20 ms for a jump to be seen within 0.1 s."""
         self._looked_s = now_s
         if self.counters.foreign != self._foreign:
             self._foreign, self._foreign_until_s = self.counters.foreign, now_s + _FOREIGN_S
@@ -388,7 +389,7 @@ class Corrector:
 
     @property
     def is_asleep(self) -> bool:
-        """Whether all branches are silent that were heard before."""
+        """Whether all branches are silent, though some were heard before."""
         return self._silent and self._was_awake
 
     def state(self) -> tuple[State, Reason]:
@@ -430,9 +431,9 @@ class Corrector:
         return fields.message
 
     def _see_whether_asleep(self, now_s: float) -> None:
-        """All branches silent: the vehicle goes to sleep, which is no fault.
+        """See whether all branches are silent: then the vehicle goes to sleep, which is no fault.
 
-        Once it sleeps, a branch that was silent or stuck is tried anew; what the sums said of the set in force stays.
+        Once it sleeps, a branch that was latched as silent or stuck is tried again; what the sums showed stays latched.
         """
         silent = all(branch.is_old(now_s) for branch in self.branches)
         if not silent:
@@ -450,16 +451,16 @@ class Corrector:
         self._silent = silent
 
     def release(self) -> None:
-        """Try again what was latched."""
+        """Release what was latched, and try to correct again."""
         self.watch.forget()
         self.latch(Reason.NONE)
 
     def _is_missed(self, branch: LiveBranch, now_s: float) -> bool:
-        """Whether a branch is stale while others are not: where all fall silent in turn, the vehicle goes to sleep."""
+        """Whether a branch is stale, and another sent after its deadline; if none did, the vehicle goes to sleep."""
         return branch.is_stale(now_s) and any(other.time_s > branch.deadline_s for other in self.branches)
 
     def latch(self, reason: Reason, branches: Sequence[str] = ()) -> None:
-        """Pass measured values through for this reason, which these branches explain; NONE: as the parameters say."""
+        """Pass measured values through for this reason, caused by these branches; NONE: do as the parameters say."""
         self.latched, self.latched_branches = reason, tuple(branches)
         active = not (self.reason or reason or self.shadow)
         for branch in self.branches:

@@ -1,7 +1,7 @@
 """End-to-end protection: frames that come in are checked before anything is read from them, outgoing ones get a CRC.
 
-So a frame that came in corrupt can never go out with a valid CRC. AUTOSAR profiles P01, P02, P04, P05, P06, P07 and
-P11, computed by autosar-e2e, and a counter with a CRC-8 (fastcrc), as control units often have.
+So a frame that came in corrupt can never go out with a valid CRC. Supported are the AUTOSAR profiles P01, P02, P04,
+P05, P06, P07 and P11, computed by autosar-e2e, and a counter with a CRC-8 (fastcrc), as many control units have it.
 """
 
 from collections import deque
@@ -21,7 +21,7 @@ from ecu_node.layout import AutosarProfile, CounterCrc8, E2EWindow, ProfileP02
 
 
 class Check(IntEnum):
-    """Outcome of checking one frame; up to LOST its content is new and intact."""
+    """Outcome of checking one frame; if it is OK or LOST, its content is new and intact."""
 
     OK = 0
     """Valid, and the next one in order."""
@@ -30,13 +30,13 @@ class Check(IntEnum):
     REPEATED = 2
     """Valid, but seen before."""
     JUMPED = 3
-    """Valid, but its counter is further on than the layout allows."""
+    """Valid, but its counter has advanced further than the layout allows."""
     CORRUPT = 4
-    """CRC or counter impossible."""
+    """Too short, with a wrong CRC, or with an impossible counter."""
 
 
 class E2EState(IntEnum):
-    """Of a message, as AUTOSAR's E2E state machine has it."""
+    """State of a message in AUTOSAR's E2E state machine."""
 
     INIT = 0
     VALID = 1
@@ -59,16 +59,17 @@ class Protection:
     modulus : int
         Number of codes of the counter, which runs from 0.
     max_step : int
-        Largest step of the counter from one frame to the next that is used.
+        Largest step of the counter from one frame to the next with which that one is still used.
     counter : BitPlace
         Where the counter stands: within one byte, or in whole bytes, the most significant one first.
     check, protect : callable
-        Take payload and identity, as those of autosar-e2e: whether the CRC is right; count on (unless
-        ``increment_counter=False``), and write CRC, length and data identifier, as the profile has them.
+        Functions of payload and identity, like those of autosar-e2e. The first returns whether the CRC is right; the
+        second increments the counter (unless ``increment_counter=False``) and writes CRC, length and data identifier,
+        as far as the profile has them.
     identity : int or bytes
         Data identifier, or the list of them.
     windows : tuple of E2EWindow
-        By :class:`E2EState`: what makes a message in it VALID.
+        For each :class:`E2EState`, what it takes for a message in that state to be VALID.
     """
 
     header_mask: int
@@ -95,20 +96,20 @@ class Protection:
         return int.from_bytes(payload[place.first : place.end]) >> place.shift & place.highest
 
     def before_first(self, payload: bytearray) -> None:
-        """Prepare an empty payload so that its counter is 0 after it has first advanced."""
+        """Prepare an empty payload so that the first :meth:`advance` sets its counter to 0."""
         self.counter.put(payload, self.modulus - 1)
 
     def seal(self, payload: bytearray) -> None:
-        """Write all but the counter, which stays."""
+        """Write CRC and all else that the profile has, and keep the counter as it is."""
         place, last = self.counter, self.counter.end - 1
         if payload[last] & place.highest and not place.shift:
-            payload[last] -= 1  # then it counts on to what it was: a keyword argument costs three times as much
+            payload[last] -= 1  # protect adds it again; the keyword argument would cost three times as much
             self.protect(payload, self.identity)
         else:
             self.protect(payload, self.identity, increment_counter=False)
 
     def advance(self, payload: bytearray) -> None:
-        """Count on, and write all else."""
+        """Increment the counter, and write CRC and all else that the profile has."""
         self.protect(payload, self.identity)
 
 
@@ -118,13 +119,13 @@ class Receiver:
     Parameters
     ----------
     protection : Protection
-        Of the message.
+        Protection of the message.
 
     Attributes
     ----------
     state : E2EState
         Whether the message as a whole can be relied on, by AUTOSAR's E2E state machine. A repeated frame, or one
-        further on than is allowed, counts neither as intact nor as corrupt.
+        whose counter jumped, counts neither as intact nor as corrupt.
     """
 
     def __init__(self, protection: Protection) -> None:
@@ -164,7 +165,7 @@ class Receiver:
         return check
 
     def restart(self) -> None:
-        """Begin anew after a silence: the next counter may be any, but a single frame makes nothing VALID."""
+        """Begin anew after a silence: any counter may come next, and a message that was VALID is INVALID."""
         self._expected, self._is_steady = -1, False
         self._past.clear()
         if self.state is E2EState.VALID:
@@ -196,13 +197,13 @@ class Receiver:
 
 
 class _Profile(NamedTuple):
-    """A profile of AUTOSAR, by autosar-e2e, and its header, counted from the offset."""
+    """A profile of AUTOSAR: its functions in autosar-e2e, and its header, counted from the offset."""
 
     check: Callable[..., bool]
     protect: Callable[..., None]
     header_bits: int
     counter_byte: int
-    """The most significant one."""
+    """Most significant byte of the counter."""
     counter_bits: int
     modulus: int
 
@@ -222,13 +223,13 @@ _DATA_ID_MODES = {
     "low": p01.E2E_P01_DATAID_LOW,
     "nibble": p01.E2E_P01_DATAID_NIBBLE,
 }
-"""``data_id_mode`` of a layout, as autosar-e2e has it; P11 has two of them, with the same numbers."""
+"""Constants of autosar-e2e for ``data_id_mode`` of a layout; P11 has two of them, with the same numbers."""
 _LONGEST_CLASSIC, _FD_LENGTHS = 8, (12, 16, 20, 24, 32, 48, 64)
-"""Bytes of payloads."""
+"""Longest payload of classic CAN, and the longer ones that CAN FD has. [byte]"""
 
 
 def protection_of(database: VehicleDatabase, message: Message) -> Protection | None:
-    """How a message is protected.
+    """Return how a message is protected.
 
     Parameters
     ----------
@@ -240,7 +241,7 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
     Returns
     -------
     Protection or None
-        None if the layout does not protect it.
+        Its protection; None if the layout names none for it.
 
     Raises
     ------
@@ -277,7 +278,7 @@ def _data_id(given: dict[str, int], message: Message, highest: int = 0xFFFF) -> 
 
 
 def _autosar(entry: AutosarProfile, message: Message) -> dict[str, Any]:
-    """Protection by a profile of AUTOSAR."""
+    """Return the fields of a :class:`Protection` by a profile of AUTOSAR."""
     profile = _PROFILES[entry.profile]
     header_bits, options = profile.header_bits, dict[str, int]()
     identity: int | bytes
@@ -303,7 +304,10 @@ def _autosar(entry: AutosarProfile, message: Message) -> dict[str, Any]:
 
 
 def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str, Any]:
-    """A counter and a CRC-8, both signals of the DBC; the CRC covers all other bytes, and a data identifier if any."""
+    """Return the fields of a :class:`Protection` by a counter and a CRC-8, both of them signals of the DBC.
+
+    The CRC covers all other bytes, and a data identifier if there is one.
+    """
     signals = {signal.name: signal for signal in message.signals}
     for name in (entry.counter, entry.crc):
         if name not in signals:

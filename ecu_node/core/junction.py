@@ -1,11 +1,11 @@
-"""The junction live: its branches, their Kirchhoff sum before and after correction, and whether it may be what it is.
+"""The junction live: its branches, their Kirchhoff sum before and after correction, and whether it is plausible.
 
 The watch asks three questions: does the correction make the sum worse than it was measured; does the corrected sum
-leave what the parameter file allows (a sensor broke); does a branch never change while the sum moves.
+leave the range that the parameter file allows (a sensor broke); does a branch never change while the sum moves.
 
-Branches are looked at in the same instant of the junction: each at the time of its frames less its calibrated delay,
-in between by linear interpolation. The instant is the newest one that all branches have reached. Currents are positive
-into the junction [A]; times are those of one steady clock, passed in [s].
+All branches are compared at the same instant of the junction: a frame counts at its time less the calibrated delay of
+its branch, and between frames currents are interpolated linearly. The instant is the newest one that all branches have
+reached. Currents are positive into the junction [A]; times are those of one steady clock, passed in [s].
 """
 
 import math
@@ -21,23 +21,23 @@ from ecu_node.core.status import Counters, Quality, Reason
 from ecu_node.parameters import JunctionResidual
 
 REMEMBERED_FRAMES = 1024
-"""Frames of a message that are remembered: longer than branches lag each other."""
+"""Number of frames of a message that are remembered: they reach back further than branches lag each other."""
 
 Frames = deque[tuple[float, bytearray]]
 """Times [s] and payloads of the last intact frames of a message."""
 Currents = Mapping[str, tuple[float, float]]
-"""Measured and corrected, by branch. [A]"""
+"""Measured and corrected current of each branch. [A]"""
 
 
 class HeardSignal:
     """A signal in the last frames of its message; read only when it is asked for.
 
-    Beside the currents these are voltages, and the state that the watch depends on.
+    Such signals are the branches themselves (:class:`LiveBranch`), voltages, and the input of the watch.
 
     Parameters
     ----------
     codes : Codes
-        Of the signal.
+        Codes of the signal.
     timeout_s : float
         Without a frame for this long its value is not used any more. [s]
     """
@@ -51,11 +51,11 @@ class HeardSignal:
         self._past: deque[tuple[float, int]] = deque(maxlen=REMEMBERED_FRAMES)
 
     def follow(self, signal: PlacedSignal, frames: Frames) -> None:
-        """Look for the signal in these frames, which its message goes on to add to."""
+        """Read the signal from these frames, to which its message goes on adding."""
         self.signal, self._frames = signal, frames
 
     def newest_first(self) -> Iterator[tuple[float, int]]:
-        """Times and codes, back from the last frame that has the signal; each frame is read once. [s]"""
+        """Return times [s] and codes, backwards from the last frame that has the signal; each frame is read once."""
         if self._frames and self._frames[-1] is not self._read:
             new = list(takewhile(lambda frame: frame is not self._read, reversed(self._frames)))
             self._read = new[0]
@@ -66,7 +66,7 @@ class HeardSignal:
         return reversed(self._past)
 
     def code_at(self, time_s: float) -> int | None:
-        """Code in the last frame up to a time [s]; None if there is none, it is no value, or too old."""
+        """Return the code of the last frame up to a time [s]; None if there is none, it is too old, or no value."""
         for seen_s, code in self.newest_first():
             if seen_s <= time_s:
                 return code if time_s - seen_s <= self.timeout_s and self.codes.is_value(code) else None
@@ -76,18 +76,18 @@ class HeardSignal:
 _LEAST_VOLTAGE_V = 10.0
 """Below this the HV net is switched off, and power / voltage says nothing of the current. [V]"""
 _FLICKER_STEPS = 4
-"""So many steps of one size are no load that was switched."""
+"""A current that makes this many steps of a size in its last frames flickers; a load that is switched does not."""
 
 
 class Movement(NamedTuple):
     """How a current moved in its last frames. [A]"""
 
     distance_a: float
-    """Largest less smallest."""
+    """Largest less smallest value."""
     step_a: float
     """Largest step between two frames."""
     flicker_a: float
-    """Size of a step that it made to and fro, as where frames of somebody else stand between those of the sensor."""
+    """Size of the steps that it makes to and fro, as when frames of another sender are among those of the sensor."""
 
 
 class Written(NamedTuple):
@@ -95,11 +95,11 @@ class Written(NamedTuple):
 
     place: BitPlace
     not_available: int | None = None
-    """Code for "no value"; None: what is no value stays as it is, as in a gateway."""
+    """Code for "no value"; None, as in a gateway: where there is no value, the payload stays as it is."""
     quality: BitPlace | None = None
 
     def put(self, payload: bytearray, out: int | None, quality: Quality) -> None:
-        """Write a code, or "no value", and its quality."""
+        """Write a code (None: "no value") and its quality."""
         code = self.not_available if out is None else out
         if code is not None:
             self.place.put(payload, code)
@@ -108,27 +108,27 @@ class Written(NamedTuple):
 
 
 class LiveBranch(HeardSignal):
-    """One branch: state of its sensor, and what is made of it.
+    """One branch on the vehicle: its last frames, the fault of its sensor, and how it is corrected now.
 
     Parameters
     ----------
     name : str
         As in the layout.
     codes : Codes
-        Of the measured signal. [A, or W with a voltage]
+        Codes of the measured signal. [A, or W with a voltage]
     sign : int
         +1 if the signal is positive into the junction.
     timeout_s : float
         Without a frame for this long the branch is stale. [s]
     start_s : float
-        So long after the bus has woken up its first frame may come, if that is longer. [s]
+        Time that its first frame may take after the bus has woken up, if longer than ``timeout_s``. [s]
     voltage : HeardSignal or None
-        Of a branch that is a power.
+        Voltage of a branch that is measured as a power; None for a current.
 
     Attributes
     ----------
     plan, quality :
-        What is done now to its codes, and what is said of values.
+        Plan by which its codes are corrected now, and the quality that is published with its values.
     """
 
     def __init__(
@@ -159,18 +159,18 @@ class LiveBranch(HeardSignal):
         delay_s: float,
         expected_since_s: float | None,
     ) -> None:
-        """Take what other parameters say of it; that is used once :meth:`activate` says so.
+        """Take over what new parameters say about the branch; it is used from the next :meth:`activate` on.
 
         Parameters
         ----------
         fault : SensorFault
-            Of its sensor.
+            Fault of its sensor.
         correcting, passing : IntegerPlan
-            What is written of it corrected, and where nothing is corrected.
+            Plans by which it is written when it is corrected, and when it is passed through.
         delay_s : float
-            How much later than the junction it is seen. [s]
+            How much later its values are seen than they were at the junction. [s]
         expected_since_s : float or None
-            Since when its frames are waited for; None: not before the first one (a vehicle may lack the branch). [s]
+            Time from which its frames are waited for [s]; None: only once one has come (a vehicle may lack the branch).
         """
         self.fault, self.delay_s = fault, delay_s
         self._passing, self._correcting = passing, correcting
@@ -179,13 +179,13 @@ class LiveBranch(HeardSignal):
             self._waited_s = max(self._waited_s, expected_since_s)
 
     def activate(self, *, active: bool, doubted: bool) -> None:
-        """Correct, or pass through; a sensor that is in doubt is never said to be right."""
+        """Correct, or pass through; what is passed through from a doubted sensor is published as implausible."""
         corrects = active and self.fault.applied
         self.plan = self._correcting if corrects else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.IMPLAUSIBLE if doubted else Quality.PASSED_THROUGH
 
     def spoil(self, now_s: float) -> None:
-        """A frame came that must not be used: until the next one there is no value."""
+        """Note that a frame came that must not be used: until the next one there is no value."""
         self._spoilt_s = now_s
 
     @property
@@ -195,7 +195,7 @@ class LiveBranch(HeardSignal):
         return self._time_s
 
     def latest(self) -> tuple[float, int] | None:
-        """When its last frame came, and its code; None if that is no value."""
+        """Return time [s] and code of its last frame; None if the code is no value."""
         found = next(self.newest_first(), None)
         return found if found is not None and self.codes.is_value(found[1]) else None
 
@@ -211,7 +211,7 @@ class LiveBranch(HeardSignal):
 
     @property
     def deadline_s(self) -> float:
-        """Until when its next frame must have come; infinity for a branch that is not fitted. [s]"""
+        """Time by which its next frame must have come; infinity for a branch that is not fitted. [s]"""
         if self.seen:
             return self.time_s + self.timeout_s
         return self._waited_s + max(self.timeout_s, self._start_s) if self._is_named else float("inf")
@@ -221,7 +221,7 @@ class LiveBranch(HeardSignal):
         return now_s > self.deadline_s
 
     def is_old(self, now_s: float) -> bool:
-        """Whether its last value is older than the timeout, whatever is waited for."""
+        """Whether its last frame is older than the timeout, even if none is waited for."""
         return now_s - self.time_s > self.timeout_s
 
     def expect(self, now_s: float) -> None:
@@ -229,21 +229,21 @@ class LiveBranch(HeardSignal):
         self._awake_s = self._waited_s = now_s
 
     def lacks_input(self, now_s: float) -> bool:
-        """Whether a branch with a fault to correct is not corrected now: something that this needs is missing."""
+        """Whether a branch with a fault to correct is not corrected now, as something that this needs is missing."""
         no_value = self.seen and self.latest() is None
         return self.quality is not Quality.CORRECTED or no_value or self._voltage_code(now_s) is None
 
     def _voltage_code(self, time_s: float) -> int | None:
-        """Code of the voltage that the plan needs at a time; 0 where it needs none."""
+        """Return the code of its voltage at a time, None if that is not known; 0 if the plan needs no voltage."""
         return self.voltage.code_at(time_s) if self.voltage is not None and self.plan.needs_voltage else 0
 
     def ordinary_codes(self) -> tuple[int, int]:
-        """Least and greatest code of a range in which each is a value with a result that only the code decides.
+        """Return the range of codes that are values and whose results depend on the code alone, without clipping.
 
         Returns
         -------
         first, last : int
-            The first one is greater where there is no such range. Results beyond the ends of the signal are none.
+            Least and greatest code of the range; ``first`` is the greater one if there is no such range.
         """
         plan, (first, last) = self.plan, (self.codes.lowest, self.codes.highest)
         while first in self.codes.named:
@@ -257,7 +257,7 @@ class LiveBranch(HeardSignal):
         return max(first, -((bias - least) // plan.gain)), min(last, (beyond - 1 - bias) // plan.gain)
 
     def convert(self, code: int, time_s: float, counters: Counters) -> tuple[int | None, Quality]:
-        """What is written of a code that came at a time: None where it is no value; saturation is counted."""
+        """Return what to write for a code that came at a time (None: no value) and its quality; count saturation."""
         if not self.codes.is_value(code):
             return None, Quality.NOT_AVAILABLE if code in self.codes.named else Quality.INVALID
         voltage_code = self._voltage_code(time_s)
@@ -268,7 +268,7 @@ class LiveBranch(HeardSignal):
         return out, self.quality
 
     def published(self, now_s: float) -> tuple[int | None, Quality]:
-        """What is written of it where no frame of it just came."""
+        """Return code and quality to write for its last value, when the current frame does not carry the branch."""
         found = next(self.newest_first(), None)
         if found is None or now_s - found[0] > self.timeout_s:
             return None, Quality.NOT_AVAILABLE
@@ -277,17 +277,17 @@ class LiveBranch(HeardSignal):
         return self.convert(found[1], found[0], Counters())
 
     def currents_at(self, time_s: float) -> tuple[float, float] | None:
-        """Measured current and what the parameters make of it, whether or not they are in force.
+        """Return the measured current, and as the parameters correct it, even while the node passes it through.
 
         Parameters
         ----------
         time_s : float
-            When, by the times of its frames; in between by linear interpolation. [s]
+            Time on the scale of its frames, between which the current is interpolated linearly. [s]
 
         Returns
         -------
         measured_a, corrected_a : float
-            Positive into the junction [A]; None if no value is known of then.
+            Positive into the junction [A]; None if no value is known for that time.
         """
         code, volts = self._code_between(time_s), self._volts_at(time_s)
         if code is None or volts is None:
@@ -296,27 +296,27 @@ class LiveBranch(HeardSignal):
         return measured_a, self.fault.true_current(measured_a)
 
     def movement(self, instant_s: float, since_s: float, frames: int) -> Movement:
-        """How its corrected current moved in the frames before an instant of the junction.
+        """Return how its corrected current moved in the frames before an instant of the junction.
 
         Parameters
         ----------
         instant_s : float
             The instant. [s]
         since_s : float
-            Over so long before it; longer, where there are fewer frames than wanted. [s]
+            How far to look back from it; further where that has fewer frames than wanted. [s]
         frames : int
-            So many are looked at, at least.
+            Least number of frames to look at.
 
         Returns
         -------
         Movement
-            That of a power at the voltage of the instant.
+            A power is turned into a current with the voltage of the instant; zeros if nothing is known.
         """
         end_s = instant_s + self.delay_s
         codes: list[int] = []
         for seen_s, code in self.newest_first():
             if seen_s > end_s:
-                codes = []  # but for the first one after the instant, towards which it is interpolated
+                codes = []  # keeps only the first one after the instant, towards which it is interpolated
             elif seen_s < end_s - since_s and len(codes) >= frames:
                 break
             if self.codes.is_value(code):
@@ -330,7 +330,7 @@ class LiveBranch(HeardSignal):
         return Movement(per_code_a * (max(codes) - min(codes)), steps[0], steps[_FLICKER_STEPS - 1])
 
     def _volts_at(self, time_s: float) -> float | None:
-        """What its signal is divided by: 1 for a current; None if the HV net is off, or that is not known. [V]"""
+        """Return what its signal is divided by: 1 for a current, else the voltage; None if off or unknown. [V]"""
         if self.voltage is None:
             return 1.0
         code = self.voltage.code_at(time_s)
@@ -338,7 +338,7 @@ class LiveBranch(HeardSignal):
         return volts if volts >= _LEAST_VOLTAGE_V else None
 
     def _code_between(self, time_s: float) -> float | None:
-        """Code at a time, between codes too; None if it is not known."""
+        """Return the code at a time, interpolated between frames; None if it is not known."""
         later: tuple[float, int] | None = None
         for sample in self.newest_first():
             seen_s, code = sample
@@ -355,23 +355,23 @@ class LiveBranch(HeardSignal):
 def aligned_currents(
     branches: Sequence[LiveBranch], delays_s: Mapping[str, float], now_s: float
 ) -> tuple[float, dict[str, tuple[float, float]]] | None:
-    """Currents of all fitted branches in the last instant of which all are known.
+    """Return the currents of all fitted branches at the last instant at which all are known.
 
     Parameters
     ----------
     branches : sequence of LiveBranch
         All branches of the layout.
     delays_s : mapping of str to float
-        How much later than the junction each is seen; 0 where not named. [s]
+        How much later than at the junction each branch is seen; 0 where not named. [s]
     now_s : float
         Now. [s]
 
     Returns
     -------
     instant_s : float
-        When, at the junction. [s]
+        The instant, in time of the junction. [s]
     currents : dict of str to (float, float)
-        Measured, and as the parameters that are in force make it; positive into the junction. [A]
+        Measured current, and as the parameters in force correct it; positive into the junction. [A]
         None, instead of both, while a fitted branch is stale or has no value.
     """
     fitted = [(branch, delays_s.get(branch.name, 0.0)) for branch in branches if branch.is_fitted]
@@ -385,33 +385,33 @@ def aligned_currents(
 
 
 _MOST_MARGINS = 10.0
-"""More than so many margins nobody may expect the corrected sum to be worse."""
+"""A parameter file may widen the margin for a worse corrected sum by at most this many margins."""
 _LEAST_LOOKS = 10
-"""Sums that a verdict needs."""
+"""Least number of sums on which a verdict is based."""
 _STUCK_SHARE = 0.02
-"""Standard deviation of the measured sum, in shares of full scale, at which a code that never changes is suspicious."""
+"""Standard deviation of the measured sum, in shares of full scale, above which a code that never changes is suspect."""
 _REST_SHARE = 0.005
-"""Up to this share of full scale a current that never changes is one at rest, as a motor's at standstill."""
+"""A current that never changes is at rest, not stuck, up to this share of full scale: a motor at standstill."""
 _MOST_DEVIATIONS = 4.0
-"""Mean of the corrected sum over a window, in standard deviations of the single sum, that no right set reaches."""
+"""Mean of the corrected sum over a window that no right parameter set reaches. [standard deviations of a single sum]"""
 _LARGEST_DEVIATION = 12.0
-"""More standard deviations count as so many: steps of loads that sensors show one after the other are short."""
+"""Larger deviations count as this many: load steps that sensors show one after the other are large, but short."""
 _PLAUSIBILITY_WINDOW_S = 4.0
-"""Long enough that sensors of 0.1 s delay do not add up to an alarm, and within the 5 s that a receiver bears. [s]"""
+"""Long enough that sensor delays of 0.1 s raise no alarm, and within the 5 s that a receiver tolerates. [s]"""
 _JUMP_DEVIATIONS, _JUMP_SHARE = 8.0, 0.05
-"""A jump is beyond so many standard deviations of the sum, and beyond this share of full scale."""
+"""A jump exceeds this many standard deviations of the sum, and this share of full scale."""
 _JUMP_LOOKS, _JUMP_S = 3, 0.03
-"""A jump lasts for so many instants, and so long [s]: frames of one load step come one after the other."""
+"""A jump lasts for this many instants and this long [s]; frames of one load step, one after the other, do not."""
 _MOVING_S, _MOVING_FRAMES = 0.25, 3
-"""Over so long [s], and so many frames at least, it is seen how far each branch moved."""
+"""How far a branch moved is seen over this long [s], and over at least this many frames."""
 _EXPLAINS, _LARGEST_SLOPE = 0.9, 0.8
-"""A gain error of a branch that explains this share of the sum's variance is what is wrong, but for slopes near 1: then
-the branch alone is right, and another one is stuck."""
+"""A gain error of one branch that explains this share of the sum's variance is the fault, unless its slope reaches the
+second number: a slope near 1 means that only this branch is right, and that another one is stuck."""
 _UNKNOWN_SD_SHARE, _UNKNOWN_SD_PER_A = 0.02, 0.05
-"""Standard deviation of the corrected sum where the parameter file does not say it: share of full scale, and of the
+"""Standard deviation of the corrected sum if the parameter file does not give it: share of full scale, and of the
 throughput. [1]"""
 _NEARLY_AS_GOOD = 1.25
-"""Branches that leave so many times what the best one leaves of the sum explain it as well."""
+"""Branches that leave at most this many times as much of the sum as the best one explain it equally well. [1]"""
 _ROUNDING = 1e-9
 """Share of the squares of the sums that rounding may leave where a branch explains all of it. [1]"""
 
@@ -428,7 +428,7 @@ _Verdict = tuple[Reason, tuple[str, ...]]
 
 
 class _Moment(NamedTuple):
-    """One instant of the junction; sums are less what is expected."""
+    """One instant of the junction; the expected sum is already subtracted from the sums."""
 
     time_s: float
     corrected_a: float
@@ -438,8 +438,8 @@ class _Moment(NamedTuple):
     codes: Mapping[str, int]
     """Last code of each branch."""
     terms: tuple[float, float, float, float, float]
-    """Of the means of a window: measured sum and its square, square of the corrected sum, deviations, and these with
-    the sign of the largest current: a gain error keeps its sign in it."""
+    """Terms of the means over a window: measured sum, its square, square of the corrected sum, deviations, and
+    deviations times the sign of the largest current, in which a gain error keeps its sign."""
 
 
 class _Window:
@@ -456,7 +456,7 @@ class _Window:
             self._sums = [total - term for total, term in zip(self._sums, old, strict=True)]
 
     def means(self, share: float) -> list[float] | None:
-        """Means of the terms; None while this share of the window is not filled."""
+        """Return the means of the terms; None until this share of the window is filled."""
         moments = self.moments
         if len(moments) < _LEAST_LOOKS or moments[-1].time_s - moments[0].time_s < share * self._length_s:
             return None
@@ -464,11 +464,12 @@ class _Window:
 
 
 class JunctionWatch:
-    """Sums of the junction, their recent past, and what is to be thought of them.
+    """Keeps the recent sums of the junction, and judges whether the parameters may still be used.
 
     A gain error or an offset shows in the mean of the corrected sum over some seconds. A jump shows within some frames:
-    the sum, or one branch alone, has moved farther than all the others together. What a load does, another branch shows
-    too. Whether the correction makes it worse, and which branch never changes, shows over a longer window.
+    the sum, or one branch alone, has moved farther than all other branches together, which no load can do, as another
+    branch shows its current too. A longer window shows whether the correction makes the sum worse, and which branch
+    never changes.
 
     Parameters
     ----------
@@ -477,14 +478,14 @@ class JunctionWatch:
     window_s : float
         Over this long measured and corrected sums are compared. [s]
     margin_a : float
-        By how much the root mean square of the corrected ones must be above that of the measured ones. [A]
+        The correction is worse if the root mean square of corrected sums exceeds that of measured ones by this. [A]
     full_scale_a : float
         Nominal maximum current of the junction. [A]
 
     Attributes
     ----------
     sums : JunctionSums or None
-        Of the last look; None while a fitted branch is stale or has no value.
+        Sums of the last look; None while a fitted branch is stale or has no value.
     currents_a : mapping of str to (float, float)
         Measured and corrected currents of the last instant that was known, by branch. [A]
     instant_s : float
@@ -502,7 +503,7 @@ class JunctionWatch:
         self.restart()
 
     def judge_only(self, state: HeardSignal, valid: frozenset[int]) -> None:
-        """Judge sums while a state has one of these codes: all currents of the junction are measured then."""
+        """Judge sums only while a state has one of these codes: only then are all currents of the junction measured."""
         self._whole = state, valid
 
     def is_whole(self, now_s: float) -> bool:
@@ -510,15 +511,16 @@ class JunctionWatch:
         return self._whole is None or self._whole[0].code_at(now_s) in self._whole[1]
 
     def is_blind(self, now_s: float) -> bool:
-        """Whether the state is missing that says when sums can be judged."""
+        """Whether the state that says when sums can be judged is not known now."""
         return self._whole is not None and self._whole[0].code_at(now_s) is None
 
     def restart(self, expected: JunctionResidual | None = None) -> None:
-        """Forget what was seen, and judge by what the parameter file says of the sum of right sensors from now on.
+        """Forget what was seen, and judge from now on by what the parameter file expects of the sum of right sensors.
 
-        What the calibrator itself expects the corrected sum to be worse, as where one of two offsets that cancel is
-        corrected, is added to the margin, up to ten times that. Where the file says no standard deviations, shares of
-        full scale (or what the calibrator saw, if more) and of the throughput are taken: then only gross faults show.
+        If the calibrator itself saw the correction make the sum worse (as where one of two offsets that cancel is
+        corrected), the difference is added to the margin, up to ten times the margin. If the file has no standard
+        deviations, shares of full scale (or what the calibrator saw, if more) and of the throughput take their place:
+        then only gross faults show.
         """
         expected = expected or JunctionResidual(measured_a=0.0, corrected_a=0.0)
         measured_a, corrected_a = expected.about_expected()
@@ -533,14 +535,14 @@ class JunctionWatch:
         self.forget()
 
     def forget(self) -> None:
-        """Begin new windows."""
+        """Begin new windows, without a jump or a verdict."""
         self._window, self._recent = _Window(self._window_s), _Window(_PLAUSIBILITY_WINDOW_S)
         self._jump: tuple[float, int, _Verdict] | None = None
-        """Instant at which a jump began [s], instants since, and what it looked like then."""
+        """Instant at which a jump began [s], number of instants since, and the verdict as it was then."""
         self.verdict: _Verdict | None = None
 
     def look(self, now_s: float) -> None:
-        """Take the sums of now [s], and judge them."""
+        """Take the newest sums, and judge them; the time is now. [s]"""
         self.sums = None
         branches = self._branches.values()
         found = aligned_currents([*branches], {branch.name: branch.delay_s for branch in branches}, now_s)
@@ -550,13 +552,13 @@ class JunctionWatch:
         self.sums = JunctionSums(*map(sum, zip(*self.currents_a.values(), strict=True)))
         if not self.is_whole(now_s):
             self.forget()
-        elif self.instant_s > self._judged_s and len(self.currents_a) > 1:  # of one branch alone nothing is known
+        elif self.instant_s > self._judged_s and len(self.currents_a) > 1:  # the sum of a single branch says nothing
             self._judged_s = self.instant_s
             self._remember(self.sums)
             self.verdict = self._judge()
 
     def _remember(self, sums: JunctionSums) -> None:
-        """Take one instant into the windows."""
+        """Add one instant to the windows."""
         measured_a, corrected_a = sums.measured_a - self._expected_a, sums.corrected_a - self._expected_a
         deviations = corrected_a / self._sum_sd_a()
         deviations = min(max(deviations, -_LARGEST_DEVIATION), _LARGEST_DEVIATION)
@@ -589,7 +591,7 @@ class JunctionWatch:
         return (Reason.CORRECTION_WORSE, ()) if is_worse else None
 
     def _jumped(self) -> _Verdict | None:
-        """What a jump looked like when it began; None unless there is one, and it has lasted."""
+        """Return the verdict on a jump as it was when it began; None unless there is a jump, and it has lasted."""
         instant_s, residual_a = self.instant_s, self._recent.moments[-1].corrected_a
         moved = {name: self._branches[name].movement(instant_s, _MOVING_S, _MOVING_FRAMES) for name in self.currents_a}
         most = max(moved, key=lambda name: moved[name].distance_a)
@@ -608,12 +610,12 @@ class JunctionWatch:
         return verdict if looks + 1 >= _JUMP_LOOKS and instant_s - since_s >= _JUMP_S else None
 
     def _frozen(self, still: Sequence[str], residual_a: float = 0.0) -> tuple[str, ...]:
-        """Those of the branches at a constant current that is no rest, and large enough to be what the sum lacks."""
+        """Return which of these unchanging branches carry more than at rest, and enough to account for the residual."""
         least_a = max(_REST_SHARE * self._full_scale_a, 0.5 * abs(residual_a))
         return tuple(name for name in still if abs(self.currents_a[name][1]) > least_a)
 
     def _stuck(self) -> tuple[str, ...]:
-        """Branches whose code never changed in the window, unless a gain error of another one explains the sum."""
+        """Return branches whose code never changed in the window; none if another's gain error explains the sum."""
         moments = self._window.moments
         still = [name for name, code in moments[-1].codes.items() if all(m.codes.get(name) == code for m in moments)]
         measured_a = [moment.terms[0] for moment in moments]
@@ -624,7 +626,7 @@ class JunctionWatch:
         return self._frozen(still)
 
     def _explaining(self) -> _Verdict:
-        """Which gain error explains the sums since they went wrong best; all branches, if an offset explains them."""
+        """Name the branches whose gain error best explains the sums since they went wrong; all if an offset does."""
         moments = list(self._recent.moments)
         good = (number for number, moment in enumerate(moments) if abs(moment.deviations) < 1.0)
         since = moments[max(good, default=-1) + 1 :]
@@ -632,7 +634,7 @@ class JunctionWatch:
         residual = [moment.corrected_a for moment in moments]
         rows = {name: [moment.currents_a.get(name, (0.0, 0.0))[1] for moment in moments] for name in self.currents_a}
         still = [name for name, row in rows.items() if min(row) == max(row)]
-        if frozen := self._frozen(still):  # a single step of another one may as well be a jump of its own sensor
+        if frozen := self._frozen(still):  # a single step of another branch may be a jump of that one's sensor
             lines = [_line(row, residual) for name, row in rows.items() if name not in still and not _is_step(row)]
             if any(explains and abs(slope) >= _LARGEST_SLOPE for slope, explains in lines):
                 return Reason.BRANCH_STUCK, frozen
@@ -644,12 +646,12 @@ class JunctionWatch:
 
 
 def _is_step(current: Sequence[float]) -> bool:
-    """Whether one step makes half of all that a current moves, or more."""
+    """Whether a single step makes up half of a current's range, or more."""
     return 2.0 * max(abs(b - a) for a, b in pairwise(current)) >= max(current) - min(current)
 
 
 def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
-    """What a gain error of a branch leaves of the squares of the sums."""
+    """Return what is left of the sum of squares of the residual after the best gain error of a branch."""
     own, both = math.fsum(map(mul, current, current)), math.fsum(map(mul, current, residual))
     return math.fsum(map(mul, residual, residual)) - (both * both / own if own else 0.0)
 
@@ -660,7 +662,7 @@ def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, bool]:
-    """Slope of a straight line through points, and whether it explains them: little of y is left around it."""
+    """Return the slope of a line through points, and whether it explains them: little of y is left around it."""
     xx, xy, yy = _covariance(x, x), _covariance(x, y), _covariance(y, y)
     slope = xy / xx if xx else 0.0
     return slope, slope * xy >= _EXPLAINS * yy

@@ -27,15 +27,15 @@ WATT: Mapping[str, float] = {"W": 1.0, "kW": 1e3, "mW": 1e-3, "MW": 1e6}
 _SPELLED = re.compile(
     r"(?:unit_|\w+:)?(milli|kilo|mega|[mk])?(a|v|w|(?:amp|amper|ampere|volt|watt)s?)([ _]?(ac|dc|rms))?", re.IGNORECASE
 )
-"""As databases of several makers have it: ``Unit_Amper``, ``current:A``."""
+"""Spellings of units in the databases of several makers, such as ``Unit_Amper`` or ``current:A``."""
 _PER_BIT = re.compile(r"(\d*\.?\d+) ?(\w+)/bit\??", re.IGNORECASE)
 _PREFIX = {"": "", "milli": "m", "m": "m", "kilo": "k", "k": "k", "mega": "M"}
 
 
 def usual_unit(text: str) -> str:
-    """Unit as this program writes it: ``A`` for ``Amps``, ``[A]`` or ``A_DC``, ``kW`` for ``KW`` or ``kilowatt``.
+    """Return a unit as this program writes it: ``A`` for ``Amps``, ``[A]`` or ``A_DC``, ``kW`` for ``KW``.
 
-    What is no spelling of A, V or W comes back without blanks and brackets around it.
+    Any text that is no spelling of A, V or W is returned without the blanks and brackets around it.
     """
     bare = text.strip().strip("[](){}<>").strip()
     found = _SPELLED.fullmatch(bare)
@@ -67,13 +67,13 @@ def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float
         If the unit is of another quantity.
     """
     unit, step = signal.unit or "", 1.0
-    if per_bit := _PER_BIT.fullmatch(unit):  # the scale says the same as "50W/bit", or it is 1 and says nothing
+    if per_bit := _PER_BIT.fullmatch(unit):  # "50W/bit" repeats the scale, or replaces one of 1
         unit, step = per_bit[2], float(per_bit[1]) if signal.scale == 1 else 1.0
     return step * factor_of(unit, known, f"{where}: signal {signal.name}")
 
 
 def factor_of(unit: str, known: Mapping[str, float], what: str) -> float:
-    """As :func:`unit_factor`, of a unit; `what` is in it."""
+    """Return the factor from a unit to the base unit, 1 if it is empty; the error says that `what` is in it."""
     if not unit:
         return 1.0
     try:
@@ -84,7 +84,7 @@ def factor_of(unit: str, known: Mapping[str, float], what: str) -> float:
 
 _BITS_PER_BYTE = 8
 _LONGEST = 64
-"""No CAN signal of integers is longer. [bit]"""
+"""Longest integer signal on CAN. [bit]"""
 
 
 Order = Literal["little", "big"]
@@ -92,7 +92,7 @@ Order = Literal["little", "big"]
 
 
 class FrameKey(NamedTuple):
-    """Identifier of a frame; one number with 11 and with 29 bits are two identifiers."""
+    """Identifier of a frame; the same number with 11 and with 29 bits is two different identifiers."""
 
     identifier: int
     extended: bool
@@ -176,7 +176,7 @@ class BitPlace:
         Raises
         ------
         ValueError
-            If the raw integer does not fit the width: the caller saturates, nothing wraps.
+            If the raw integer does not fit the width: the caller must saturate, as nothing wraps.
         """
         if not self.lowest <= raw <= self.highest:
             raise ValueError(f"raw code {raw} does not fit into {self.length} bits")
@@ -226,12 +226,12 @@ def bit_place(signal: Signal) -> BitPlace:
 
 @dataclass(frozen=True, kw_only=True)
 class Multiplexer:
-    """A signal that tells which others a frame has.
+    """A multiplexer signal: its code decides whether another signal is in a frame.
 
     Attributes
     ----------
     place : BitPlace
-        Of the multiplexer.
+        Place of the multiplexer.
     codes : frozenset of int
         Its raw codes with which the other signal is in the frame.
     """
@@ -272,13 +272,13 @@ def placed_signal(message: Message, signal: Signal) -> PlacedSignal:
     Returns
     -------
     PlacedSignal
-        All multiplexers of it must have one of their codes, the nearest one first; none for a signal of every frame.
+        The signal with all its multiplexers, the nearest one first; none for a signal that is in every frame.
 
     Raises
     ------
     DatabaseError
-        As :func:`bit_place`, for the signal or one of its multiplexers; if the message lacks one of these, or they
-        stand in a circle.
+        If the signal or one of its multiplexers is a floating-point number or wider than 64 bits, if the message lacks
+        one of the multiplexers, or if they multiplex each other in a circle.
     """
     found, inner = list[Multiplexer](), signal
     while inner.multiplexer_ids is not None and inner.multiplexer_signal is not None:
@@ -300,7 +300,7 @@ _NOT_AVAILABLE_NAMES = ("sna", "notavailable", "signalnotavailable", "na", "inva
 
 @dataclass(frozen=True, kw_only=True)
 class Codes:
-    """Raw codes of one signal and their worth.
+    """Raw codes of one signal, and the values that they stand for.
 
     Attributes
     ----------
@@ -339,7 +339,7 @@ class Codes:
 
 
 _ENDLESS = 1e300
-"""Some tools write the largest double as a limit, rounded up to what is read as infinite."""
+"""Limits are cut to this: some tools write the largest double, rounded up so far that it is read as infinite."""
 
 
 def as_written(number: float) -> Fraction:
@@ -355,14 +355,14 @@ def read_codes(signal: Signal, units: Mapping[str, float] | None, where: str) ->
     signal : Signal
         An integer signal of the DBC.
     units : mapping of str to float, or None
-        One of the tables of :mod:`ecu_node.core.signals`, in whose base unit values come out; None: in their own unit.
+        :data:`AMPERE`, :data:`VOLT` or :data:`WATT`, for values in A, V or W; None: for values in the signal's unit.
     where : str
         What the signal is for, for messages of errors.
 
     Returns
     -------
     Codes
-        Codes and their worth.
+        Codes and the values that they stand for.
 
     Raises
     ------
@@ -396,12 +396,12 @@ def read_codes(signal: Signal, units: Mapping[str, float] | None, where: str) ->
 
 
 def writable_range(codes: Codes, where: str) -> tuple[int, int]:
-    """Ends of the unbroken run of values around 0, into which results are clamped so that no named code is hit.
+    """Return the ends of the unbroken run of values around 0; results are clamped to it, so as to hit no named code.
 
     Parameters
     ----------
     codes : Codes
-        Of the signal to write.
+        Codes of the signal to write.
     where : str
         What the signal is for, for the message of the error.
 
@@ -413,7 +413,7 @@ def writable_range(codes: Codes, where: str) -> tuple[int, int]:
     Raises
     ------
     DatabaseError
-        If 0 itself has a name: no run is around it.
+        If the code of 0 itself has a name, so that there is no such run.
     """
     zero = codes.nearest(Fraction(0))
     if zero in codes.named:
@@ -427,16 +427,16 @@ def writable_range(codes: Codes, where: str) -> tuple[int, int]:
 
 
 _NEARLY = Fraction(98, 100)
-"""A range that reaches this share of what it could is whole, but for codes beside those with names. [1]"""
+"""A range that reaches this share of the outermost value is long enough: named codes may cost a few codes. [1]"""
 
 
 def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
-    """Refuse a signal to write if a name amid its values keeps results of full scale out.
+    """Refuse a signal in which a named code amid its values keeps results up to full scale from being written.
 
     Parameters
     ----------
     codes : Codes
-        Of the signal to write.
+        Codes of the signal to write.
     largest : Fraction
         Largest magnitude that must be written, as far as the signal reaches at all. [unit of the codes]
     where : str
@@ -463,12 +463,12 @@ def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
 
 
 def exact_code(signal: Signal, value: float) -> Fraction:
-    """Code of a signal that stands for a value in the unit of the DBC; no whole number if none does."""
+    """Return the code that stands for a value in the unit of the DBC; it is no whole number if no code does."""
     return (as_written(float(value)) - as_written(signal.offset)) / as_written(signal.scale)
 
 
 def impossible_values(signal: Signal, values: Sequence[float]) -> list[float]:
-    """Those of some values that a signal of the DBC can never have; none of a floating-point number's.
+    """Return which of these values a signal of the DBC can never have; none for a floating-point signal.
 
     Parameters
     ----------
@@ -489,12 +489,12 @@ def impossible_values(signal: Signal, values: Sequence[float]) -> list[float]:
 
 
 def not_available_code(codes: Codes, where: str) -> int:
-    """Code by which a signal says that it has no value.
+    """Return the code by which a signal says that it has no value.
 
     Parameters
     ----------
     codes : Codes
-        Of the signal to write.
+        Codes of the signal to write.
     where : str
         What the signal is for, for the message of the error.
 

@@ -1,4 +1,4 @@
-"""What the node tells of itself: codes, which are those of the DBC's value tables, counts, and latency."""
+"""What the node reports about itself: codes (those of the DBC's value tables), counters, and latency."""
 
 import time
 from dataclasses import asdict, dataclass
@@ -12,10 +12,10 @@ __all__ = ["Counters", "Latency", "Quality", "Reason", "State", "TrustError", "U
 
 
 class _WithWords(IntEnum):
-    """Codes, each with words for people."""
+    """Enumeration of codes, each with a description in words."""
 
     words: str
-    """What it means, within a sentence."""
+    """What the code means, worded so that it fits into a sentence."""
 
     def __new__(cls, code: int, words: str = "") -> Self:
         member = int.__new__(cls, code)
@@ -59,7 +59,7 @@ class Reason(_WithWords):
     ON_TRIAL = 15, "the parameters are on trial"
     SUM_IMPLAUSIBLE = 16, "the corrected Kirchhoff sum is not what it may be: a sensor is wrong"
     FOREIGN_FRAMES = 17, "another node sends frames that only this gateway may send; they are dropped"
-    """Nothing is held back for it."""
+    """This is only reported: the node goes on correcting."""
     E2E_INVALID = 18, "so many frames of a message fail their end-to-end check that it is not used"
 
 
@@ -71,63 +71,63 @@ class UnfitError(ParameterError):
         self.reason = reason
 
     def __reduce__(self) -> tuple[type["UnfitError"], tuple[Reason, str]]:
-        """Let it travel between processes."""
+        """Let the error be pickled, so that it can be raised in another process."""
         return type(self), (self.reason, str(self))
 
 
 class TrustError(UnfitError):
-    """Parameters that nobody may vouch for: signature, time, order, or form."""
+    """Parameters that cannot be trusted, because of their signature, expiry, order (a replay) or form."""
 
 
 class Quality(IntEnum):
-    """What stands in one corrected signal."""
+    """What kind of value stands in a corrected signal."""
 
     NOT_AVAILABLE = 0
     PASSED_THROUGH = 1
     CORRECTED = 2
     INVALID = 3
     IMPLAUSIBLE = 4
-    """A measured value that the Kirchhoff sum says is wrong; in a signal of 2 bits INVALID stands for it."""
+    """A measured value that is wrong by the Kirchhoff sum; a quality signal of only 2 bits shows INVALID instead."""
 
 
 @dataclass(kw_only=True)
 class Counters:
-    """Counted by the core and by the loop around it."""
+    """Counters of the core and of the loop around it."""
 
     frames_in: int = 0
-    """Frames of branches, their voltages and the state of [watch] received."""
+    """Received frames that carry a branch, its voltage, or the input of [watch]."""
     answers: int = 0
-    """Corrected messages that an overlay node made, those with values passed through or not available included."""
+    """Corrected messages that an overlay node made, including those with values passed through or not available."""
     rewritten: int = 0
-    """Frames in which a gateway wrote another current than was measured."""
+    """Frames in which a gateway changed a measured current."""
     forwarded: int = 0
-    """Frames passed on by a gateway, those that it rewrote included, those that the kernel carries not."""
+    """Frames that a gateway passed on, including those that it rewrote, but not those that the kernel carries."""
     returned: int = 0
-    """The same from the vehicle to the sensors' bus."""
+    """Frames that a gateway passed on from the vehicle to the sensors' bus, but not those that the kernel carries."""
     not_returned: int = 0
-    """Frames of the vehicle that the sensors' bus did not take."""
+    """Frames from the vehicle's bus that the sensors' bus did not take."""
     held_back: int = 0
     """Frames that failed their check and that a gateway did not pass on."""
     corrupt: int = 0
     """Frames with a wrong CRC or an impossible counter."""
     repeated: int = 0
-    """Frames with the counter of the one before."""
+    """Frames with the same counter as the one before."""
     jumped: int = 0
-    """Frames whose counter was further on than the layout allows."""
+    """Frames whose counter had advanced further than the layout allows."""
     gaps: int = 0
     """Times that the counter showed a few lost frames."""
     short: int = 0
     """Frames too short for a signal that the layout reads from them."""
     late: int = 0
-    """Frames of branches that were too old when they were read; nothing was made of them."""
+    """Frames of branches that were too old when they were read; they were not used."""
     dropped: int = 0
     """Frames that the kernel dropped because they were not read in time."""
     saturated: int = 0
     """Corrected values beyond the ends of their signal; the end was sent instead."""
     foreign: int = 0
-    """Frames that only this gateway may send and another node sent; they were dropped."""
+    """Frames that another node sent, though only this gateway may send them; they were dropped."""
     echoes: int = 0
-    """Own frames that came back."""
+    """Own frames that the node received again."""
     send_errors: int = 0
     """Frames that the bus did not take."""
     bus_errors: int = 0
@@ -137,31 +137,32 @@ class Counters:
     reopened: int = 0
     """Times that the bus was opened again."""
     clock_steps: int = 0
-    """Times that the time of day jumped against the steady clock; the times of reading are taken for a while then."""
+    """Times that the time of day jumped against the steady clock; time stamps of frames are ignored for a while."""
     telemetry_lost: int = 0
     """Lines of telemetry that could not be written in time."""
     reloads: int = 0
-    """Times that other parameters came in force, or those in force ended."""
+    """Times that other parameters were put in force, or those in force ended."""
 
     def text(self) -> str:
-        """One line for the log: what is not 0."""
+        """Return one line for the log, with all counters that are not 0."""
         counted = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in asdict(self).items() if value)
         return counted or "no frames"
 
 
 class Latency:
-    """Histogram of the time from when a branch's frame came until its answer was sent.
+    """Histogram of the time from the arrival of a branch's frame until its answer was sent.
 
-    Answers that are sent with one call count as the one that waited longest: a fifth of the cost, and never too little.
+    All answers sent with one call count with the latency of the one that waited longest: that costs a fifth of timing
+    each of them, and is never too small.
 
     Attributes
     ----------
     counts : list of int
-        Frames whose latency in whole microseconds has so many bits: number n counts those below 2^n us.
+        Element n counts the frames whose latency in whole microseconds has n bits, so that it is below 2^n us.
     largest_s : float
-        Largest one. [s]
+        Largest latency. [s]
     came : callable
-        Takes when a frame came, on the steady clock [s]; its answer is sent next.
+        Called with the time on the steady clock at which a frame came [s], before its answer is sent.
     """
 
     def __init__(self) -> None:
@@ -171,7 +172,7 @@ class Latency:
         self.came = self._waiting.append
 
     def sent(self, not_sent: int) -> None:
-        """Count the frames that came since the last time, unless the bus did not take some of their answers."""
+        """Count the frames that came since the last call, unless the bus did not take some of their answers."""
         waiting = self._waiting
         if waiting and not not_sent:
             self.add(time.monotonic() - waiting[0], len(waiting))
@@ -183,12 +184,12 @@ class Latency:
         self.largest_s = max(self.largest_s, latency_s)
 
     def at_most_s(self, share: float) -> float:
-        """Latency that this share of the frames does not exceed, up to a factor of 2 more than it is. [s]"""
+        """Return the latency that this share of the frames does not exceed; it may be up to twice the true one. [s]"""
         wanted = share * sum(self.counts)
         bits = next(n for n, below in enumerate(accumulate(self.counts)) if below >= wanted)
         return min(1e-6 * 2.0**bits, self.largest_s)
 
     def microseconds(self) -> dict[str, int]:
-        """Median, 99.9 % and largest. [us]"""
+        """Return median, 99.9 % quantile and largest latency. [us]"""
         found_s = {"p50": self.at_most_s(0.5), "p99.9": self.at_most_s(0.999), "max": self.largest_s}
         return {name: round(1e6 * value_s) for name, value_s in found_s.items()}
