@@ -1,1 +1,1 @@
-"""The node's buses, clocks, files and surroundings around :mod:`ecu_node.core`."""
+"""The node around :mod:`ecu_node.core`: its buses, clocks, files and service manager."""

@@ -1,7 +1,8 @@
-"""Opening a bus of python-can: its settings by the command line first, then by python-can's own configuration.
+"""Opens a bus of python-can; its settings come from the command line, then from python-can's own configuration.
 
-That is CAN_BITRATE and CAN_CONFIG of the environment, and can.conf: its section named as the channel, then [default].
-An adapter's driver takes 500 kbit/s where nothing is said, which disturbs a bus of another rate: it is never asked to.
+The latter is CAN_BITRATE and CAN_CONFIG of the environment, and can.conf: the section named like the channel, then
+[default]. Without a bit rate an adapter's driver would take 500 kbit/s, which disturbs a bus of another rate: no such
+bus is opened.
 """
 
 import configparser
@@ -20,9 +21,9 @@ from ecu_node.errors import BusError
 _SPEED_SET_ELSEWHERE = frozenset({"serial", "socketcan", "socketcand", "udp_multicast", "virtual"})
 _WITHOUT_ADAPTER = frozenset({"udp_multicast", "virtual"})
 _TAKE_TIMING = frozenset({"canalystii", "cantact", "kvaser", "nixnet", "pcan", "slcan", "usb2can", "vector"})
-"""The other drivers of python-can 4.6 drop a bit timing silently."""
+"""Interfaces that can be given a bit timing; the other drivers of python-can 4.6 drop it silently."""
 _TAKE_NO_DATA_BITRATE = frozenset({"nixnet", "pcan", "slcan"})
-"""Of these the rates of CAN FD can only be set as bit timing."""
+"""Interfaces whose rates of CAN FD can only be set as bit timing."""
 _LISTEN_ONLY: dict[str, dict[str, Any]] = {
     "cantact": {"monitor": True},
     "kvaser": {"driver_mode": False},
@@ -33,11 +34,11 @@ _LISTEN_ONLY: dict[str, dict[str, Any]] = {
     "systec": {"state": can.BusState.PASSIVE},
     "vector": {"listen_only": True},
 }
-"""Settings with which a driver's adapter sends nothing at all, not even acknowledgements."""
+"""Settings, by interface, with which the adapter sends nothing at all, not even acknowledgements."""
 _RECEIVE_BUFFER_BYTES = 1 << 20
-"""Asked of the kernel, which gives what it allows: frames of the time in which the node does something else."""
+"""Buffer for frames that come while the node is busy; the kernel gives as much of it as it allows. [byte]"""
 _FD_MTU = 72
-"""Bytes of a frame of an interface of SocketCAN that carries CAN FD."""
+"""MTU of a SocketCAN interface that carries CAN FD. [byte]"""
 
 
 class Settings(TypedDict, total=False):
@@ -46,10 +47,10 @@ class Settings(TypedDict, total=False):
     fd: bool
     """Whether to use CAN FD."""
     listen_only: bool
-    """Whether to send nothing, acknowledgements included where the adapter can do without."""
+    """Whether to send nothing, and no acknowledgements either if the adapter can omit them."""
     bitrate: int | None
     data_bitrate: int | None
-    """Of the command line. [bit/s]"""
+    """Bit rates given on the command line. [bit/s]"""
 
 
 def connect(
@@ -60,9 +61,9 @@ def connect(
     Parameters
     ----------
     filters : list of CanFilter, optional
-        What to receive; everything if not given.
+        Frames to receive; all if not given.
     interface, channel, **settings :
-        As for :func:`bus_config`.
+        Arguments of :func:`bus_config`.
 
     Returns
     -------
@@ -80,12 +81,12 @@ def connect(
         bus = can.Bus(**config, ignore_config=True)
     except (can.CanError, OSError, ValueError, TypeError, KeyError, NotImplementedError) as error:
         raise BusError(f"{interface} {channel}: cannot open the bus: {error_text(error)}") from None
-    except (ImportError, NameError) as error:  # python-can's kvaser calls functions of a driver that it did not find
+    except (ImportError, NameError) as error:  # python-can's kvaser calls functions of a driver that is missing
         raise BusError(
             f"{interface} {channel}: cannot open the bus: {error}; install the driver of the adapter"
         ) from None
     if bus.channel_info == can.BusABC.channel_info:
-        bus.channel_info = f"{interface} {channel}"  # what an interface does not tell of itself
+        bus.channel_info = f"{interface} {channel}"  # for interfaces that do not name themselves
     opened = socketcan_socket(bus)
     if opened is not None:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
@@ -93,12 +94,12 @@ def connect(
 
 
 def filters_of(keys: Iterable[tuple[int, bool]]) -> list[CanFilter]:
-    """Filters for the kernel to apply: these identifiers, each with whether it has 29 bits."""
+    """Return filters that let these identifiers pass, each given with whether it has 29 bits."""
     return [{"can_id": key, "can_mask": 0x1FFFFFFF if long else 0x7FF, "extended": long} for key, long in keys]
 
 
 def error_text(error: Exception) -> str:
-    """What went wrong, in one line; where it is known, what to do."""
+    """Say what went wrong, in one line, and what to do if that is known."""
     if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
         return "this kernel has no SocketCAN (modules can, can_raw and, for virtual buses, vcan)"
     if isinstance(error, OSError) and error.errno == errno.ENODEV:
@@ -107,18 +108,18 @@ def error_text(error: Exception) -> str:
 
 
 def is_interface(bus: can.BusABC, name: str) -> bool:
-    """Whether a bus is one of python-can's interface of this name."""
+    """Whether a bus belongs to python-can's interface of this name."""
     return any(f"{kind.__module__}.".startswith(f"can.interfaces.{name}.") for kind in type(bus).__mro__)
 
 
 def socketcan_socket(bus: can.BusABC) -> socket.socket | None:
-    """Socket of a bus of SocketCAN; None for other interfaces."""
+    """Return the socket of a SocketCAN bus; None for other interfaces."""
     found = getattr(bus, "socket", None) if is_interface(bus, "socketcan") else None
     return found if isinstance(found, socket.socket) else None
 
 
 def carries_fd(interface: str, channel: str) -> bool:
-    """Whether an interface of SocketCAN is set up for CAN FD; False where that is not known."""
+    """Whether a SocketCAN interface is set up for CAN FD; False if that is not known."""
     try:
         return interface == "socketcan" and int(Path(f"/sys/class/net/{channel}/mtu").read_text()) >= _FD_MTU
     except (OSError, ValueError):
@@ -126,14 +127,14 @@ def carries_fd(interface: str, channel: str) -> bool:
 
 
 def bus_config(interface: str, channel: str | None, **settings: Unpack[Settings]) -> dict[str, Any]:
-    """Settings of a bus, checked as far as that goes without opening it.
+    """Return the settings of a bus, checked as far as is possible without opening it.
 
     Parameters
     ----------
     interface, channel : str
-        As python-can names them; None: the channel of its configuration.
+        Names of interface and channel in python-can; None: the channel of its configuration.
     **settings : Settings
-        By keyword, what is not as it is set up or as python-can's configuration says.
+        Settings that take precedence over those of python-can's configuration.
 
     Returns
     -------
@@ -160,7 +161,7 @@ def bus_config(interface: str, channel: str | None, **settings: Unpack[Settings]
 
 
 def _wrong_speed(config: Mapping[str, Any]) -> str | None:
-    """Why the speed of the bus would not be the one that was meant; None if it will be."""
+    """Say why the bus would not get the speed that was meant; None if it will."""
     interface, channel = config["interface"], config["channel"]
     rates = {name: config[name] for name in ("bitrate", "data_bitrate") if name in config}
     has_timing = "timing" in config or "f_clock" in config
@@ -176,7 +177,7 @@ def _wrong_speed(config: Mapping[str, Any]) -> str | None:
 
 
 def _wrong_timing(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterator[str]:
-    """Why python-can would drop a bit timing, or how it contradicts the bit rates given beside it."""
+    """Yield why python-can would drop a bit timing, or how the timing contradicts bit rates that are given too."""
     timing, fd = config.get("timing"), config.get("fd")
     if config["interface"] not in _TAKE_TIMING:
         yield "python-can cannot set a bit timing there; take f_clock out, and give a bit rate"
@@ -194,7 +195,7 @@ def _timing_keys(*, fd: Any) -> str:
 
 
 def _wrong_rates(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterator[str]:
-    """Which bit rate is missing, or is none of the adapter's."""
+    """Yield which bit rate is missing, or is not one that the adapter can set."""
     interface, channel, fd = config["interface"], config["channel"], config.get("fd")
     if fd and interface in _TAKE_NO_DATA_BITRATE:
         yield f"CAN FD needs its bit timing: {_timing_keys(fd=fd)} in section [{channel}] of can.conf"
@@ -207,7 +208,7 @@ def _wrong_rates(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterato
         elif not isinstance(rates[name], int) or rates[name] <= 0:
             yield f"{name} = {rates[name]}: a number of bit/s is expected, such as 250000"
     if interface == "pcan":
-        from can.interfaces.pcan.basic import PCAN_BITRATES  # noqa: PLC0415  # warns of what it lacks
+        from can.interfaces.pcan.basic import PCAN_BITRATES  # noqa: PLC0415  # imported only for pcan, as it warns of missing drivers
 
         if rates["bitrate"] not in PCAN_BITRATES:  # the driver would set 500 kbit/s
             known = ", ".join(map(str, PCAN_BITRATES))
@@ -215,7 +216,7 @@ def _wrong_rates(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterato
 
 
 def config_text(config: Mapping[str, Any]) -> str:
-    """A bus, and what it is opened with, in one line."""
+    """Describe a bus and the settings that it is opened with, in one line."""
     hidden = {"interface", "channel", "can_filters", "receive_own_messages"}
     if "timing" in config:
         hidden |= BitTimingDict.__annotations__.keys() | BitTimingFdDict.__annotations__.keys()
@@ -226,7 +227,7 @@ def config_text(config: Mapping[str, Any]) -> str:
 
 
 def acknowledgement(interface: str, channel: str) -> str:
-    """What a listen-only node says of itself: whether its adapter still acknowledges frames."""
+    """Return the line that a listen-only node logs: whether its adapter still acknowledges frames."""
     if interface in _LISTEN_ONLY:
         return "listen-only: nothing is sent, and no frame acknowledged"
     if interface in _WITHOUT_ADAPTER:

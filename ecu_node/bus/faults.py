@@ -1,7 +1,7 @@
 """Fault memory: why the node fell back, kept in the state folder as a control unit keeps its trouble codes.
 
-One entry per reason and branches: when first and last, how often, and the currents of the last time. What is active
-holds also after a restart, until the bus has slept (a branch that was silent or stuck), another parameter set is in
+There is one entry per reason and branches: when first and last, how often, and the currents of the last time. An active
+fault stays so after a restart, until the bus has slept (a branch that was silent or stuck), another parameter set is in
 force, or ``ecu-node clear``.
 """
 
@@ -20,27 +20,27 @@ from ecu_node.errors import UserError
 _NAME = "faults.json"
 _MOST_FAULTS, _LARGEST_BYTES = 64, 1_000_000
 _LOOK_EVERY_S = 1.0
-"""Between looks whether somebody cleared the memory. [s]"""
+"""Time between checks whether somebody cleared the memory. [s]"""
 _TRY_AGAIN_S = 60.0
-"""Between attempts to write what could not be written. [s]"""
+"""Time between attempts to write what could not be written. [s]"""
 
 
 class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """One entry."""
+    """One entry of the fault memory."""
 
     reason: str
-    """As the status message names it."""
+    """Name of the reason in the status message."""
     branches: list[str]
-    """Which explain it best."""
+    """Branches that explain it best, the best one first."""
     parameter_set: int
-    """In force the last time, modulo 256."""
+    """Number of the parameter set in force when it last occurred, modulo 256."""
     first: str
     last: str
-    """ISO 8601, UTC."""
+    """When it occurred first and last; ISO 8601, UTC."""
     count: int = 0
     measured_a: dict[str, float] = {}
     corrected_a: dict[str, float] = {}
-    """Currents of the last time, positive into the junction. [A]"""
+    """Currents when it last occurred, positive into the junction. [A]"""
     active: bool = True
     """Whether it still keeps the node from correcting."""
 
@@ -56,7 +56,7 @@ def _file(folder: Path) -> Path:
 
 
 def read_faults(folder: Path) -> list[Fault]:
-    """Entries of a state folder, the last one first; UserError if they cannot be read."""
+    """Return the entries of a state folder, the last one first; raise UserError if they cannot be read."""
     path = _file(folder)
     try:
         return msgspec.json.decode(read_user_file(path, largest_bytes=_LARGEST_BYTES), type=list[Fault])
@@ -73,7 +73,7 @@ def clear_faults(folder: Path) -> None:
 
 
 def faults_text(faults: list[Fault]) -> str:
-    """Entries for people."""
+    """Return the entries as text for people."""
     lines = []
     for fault in faults:
         which = f" ({' or '.join(fault.branches)})" if fault.branches else ""
@@ -94,20 +94,20 @@ class FaultMemory:
     Parameters
     ----------
     corrector : Corrector
-        Parameters are in force in it; what is active of the same set is latched again.
+        Core, with its parameters already in force; an active fault of the same parameter set is latched again.
     folder : Path
         State folder.
     say : callable
         Takes one line for the log.
     background : Executor
-        Writes: a slow disk must not hold up the bus.
+        Runs the writing, as a slow disk must not hold up the bus.
     """
 
     def __init__(self, corrector: Corrector, folder: Path, say: Callable[[str], None], background: Executor) -> None:
         self._corrector, self._folder, self._say, self._background = corrector, folder, say, background
         self._due_s = self._tried_s = float("-inf")
         self._written: Future[bool] | None = None
-        """Whether the file is as the faults are, once that is known; None: as it was read."""
+        """Result of the last write: whether the file now holds the faults; None before the first one."""
         try:
             self._faults = read_faults(folder)
         except UserError as error:
@@ -119,7 +119,7 @@ class FaultMemory:
         self._before = corrector.latched, corrector.latched_branches
 
     def look(self, now_s: float) -> None:
-        """Keep what has changed since the last time."""
+        """Record a change of what is latched since the last call, and see whether the memory was cleared."""
         corrector = self._corrector
         if now_s >= self._due_s and (self._written is None or self._written.done()):
             self._due_s = now_s + _LOOK_EVERY_S

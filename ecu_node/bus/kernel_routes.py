@@ -1,9 +1,9 @@
-"""Frames that a gateway only passes on, carried by the kernel: rules of its module can-gw, which outlive the node.
+"""Lets the kernel carry the frames that a gateway only passes on, by rules of its module can-gw that outlive the node.
 
-They are set over netlink, not by the program ``cangw``: a rule takes microseconds instead of a process, its error is a
-number, and rules can be read back and compared. A rule copies what its one filter matches, so several identifiers can
-be left out only by filters for all others. The kernel routes no frame twice, and none back to where it came from
-(net/can/gw.c); structures are those of linux/can/gw.h and linux/netlink.h.
+Rules are set over netlink, not by the program ``cangw``: a rule then takes microseconds instead of a process, its error
+is a number, and rules can be read back and compared. A rule copies the frames that its one filter matches, so several
+identifiers can be left out only by filters for all others. The kernel routes no frame twice, and none back to where it
+came from (net/can/gw.c); structures are those of linux/can/gw.h and linux/netlink.h.
 """
 
 import errno
@@ -22,25 +22,25 @@ _NEW, _DELETE, _GET = 24, 25, 26
 _REQUEST, _ACKNOWLEDGE, _DUMP = 0x1, 0x4, 0x300
 _ERROR, _DONE = 2, 3
 _MESSAGE = struct.Struct("=IHHII")
-"""struct nlmsghdr: length, kind, flags, two numbers that are not needed."""
+"""struct nlmsghdr: length, kind, flags, and two numbers that are not used here."""
 _RULE = struct.Struct("=BBH")
 """struct rtcanmsg: family, kind, flags."""
 _CAN_TO_CAN, _ECHO, _FD = 1, 0x1, 0x8
 _ATTRIBUTE = struct.Struct("=HH")
-"""struct nlattr: length, number."""
+"""struct nlattr: length, number of the attribute."""
 _ATTRIBUTES = struct.Struct("=HHI HHI HHII HHB3x")
-"""Source, target, filter and hop limit, each with length and number."""
+"""Attributes of a rule: source, target, filter and hop limit, each with its length and number."""
 _FROM, _TO, _FILTER, _LIMIT = 9, 10, 11, 13
 _COUNTERS = {7, 8, 12}
-"""Attributes with the frames that were handled, dropped, and not routed again."""
+"""Attributes with counts of the frames that were handled, dropped, and not routed again."""
 _EXTENDED = 0x80000000
 _LOOK_EVERY_S = 2.0
 _LONGEST_ANSWER_S = 1.0
-"""The kernel answers at once. [s]"""
+"""Longest wait for an answer of the kernel, which answers at once. [s]"""
 
 
 def complement(taken: Collection[int], bits: int) -> Iterator[tuple[int, int]]:
-    """Cover all identifiers of so many bits but those taken, each once, by pairs of identifier and mask."""
+    """Yield pairs of identifier and mask that match each identifier of `bits` bits once, except those taken."""
 
     def cover(prefix: int, free: int) -> Iterator[tuple[int, int]]:
         if not any(identifier >> free == prefix for identifier in taken):
@@ -61,7 +61,7 @@ class _Route(NamedTuple):
 
 
 class KernelRoutes:
-    """The kernel's rules between two buses, both ways; as a context it removes them, unless the program itself fails.
+    """The kernel's rules between two buses, both ways; leaving the context removes them, unless the program crashed.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class KernelRoutes:
     ours : collection of tuple
         Identifiers, each with whether it has 29 bits, that the kernel must not carry.
     fd : bool
-        Whether it carries CAN FD frames, too (Linux 5.4 or newer).
+        Whether the kernel carries CAN FD frames, too (Linux 5.4 or newer).
     say : callable
         Takes one line for the log.
 
@@ -98,12 +98,12 @@ class KernelRoutes:
         self._socket.settimeout(_LONGEST_ANSWER_S)
         where = " and ".join(channels)
         try:
-            # A port that two gateways between the same buses would share, above those that are process numbers.
+            # Two gateways between the same buses would need the same port; it is above those that are process numbers.
             self._socket.bind((1 << 30 | one << 15 | other, 0))
         except OSError:
             raise BusError(f"{where}: another gateway works between them on this computer; stop one") from None
         try:
-            self._change(_DELETE, _Route(0, one, one, 0, 0))  # there is none: EINVAL from who may delete
+            self._change(_DELETE, _Route(0, one, one, 0, 0))  # no such rule exists: EINVAL if we may delete, else EPERM
         except OSError as error:
             if error.errno == errno.EPERM and self._present():
                 raise BusError(
@@ -114,7 +114,7 @@ class KernelRoutes:
                 raise
 
     def set(self) -> None:
-        """Have all rules at work, both ways or none; what an earlier gateway left and is right stays as it is.
+        """Set all rules, both ways, or none; right rules that an earlier gateway left stay as they are.
 
         Raises
         ------
@@ -129,7 +129,7 @@ class KernelRoutes:
         self._due_s = float("-inf")
 
     def look(self, now_s: float) -> None:
-        """See every few seconds that the rules are there, and set again what is missing: rules go with an interface."""
+        """Check every few seconds that all rules are there, and set missing ones: rules vanish with their interface."""
         if now_s < self._due_s:
             return
         self._due_s = now_s + _LOOK_EVERY_S
@@ -144,7 +144,7 @@ class KernelRoutes:
 
     def remove(self) -> None:
         """Remove all rules, both ways."""
-        with suppress(OSError):  # as an interface that goes just now, with its rules
+        with suppress(OSError):  # an interface may vanish just now, with its rules
             self._replace(Counter())
 
     def __enter__(self) -> Self:
@@ -161,13 +161,13 @@ class KernelRoutes:
         return Counter(_Route(flags, *way, *pair) for way in ways for flags, *pair in self._kinds)
 
     def _present(self) -> Counter[_Route]:
-        """Rules of a gateway between these buses, which have its hop limit and change no frame."""
+        """Return the rules of a gateway between these buses: those with a hop limit that change no frame."""
         ends = set(map(socket.if_nametoindex, self._channels))
         found = map(_route, self._ask(_GET, _DUMP, _RULE.pack(socket.AF_CAN, _CAN_TO_CAN, 0)))
         return Counter(route for route in found if route is not None and {route.source, route.target} == ends)
 
     def _replace(self, wanted: Counter[_Route]) -> int:
-        """Make the rules these; how many were not as they must be."""
+        """Replace the rules by these; return how many were surplus or missing."""
         present = self._present()
         surplus, missing = present - wanted, wanted - present
         for kind, routes in ((_DELETE, surplus), (_NEW, missing)):
@@ -181,7 +181,7 @@ class KernelRoutes:
         self._ask(kind, _ACKNOWLEDGE, _RULE.pack(socket.AF_CAN, _CAN_TO_CAN, flags) + attributes)
 
     def _ask(self, kind: int, flags: int, body: bytes) -> list[bytes]:
-        """Ask the kernel; what it answers, without headers."""
+        """Send a request to the kernel; return its answers, without headers."""
         self._socket.send(_MESSAGE.pack(_MESSAGE.size + len(body), kind, _REQUEST | flags, 0, 0) + body)
         found: list[bytes] = []
         while True:
@@ -198,7 +198,7 @@ class KernelRoutes:
 
 
 def _route(payload: bytes) -> _Route | None:
-    """A rule as the kernel tells it; None for one that no gateway sets."""
+    """Decode a rule that the kernel reports; None for one that no gateway sets."""
     _, _, flags = _RULE.unpack_from(payload)
     found, at = {}, _RULE.size
     while at < len(payload):
@@ -214,7 +214,7 @@ def _route(payload: bytes) -> _Route | None:
 def kernel_routes(
     channels: tuple[str, str], ours: Collection[tuple[int, bool]], *, fd: bool, say: Callable[[str], None]
 ) -> KernelRoutes | None:
-    """Rules for all identifiers but ours; None, and a line in the log, if the node must carry all frames itself."""
+    """Return rules for all identifiers but ours; None, and a line in the log, if the node carries all frames itself."""
     if set(channels) - {name for _, name in socket.if_nameindex()}:
         return None  # opening the bus says so
     try:

@@ -1,7 +1,7 @@
-"""The node on one bus (overlay), and between two (gateway): thin shells around the core that own clock and buses.
+"""The node on one bus (overlay) or between two (gateway): a thin shell around the core, with clock and buses.
 
-An overlay node works in one thread. In a gateway one thread passes frames on from the sensors, and corrects; another
-one passes all others on the other way. Where the kernel carries what is only passed on, neither does so again.
+An overlay node works in one thread. In a gateway one thread corrects the sensors' frames and passes them on, another
+passes frames back from the vehicle. Frames that the kernel carries are passed on by neither.
 """
 
 import threading
@@ -19,18 +19,18 @@ from ecu_node.core.status import Counters, Latency
 from ecu_node.errors import BusError
 
 _OLDEST_FRAME_S = 10.0
-"""No frame waits for longer, unless the whole process pauses. [s]"""
+"""No frame waits for longer than this, unless the whole process pauses. [s]"""
 _LARGEST_JITTER_S = 0.05
-"""By more than this the time of day changes against the steady clock only if it is set. [s]"""
+"""If the time of day changes by more than this against the steady clock, it was set. [s]"""
 
 
 def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float) -> float:
-    """When a frame came, on the steady clock.
+    """Return when a frame came, on the steady clock.
 
     Parameters
     ----------
     stamp_s : float
-        Its time stamp by the kernel or the adapter; 0 if there is none. [s]
+        Its time stamp by the kernel or the adapter, in time of day; 0 if there is none. [s]
     now_s : float
         The steady clock now. [s]
     clock_ahead_s : float
@@ -39,7 +39,7 @@ def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float) -> float:
     Returns
     -------
     float
-        The stamp on the steady clock; now if there is none, it would be in the future, or the clock was set.
+        The stamp on the steady clock; ``now_s`` if there is none, it lies in the future, or the clock was set. [s]
     """
     if stamp_s == 0.0 or clock_ahead_s == float("inf"):
         return now_s
@@ -47,12 +47,12 @@ def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float) -> float:
 
 
 class TimeOfDay:
-    """By how much the time of day is ahead of the steady clock, and whether it was set.
+    """Tells by how much the time of day is ahead of the steady clock, and notices when it is set.
 
     Parameters
     ----------
     counters : Counters
-        Where it is counted how often it was set.
+        Counters, in which it counts how often the time of day was set.
     """
 
     def __init__(self, counters: Counters) -> None:
@@ -61,7 +61,7 @@ class TimeOfDay:
             self._read()
 
     def ahead_s(self) -> float:
-        """By how much it is ahead now [s]; infinity while frames may be waiting that were stamped before it was set."""
+        """Return by how much it is ahead [s]; infinity while frames stamped before it was set may be waiting."""
         before_s = self._ahead_s
         now_s = self._read()
         if abs(self._ahead_s - before_s) > _LARGEST_JITTER_S:
@@ -70,7 +70,7 @@ class TimeOfDay:
         return self._ahead_s if now_s - self._set_s > _OLDEST_FRAME_S else float("inf")
 
     def _read(self) -> float:
-        """Read both clocks, unless the process was held up in between; the steady one. [s]"""
+        """Compare both clocks, unless the process was held up in between; return the steady one. [s]"""
         now_s = time.monotonic()
         ahead_s = time.time() - now_s
         if time.monotonic() - now_s < _LARGEST_JITTER_S:
@@ -79,20 +79,20 @@ class TimeOfDay:
 
 
 _REMEMBERED = 256
-"""Frames of one identifier that may be on their way back."""
+"""Most frames of one identifier that may be on their way back."""
 _Key = tuple[int, bool]
 """An identifier, and whether it has 29 bits."""
 
 
 class OwnFrames:
-    """Frames that nobody but this node may send on a bus, and which of them it may hear itself.
+    """Frames that only this node may send on a bus; it remembers which it sent, as it may receive its own.
 
     Parameters
     ----------
     keys : iterable of tuple
         Identifiers, each with whether it has 29 bits.
     remembered : int
-        So many frames of each may be on their way.
+        Number of frames of each identifier that may be on their way back.
     """
 
     def __init__(self, keys: Iterable[_Key], remembered: int = _REMEMBERED) -> None:
@@ -103,7 +103,7 @@ class OwnFrames:
         self._sent[key].append(data)
 
     def is_foreign(self, key: _Key, data: bytes | bytearray) -> bool:
-        """Whether another node must have sent this frame; one that was sent from here may come back once."""
+        """Whether another node must have sent this frame; one that was sent from here may be received once."""
         try:
             self._sent[key].remove(data)
         except ValueError:
@@ -115,57 +115,57 @@ class OwnFrames:
 
 
 _LONGEST_WAIT_S = 0.1
-"""A wake-up at least this often, so that a request to stop is seen. [s]"""
+"""The node wakes up at least this often, so that a request to stop is seen. [s]"""
 _LOOK_EVERY_S = 0.02
-"""The junction is looked at, and the watchdog fed, at least this often, however rare the status is. [s]"""
+"""The junction is looked at, and the watchdog fed, at least this often, even if the status is sent more rarely. [s]"""
 _LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
-"""So many status periods, but no longer than this [s], the node listens for another one before it says anything."""
+"""The node listens for another one before it sends: for this many status periods, but no longer than this [s]."""
 
 _LONGEST_TURN_S = 2.0
-"""A gateway's way back is at work if it has looked for frames within this time. [s]"""
+"""A gateway's thread from vehicle to sensors counts as alive if it has looked for frames within this time. [s]"""
 _LONGEST_DELAY_S = 1.0
-"""A gateway passes a branch's frame on only if it waited no longer than this, or than the branch's timeout. [s]"""
+"""A gateway drops a branch's frame that has waited longer than this and than the branch's timeout. [s]"""
 _COPIES, _COPIES_WITHIN_S = 10, 2.0
-"""So many copies of one bus's frames on the other one, in so long [s], show that both are one."""
+"""This many copies of one bus's frames on the other, within this time [s], show that both are the same bus."""
 _REMEMBERED_COPIES = 16
-"""Frames of each identifier that may be on their way round."""
+"""Number of frames of each identifier that may be on their way from one bus to the other."""
 
 
 @dataclass
 class _Job:
-    """Something to be done beside the frames, again and again."""
+    """Something that is done periodically, between frames."""
 
     period_s: float
     do: Callable[[float], None]
     due_s: float = float("-inf")
 
     def run(self, now_s: float) -> None:
-        """Do it; it is due again in step, unless it is late by a whole period."""
+        """Do the job; it is next due one period after it was due, or after now if it is a whole period late."""
         self.do(now_s)
         in_step_s = self.due_s + self.period_s
         self.due_s = in_step_s if in_step_s > now_s else now_s + self.period_s
 
 
 class Node:
-    """Takes frames as they come, and in between looks at the junction and tells the status.
+    """Takes frames as they come, and in between looks at the junction and sends the status.
 
-    Of these one at a time is done: a frame that comes meanwhile waits for no more than that.
+    It does one of these at a time, and a frame that comes meanwhile waits for that one only.
 
     Parameters
     ----------
     sensors, vehicle : SteadyBus
-        Where the sensors are heard, and where the node answers and tells its status: the same bus for an overlay node,
-        another one for a gateway.
+        Bus on which the sensors are heard, and bus on which the node answers and sends its status: the same one for an
+        overlay node, two for a gateway.
     corrector : Corrector
         The core.
     period_s : float
-        Between status messages. [s]
+        Time between status messages. [s]
     on_tick : callable
-        Called after each look at the junction, with the steady clock's time [s], and whether the whole node works.
+        Called after each look at the junction, with the time of the steady clock [s], and whether all threads work.
     latency : Latency
-        Where it is counted how long answers take.
+        Histogram to which the latencies of answers are added.
     routed : bool
-        Whether the kernel carries all identifiers but those that only the gateway may send to the vehicle.
+        Whether the kernel carries all identifiers except those that only the gateway may send to the vehicle.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class Node:
         if self._is_gateway:
             self._not_from_vehicle = OwnFrames(corrector.own_keys | corrector.branch_keys, _REMEMBERED_COPIES)
         self._copies: deque[float] = deque(maxlen=_COPIES)
-        """When copies of one bus's frames came from the other one. [s]"""
+        """When copies of frames from one bus came from the other bus. [s]"""
         self._time_of_day = TimeOfDay(corrector.counters)
         self._heard_s = self._due_s = self._back_s = float("-inf")
         often_s = min(period_s, _LOOK_EVERY_S)
@@ -213,7 +213,7 @@ class Node:
             ready()
             self._work(stop)
             return
-        end_s = time.monotonic() + _LONGEST_WAIT_S  # on a full bus more comes meanwhile
+        end_s = time.monotonic() + _LONGEST_WAIT_S  # a busy bus never runs empty
         while time.monotonic() < end_s and self._sensors.receive(0.0) is not None:
             pass  # too old by now
         ready()
@@ -228,7 +228,7 @@ class Node:
         back.result()  # raises what ended it
 
     def _listen(self, stop: Callable[[], bool]) -> None:
-        """Hear whether another node sends what only this one may; what else comes is too old afterwards."""
+        """Listen whether another node sends what only this one may; drop all else, which is too old afterwards."""
         end_s = time.monotonic() + min(_LISTEN_PERIODS * self._period_s, _LONGEST_LISTEN_S)
         while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
             message = self._vehicle.receive(min(left_s, _LONGEST_WAIT_S))
@@ -248,7 +248,7 @@ class Node:
             self._hear()
 
     def _look(self, now_s: float) -> None:
-        self._corrector.look(self._heard_s)  # no branch is stale for what has not been heard yet
+        self._corrector.look(self._heard_s)  # frames that wait to be read make no branch stale
         self._on_tick(now_s, not self._is_gateway or time.monotonic() - self._back_s < _LONGEST_TURN_S)
 
     def _tell(self, _: float) -> None:
@@ -259,10 +259,10 @@ class Node:
             self._corrector.counters.send_errors += self._vehicle.flush()[1]
 
     def _hear(self) -> None:
-        """Take what comes until there is something else to do, and note up to when the bus was heard.
+        """Take frames until there is something else to do, and note up to which time the bus was heard.
 
-        That is until it was asked last, or, if there may be more, until the last frame came. After a pause of the whole
-        process, frames of all branches wait to be read, and none of these is stale.
+        That is when it was asked last, or, if more frames may wait, when the last one came. So no branch is stale after
+        a pause of the whole process, while frames of all branches wait to be read.
         """
         bus = self._sensors
         message = bus.receive(min(_LONGEST_WAIT_S, max(0.0, self._due_s - bus.asked_s)))
@@ -277,11 +277,11 @@ class Node:
                         self._heard_s = steady_time_s(message.timestamp, now_s, ahead_s)
                     return
             message = bus.receive(0.0)
-        self._flush()  # error frames may have ended a batch, or the bus
+        self._flush()  # for a batch that was ended by error frames, or by a bus that failed
         self._heard_s = bus.asked_s
 
     def _answer(self, message: can.Message, now_s: float, ahead_s: float) -> None:
-        """Overlay: take a frame; given are the steady clock, and by how much the time of day is ahead of it. [s]"""
+        """Overlay: answer a frame; given the steady clock, and how far the time of day is ahead of it. [s]"""
         if message.is_remote_frame:
             return
         key, corrector = (message.arbitration_id, message.is_extended_id), self._corrector
@@ -304,7 +304,7 @@ class Node:
             self._latency.came(time_s)
 
     def _pass_on(self, message: can.Message, now_s: float, ahead_s: float) -> None:
-        """Gateway: pass a frame on to the vehicle, the current of a branch corrected in it."""
+        """Gateway: pass a frame on to the vehicle, with the currents of branches corrected."""
         key, source = (message.arbitration_id, message.is_extended_id), None
         if not message.is_remote_frame:
             if key in self._own:
@@ -327,7 +327,7 @@ class Node:
             self._vehicle.send(message)
 
     def _flush(self) -> None:
-        """Send what was made of the frames."""
+        """Send the answers or frames that are queued, and count them."""
         sent, not_sent = self._vehicle.flush()
         self._corrector.counters.send_errors += not_sent
         self._latency.sent(not_sent)
@@ -335,7 +335,7 @@ class Node:
             self._corrector.counters.forwarded += sent
 
     def _pass_back(self, stop: Callable[[], bool]) -> None:
-        """Pass on what the vehicle sends to the sensors' bus, but for frames that only this side may send."""
+        """Pass frames from the vehicle on to the sensors' bus, except those that only this side may send."""
         vehicle, own, counters = self._vehicle, self._not_from_vehicle, self._corrector.counters
         while not stop():
             message = vehicle.receive(_LONGEST_WAIT_S)
@@ -352,9 +352,9 @@ class Node:
                 counters.not_returned += not_sent
 
     def _refuse(self, message: can.Message, bus: SteadyBus, own: OwnFrames) -> None:
-        """Drop a frame that only this node may send there: whoever sends it must not stop the branches' frames.
+        """Drop a frame that only this node may send there, and go on: its sender must not stop the branches' frames.
 
-        Many copies of the other bus's frames end the node, rather than go round in circles: both buses are one.
+        Many copies of the other bus's frames end the node, as frames would go round in circles: both are the same bus.
         """
         if not own.is_foreign((message.arbitration_id, message.is_extended_id), message.data):
             now_s = time.monotonic()

@@ -1,10 +1,10 @@
 """``ecu-node run --summary``: the node sums up its drives as ``calibrator summarise`` does, in plain Python.
 
-What is summed stands in :mod:`ecu_node.summary`. Good samples are kept until a batch of blocks is over (150 s at
+:mod:`ecu_node.summary` defines what is summed. Good samples are kept until a batch of blocks is complete (150 s at
 10 Hz, which is what a power cut can lose); then all channels are put on one time base and summed, in a thread that
-frames interrupt. A record has one entry per batch. It is a file ``FOLDER/VEHICLE/TIME.summary`` of at most
-:data:`MOST_BATCHES`, replaced as a whole with each batch. Delays are those of the parameter file. Frames are read from
-the bus as a logger would, beside the node.
+yields to frames. A record has one entry per batch. It is a file ``FOLDER/VEHICLE/TIME.summary`` of at most
+:data:`MOST_BATCHES` batches, replaced as a whole with each batch. Delays are those of the parameter file. Frames are
+read from the bus as a logger would read them, beside the node.
 """
 
 import argparse
@@ -39,17 +39,17 @@ from ecu_node.parameters import VehicleParameters
 from ecu_node.summary import SummaryFile, encode_summary, packed
 
 MOST_BATCHES = 48
-"""Of a file: two hours at 10 Hz, so that no file that is written again and again grows large."""
+"""Most batches of a file, two hours at 10 Hz: the file is rewritten with each batch, so it must not grow large."""
 MOST_AT_ONCE = 64
-"""Frames taken in one look, so that a flood of them delays no correction; what the bus cannot keep is a gap."""
+"""Most frames taken in one look, so that a flood delays no correction; frames that are dropped leave a gap."""
 DRIVE_GAP_S = 60.0
-"""Nothing on the bus for so long ends a drive. [s]"""
+"""A silence of the bus for this long ends a drive. [s]"""
 _MOST_ZERO = 20_000
-"""Samples of a branch that are kept of one window with open contactors."""
+"""Most samples of a branch that are kept of one window with open contactors."""
 _PROBED_S = 30.0
-"""From the start of a drive: branches and inputs without a good value until then count as not fitted. [s]"""
+"""Branches and inputs without a good value until this time after the start of a drive count as not fitted. [s]"""
 _LONGEST_TURN_S = 0.0005
-"""After this a frame interrupts the thread that sums. [s]"""
+"""Longest time for which the thread that sums keeps the GIL when a frame comes. [s]"""
 
 _Column = list[float]
 _Samples = list[tuple[float, float]]
@@ -58,7 +58,7 @@ _Take = Callable[[float, float], None]
 
 
 def _reader(placed: PlacedSignal, codes: Codes) -> Callable[[bytearray], float | None]:
-    """Make a function that reads a signal from a payload: NaN if it is no value, None if a frame goes without it."""
+    """Return a function that reads a signal from a payload: NaN if it is no value, None if it is multiplexed out."""
     scale, offset = float(codes.scale), float(codes.offset)
 
     def value(payload: bytearray) -> float | None:
@@ -71,14 +71,14 @@ def _reader(placed: PlacedSignal, codes: Codes) -> Callable[[bytearray], float |
 
 
 class _Channel:
-    """Good samples of a branch or input since the last batch; at the time at the junction. [s], [base unit]"""
+    """Good samples of a branch or input since the last batch, with their times at the junction. [s], [base unit]"""
 
     def __init__(self, limit_s: float, delay_s: float = 0.0) -> None:
         self.limit_s, self._delay_s = limit_s + rule.TIME_RESOLUTION_S, delay_s
         self.samples: _Samples = []
 
     def put(self, time_s: float, value: float) -> None:
-        """Take a sample; one that was overtaken is left out, and of several at one instant the last counts."""
+        """Take a sample; one older than the last is left out, and of several at one instant the last counts."""
         sample, samples = (time_s - self._delay_s, value), self.samples
         if math.isnan(value) or (samples and samples[-1][0] > sample[0]):
             return
@@ -87,19 +87,19 @@ class _Channel:
         samples.append(sample)
 
     def until(self, time_s: float) -> _Samples:
-        """All samples; what the instants from a time on need is kept. [s]"""
+        """Return all samples, and keep those that instants from a time [s] on need."""
         samples = self.samples
         self.samples = samples[max(bisect_right(samples, (time_s, math.inf)) - 1, 0) :]
         return samples
 
 
 def _aligned(samples: _Samples, instants_s: Sequence[float], limit_s: float) -> _Column:
-    """Values at instants, interpolated; NaN where the samples around are too far apart, and behind the last one."""
+    """Interpolate samples at instants; NaN where neighbouring samples are too far apart, and after the last one."""
     times_s, found = [time_s for time_s, _ in samples], []
     for instant_s in instants_s:
         following = bisect_right(times_s, instant_s)
         (before_s, before), (after_s, after) = samples[max(following - 1, 0)], samples[min(following, len(samples) - 1)]
-        gap_s, since_s = after_s - before_s, instant_s - before_s  # no gap before the first sample and behind the last
+        gap_s, since_s = after_s - before_s, instant_s - before_s  # gap 0 before the first sample and after the last
         if since_s <= (0.0 if gap_s else rule.INSTANT_SLACK * limit_s):
             found.append(before)
         elif gap_s and gap_s <= limit_s:
@@ -114,18 +114,18 @@ class _Window(NamedTuple):
 
     middle: float
     pieces: _Column
-    """Medians of its pieces."""
+    """Medians of the pieces of the window."""
     samples: int
     total: float
     squares: float
-    """Number, sum and sum of squares of the distances from the median."""
+    """``samples``, ``total`` and ``squares`` are number, sum and sum of squares of the distances from the median."""
 
 
 _Reading: TypeAlias = tuple[float, float] | tuple[None, None]
 
 
 class _ZeroCurrent:
-    """What the sensors show while the contactors are open."""
+    """Offsets that the sensors show while the contactors are open."""
 
     def __init__(self, database: VehicleDatabase) -> None:
         layout = database.layout
@@ -133,12 +133,12 @@ class _ZeroCurrent:
         self._open = [] if layout.contactor is None else layout.contactor.open
         self._max_age_s = layout.max_age_s
         self._samples: dict[str, _Samples] | None = None
-        """Of the window that is open."""
+        """Samples of the current window, by branch; None while the contactors are closed."""
         self._first_s = self._last_s = 0.0
         self._windows: dict[str, list[_Window]] = {name: [] for name in layout.branch_names}
 
     def state(self, time_s: float, value: float) -> None:
-        """Take a state of the contactors."""
+        """Take a state of the contactors, and begin or end a window."""
         is_open = any(math.isclose(value, other, rel_tol=1e-9, abs_tol=1e-9) for other in self._open)
         if self._samples is not None and (not is_open or time_s - self._last_s > self._max_age_s):
             self.end_window()
@@ -153,7 +153,7 @@ class _ZeroCurrent:
             self._samples[branch].append((time_s, value_a))
 
     def end_window(self) -> None:
-        """Take the median of each branch well inside the window, and those of its pieces."""
+        """End the window; keep each branch's median, without the ends of the window, and medians of its pieces."""
         samples, self._samples = self._samples or {}, None
         first_s, last_s = self._first_s + rule.ZERO_SETTLING_S, self._last_s - rule.ZERO_SETTLING_S
         for name, windows in self._windows.items():
@@ -167,11 +167,11 @@ class _ZeroCurrent:
                 windows.append(_Window(middle, [*map(median, pieces.values())], len(far), sum(far), _product(far, far)))
 
     def forget(self) -> None:
-        """Begin anew, but for a window that is open."""
+        """Forget all windows except the current one."""
         self._windows = {name: [] for name in self._windows}
 
     def reading(self, branch: str) -> _Reading:
-        """Offset of a branch and its standard deviation [A]; None if the windows are too short."""
+        """Return the offset of a branch and its standard deviation [A]; None for both if there are too few samples."""
         windows = self._windows[branch]
         count = sum(window.samples for window in windows)
         if count < rule.FEWEST_ZERO_SAMPLES:
@@ -186,7 +186,7 @@ class _ZeroCurrent:
 
 
 _NUMBERS = ("mean", "covariance", "noise_a2", "fast_a2", "spikes", "temperature_c")
-"""Of :class:`SummaryFile`, per batch."""
+"""Fields of :class:`SummaryFile` with numbers for each batch."""
 
 
 class OnBoardSummary:
@@ -195,13 +195,13 @@ class OnBoardSummary:
     Parameters
     ----------
     folder : Path
-        Where records are written, in a folder named as the vehicle.
+        Folder for records, which are written into a subfolder named after the vehicle.
     vehicle : str
-        Its name.
+        Name of the vehicle.
     database : VehicleDatabase
         Layout and DBC.
     delays : mapping of str to (float, float or None)
-        Delay of each branch and its standard deviation, None: not known; branches that are not named have none. [s]
+        Delay of each branch and its standard deviation (None: not known); 0 for branches that are not named. [s]
     say : callable
         Takes one line for the log.
 
@@ -240,7 +240,7 @@ class OnBoardSummary:
         self.messages: dict[
             FrameKey, tuple[Callable[[bytearray], bool], list[tuple[Callable[[bytearray], float | None], _Take]]]
         ] = {}
-        """What is read, by identifier: whether a payload is sound, and per signal how it is read and who takes it."""
+        """Messages to read, by identifier: a check of the payload, and a reader and a taker for each signal."""
         self._channels: dict[str, _Channel] = {}
         self._warm = _Channel(math.inf)
         self._read_all()
@@ -248,12 +248,12 @@ class OnBoardSummary:
         self._wait_s += max(abs(delay_s) for delay_s, _ in self._delays.values())
         self._background = ThreadPoolExecutor(1, "summary")
         self._job: Future[None] | None = None
-        """Sums and writes a batch; what :meth:`_begin_file` makes, and ``_drive_starts``, is its own meanwhile."""
+        """Job that sums and writes a batch; until it ends only it uses ``_drive_starts`` and the fields of the file."""
         self._has_failed = False
         self._zero_s: float | None = None
-        """When the drive began, by the time of day. [s]"""
+        """When the drive began, in time of day [s]; None between drives."""
         self._next: int | None = None
-        """Instant of the time base from which on nothing was summed yet."""
+        """Number of the first instant of the time base that was not summed yet; None before the time base begins."""
         self._heard_s = self._last_s = self._due_s = 0.0
         self._recorded: list[str] = []
         self._inputs: list[str] = []
@@ -264,11 +264,11 @@ class OnBoardSummary:
     # ---- frames
 
     def listen(self, bus: SteadyBus) -> None:
-        """Take frames from a bus from now on, at each :meth:`look`; it is closed with the summary."""
+        """Take frames from a bus at each :meth:`look` from now on; :meth:`close` closes the bus."""
         self._bus = bus
 
     def look(self, now_s: float) -> None:
-        """Take the frames that have come; on the steady clock. [s]"""
+        """Take the frames that have come; ``now_s`` is the steady clock. [s]"""
         for _ in range(MOST_AT_ONCE):
             if self._bus is None or (message := self._bus.receive(0.0)) is None:
                 break
@@ -285,11 +285,11 @@ class OnBoardSummary:
         Parameters
         ----------
         key : FrameKey
-            Identifier.
+            Its identifier.
         payload : bytearray
-            Data.
+            Its data.
         stamp_s : float
-            Time of day. A step of it, forwards or backwards, begins another drive. [s]
+            Time of day at which it came [s]; a large step of it, forwards or backwards, begins another drive.
         """
         if self._zero_s is not None and abs(stamp_s - self._zero_s - self._last_s) > DRIVE_GAP_S:
             self.end_drive()
@@ -307,7 +307,7 @@ class OnBoardSummary:
             self._sum_batch()
 
     def end_drive(self) -> None:
-        """End a drive: its last block is closed, short as it may be, and written."""
+        """End the drive: sum and write its last block, however short."""
         self._zero.end_window()
         if self._zero_s is not None and (self._next is not None or self._start()):
             end_s = min(self._channels[name].samples[-1][0] for name in (*self._recorded, *self._branches))
@@ -318,14 +318,14 @@ class OnBoardSummary:
         self._restart()
 
     def close(self) -> None:
-        """End the drive, and see that it is on the disk."""
+        """End the drive, and wait until it is written."""
         if self._bus is not None:
             self._bus.close()
         self.end_drive()
         self._background.shutdown()
 
     def _restart(self) -> None:
-        """Begin a drive, with the next frame."""
+        """Make ready for the next drive, which begins with the next frame."""
         self._zero_s = self._next = None
         self._last_s, self._drive_starts = 0.0, True
         self._due_s = _PROBED_S + self._batch * self._period_s + self._wait_s
@@ -333,7 +333,7 @@ class OnBoardSummary:
             channel.samples.clear()
 
     def _read_all(self) -> None:
-        """Say what is read: inputs, temperature of the sensors, state of the contactors, and the branches."""
+        """Set up what is read: inputs, temperature of the sensors, state of the contactors, and branches."""
         layout, database = self._database.layout, self._database
         wanted = layout.base_inputs(layout.fleet_inputs or layout.model_inputs)
         for item in layout.input:
@@ -375,7 +375,7 @@ class OnBoardSummary:
     # ---- batches
 
     def _start(self) -> bool:
-        """Let the time base of the drive begin, with the branches and inputs that there are; whether it can."""
+        """Begin the time base of the drive with the branches and inputs that were seen; return whether it can."""
         layout, channels = self._database.layout, self._channels
         fitted = [name for name, item in channels.items() if item.samples and item.samples[0][0] <= _PROBED_S]
         branches = [name for name in layout.branch_names if name in fitted]
@@ -402,7 +402,7 @@ class OnBoardSummary:
         self._levels: dict[str, dict[int, _Column]] = {name: {} for name in self._branches}
 
     def _sum_batch(self, end: int | None = None) -> None:
-        """Have the next batch summed, up to an instant; the one before is finished first."""
+        """Have the next batch summed in the background, up to an instant; wait for the batch before it."""
         if self._next is None and not self._start():
             self._restart()
             return
@@ -417,7 +417,7 @@ class OnBoardSummary:
         self._job = self._background.submit(self._sum, instants_s, samples, warm, readings)
 
     def _finish_job(self) -> None:
-        """Say when writing fails, and when it does no more."""
+        """Wait for the running job; log when writing fails, and when it works again."""
         if self._job is None:
             return
         try:
@@ -434,7 +434,7 @@ class OnBoardSummary:
         self._job = None
 
     def _columns(self, instants_s: Sequence[float], samples: Mapping[str, _Samples]) -> list[_Column]:
-        """Inputs and currents at each instant, up to the end of a block; NaN in all where one has no value."""
+        """Return inputs and currents at each instant, filled up to a whole block; NaN in all where one is NaN."""
         names, layout = [*self._recorded, *self._branches], self._database.layout
         derived = [item for item in layout.derived if layout.base_inputs([item.name]) <= {*self._recorded}]
         rows: list[_Column] = []
@@ -487,7 +487,7 @@ class OnBoardSummary:
         self._write(readings)
 
     def _write(self, readings: list[_Reading]) -> None:
-        """Replace the file as a whole; what could not be written is so again with the next batch."""
+        """Replace the file as a whole; if that fails, its content is written with the next batch."""
         if self._path is None:
             self._path = self._folder / f"{datetime.now(UTC):%Y-%m-%dT%H%M%S.%f}{rule.SUFFIX}"
         layout, database = self._database.layout, self._database
@@ -516,7 +516,7 @@ class OnBoardSummary:
 
 
 def _power_over_voltage(limit_s: float, take: _Take) -> tuple[_Take, _Take]:
-    """Who takes a voltage, and who takes a power and hands it on as a current, by the latest good voltage in time."""
+    """Return functions that take a voltage, and a power, which is passed on as a current if a voltage is recent."""
     latest = -math.inf, 0.0
 
     def put_voltage(time_s: float, value: float) -> None:
@@ -539,16 +539,16 @@ def on_board_summary(
     parameters: VehicleParameters | None,
     say: Callable[[str], None],
 ) -> OnBoardSummary:
-    """Summary of a run of the node, which listens to the bus of the sensors by itself, as a logger does.
+    """Make the summary for a run of the node; it opens the sensors' bus a second time and listens like a logger.
 
     Parameters
     ----------
     options : argparse.Namespace
-        Those of ``ecu-node run``.
+        Options of ``ecu-node run``.
     bus : mapping
         Bus of the sensors, as the arguments of :func:`ecu_node.bus.adapters.bus_config`.
     database, parameters : VehicleDatabase, VehicleParameters or None
-        Of the vehicle; delays are those of the parameters.
+        Layout, DBC and parameters of the vehicle; delays of branches are those of the parameters.
     say : callable
         Takes one line for the log.
 
@@ -565,7 +565,7 @@ def on_board_summary(
     found = parameters.branches if parameters is not None else {}
     delays = {name: (branch.delay_s or 0.0, branch.delay_sd_s) for name, branch in found.items()}
     summary = OnBoardSummary(options.summary, vehicle, database, delays=delays, say=say)
-    # python-can's own filter ends a look at the first frame that does not pass it
+    # elsewhere python-can filters by itself, and a frame that does not pass would end a look
     filters = filters_of(summary.messages) if bus["interface"] == "socketcan" else None
     opened = partial(connect, filters=filters, **bus)
     sys.setswitchinterval(_LONGEST_TURN_S)
@@ -581,12 +581,12 @@ def _product(one: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _products(columns: Sequence[Sequence[float]]) -> _Column:
-    """Sums of the products of each two columns: the lower triangle of their matrix."""
+    """Return the sums of the products of each two columns: the lower triangle of their matrix."""
     return [_product(one, other) for i, one in enumerate(columns) for other in columns[: i + 1]]
 
 
 def _white_noise_a2(current_a: Sequence[float]) -> float:
-    """Variance of white noise in a block, from the median third difference; gaps (NaN) take no part. [A^2]"""
+    """Estimate the variance of white noise in a block from its median third difference, without gaps (NaN). [A^2]"""
     x = current_a
     third = [abs(late - early - 3.0 * (c - b)) for early, b, c, late in zip(x, x[1:], x[2:], x[3:], strict=False)]
     known = [value for value in third if not math.isnan(value)]
@@ -596,7 +596,7 @@ def _white_noise_a2(current_a: Sequence[float]) -> float:
 
 
 def _add_levels(columns: Sequence[_Column], own: _Column, sums: dict[int, _Column]) -> None:
-    """Add samples to the sums of the level of one of their currents."""
+    """Add samples to the sums of the levels that a branch's own current is in."""
     sorted_rows: dict[int, list[int]] = {}
     for t, x in enumerate(own):
         away = bisect_right(rule.LEVELS_A, int(abs(x)))
@@ -608,7 +608,7 @@ def _add_levels(columns: Sequence[_Column], own: _Column, sums: dict[int, _Colum
 
 
 def _second_differences(blocks: Sequence[_Column], used: Sequence[Sequence[bool]]) -> _Column:
-    """Distance of samples from the mean of their neighbours; zero where one of the three is not used. [A]"""
+    """Return distances of samples from the mean of their neighbours; 0 if one of the three is not used. [A]"""
     return [
         b - 0.5 * (a + c) if all(there) else 0.0
         for x, u in zip(blocks, used, strict=True)
@@ -617,10 +617,10 @@ def _second_differences(blocks: Sequence[_Column], used: Sequence[Sequence[bool]
 
 
 def _find_spikes(currents: list[_Column], used: Sequence[bool]) -> dict[int, list[int]]:
-    """As :func:`calibrator.summaries.summariser.find_spikes`; returns by sample the sign of each branch's spike."""
+    """Find spikes as :func:`calibrator.summaries.summariser.find_spikes`; return signs per branch, by sample."""
     K, count, found, half = len(currents), len(used), dict[int, list[int]](), rule.SPIKE_WINDOW // 2
     kept, suspects, weights = list(used), list[int](), list[float]()
-    for _ in range(2):  # the second time with gains that the spikes did not bend
+    for _ in range(2):  # the second time with gains that the spikes did not distort
         if sum(kept) < rule.FEWEST_FOR_GAINS * K:
             return found
         weights = _junction_weights(currents, kept)
@@ -658,7 +658,7 @@ def _find_spikes(currents: list[_Column], used: Sequence[bool]) -> dict[int, lis
 
 
 def _junction_weights(currents: list[_Column], kept: Sequence[bool]) -> list[float]:
-    """Weights of the branches in the junction law by least squares, that of the one that moves most being one."""
+    """Fit the weights of the branches in the junction law by least squares; the branch that moves most has weight 1."""
     parts = [[value for value, there in zip(column, kept, strict=True) if there] for column in currents]
     count = len(parts[0])
     parts = [[value - mean for value in part] for part in parts for mean in (sum(part) / count,)]
@@ -667,7 +667,7 @@ def _junction_weights(currents: list[_Column], kept: Sequence[bool]) -> list[flo
     others = [k for k in range(len(gram)) if k != first]
     rows = [[*(gram[i][j] for j in others), -gram[i][first]] for i in others]
     scale = max((abs(row[n]) for n, row in enumerate(rows)), default=0.0)
-    for n, pivot in enumerate(rows):  # Gauss and Jordan, pivots on the diagonal: the matrix is a covariance
+    for n, pivot in enumerate(rows):  # Gauss-Jordan with pivots on the diagonal, as the matrix is a covariance
         if not pivot[n] > 1e-9 * scale:
             pivot[:] = [0.0] * len(pivot)  # a branch that does not move
             continue

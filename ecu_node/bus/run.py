@@ -1,8 +1,9 @@
 """``ecu-node run``: parameters, core, buses and service put together; ``ecu-node check``: what a run would apply.
 
-What else has something to do beside the frames, as the fault memory and the telemetry do, has a method ``look`` and
-stands in the list ``looks`` of :func:`run_node`: it is called every 20 ms, just after the junction was looked at. The
-samples of all branches then stand in ``corrector.watch``: ``instant_s`` and ``currents_a`` (measured and corrected).
+Parts that have something to do besides the frames, such as the fault memory and the telemetry, have a method ``look``
+and are in the lists ``looks`` or ``records`` of :func:`run_node`. It is called every 20 ms, just after the junction was
+looked at; ``corrector.watch`` then has the currents of all branches: ``instant_s`` and ``currents_a`` (measured and
+corrected).
 """
 
 import argparse
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
 
 
 class StateChanges:
-    """Looks for changes of the state; those of the parameters are told by who reads them.
+    """Notes changes of the node's state for the log; changes of the parameters are logged where they are read.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ class StateChanges:
         self._before = Reason.NONE, False
 
     def news(self) -> str | None:
-        """One line on what has changed since the last time; None if nothing has."""
+        """Return one line on what has changed since the last call; None if nothing has."""
         corrector = self._corrector
         latched_before, asleep_before = self._before
         latched, asleep = self._before = corrector.latched, corrector.is_asleep
@@ -85,7 +86,7 @@ class StateChanges:
 
 _DEFAULT_PERIOD_S = 0.1
 _GARBAGE = 10_000
-"""Objects that were made and not freed, after which garbage is looked for among them, in about a millisecond."""
+"""Number of new objects after which garbage is looked for among them, which takes about a millisecond."""
 
 
 def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noqa: PLR0915 (in the order of a run)
@@ -94,10 +95,10 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
     Parameters
     ----------
     options : argparse.Namespace
-        Those of ``ecu-node run``, see :mod:`ecu_node.cli`.
+        Options of ``ecu-node run``, see :mod:`ecu_node.cli`.
     bus : mapping
-        Bus of the sensors, as the arguments of :func:`ecu_node.bus.adapters.bus_config`; of a gateway the other one is
-        alike.
+        Bus of the sensors, as the arguments of :func:`ecu_node.bus.adapters.bus_config`; a gateway's other bus differs
+        in its channel only.
 
     Returns
     -------
@@ -142,7 +143,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             say(text)
 
         def correcting(in_force: InForce) -> str:
-            """Which branches are corrected; says which are not, though they have a fault."""
+            """Return which branches are corrected; log which are not, though they have a fault."""
             hidden = unpublished(database, in_force, mode)
             for text in hidden.values():
                 say(text)
@@ -168,7 +169,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         if options.telemetry is not None:
             records.append(Telemetry(options.telemetry, corrector, database.layout, latency, buses, say).look)
         if options.summary is not None:
-            from ecu_node.bus.on_board_summary import on_board_summary  # noqa: PLC0415  # the only user of statistics
+            from ecu_node.bus.on_board_summary import on_board_summary  # noqa: PLC0415  # nothing else needs statistics
 
             summing = on_board_summary(options, bus, database, in_force.parameters, say)
             records.append(closed_at_end.enter_context(closing(summing)).look)
@@ -186,7 +187,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             for look in [*records]:
                 try:
                     look(now_s)
-                except Exception as error:  # noqa: BLE001  # a fault of what only records must not end the correction
+                except Exception as error:  # noqa: BLE001  # what only records must not end the correction
                     records.remove(look)
                     what = type(look.__self__).__name__  # type: ignore[attr-defined]
                     say(
@@ -210,7 +211,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             latency=latency,
             routed=routes is not None,
         )
-        gc.collect()  # what was made at the start is left out of all others, which come only when something grows
+        gc.collect()  # freeze: later collections leave out what was made at the start
         gc.freeze()
         gc.set_threshold(_GARBAGE)
         node.run(stop, ready)
@@ -220,7 +221,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
 def _store(
     options: argparse.Namespace, database: VehicleDatabase, mode: Mode, say: Callable[[str], None]
 ) -> "ParameterStore":
-    from ecu_node.update.store import ParameterStore  # noqa: PLC0415  # imports this room
+    from ecu_node.update.store import ParameterStore  # noqa: PLC0415  # imports this package
 
     now, background = partial(datetime.now, UTC), ThreadPoolExecutor(1, "state of the vehicle")
     return ParameterStore(
@@ -229,7 +230,7 @@ def _store(
 
 
 def _dry_run(buses: Sequence[Mapping[str, Any]], database: VehicleDatabase, mode: Mode) -> str:
-    """What a node on these buses would open, read and send."""
+    """Describe what a node on these buses would open, read and send."""
     near = buses[0]
     require_fd(database, mode, fd=near["fd"])
     written = _names(transmitted(database, mode))
@@ -251,7 +252,7 @@ def _names(messages: Mapping[FrameKey, Message]) -> str:
 
 
 def _notes(options: argparse.Namespace, why_not: str | None) -> Iterator[str]:
-    """What to know of the parameters and the buses at the start."""
+    """Yield lines for the log at the start: what to know about the parameters and the buses."""
     if options.params is not None:
         yield "parameters are used that nobody signed (--unsigned)"
     if why_not is not None:
@@ -280,7 +281,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
     Returns
     -------
     dict
-        ``fit`` [bool], ``reason`` (name in the status message), ``message`` (why not, or None), ``vehicle``,
+        ``fit`` [bool], ``reason`` (as named in the status message), ``message`` (why not, or None), ``vehicle``,
         ``parameter_set``, ``warnings`` (texts), and ``branches``: per branch drift [1], offset_a [A] and apply, as the
         file says (0 and None where it does not name the branch), applied (whether it is corrected), target, and plan: a
         dict with gain, voltage_gain, bias and shift; None where the branch is not written.
@@ -288,7 +289,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
     Raises
     ------
     LayoutError, DatabaseError
-        If layout or DBC cannot be used at all, by which ``ecu-node run`` would be refused too.
+        If layout or DBC cannot be used at all, so that ``ecu-node run`` would fail, too.
     """
     mode = Mode.GATEWAY if is_gateway else Mode.OVERLAY
     database = node_database(layout)

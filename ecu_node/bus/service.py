@@ -15,16 +15,16 @@ from contextlib import suppress
 from ecu_node.errors import printable
 
 _WHILE_S, _SAME_LINE_TIMES = 10.0, 3
-"""The same line is written so many times in so long [s]: enough to see it come and go, and no flood."""
+"""The same line is written at most this often within this time [s]: enough to see it come and go, without a flood."""
 _REMEMBERED_LINES = 100
 _LONGEST_LINE = 900
-"""Characters of a line, such that it fits into PIPE_BUF in UTF-8 with what is written around it."""
+"""Most characters of a line, so that with what is written around it, it fits into PIPE_BUF in UTF-8."""
 _LONGEST_NOTIFY_S = 0.1
-"""A service manager that does not read must not hold up the bus. [s]"""
+"""Longest wait for a service manager that does not read: it must not hold up the bus. [s]"""
 
 
 def stopped_by(*numbers: signal.Signals) -> Callable[[], bool]:
-    """Handle these signals from now on; returns what tells whether one of them has come."""
+    """Handle these signals from now on; return a function that says whether one of them has come."""
     stopped = threading.Event()
     for number in numbers:
         signal.signal(number, lambda _, __: stopped.set())
@@ -32,7 +32,7 @@ def stopped_by(*numbers: signal.Signals) -> Callable[[], bool]:
 
 
 class Log:
-    """Lines on standard error; the same line a few times in a while, and then with how often it came in between.
+    """Log on standard error; a line that repeats is written a few times, and later with how often it came in between.
 
     A reader that does not read must not hold up the bus: lines that standard error does not take at once are lost, and
     the next one that it takes says how many.
@@ -76,7 +76,7 @@ def _takes_a_line() -> bool:
 
 
 class ServiceManager:
-    """systemd, if it started the node: told that the node is ready, alive, and what it does; see sd_notify(3)."""
+    """Tells systemd, if it started the node, that the node is ready, alive, and what it does; see sd_notify(3)."""
 
     def __init__(self) -> None:
         address = os.environ.get("NOTIFY_SOCKET")
@@ -87,21 +87,21 @@ class ServiceManager:
         self._due_s = 0.0
 
     def ready(self, text: str) -> None:
-        """The node is at work."""
+        """Tell that the node is at work."""
         self._notify(f"READY=1\nSTATUS={text}")
 
     def alive(self, now_s: float) -> None:
-        """The node has just done its work; told at half the time that the watchdog allows."""
+        """Tell that the node has just done its work, at intervals of half the time that the watchdog allows."""
         if self._period_s is not None and now_s >= self._due_s:
             self._due_s = now_s + self._period_s
             self._notify("WATCHDOG=1")
 
     def status(self, text: str) -> None:
-        """What the node does now."""
+        """Tell what the node does now."""
         self._notify(f"STATUS={text}")
 
     def stopping(self) -> None:
-        """The node ends."""
+        """Tell that the node ends."""
         self._notify("STOPPING=1")
 
     def _notify(self, text: str) -> None:
@@ -114,20 +114,20 @@ class ServiceManager:
 
 
 _FIFO_PRIORITY = 50
-"""That of the kernel's interrupt threads, which bring the frames; see sched(7)."""
+"""Priority of the kernel's interrupt threads, which bring the frames; see sched(7)."""
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
-"""Of mlockall(2): memory that there is and that there will be, each page once it was used."""
+"""Flags of mlockall(2): lock present and future memory, each page once it is used."""
 
 
 def be_real_time() -> str:
-    """Run before all that is no real-time process, on one processor, with memory that stays in RAM.
+    """Run with real-time priority, ahead of ordinary processes, on one processor, with memory that stays in RAM.
 
-    To be called before there are other threads: these inherit it.
+    Call it before other threads are started: they inherit it.
 
     Returns
     -------
     str
-        One line for the log, with what was not allowed.
+        One line for the log, which names what was not allowed.
     """
     steps: dict[str, Callable[[], None]] = {
         "SCHED_FIFO": lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY)),
@@ -144,7 +144,7 @@ def be_real_time() -> str:
 
 
 def _lock_memory() -> None:
-    # Without this limit lifted, memory that is asked for later could not be had.
+    # Unless this limit is lifted, later requests for memory would fail.
     resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     if ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))

@@ -1,8 +1,8 @@
-"""A bus in use: it is sent on with bounded patience, and opened again after it was gone.
+"""A bus in use: a full one is tried again for a limited time, and one that was gone is opened again.
 
-Any interface of python-can works frame by frame. On SocketCAN one system call, recvmmsg(2) and sendmmsg(2), takes all
-frames that wait and sends all that were made of them: a system call per frame, and python-can makes four to pass one
-on, is what a node's time goes to. Structures are those of linux/can.h and of socket.h.
+Any interface of python-can works frame by frame. On SocketCAN one call of recvmmsg(2) takes all frames that wait, and
+one of sendmmsg(2) sends all that were made of them: system calls are what takes a node's time, and python-can makes
+four to pass one frame on. Structures are those of linux/can.h and of socket.h.
 """
 
 import contextlib
@@ -25,21 +25,21 @@ from ecu_node.errors import BusError
 
 _SEND_ATTEMPTS = 3
 _SEND_PAUSE_S = 0.001
-"""A full send queue drains by some frames in this time. [s]"""
+"""Pause between attempts to send; a full send queue drains by some frames in this time. [s]"""
 _FULL_S = 1.0
-"""A send queue that is full for longer is told. [s]"""
+"""A send queue that is full for longer than this is reported. [s]"""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 2.0
-"""Between attempts to open a bus again. [s]"""
+"""Pauses between attempts to open a bus again; they double from the first to the longest. [s]"""
 _BUS_OFF = 0x40
-"""Class of error frames of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
+"""Class bit of SocketCAN error frames that report bus off (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
 
 _GONE = frozenset((errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF))
 """Errors of sending after which only opening the bus again helps."""
 _OF_FRAME = frozenset((errno.EINVAL, errno.EMSGSIZE))
-"""Errors with which a bus does not take this frame, whatever its state, as one that is too long for it."""
+"""Errors of a frame that the bus never takes, whatever its state, such as one that is too long for it."""
 _ERRORS = (can.CanError, OSError, ValueError)
-"""Of a bus in use; ValueError: just closed by the other thread."""
+"""Exceptions of a bus in use; ValueError: the other thread has just closed it."""
 
 
 def _number(error: Exception) -> int | None:
@@ -55,13 +55,13 @@ class SteadyBus:
     Parameters
     ----------
     open_bus : callable
-        Opens it, raising :class:`BusError` if it cannot.
+        Opens the bus; raises :class:`BusError` if that fails.
     counters : Counters
-        Where it is counted what happened.
+        Counters to add to.
     say : callable
         Takes one line for the log.
     listen_only : bool
-        Whether nothing is ever sent: what is given to be sent is dropped.
+        Whether nothing is ever sent; frames that are given to be sent are then dropped.
 
     Raises
     ------
@@ -90,18 +90,18 @@ class SteadyBus:
         self.send: Callable[[can.Message], None] = (lambda _: None) if listen_only else self._queue.append
         """Takes a frame to be sent at the next :meth:`flush`."""
         self.asked_s = self.read_s = time.monotonic()
-        """When the bus was asked last (if it had no more, all that came before was received), and when the last frame
-        was read: it came before that. [s]"""
+        """When the bus was asked last (if it had no more frames, all that came before were received), and when the last
+        frame was read, which came before that. [s]"""
 
     @property
     def at_hand(self) -> bool:
-        """Whether a frame that came is here already, and the bus need not be asked for it."""
+        """Whether the next frame was already taken from the bus, so that the bus need not be asked for it."""
         link = self._link
         return link is not None and link.at_hand
 
     @property
     def state(self) -> str:
-        """What it is: "open", "full" for longer than a second, or "gone" until it is open again."""
+        """State of the bus: "open", "full" (for longer than a second), or "gone" (until it is open again)."""
         return "gone" if self._link is None else "full" if self._is_full_told else "open"
 
     def receive(self, timeout_s: float) -> can.Message | None:
@@ -110,12 +110,12 @@ class SteadyBus:
         Parameters
         ----------
         timeout_s : float
-            How long to wait; 0: not at all, and the bus is not asked if it had no more the last time. [s]
+            How long to wait; 0: not at all, and if the last call left no frames the bus is not even asked. [s]
 
         Returns
         -------
         can.Message or None
-            None if none came in time, or the bus is gone. The time stamp is of the time of day [s]; 0: not known.
+            The frame, its time stamp in time of day [s], or 0 if not known; None if none came, or the bus is gone.
         """
         if self._failed is not None:
             failed, error = self._failed
@@ -142,11 +142,12 @@ class SteadyBus:
         Returns
         -------
         sent, not_sent : int
-            Frames that the bus took, and that it did not: a full one is asked a few times, and once while it stays so.
+            Numbers of frames that the bus took, and did not take. A full bus is tried a few times; while it stays full,
+            once.
         """
         queue, done, lost = self._queue, 0, 0
         while done < len(queue):
-            refused = len(queue) - done  # what is full, or gone, is so for all that follow
+            refused = len(queue) - done  # a bus that is full or gone is so for all that follow
             link = self._link
             if link is not None:
                 try:
@@ -154,7 +155,7 @@ class SteadyBus:
                     continue
                 except _ERRORS as error:
                     if _number(error) in _GONE:
-                        # Whoever asks first is told that the bus is gone, and nobody after: receiving may not fail.
+                        # The kernel reports this once, so that receiving may not fail; receive is told by this.
                         self._failed = link, error
                     elif _number(error) in _OF_FRAME:
                         refused = 1
@@ -164,7 +165,7 @@ class SteadyBus:
         return sent, lost
 
     def _send_some(self, link: "_Link", first: int) -> int:
-        """Give the bus what it takes now, with some patience if it is full; how many frames, or why not the first."""
+        """Send what the bus takes now, trying a full one a few times; return how many frames, or raise if none."""
         for attempts_left in reversed(range(_SEND_ATTEMPTS if self._full_since_s is None else 1)):
             try:
                 with self._closing:
@@ -192,16 +193,16 @@ class SteadyBus:
             self.say(f"{self.channel}: the send queue stays full, frames are lost {why}")
 
     def count_dropped(self) -> None:
-        """Count the frames that the kernel dropped since the last time, because they were not read in time."""
+        """Count the frames that the kernel dropped since the last call, as they were not read in time."""
         link = self._link
         if link is not None:
             self._counters.dropped += link.newly_dropped()
 
     def close(self) -> None:
-        """Close it."""
+        """Close the bus."""
         link, self._link = self._link, None
         if link is not None:
-            with self._closing:  # else the other thread might send into whatever takes the socket's number
+            with self._closing:  # else the other thread might send to a file that reuses the socket's number
                 link.close()
 
     def _count_error(self, message: can.Message) -> None:
@@ -215,7 +216,7 @@ class SteadyBus:
             self.close()
 
     def _reopened(self, timeout_s: float) -> can.Message | None:
-        """Open it again if it is time to, and receive; wait no longer than the timeout."""
+        """Open the bus again if that is due, and receive; wait no longer than the timeout."""
         now_s = self.asked_s = time.monotonic()
         if now_s < self._retry_s:
             time.sleep(min(timeout_s, self._retry_s - now_s))
@@ -242,24 +243,24 @@ class SteadyBus:
 
 
 class _FrameByFrame:
-    """A bus of any interface, as python-can uses it; attributes and methods are those of :class:`SocketCanLink`."""
+    """A bus of any interface, used frame by frame; has the attributes and methods of :class:`SocketCanLink`."""
 
     at_hand = False
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus, self.close = bus, bus.shutdown
         self.asked_s = self.read_s = time.monotonic()
-        # Time stamps of other interfaces are of an adapter's own clock, which tells nothing here.
+        # Time stamps of other interfaces come from the adapter's own clock, and are useless here.
         self._has_time_of_day = any(is_interface(bus, name) for name in ("socketcan", "udp_multicast", "virtual"))
 
     def receive(self, timeout_s: float) -> can.Message | None:
         asked_s = time.monotonic()
         try:
             message = self._bus.recv(timeout_s)
-        except (ValueError, TypeError, struct.error) as error:  # of python-can's serial driver, on a disturbed line
+        except (ValueError, TypeError, struct.error) as error:  # python-can's serial driver, on a disturbed line
             raise can.CanOperationError(f"the adapter sends what is no frame: {error}") from None
         now_s = time.monotonic()
-        self.asked_s = min(now_s, asked_s + timeout_s)  # a pause of the process after the wait heard nothing
+        self.asked_s = min(now_s, asked_s + timeout_s)  # in a pause of the process after it nothing was heard
         if message is not None:
             self.read_s = now_s
             if not self._has_time_of_day:
@@ -275,33 +276,33 @@ class _FrameByFrame:
 
 
 MOST_AT_ONCE = 16
-"""Frames per system call, and so the most that a frame waits for others: they take a fraction of a millisecond."""
+"""Most frames per system call, and so the most that one frame waits for: a fraction of a millisecond."""
 _CLASSIC_BYTES, _FD_BYTES = 16, 72
-"""Of struct can_frame and struct canfd_frame; by its length a frame is known as one of CAN FD."""
+"""Sizes of struct can_frame and struct canfd_frame, which tell classic frames from those of CAN FD."""
 _FRAME = struct.Struct("=IBBxB64s")
 """Identifier with flags, length, flags of CAN FD, DLC if above 8, data; the first 16 bytes are a classic frame."""
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 _BITRATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04
 _LONGEST_CLASSIC, _LARGEST_DLC = 8, 15
 _FD_LENGTHS = [dlc2len(len2dlc(length)) for length in range(65)]
-"""The length that CAN FD has for each number of bytes."""
+"""Length of the CAN FD frame that holds a number of bytes, by that number."""
 _STAMP = struct.Struct("@Niill")
-"""Control message with a time stamp: its length, level and type, seconds, nanoseconds."""
+"""Control message with a time stamp: length, level, type, seconds, nanoseconds."""
 _SO_TIMESTAMPNS, _SO_MEMINFO, _DROPS = 35, 55, 8
-"""Socket options, and the place of the dropped frames in the second one (asm-generic/socket.h, linux/sock_diag.h)."""
+"""Socket options, and where SO_MEMINFO has the dropped frames (asm-generic/socket.h, linux/sock_diag.h)."""
 _VECTOR = struct.Struct("@PN")
 """struct iovec: address and length of a frame."""
 _HEADER = struct.Struct("@PIPNPNi0PI0P")
-"""struct mmsghdr: no address of a peer and its length; a vector's address, one; a control message's address and length;
-flags; bytes that came."""
+"""struct mmsghdr: peer address (none) and its length; address and number (1) of vectors; address and length of the
+control message; flags; bytes received."""
 _CAME, _CAME_AT = struct.Struct("@Ni0PI"), struct.calcsize("@PIPNP")
-"""The part of it that the kernel fills in: a control message's length, flags, bytes that came."""
+"""The part of struct mmsghdr that the kernel fills in (control length, flags, bytes received), and where it starts."""
 
-_libc = ctypes.PyDLL(None, use_errno=True)  # calls that never wait: handing over Python's lock would cost more
+_libc = ctypes.PyDLL(None, use_errno=True)  # keeps the GIL: the calls never wait, releasing it would cost more
 
 
 class _Batch:
-    """Memory for frames and their control messages, and the headers that tell the kernel where it is."""
+    """Memory for frames and their control messages, with the headers that tell the kernel where they are."""
 
     def __init__(self, control_bytes: int) -> None:
         sizes = _FD_BYTES, _STAMP.size, _VECTOR.size, _HEADER.size
@@ -317,11 +318,11 @@ class _Batch:
         self._fresh = bytes(self.headers)
 
     def set_length(self, number: int, length: int) -> None:
-        """Let the kernel take, or put, so many bytes of a frame."""
+        """Set how many bytes of a frame the kernel takes or puts."""
         _VECTOR.pack_into(self._vectors, number * _VECTOR.size, self._frames_at + number * _FD_BYTES, length)
 
     def reset(self, used: int) -> None:
-        """Undo what the kernel wrote into so many headers."""
+        """Undo what the kernel wrote into the first `used` headers."""
         self.headers[: used * _HEADER.size] = self._fresh[: used * _HEADER.size]
 
 
@@ -331,14 +332,14 @@ class SocketCanLink:
     Parameters
     ----------
     opened : socket.socket
-        Raw CAN socket, as python-can has opened it.
+        Raw CAN socket, opened by python-can.
     close : callable, optional
         Closes what the socket belongs to.
 
     Attributes
     ----------
     at_hand : bool
-        Whether the next frame is here already, and the bus need not be asked for it.
+        Whether the next frame was already taken from the bus, so that the bus need not be asked for it.
     asked_s, read_s : float
         When the bus was asked last, and when it had frames last, on the steady clock. [s]
     """
@@ -354,7 +355,7 @@ class SocketCanLink:
         self.asked_s = self.read_s = time.monotonic()
 
     def receive(self, timeout_s: float) -> can.Message | None:
-        """Wait for a frame of any kind; see :meth:`SteadyBus.receive`. Raises OSError if the bus is gone or down."""
+        """Wait for a frame of any kind, see :meth:`SteadyBus.receive`; raise OSError if the bus is gone or down."""
         if not self.at_hand and not self._fill(timeout_s):
             return None
         number = self._next
@@ -363,7 +364,7 @@ class SocketCanLink:
         return self._message(number)
 
     def _fill(self, timeout_s: float) -> bool:
-        """Take all frames that wait; whether there were any."""
+        """Take all frames that wait; return whether there were any."""
         if timeout_s > 0.0:
             waiting_s = time.monotonic()
             is_asked = bool(self._waiting.poll(1e3 * timeout_s))
@@ -391,7 +392,7 @@ class SocketCanLink:
         word, length, flags, dlc, data = _FRAME.unpack_from(batch.frames, number * _FD_BYTES)
         control_bytes, _, came_bytes = _CAME.unpack_from(batch.headers, number * _HEADER.size + _CAME_AT)
         stamp_s = 0.0
-        if control_bytes:  # the one kind that was asked for
+        if control_bytes:  # time stamps, as no other kind was asked for
             _, _, _, seconds, nanoseconds = _STAMP.unpack_from(batch.control, number * _STAMP.size)
             stamp_s = seconds + 1e-9 * nanoseconds
         is_fd = came_bytes == _FD_BYTES
@@ -424,7 +425,7 @@ class SocketCanLink:
         Returns
         -------
         int
-            How many were taken, at least 1.
+            Number of frames that were taken, at least 1.
 
         Raises
         ------
@@ -441,7 +442,7 @@ class SocketCanLink:
         return sent
 
     def newly_dropped(self) -> int:
-        """Frames that the kernel dropped since the last time; 0 where that is not known."""
+        """Return the number of frames that the kernel dropped since the last call; 0 if that is not known."""
         try:
             info = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_DROPS + 1))
             (dropped,) = struct.unpack_from("=I", info, 4 * _DROPS)
@@ -452,7 +453,7 @@ class SocketCanLink:
 
 
 def _put(frames: memoryview, at: int, message: can.Message) -> int:
-    """Write a frame; the bytes that it takes."""
+    """Write a frame into memory; return its size in bytes."""
     word = message.arbitration_id
     if message.is_extended_id:
         word |= _EXTENDED

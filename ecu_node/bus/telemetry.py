@@ -1,4 +1,4 @@
-"""What the node tells beside the bus: a line of JSON per second."""
+"""Telemetry of the node, apart from the bus: a line of JSON per second, to a file or by UDP."""
 
 import errno
 import os
@@ -26,22 +26,22 @@ _PERIOD_S = 1.0
 
 @dataclass
 class Telemetry:
-    """Writes a line per second, in a thread of its own: neither a disk nor a network holds up the bus.
+    """Writes a line per second, in a thread of its own, so that neither a disk nor a network holds up the bus.
 
     Parameters
     ----------
     target : Path or tuple of str and int
         File to which lines are added, or host and UDP port.
     corrector : Corrector
-        What is told of.
+        Core whose state is reported.
     layout : Layout
         Names of the branches.
     latency : Latency
-        Of the answers.
+        Latency of the answers.
     buses : sequence of SteadyBus
-        Their states are told.
+        Buses whose states are reported.
     say : callable
-        Takes one line for the log, when lines begin to get lost and when they do no more.
+        Takes one line for the log: when lines begin to get lost, and when they are written again.
     """
 
     target: Path | tuple[str, int]
@@ -58,7 +58,7 @@ class Telemetry:
         threading.Thread(target=self._write_lines, name="telemetry", daemon=True).start()
 
     def look(self, now_s: float) -> None:
-        """Hand over a line if it is time to; one that finds the last one still waiting is lost, and counted."""
+        """Hand over a line if one is due; if the last one is still waiting, the new one is lost, and counted."""
         if now_s < self._due_s:
             return
         self._due_s = max(self._due_s + _PERIOD_S, now_s)
@@ -94,7 +94,7 @@ class Telemetry:
                 else:
                     _send(*self.target, line)
                 is_lost, news = False, "lines are written again"
-            except (OSError, UnicodeError) as error:  # UnicodeError: a host that no name server could know
+            except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot exist
                 why = error.strerror if isinstance(error, OSError) else error
                 is_lost, news = True, f"{why}; lines are lost until that has changed"
                 self.corrector.counters.telemetry_lost += 1
@@ -103,7 +103,7 @@ class Telemetry:
 
 
 def _branch(branch: LiveBranch, now_s: float) -> dict[str, Any]:
-    """Measured current and what is published of it, positive into the junction. [A]"""
+    """Return the measured and the published current of a branch, positive into the junction. [A]"""
     quality = branch.published(now_s)[1]
     currents_a = None if quality in _WITHOUT_VALUE else branch.currents_at(branch.time_s)
     if currents_a is None:
@@ -113,7 +113,7 @@ def _branch(branch: LiveBranch, now_s: float) -> dict[str, Any]:
 
 
 def _append(path: Path, line: bytes) -> None:
-    """Add a line, whole or not at all; a pipe that nobody reads takes none."""
+    """Add a line to a file, whole or not at all; a pipe that nobody reads is an error."""
     file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK, 0o644)
     try:
         written = os.write(file, line)

@@ -1,9 +1,9 @@
-"""From layout, DBC and parameters to the node's core: everything is looked up once, at start.
+"""Builds the node's core from layout, DBC and parameters: everything is looked up once, at start.
 
 Loop guard: no message that the layout reads may be sent on the same bus, else the node would correct its own output, or
-speak in the name of another control unit; and by the DBC all that is sent comes from one control unit, which sends
-nothing that is read. Each bit the node sends belongs to one signal only. A gateway sends the branches' messages on, on
-the other bus, and in its own name the status alone.
+speak in the name of another control unit. By the DBC, all messages that the node sends must come from one control unit,
+which sends none of the messages that are read. Each bit that the node writes belongs to one signal only. A gateway
+passes the branches' messages on to the other bus; only the status message is its own.
 """
 
 from collections import defaultdict
@@ -61,7 +61,7 @@ class Mode(Enum):
 
 
 def key_of(message: Message) -> FrameKey:
-    """Identifier of a message of the DBC."""
+    """Return the identifier of a message of the DBC."""
     return FrameKey(message.frame_id, message.is_extended_frame)
 
 
@@ -71,29 +71,29 @@ def is_fd(message: Message) -> bool:
 
 
 def _by_key(database: VehicleDatabase, names: Iterable[SignalName | None]) -> dict[FrameKey, Message]:
-    """Messages of signals, by identifier."""
+    """Return the messages that carry these signals, by identifier."""
     return {key_of(message): message for message, _ in (database.signal(name) for name in names if name is not None)}
 
 
 def received(database: VehicleDatabase) -> dict[FrameKey, Message]:
-    """Messages that carry the branches and what else the node needs of the vehicle, by identifier."""
+    """Return the messages that carry branches, their voltages and the input of the watch, by identifier."""
     layout = database.layout
     names = [name for branch in layout.branch for name in (branch.source, branch.voltage)]
     return _by_key(database, [*names, layout.watch_signal])
 
 
 def rewritten(database: VehicleDatabase) -> dict[FrameKey, Message]:
-    """Messages that a gateway rewrites, by identifier."""
+    """Return the messages that a gateway rewrites, by identifier."""
     return _by_key(database, (branch.source for branch in database.layout.branch))
 
 
 def transmitted(database: VehicleDatabase, mode: Mode) -> dict[FrameKey, Message]:
-    """Messages of which the node is the sender, by identifier; not those that a gateway rewrites."""
+    """Return the messages that the node sends in its own name, by identifier; not those that a gateway rewrites."""
     return _by_key(database, (item.name for item in _written(database, mode) if item.own))
 
 
 def needs_fd(database: VehicleDatabase, mode: Mode) -> list[str]:
-    """Names of the messages, received or sent, that need CAN FD."""
+    """Return the names of the messages, received or sent, that need CAN FD."""
     messages = {**received(database), **transmitted(database, mode)}
     return [message.name for message in messages.values() if is_fd(message)]
 
@@ -104,13 +104,13 @@ class _WrittenSignal(NamedTuple):
     name: SignalName
     purpose: str
     largest: int
-    """The greatest code it must hold."""
+    """The greatest code that it must hold."""
     own: bool
-    """Whether the whole message is the node's."""
+    """Whether the node is the sender of the whole message."""
 
 
 def _written(database: VehicleDatabase, mode: Mode) -> list[_WrittenSignal]:
-    """All signals that the node writes; a gateway writes the branches where it reads them."""
+    """Return all signals that the node writes; a gateway writes the branches where it reads them."""
     own, status = mode is Mode.OVERLAY, database.layout.status
     found = []
     for branch in database.layout.branch:
@@ -124,7 +124,7 @@ def _written(database: VehicleDatabase, mode: Mode) -> list[_WrittenSignal]:
 
 
 def _check_output(database: VehicleDatabase, mode: Mode) -> None:
-    """Refuse a layout with which the node would disturb the bus or itself; raises as :func:`wire`."""
+    """Refuse a layout with which the node would disturb the bus or itself; errors are those of :func:`wire`."""
     where, sent = database.layout.path, transmitted(database, mode)
     if not sent and mode is Mode.OVERLAY:
         raise LayoutError(
@@ -173,14 +173,14 @@ def signal_codes(
     what: str,
     no_value: tuple[int, ...] = (),
 ) -> Codes:
-    """Codes of a signal in a base unit (None: its own), with those that the layout itself says are no value.
+    """Return the codes of a signal in a base unit (None: its own); `no_value` are further codes that are no values.
 
     Raises
     ------
     DatabaseError
         If the signal cannot be read, see :func:`ecu_node.core.signals.read_codes`.
     LayoutError
-        If the signal has no such codes.
+        If the signal cannot have a code of `no_value`.
     """
     codes = read_codes(database.signal(name)[1], units, f"{database.layout.path}: {what}")
     place = codes.place
@@ -193,10 +193,10 @@ def signal_codes(
 
 
 def branch_signals(database: VehicleDatabase, branch: Branch, mode: Mode) -> Signals:
-    """What a branch is read from and written to.
+    """Return the signals that a branch is read from and written to.
 
-    In a gateway every branch is written back where it was read; else where the layout says. Where nothing is published
-    the source itself is the target. Raises as :func:`signal_codes`.
+    A gateway writes every branch back where it was read, an overlay node where the layout says. If nothing is published
+    the source itself is the target. Errors are those of :func:`signal_codes`.
     """
     what, units = f"branch {branch.name}", AMPERE if branch.signal is not None else WATT
     source = signal_codes(database, branch.source, units, what, tuple(branch.no_value))
@@ -210,7 +210,7 @@ def branch_signals(database: VehicleDatabase, branch: Branch, mode: Mode) -> Sig
 
 
 def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, mode: Mode) -> IntegerPlan:
-    """Integer plan of one branch, from measured to written codes; raises as ``branch_signals``."""
+    """Return the plan of one branch, from measured to written codes; errors are those of ``branch_signals``."""
     return correction_plan(branch_signals(database, branch, mode), fault)
 
 
@@ -224,7 +224,7 @@ class InForce:
     """The reason in words, one line; None where there are parameters."""
 
     def fault(self, branch: str) -> SensorFault:
-        """What is corrected on one branch; NO_FAULT where the parameters apply none."""
+        """Return the fault that is corrected on one branch; NO_FAULT if the parameters apply none."""
         return self.parameters.fault(branch) if self.parameters is not None else NO_FAULT
 
 
@@ -245,7 +245,7 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
     InForce
         The parameters, or the reason why measured values are passed through.
     """
-    where = ""  # which errors of reading name themselves
+    where = ""  # errors of reading name the file themselves
     try:
         parameters = read_parameters(path)
         where = f"{path}: "
@@ -256,7 +256,7 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
 
 
 def unpublished(database: VehicleDatabase, in_force: InForce, mode: Mode) -> dict[str, str]:
-    """Branches with a fault that is not corrected, as an overlay has no signal for it, and what to say of each."""
+    """Return branches whose fault stays uncorrected, as an overlay has no signal for them, each with a line to log."""
     hidden = [branch.name for branch in database.layout.branch if mode is Mode.OVERLAY and branch.corrected is None]
     why = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
     return {name: f"branch {name} is not published: {why}" for name in hidden if in_force.fault(name).applied}
@@ -278,11 +278,11 @@ def put_in_force(
     now_s : float
         Now; branches that the parameters name are waited for from here. [s]
     mode : Mode
-        Where corrected values go, as when the corrector was built: what can be wrong with layout and DBC was said then.
+        Where corrected values go, as when the corrector was built: errors of layout and DBC were raised then.
     """
     parameters = in_force.parameters
     found = parameters.branches if parameters is not None else {}
-    takes = []  # all of them before the first is taken: either all or none
+    takes = []  # prepare all before the first takes effect: either all or none
     for branch, live in zip(database.layout.branch, corrector.branches, strict=True):
         fault, said = in_force.fault(branch.name), found.get(branch.name)
         is_in_place = mode is Mode.GATEWAY or branch.corrected is None
@@ -371,7 +371,7 @@ def wire(
     )
     if (name := layout.watch_signal) is not None:
         codes = signal_codes(database, name, None, "[watch] input")
-        state = HeardSignal(replace(codes, named={}), layout.max_age_s)  # a state's names are no lack of a value
+        state = HeardSignal(replace(codes, named={}), layout.max_age_s)  # the name of a state is no lack of a value
         valid = (exact_code(database.signal(name)[1], value) for value in layout.watch.valid)
         watch.judge_only(state, frozenset(map(int, valid)))
         read(name, state)
@@ -404,7 +404,7 @@ def _own_message(database: VehicleDatabase, name: str) -> OwnMessage:
 
 
 def _answers(database: VehicleDatabase, branches: Mapping[str, LiveBranch]) -> dict[FrameKey, list[OwnMessage]]:
-    """Corrected messages of an overlay node, by the incoming messages that they answer."""
+    """Return the corrected messages of an overlay node, by the incoming messages that they answer."""
     answers: dict[FrameKey, list[OwnMessage]] = defaultdict(list)
     made: dict[str, OwnMessage] = {}
     for branch in database.layout.branch:
@@ -456,9 +456,9 @@ def open_bus(
     mode : Mode
         An overlay node receives what it needs, a gateway everything.
     routed : bool
-        Whether the kernel carries what a gateway does not need.
+        Whether the kernel carries the frames that a gateway only passes on, so that it need not receive them.
     own : bool
-        Whether an overlay node also receives what only one node may send, as sent by others.
+        Whether an overlay node also receives its own messages, so as to notice another node that sends them.
     interface, channel, **settings :
         As for ``ecu_node.bus.adapters.bus_config``.
 

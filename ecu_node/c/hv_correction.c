@@ -3,7 +3,7 @@
 
 #define SHIFT 58U /* bits of gains and fractions below one code */
 #define ONE_CODE INT64_C(288230376151711744) /* 2^SHIFT */
-#define ANY 0xFFU /* counter: the first intact frame may have any */
+#define ANY 0xFFU /* expected counter: the first intact frame may have any */
 #define LOW_HALF 0xFFFFFFFFU
 
 typedef enum { OK, LOST, REPEATED, JUMPED, CORRUPT } check_t;
@@ -13,7 +13,7 @@ typedef struct { /* 128 bits, two's complement */
     uint64_t low;
 } wide_t;
 
-static int64_t to_signed(uint64_t word) /* without the conversion that C leaves to the compiler */
+static int64_t to_signed(uint64_t word) /* avoids the conversion whose result C leaves to the compiler */
 {
     const uint64_t inverted = ~word;
     return (word <= (uint64_t)INT64_MAX) ? (int64_t)word : (-(int64_t)inverted - 1);
@@ -76,7 +76,7 @@ int64_t hv_correct(const hv_branch_t *branch, const hv_values_t *values, int64_t
         if (needs_voltage) {
             sum = wide_sum(sum, wide_product(*voltage_code, values->voltage_gain));
         }
-        const uint64_t top = sum.high >> (SHIFT - 1U); /* sign of the result, and all that is beyond 64 bits of it */
+        const uint64_t top = sum.high >> (SHIFT - 1U); /* sign of the result, and its bits beyond 64 */
         if ((top != 0U) && (top != (UINT64_MAX >> (SHIFT - 1U)))) {
             result = ((sum.high >> 63U) != 0U) ? branch->lowest : branch->highest;
         } else {
@@ -168,7 +168,7 @@ static uint8_t crc_of(const hv_message_t *message, const uint8_t *payload, size_
             crc = crc8(crc, (message->profile == HV_P01_BOTH) ? message->data_id[1] : 0U, polynomial);
         }
     } else {
-        /* profile 2 has its data identifier at the end */
+        /* profile 2 takes its data identifier at the end */
     }
     for (size_t k = 0U; k < length; k++) {
         if (k != message->offset) {

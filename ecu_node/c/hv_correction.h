@@ -14,25 +14,25 @@
 #define HV_BRANCHES 16U /* most branches and messages that a layout can have */
 #define HV_MESSAGES 32U
 
-/* What is flashed. A corrected code is (code * gain + voltage_code * voltage_gain + fraction) / 2^58 + bias, rounded
+/* Flashed data. A corrected code is (code * gain + voltage_code * voltage_gain + fraction) / 2^58 + bias, rounded
  * down, and then clamped; half a code, which rounds to the nearest one, is part of bias and fraction. */
 typedef struct {
     int64_t gain;         /* [2^-58] */
-    int64_t voltage_gain; /* of a power: [2^-58 codes of the power per code of the voltage]; else 0 */
+    int64_t voltage_gain; /* for a power: [2^-58 codes of the power per code of the voltage]; else 0 */
     int64_t bias;         /* [code] */
     uint64_t fraction;    /* [2^-58 codes], below 2^58 */
     uint64_t applied;     /* 1: corrected; all else: passed through */
 } hv_values_t;
 
 typedef struct {
-    uint64_t layout;        /* must be that of the layout, or nothing is corrected */
+    uint64_t layout;        /* digest of the layout; if it is not that of hv_layout_t, nothing is corrected */
     uint64_t parameter_set; /* number of the parameter set */
     hv_values_t branch[HV_BRANCHES];
 } hv_calibration_t;
 
-/* What is compiled: where signals stand and which of their codes are values, from DBC and layout. */
+/* Compiled data: where signals stand and which of their codes are values, from DBC and layout. */
 typedef struct {
-    uint8_t byte;  /* that holds the least significant bit */
+    uint8_t byte;  /* byte that holds the least significant bit */
     uint8_t shift; /* bits below the signal in that byte, 0 to 7 */
     uint8_t bits;  /* 1 to 64 */
     bool is_big;   /* byte order: big-endian */
@@ -64,7 +64,7 @@ typedef struct {
     int64_t highest;
 } hv_branch_t;
 
-typedef enum { /* AUTOSAR end-to-end protection of a message; 1A, 1B, low byte only, 1C */
+typedef enum { /* AUTOSAR end-to-end protection of a message: profiles 1A, 1B, 1 with the low byte only, 1C, 2 */
     HV_UNPROTECTED,
     HV_P01_BOTH,
     HV_P01_ALTERNATING,
@@ -74,7 +74,7 @@ typedef enum { /* AUTOSAR end-to-end protection of a message; 1A, 1B, low byte o
 } hv_profile_t;
 
 typedef struct {
-    uint32_t identifier; /* bit 31 is set in those of 29 bits */
+    uint32_t identifier; /* bit 31 is set in 29-bit identifiers */
     hv_profile_t profile;
     uint8_t offset;      /* first byte of the header */
     uint8_t max_step;    /* largest step of the counter that is used */
@@ -98,7 +98,7 @@ typedef struct { /* what is remembered from frame to frame; one for each layout,
 
 typedef enum { HV_SAME, HV_CHANGED, HV_HELD_BACK } hv_result_t;
 
-/* Of the file that 'calibrator export' writes. */
+/* Defined in the file that 'calibrator export' writes. */
 extern const hv_layout_t hv_layout;
 extern const hv_calibration_t hv_calibration;
 

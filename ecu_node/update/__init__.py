@@ -1,1 +1,1 @@
-"""Updates of parameters: from a repository of The Update Framework (TUF) to parameters in force, see docs/trust.md."""
+"""Updates of parameters, from a repository of The Update Framework (TUF) until they are in force; see docs/trust.md."""

@@ -1,9 +1,9 @@
-"""The update of a vehicle: TUF's client verifies what the repository offers, then come the checks of our own.
+"""The update of a vehicle: TUF's client verifies what the repository offers, then our own checks follow.
 
-TUF sees to signatures, thresholds, versions, expiry and digests. Ours are about currents: vehicle, layout, DBC, limits,
-largest step against the set in force, expiry of the set. A set that passes goes on trial
-(:mod:`ecu_node.update.trial`) in the running node. Metadata that TUF has verified is kept, and revocations hold, even
-where our own checks then refuse the set; whatever TUF refuses leaves the state as it was.
+TUF checks signatures, thresholds, versions, expiry and digests. Our checks are about the parameter set: vehicle,
+layout, DBC, limits, largest step from the set in force, expiry of the set. A set that passes goes on trial
+(:mod:`ecu_node.update.trial`) in the running node. Metadata that TUF has verified is kept, and revocations take effect,
+even if our own checks then refuse the set; whatever TUF refuses leaves the state as it was.
 """
 
 import os
@@ -44,10 +44,10 @@ from ecu_node.update.state import (
 __all__ = ["TargetFacts", "expiry_of", "provision", "target_path", "update"]
 
 _CONFIG = UpdaterConfig(max_delegations=4, targets_max_length=2_000_000)
-"""Other limits are TUF's own: 16 kB for a timestamp, 500 kB for a root, 2 MB for a snapshot."""
+"""Limits of TUF's client; others are its own: 16 kB for a timestamp, 500 kB for a root, 2 MB for a snapshot."""
 _LARGEST_ROOT_BYTES = 512_000
 _WORK = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
-"""Where TUF's client works: in memory where there is such a folder, which spares time and flash."""
+"""Folder in which TUF's client works: in memory if there is such a folder, which saves time and flash wear."""
 _ROLES = ("root", "timestamp", "snapshot")
 """Metadata that a client keeps, against replays."""
 _FOREIGN = (
@@ -58,11 +58,11 @@ _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
 
 def _canonical_json(document: Any) -> str | None:
-    """Write what is signed; a text without escapes is the same in canonical JSON and in msgspec's with sorted keys.
+    """Encode a signed document as canonical JSON, by msgspec where the result is the same: if nothing is escaped.
 
-    securesystemslib writes it in Python, and python-tuf has it written twice for each file: of the snapshot of 10^6
-    vehicles that was two thirds of the time of an update. It refuses numbers that are not finite, which msgspec writes
-    as null: so it writes what has a null, too.
+    securesystemslib encodes in Python, and python-tuf lets it do so twice for each file: for the snapshot of 10^6
+    vehicles that took two thirds of the time of an update. It refuses numbers that are not finite, which msgspec writes
+    as null, so it also encodes documents with a null.
     """
     text = msgspec.json.encode(document, order="sorted").decode()
     return encode_canonical(document) if "\\" in text or "null" in text else text
@@ -72,7 +72,7 @@ tuf_json.encode_canonical = _canonical_json  # type: ignore[assignment]  # calle
 
 
 class TargetFacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Custom fields of a target: what is signed of a parameter file besides its digest."""
+    """Custom fields of a target: what is signed about a parameter file besides its digest."""
 
     vehicle: str
     layout: _Digest
@@ -91,7 +91,7 @@ class _Metadata(msgspec.Struct):
 
 
 class _Offer(msgspec.Struct, frozen=True):
-    """What the repository has for this vehicle, verified by TUF."""
+    """What the repository offers to this vehicle, verified by TUF."""
 
     trusted: dict[str, str]
     facts: TargetFacts
@@ -100,17 +100,17 @@ class _Offer(msgspec.Struct, frozen=True):
 
 
 def target_path(vehicle: str) -> str:
-    """Path of a vehicle's parameter file in the repository, such as ``V001.json``; never outside it."""
+    """Return the path of a vehicle's parameter file in the repository, such as ``V001.json``; never outside it."""
     return f"{quote(vehicle, safe='', errors='surrogateescape')}.json"
 
 
 def expiry_of(metadata: bytes) -> datetime:
-    """Expiry of metadata, of which nothing else is read, as it may be large."""
+    """Return the expiry of metadata; nothing else is decoded, as metadata may be large."""
     return msgspec.json.decode(metadata, type=_Metadata).signed.expires
 
 
 def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
-    """Begin the state of a vehicle: which repository it trusts.
+    """Create the state of a vehicle, which says which repository it trusts.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
     Raises
     ------
     UserError
-        If the file is no root that its own keys have signed, there is a state already, or it cannot be written.
+        If the file is not a root signed by its own keys, a state exists already, or it cannot be written.
     """
     try:
         content = read_user_file(root, largest_bytes=_LARGEST_ROOT_BYTES)
@@ -169,17 +169,17 @@ def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, 
     now : datetime
         Time of day.
     dry_run : bool
-        Check all, change nothing.
+        Check everything, change nothing.
 
     Returns
     -------
     str
-        What became of it, one line.
+        The outcome, in one line.
 
     Raises
     ------
     UnfitError
-        With the reason why it is refused.
+        If the offer is refused, with the reason.
     UserError
         If the state cannot be written.
     """
@@ -236,7 +236,7 @@ def _verified_offer(state: VehicleState, source: str, now: datetime) -> _Offer:
 
 
 def _require_fresh(path: Path, source: str, now: datetime) -> None:
-    """Check the expiry of verified metadata against the time that is believed: TUF's client asks the clock alone."""
+    """Check the expiry of verified metadata against the latest known time, as TUF's client uses only the clock."""
     expires = expiry_of(path.read_bytes())
     if now >= expires:
         raise TrustError(
@@ -256,20 +256,20 @@ _REFUSALS: tuple[tuple[type[Exception], Reason, str], ...] = (
     (exceptions.DownloadHTTPError, Reason.NO_PARAMETERS, "is it complete, and for vehicle {vehicle!r}, which this is?"),
     (Exception, Reason.NO_PARAMETERS, "check address and connection, or whether it can be read"),
 )
-"""Errors of TUF's client: why a set is refused, and what there is to do; the first kind counts."""
+"""Reason and advice for each error of TUF's client; the first class that matches counts."""
 
 
 def _refusal(error: Exception, source: str, vehicle: str) -> TrustError:
     """Translate an error of TUF's client into one line with a reason."""
     reason, advice = next(found[1:] for found in _REFUSALS if isinstance(error, found[0]))
     is_of_web = source.startswith("http") and isinstance(error, exceptions.DownloadError | HTTPError)
-    while is_of_web and error.__context__ is not None:  # the innermost says what it was, such as an unknown name
+    while is_of_web and error.__context__ is not None:  # the innermost error names the cause, such as an unknown host
         error = error.__context__  # type: ignore[assignment]
     return TrustError(reason, f"{source}: {str(error) or type(error).__name__}; {advice.format(vehicle=vehicle)}")
 
 
 def _without_revoked(state: VehicleState, offer: _Offer, now: datetime) -> tuple[VehicleState, str]:
-    """The state with the verified metadata and without the sets that were revoked; and what was revoked, in words."""
+    """Return the state with the verified metadata and without revoked sets, and in words what was revoked."""
     if offer.facts.vehicle != state.vehicle:
         raise TrustError(
             Reason.WRONG_VEHICLE, f"the parameters are for {offer.facts.vehicle!r}, this is {state.vehicle!r}"
@@ -290,7 +290,7 @@ def _without_revoked(state: VehicleState, offer: _Offer, now: datetime) -> tuple
 def _judged(
     state: VehicleState, offer: _Offer, source: str, database: VehicleDatabase, now: datetime
 ) -> tuple[VehicleState, str, str]:
-    """Decide on the set that is offered: the new state, the event, and words."""
+    """Decide on the set that is offered; return the new state, the event, and a text for people."""
     if offer.sha256 in offer.facts.revoked:
         return state, "nothing new", f"what the repository has for vehicle {state.vehicle} is revoked"
     try:

@@ -16,7 +16,7 @@ from ecu_node.program import say_error, write_output, write_result
 if TYPE_CHECKING:
     from ecu_node.update.state import ParameterSet, VehicleState
 
-# what stands on python-can is imported by the commands themselves, after load_python_can
+# the commands themselves import what needs python-can, as load_python_can must come first
 
 __all__ = ["add_update_commands"]
 
@@ -29,7 +29,7 @@ def add_update_commands(commands: "argparse._SubParsersAction[Any]", vehicle: Ca
     Parameters
     ----------
     commands : argparse's subparsers
-        Of ``ecu-node``; each command is left in ``command`` as a callable that takes the options.
+        Subparsers of ``ecu-node``; each sets ``command`` to a callable that takes the options.
     vehicle : callable
         Reads the identity of a vehicle, as a type for argparse.
     """
@@ -77,7 +77,7 @@ def add_update_commands(commands: "argparse._SubParsersAction[Any]", vehicle: Ca
 
 
 def _client() -> Any:
-    """Import the client, which needs the extra of updates."""
+    """Import the client, which needs the packages of the extra ``update``."""
     try:
         from ecu_node.update import client  # noqa: PLC0415
     except ModuleNotFoundError as error:
@@ -106,7 +106,7 @@ def _update(options: argparse.Namespace) -> int:
 
 
 def _facts(state: "VehicleState") -> dict[str, Any]:
-    """State for programs; ``null`` where there is no set."""
+    """Return the state as plain values for JSON; ``null`` where there is no set."""
     from ecu_node.update.state import time_text  # noqa: PLC0415
 
     def of_set(found: "ParameterSet | None") -> dict[str, Any] | None:

@@ -1,10 +1,10 @@
-"""Keys by name: a private key in a PEM file, or a public one with the URI of where its private half is kept.
+"""Opens keys by name: a private key in a PEM file, or a public key with the URI of the place of its private half.
 
     anna.key                        PEM, PKCS #8; its passphrase, if it has one, in $CALIBRATOR_KEY_PASSPHRASE or typed
     anna.pub=hsm:2                  PKCS #11, such as a YubiKey; $PYKCS11LIB names its library; the PIN likewise
     release.pub=awskms:KEY          cloud key services; also gcpkms:, azurekms:, hv: (HashiCorp Vault)
 
-What stands behind the equals sign is a signer URI of securesystemslib, which says which package each kind needs.
+After the equals sign comes a signer URI of securesystemslib, which says which package each kind needs.
 """
 
 import os
@@ -54,7 +54,7 @@ def signer_of(text: str) -> Signer:
     Raises
     ------
     UserError
-        If the key cannot be had, others may read its file, or its passphrase is another one.
+        If the key cannot be loaded, others may read or write its file, or its passphrase is wrong.
     """
     public, is_uri, uri = text.partition("=")
     if is_uri:
@@ -89,7 +89,7 @@ def signer_of(text: str) -> Signer:
 
 
 def _secrets(what: str) -> Iterator[str]:
-    """A passphrase or PIN: that of the environment, then what a person at the terminal types, each in one try."""
+    """Yield a passphrase or PIN: first that of the environment, then what a person types at the terminal, once."""
     if secret := os.environ.get(PASSPHRASE_VARIABLE):
         yield secret
     if sys.stdin.isatty():

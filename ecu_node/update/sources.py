@@ -1,8 +1,8 @@
-"""Where an update comes from: a bundle (one file), a folder, or a web server; each as a fetcher of TUF's client.
+"""Sources of updates: a bundle (one file), a folder, or a web server; each is a fetcher for TUF's client.
 
 A repository is a folder with ``metadata`` and ``targets``. A bundle is the part of it that one vehicle needs: a JSON
-object of names and texts, compressed as XZ, whose checks notice any byte that was changed on the way. What is read is
-bounded here, and again, file by file, by TUF's client.
+object of names and texts, compressed as XZ, whose checksum notices any byte that was changed on the way. Sizes are
+limited here, and again, file by file, by TUF's client.
 """
 
 import errno
@@ -26,13 +26,13 @@ __all__ = ["bundle_bytes", "open_source"]
 
 _LARGEST_BUNDLE_BYTES = 1_000_000
 _LARGEST_TEXT_BYTES = 8_000_000
-"""All files of a bundle; a decompressor that wants to write more is stopped."""
+"""Largest size of all files of a bundle together; decompression stops there."""
 _LARGEST_FILE_BYTES = 5_000_000
-"""Of a folder; TUF's client allows less for most files."""
+"""Largest file that is read from a folder; TUF's client allows less for most files."""
 _MOST_MEMORY_BYTES = 64_000_000
-"""That the decompressor may take."""
+"""Most memory that the decompressor may take."""
 _LONGEST_DOWNLOAD_S = 300.0
-"""Of one file from a web server. [s]"""
+"""Longest time for one file from a web server. [s]"""
 
 
 def open_source(text: str) -> FetcherInterface:
@@ -41,17 +41,17 @@ def open_source(text: str) -> FetcherInterface:
     Parameters
     ----------
     text : str
-        File of a bundle, folder of a repository, or its URL (http or https).
+        Path of a bundle, folder of a repository, or URL of a repository (http or https).
 
     Returns
     -------
     FetcherInterface
-        For TUF's client; takes names such as ``metadata/timestamp.json``.
+        Fetcher for TUF's client; takes names such as ``metadata/timestamp.json``.
 
     Raises
     ------
     TrustError
-        If there is no such file or folder, or the file is no whole bundle.
+        If there is no such file or folder, or the file is not a complete bundle.
     """
     if text.startswith(("http://", "https://")):
         return _WebFetcher(text.rstrip("/"))
@@ -119,7 +119,7 @@ class _FolderFetcher(FetcherInterface):
 
 
 class _WebFetcher(Urllib3Fetcher):
-    """Gives up when a server sends too slowly; TUF's own limit is on each read."""
+    """Fetches from a web server, and gives up if a file takes too long; TUF's own limit is on each read only."""
 
     def __init__(self, base: str) -> None:
         super().__init__()
@@ -127,7 +127,7 @@ class _WebFetcher(Urllib3Fetcher):
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         end_s = time.monotonic() + _LONGEST_DOWNLOAD_S
-        chunks = super()._fetch(f"{self._base}/{quote(url)}")  # names of files have a % themselves, as V%201.json
+        chunks = super()._fetch(f"{self._base}/{quote(url)}")  # file names may contain a %, as V%201.json does
         with closing(cast("Generator[bytes]", chunks)):  # gives the connection back
             for chunk in chunks:
                 if time.monotonic() > end_s:

@@ -1,8 +1,8 @@
 """State of a vehicle on its disk: which parameters it holds, and which metadata of the repository it trusts.
 
-All of it is one file, ``state.json``, which is replaced whole: after a power cut at any moment the state is that of
-before a change or that of after it. Its first line is the SHA-256 of the rest, so that a bit that the disk has changed
-is noticed. ``decisions.log`` is a log for people: one line of JSON for each decision.
+All of it is one file, ``state.json``, which is replaced whole: after a power cut at any moment the state is the old or
+the new one. Its first line is the SHA-256 of the rest, so that a bit that the disk has changed is noticed.
+``decisions.log`` is a log for people: one line of JSON for each decision.
 """
 
 import errno
@@ -37,12 +37,12 @@ __all__ = [
 ]
 
 _LARGEST_STATE_BYTES = 8_000_000
-"""Metadata of a repository of 10^6 vehicles and three parameter files have about 100 kB."""
+"""Largest state that is read; metadata of a repository of 10^6 vehicles and three parameter files take about 100 kB."""
 _REPLACE = "remove the folder, make it anew with 'ecu-node provision', and update anew"
 _CAREFUL = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-"""Root writes into a folder that belongs to the node's user: no link is followed, and no pipe blocks."""
+"""Flags for opening files safely when root writes into the node's folder: no link is followed, no pipe blocks."""
 _LONGEST_WAIT_S = 30.0
-"""For another process that holds the lock; one that was stopped never ends. [s]"""
+"""Longest wait for another process that holds the lock; one that was stopped would hold it for ever. [s]"""
 
 
 class ParameterSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -53,7 +53,7 @@ class ParameterSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of the file, by which a revocation names it."""
+        """SHA-256 of the file; revocations name a file by it."""
         return hashlib.sha256(self.content.encode()).hexdigest()
 
     @property
@@ -62,7 +62,7 @@ class ParameterSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return decode_parameters(self.content.encode(), "state.json")
 
     def __str__(self) -> str:
-        """Name for messages: number of the set and begin of the digest."""
+        """Return a name for messages: number of the set and beginning of its digest."""
         return f"parameter set {self.parameters.number} ({self.sha256[:8]})"
 
 
@@ -85,17 +85,17 @@ class VehicleState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 def state_path(folder: Path) -> Path:
-    """File that holds the state."""
+    """Return the path of the file that holds the state."""
     return folder / "state.json"
 
 
 def time_text(moment: datetime) -> str:
-    """Time as ISO 8601, UTC, to the second."""
+    """Return a time as ISO 8601, UTC, to the second."""
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def require_not_expired(found: ParameterSet, state: VehicleState, now: datetime) -> None:
-    """Raise TrustError (NOT_VALID_NOW) if a set has expired; the clock is not believed if it is behind the state."""
+    """Raise TrustError (NOT_VALID_NOW) if a set has expired; a clock behind the state's latest time is not believed."""
     if max(now, state.latest) >= found.expires:
         believed = f"the latest time seen here is {time_text(state.latest)}, though the clock says {time_text(now)}"
         what = f"now it is {time_text(now)}" if now >= state.latest else believed
@@ -110,12 +110,12 @@ def read_state(folder: Path) -> VehicleState:
     Parameters
     ----------
     folder : Path
-        Made by 'ecu-node provision'.
+        State folder, made by 'ecu-node provision'.
 
     Returns
     -------
     VehicleState
-        What it holds.
+        What the vehicle holds and trusts.
 
     Raises
     ------
@@ -191,12 +191,12 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
     folder : Path
         It must exist.
     wait : bool
-        Wait for another process, 30 s at most; else that is an error at once.
+        Whether to wait for another process, 30 s at most, instead of raising an error at once.
 
     Raises
     ------
     UserError
-        If the folder cannot be used, or another process changes it now.
+        If the folder cannot be used, or another process holds the lock.
     """
     try:
         handle = _open(folder / "lock", os.O_RDWR | os.O_CREAT)
@@ -220,7 +220,7 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
 
 
 def _open(path: Path, flags: int) -> int:
-    """Open a file of the folder, and leave it to the folder's owner: the node goes on with it."""
+    """Open a file of the state folder; if root does so, give it to the folder's owner, as whom the node runs."""
     handle = os.open(path, flags | _CAREFUL, 0o644)
     try:
         found, owner = os.fstat(handle), path.parent.stat()

@@ -1,4 +1,4 @@
-"""Parameters of a running node: those in force, those on trial, and the way from one to the other. Needs no TUF."""
+"""Parameters of a running node: those in force, those on trial, and how a trial puts them in force. Needs no TUF."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -30,15 +30,15 @@ from ecu_node.update.trial import ParameterTrial, TrialResult
 __all__ = ["ParameterStore", "conclude", "end_expired"]
 
 _LOOK_EVERY_S = 1.0
-"""Between looks whether the state has changed, or what is in force has expired. [s]"""
+"""Time between checks whether the state has changed, or what is in force has expired. [s]"""
 _RETRY_EVERY_S = 60.0
-"""Between attempts to begin a trial, as before the clock is set, or to write a decision, as on a full disk. [s]"""
+"""Time between attempts to begin a trial (the clock may not be set yet) or to write a decision (disk full). [s]"""
 _SURELY_EXPIRED = timedelta(minutes=1)
-"""A clock that jumps ahead for a moment, as before it is set from the network, ends nothing for ever."""
+"""How long a set must be expired to be removed for good: a clock may jump ahead for a moment before it is set."""
 
 
 def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now: datetime) -> VehicleState:
-    """End a trial: the set is in force, or gone. Does not wait for other processes, as the bus would wait too.
+    """End a trial: put the set in force, or drop it. Does not wait for the lock, as the bus would wait too.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
     tried : ParameterSet
         The set that was on trial.
     passed : bool
-        Whether it did as it promised; a set that has expired meanwhile is not used all the same.
+        Whether the set kept what it promised; even so it is not used if it has expired meanwhile.
     text : str
         What was seen, for the log.
     now : datetime
@@ -56,7 +56,7 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
     Returns
     -------
     VehicleState
-        After that; as it was if another set is on trial by now.
+        State after that; unchanged if another set is on trial by now.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def end_expired(folder: Path, expired: ParameterSet, now: datetime) -> VehicleSt
 
 
 class ParameterStore:
-    """Keeps the parameters of a running node as the state of its vehicle says.
+    """Keeps the parameters of a running node in step with the state of its vehicle.
 
     Parameters
     ----------
@@ -109,11 +109,11 @@ class ParameterStore:
     say : callable
         Takes one line for the log.
     now : callable
-        The time of day.
+        Returns the time of day.
     vehicle : str or None
-        Identity of the vehicle, where it is known besides; the state of another one is not used.
+        Identity of the vehicle, if it is also known from elsewhere; parameters of another one are not used.
     background : Executor
-        Writes decisions, as a slow disk may take seconds, and the bus must not wait.
+        Runs the writing of decisions: a slow disk may take seconds, and the bus must not wait.
     """
 
     def __init__(
@@ -149,19 +149,19 @@ class ParameterStore:
             self.in_force = self._in_force(self._state)
 
     def look(self, corrector: Corrector, now_s: float) -> bool:
-        """See whether a trial has ended, the state was changed, or time has passed; to be called now and then.
+        """See whether a trial has ended, the state was changed, or a set has expired; call it at each look.
 
         Parameters
         ----------
         corrector : Corrector
-            Where new parameters are put in force.
+            Core in which new parameters are put in force.
         now_s : float
             Now. [s]
 
         Returns
         -------
         bool
-            Whether other parameters are in force than before, or none.
+            Whether the parameters in force have changed, or have ended.
         """
         self._finish_writing(now_s)
         self._try(corrector, now_s)
@@ -186,7 +186,7 @@ class ParameterStore:
         return True
 
     def _read_again(self) -> None:
-        """Read the state if it was changed, or could not be read the last time: it may hold a revocation."""
+        """Read the state if its file was changed, or could not be read the last time; it may hold a revocation."""
         seen = signature(state_path(self._folder))
         if self._unread is None and seen == self._seen:
             return
@@ -199,7 +199,7 @@ class ParameterStore:
             self._unread = str(error)
 
     def _in_force(self, state: VehicleState) -> InForce:
-        """What the state says."""
+        """Return the parameters that are in force by the state, or why there are none."""
         try:
             if state.in_force is None:
                 raise _why_nothing(state)
@@ -208,7 +208,7 @@ class ParameterStore:
             return InForce(parameters=None, reason=error.reason, why_not=f"{self._folder}: {error}")
 
     def _usable(self, state: VehicleState, found: ParameterSet) -> VehicleParameters:
-        """Parameters of a set that has not expired and fits; decoded once, as the bus waits meanwhile."""
+        """Return the parameters of a set, checked for expiry and fit; decoded only once, as the bus waits meanwhile."""
         require_not_expired(found, state, self._now())
         if self._fitting is None or self._fitting[0] is not found:
             parameters = found.parameters
@@ -217,7 +217,7 @@ class ParameterStore:
         return self._fitting[1]
 
     def _try(self, corrector: Corrector, now_s: float) -> None:
-        """Begin the trial of the set on trial, or go on with it; at its end the set is in force, or gone."""
+        """Begin or continue the trial of the set on trial; at its end, have the set put in force or dropped."""
         on_trial = self._state.on_trial if self._state is not None else None
         if on_trial != self._tried:
             self._tried, self._trial, self._no_trial, self._result = on_trial, None, None, None
@@ -243,7 +243,7 @@ class ParameterStore:
             self._trial = ParameterTrial(parameters, self._database, corrector.branches)
 
     def _end_expired(self, state: VehicleState, now_s: float) -> None:
-        """Once the set in force is seen to be expired for a minute, it is so for good."""
+        """Remove the set in force for good once it has been seen expired for a minute."""
         found, now = state.in_force, self._now()
         if found is None or now < found.expires:
             self._expired_since = None
@@ -253,12 +253,12 @@ class ParameterStore:
             self._write(partial(end_expired, self._folder, found, now), now_s)
 
     def _write(self, work: Callable[[], VehicleState], now_s: float) -> None:
-        """Write a decision in the background, unless one is being written or could not be a moment ago."""
+        """Write a decision in the background, unless one is being written or an attempt failed a moment ago."""
         if self._writing is None and now_s >= self._retry_due_s:
             self._writing = self._background.submit(work)
 
     def _finish_writing(self, now_s: float) -> None:
-        """Take a decision over once it is written; try again later if that failed, as nothing changes meanwhile."""
+        """Adopt a decision once it is written; if that failed, nothing changes, and it is tried again later."""
         if self._writing is None or not self._writing.done():
             return
         written, self._writing = self._writing, None

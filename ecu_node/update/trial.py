@@ -1,16 +1,16 @@
 """Trial of a parameter set on its own vehicle: the Kirchhoff sum must fall as the calibrator says, before it is used.
 
-The set changes the sum from m (measured) to c, by m - c = s. Right sensors show the sum e: 0, or a load that none of
-them sees. If the set is right, what remains in c - e has nothing to do with s, and the mean square of the sum about e
-falls by just that of s:
+The set changes the sum from m (measured) to c, by s = m - c. Right sensors show the sum e: 0, or a load that none of
+them sees. If the set is right, the remainder c - e is uncorrelated with s, and correction lowers the mean square of the
+sum about e by exactly that of s:
 
     share = (E[(m - e)^2] - E[(c - e)^2]) / E[s^2]        1: the set is right; 0: half of s is wrong; -1: all of it is
 
-The share does not depend on how hard the vehicle is driven. The parameter file tells e, and which share the calibrator
-saw on the drives that it used; where it is below 1, as where one of two offsets that cancel is corrected, so is this.
-A set whose s stays below the layout's margin changes nothing that this sum could tell, and must make it no worse.
-In either case what is left, the mean square of c - e, must be about what the calibrator saw: a set that takes away an
-error and leaves others is not this vehicle's, or no more.
+The share does not depend on how hard the vehicle is driven. The parameter file says e, and which share the calibrator
+saw on the drives that it used; where that is below 1, as where one of two offsets that cancel is corrected, so is the
+share on the vehicle. A set whose s stays below the layout's margin changes too little for this sum to judge, and must
+only not make it worse. In either case the rest, the mean square of c - e, must be about what the calibrator saw: a set
+that removes one error and leaves others is not for this vehicle, or not any more.
 """
 
 import math
@@ -24,11 +24,11 @@ from ecu_node.parameters import VehicleParameters
 __all__ = ["ParameterTrial", "TrialResult"]
 
 _LEAST_CURRENT_SHARE = 0.02
-"""A trial counts while a branch carries this share of full scale. [1]"""
+"""Trial time counts only while a branch carries this share of full scale. [1]"""
 _MOST_LEFT = 2.0
-"""So many times what the calibrator saw may be left of the sum. [1]"""
+"""Residual sum that is allowed, as a multiple of what the calibrator saw. [1]"""
 _LONGEST_STEP_S = 0.5
-"""More time than this between two looks is none in which currents were watched. [s]"""
+"""Of the time between two looks at most this counts as watched. [s]"""
 
 
 class TrialResult(NamedTuple):
@@ -39,14 +39,14 @@ class TrialResult(NamedTuple):
 
 
 class ParameterTrial:
-    """One set on trial, to be asked at each look at the junction.
+    """Trial of one set, evaluated at each look at the junction.
 
     Parameters
     ----------
     parameters : VehicleParameters
-        The set; it tells what the calibrator saw.
+        The set; it also says what the calibrator saw.
     database : VehicleDatabase
-        Layout and DBC in use; the layout says what a trial takes.
+        Layout and DBC in use; the layout sets the length and tolerance of a trial.
     branches : sequence of LiveBranch
         All branches of the layout, as the node sees them.
     """
@@ -69,7 +69,7 @@ class ParameterTrial:
         self._last_s = self._instant_s = float("-inf")
 
     def look(self, now_s: float) -> TrialResult | None:
-        """Take the sums of now; the result once there is one.
+        """Take the newest sums, and return the result once there is one.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class ParameterTrial:
         Returns
         -------
         TrialResult or None
-            None while more is to be seen.
+            How the trial ended; None while it goes on.
         """
         passed_s, self._last_s = now_s - self._last_s, now_s
         found = aligned_currents(self._branches, self._delays_s, now_s)
@@ -121,7 +121,7 @@ class ParameterTrial:
         )
 
     def _most_left(self, step_a: float) -> float:
-        """What may be left of the sum (RMS); more where the set changes more than the calibrator saw. [A]"""
+        """Return the allowed residual sum (RMS), larger if the set changes more here than the calibrator saw. [A]"""
         if self._step_a is None:
             return math.inf
         harder = step_a / self._step_a if self._step_a > self._margin_a else 1.0
@@ -129,7 +129,7 @@ class ParameterTrial:
 
 
 def _share(measured2: float, corrected2: float, step2: float) -> float:
-    """Share of the change that was an error; that of a right set where the change is not known. [1]"""
+    """Return the share of the change that was an error; if no change is known 1, or 0 if the sum is worse. [1]"""
     if step2 <= 0.0:
         return 1.0 if corrected2 <= measured2 else 0.0
     return min(1.0, (measured2 - corrected2) / step2)
