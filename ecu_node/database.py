@@ -272,7 +272,7 @@ def _look_everything_up(vehicle: VehicleDatabase) -> None:
     for item in layout.input:
         _, signal = vehicle.signal(item.signal)
         for key, name, values in waited:
-            if name == item.name and (never := impossible_values(signal, values)):  # waited for in vain
+            if name == item.name and (never := impossible_values(signal, values)):  # it would never come
                 raise LayoutError(
                     f"{layout.path}: {key}: {', '.join(f'{value:g}' for value in never)} is no value of {item.signal}, "
                     f"which has {signal.length} bits, scale {signal.scale:g} and offset {signal.offset:g}"

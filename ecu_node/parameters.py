@@ -283,9 +283,9 @@ def write_parameters(parameters: VehicleParameters, path: Path) -> None:
     Parameters
     ----------
     parameters : VehicleParameters
-        What to write.
+        Parameters to write.
     path : Path
-        Where; the folder must exist.
+        File to write; its folder must exist.
 
     Raises
     ------

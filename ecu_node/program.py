@@ -38,7 +38,7 @@ def write_output(text: str, end: str = "\n") -> None:
     Parameters
     ----------
     text : str
-        What to print; nothing happens where standard output is closed.
+        Text to print; nothing happens if standard output is closed.
     end : str
         Text that is printed after it.
 
@@ -106,7 +106,7 @@ def end_of(program: str, error: Exception, *, debug: bool, packages: Sequence[st
     program : str
         Its name.
     error : Exception
-        What ended it.
+        Error that ended it.
     debug : bool
         Whether the traceback is shown before the line.
     packages : sequence of str

@@ -1,8 +1,8 @@
 """Opens a bus of python-can; its settings come from the command line, then from python-can's own configuration.
 
 The latter is CAN_BITRATE and CAN_CONFIG of the environment, and can.conf: the section named like the channel, then
-[default]. Without a bit rate an adapter's driver would take 500 kbit/s, which disturbs a bus of another rate: no such
-bus is opened.
+[default]. Without a bit rate an adapter's driver would take 500 kbit/s, which disturbs a bus of another rate: that is
+refused.
 """
 
 import configparser
@@ -208,7 +208,7 @@ def _wrong_rates(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterato
         elif not isinstance(rates[name], int) or rates[name] <= 0:
             yield f"{name} = {rates[name]}: a number of bit/s is expected, such as 250000"
     if interface == "pcan":
-        from can.interfaces.pcan.basic import PCAN_BITRATES  # noqa: PLC0415  # imported only for pcan, as it warns of missing drivers
+        from can.interfaces.pcan.basic import PCAN_BITRATES  # noqa: PLC0415  # here, as its import warns of what it lacks
 
         if rates["bitrate"] not in PCAN_BITRATES:  # the driver would set 500 kbit/s
             known = ", ".join(map(str, PCAN_BITRATES))

@@ -31,7 +31,7 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     reason: str
     """Name of the reason in the status message."""
     branches: list[str]
-    """Branches that explain it best, the best one first."""
+    """Branches that explain it best."""
     parameter_set: int
     """Number of the parameter set in force when it last occurred, modulo 256."""
     first: str

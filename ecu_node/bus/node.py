@@ -228,7 +228,7 @@ class Node:
         back.result()  # raises what ended it
 
     def _listen(self, stop: Callable[[], bool]) -> None:
-        """Listen whether another node sends what only this one may; drop all else, which is too old afterwards."""
+        """Listen for another node that sends what only this one may; drop all else, which is too old afterwards."""
         end_s = time.monotonic() + min(_LISTEN_PERIODS * self._period_s, _LONGEST_LISTEN_S)
         while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
             message = self._vehicle.receive(min(left_s, _LONGEST_WAIT_S))

@@ -41,7 +41,7 @@ from ecu_node.summary import SummaryFile, encode_summary, packed
 MOST_BATCHES = 48
 """Most batches of a file, two hours at 10 Hz: the file is rewritten with each batch, so it must not grow large."""
 MOST_AT_ONCE = 64
-"""Most frames taken in one look, so that a flood delays no correction; frames that are dropped leave a gap."""
+"""Most frames taken in one look, so that a flood delays no correction; frames that the bus drops leave a gap."""
 DRIVE_GAP_S = 60.0
 """A silence of the bus for this long ends a drive. [s]"""
 _MOST_ZERO = 20_000
@@ -133,7 +133,7 @@ class _ZeroCurrent:
         self._open = [] if layout.contactor is None else layout.contactor.open
         self._max_age_s = layout.max_age_s
         self._samples: dict[str, _Samples] | None = None
-        """Samples of the current window, by branch; None while the contactors are closed."""
+        """Samples of the window that goes on now, by branch; None if none does."""
         self._first_s = self._last_s = 0.0
         self._windows: dict[str, list[_Window]] = {name: [] for name in layout.branch_names}
 
@@ -167,7 +167,7 @@ class _ZeroCurrent:
                 windows.append(_Window(middle, [*map(median, pieces.values())], len(far), sum(far), _product(far, far)))
 
     def forget(self) -> None:
-        """Forget all windows except the current one."""
+        """Forget all windows that have ended."""
         self._windows = {name: [] for name in self._windows}
 
     def reading(self, branch: str) -> _Reading:

@@ -1,4 +1,4 @@
-"""What a service needs of its surroundings: signals, the service manager, a log that does not flood, real time."""
+"""The node as a service: stop signals, the service manager, a log that does not flood, real-time priority."""
 
 import ctypes
 import os

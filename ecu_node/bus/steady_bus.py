@@ -48,7 +48,7 @@ def _number(error: Exception) -> int | None:
 
 
 class SteadyBus:
-    """A bus that survives what buses do: going down, away, off, or being full.
+    """A bus that survives an interface that is down, an adapter that is gone, bus off, and a full send queue.
 
     One thread may receive while another one sends; the one that receives opens the bus again.
 
@@ -155,7 +155,7 @@ class SteadyBus:
                     continue
                 except _ERRORS as error:
                     if _number(error) in _GONE:
-                        # The kernel reports this once, so that receiving may not fail; receive is told by this.
+                        # The kernel reports this once only, so receiving might not fail: note it for receive.
                         self._failed = link, error
                     elif _number(error) in _OF_FRAME:
                         refused = 1
@@ -334,7 +334,7 @@ class SocketCanLink:
     opened : socket.socket
         Raw CAN socket, opened by python-can.
     close : callable, optional
-        Closes what the socket belongs to.
+        Closes the bus that the socket belongs to; if not given, the socket is closed.
 
     Attributes
     ----------
@@ -368,7 +368,7 @@ class SocketCanLink:
         if timeout_s > 0.0:
             waiting_s = time.monotonic()
             is_asked = bool(self._waiting.poll(1e3 * timeout_s))
-            self.asked_s = min(time.monotonic(), waiting_s + timeout_s)  # a pause after the wait heard nothing
+            self.asked_s = min(time.monotonic(), waiting_s + timeout_s)  # nothing was heard in a pause after it
         else:
             is_asked, self._had_no_more = not self._had_no_more, False
             if is_asked:

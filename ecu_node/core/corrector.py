@@ -257,7 +257,7 @@ class Source:
         if self._receiver is not None:
             if now_s > self._silent_from_s:
                 self._receiver.restart()
-            self._silent_from_s = now_s + self._silence_s  # frames that fail are no silence: a frozen counter stays one
+            self._silent_from_s = now_s + self._silence_s  # also for frames that fail, or a frozen counter would pass
             check = self._receiver.check(payload)
             if check is not _OK:
                 counters.corrupt += check is Check.CORRUPT
@@ -322,7 +322,7 @@ class Corrector:
     shadow : bool
         Compute and report, change nothing.
     sleep_s : float
-        The bus sleeps once all branches have been silent for so long. [s]
+        The bus sleeps once all branches have been silent for this long. [s]
     """
 
     def __init__(
@@ -341,8 +341,8 @@ class Corrector:
         self.reason = Reason.NO_PARAMETERS
         """Why the parameters cannot be applied and measured values are passed through; NONE if they can."""
         self.latched = Reason.NONE
-        """Why the node has fallen back to passing through. That lasts until parameters are put in force or
-        :meth:`release` is called; for a branch that was silent or stuck, only until the bus has slept."""
+        """Why the node has fallen back to passing through; NONE if it has not. Lasts until parameters are put in force,
+        until :meth:`release`, or, if a branch was silent or stuck, until the bus has slept."""
         self.latched_branches: tuple[str, ...] = ()
         self.parameter_set = 0
         self.sources: dict[tuple[int, bool], Source] = dict(sources.items())
@@ -431,7 +431,7 @@ class Corrector:
         return fields.message
 
     def _see_whether_asleep(self, now_s: float) -> None:
-        """See whether all branches are silent: then the vehicle goes to sleep, which is no fault.
+        """See whether all branches are silent: then the vehicle goes to sleep, which is not a fault.
 
         Once it sleeps, a branch that was latched as silent or stuck is tried again; what the sums showed stays latched.
         """

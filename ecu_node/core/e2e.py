@@ -165,7 +165,7 @@ class Receiver:
         return check
 
     def restart(self) -> None:
-        """Begin anew after a silence: any counter may come next, and a message that was VALID is INVALID."""
+        """Begin anew after a silence: any counter may come next, and a VALID message becomes INVALID."""
         self._expected, self._is_steady = -1, False
         self._past.clear()
         if self.state is E2EState.VALID:
@@ -288,7 +288,7 @@ def _autosar(entry: AutosarProfile, message: Message) -> dict[str, Any]:
         highest = 0xFFFFFFFF if entry.profile in {"P04", "P07"} else 0xFFFF
         identity, offset = _data_id(entry.data_id, message, highest), entry.offset
         mode = _DATA_ID_MODES[getattr(entry, "data_id_mode", "both")]
-        header_bits += 4 * (mode == p01.E2E_P01_DATAID_NIBBLE)  # it is sent above the counter
+        header_bits += 4 * (mode == p01.E2E_P01_DATAID_NIBBLE)  # sent above the counter
         options = {key: value for key, value in (("offset", offset), ("data_id_mode", mode)) if value}
     first, bits = offset + profile.counter_byte, profile.counter_bits
     return {

@@ -542,7 +542,7 @@ class JunctionWatch:
         self.verdict: _Verdict | None = None
 
     def look(self, now_s: float) -> None:
-        """Take the newest sums, and judge them; the time is now. [s]"""
+        """Take the newest sums that are known at a time [s], and judge them."""
         self.sums = None
         branches = self._branches.values()
         found = aligned_currents([*branches], {branch.name: branch.delay_s for branch in branches}, now_s)

@@ -1,4 +1,4 @@
-"""A signal of the DBC: its raw integer in a frame, and what its codes are worth.
+"""A signal of the DBC: its raw integer in a frame, and the values of its codes.
 
 The bytes that a signal touches are one integer of its own byte order; the signal is ``length`` bits of it, ``shift``
 bits above the least significant one. No other bit is ever touched. A multiplexed signal is in a frame only if the
@@ -33,7 +33,7 @@ _PREFIX = {"": "", "milli": "m", "m": "m", "kilo": "k", "k": "k", "mega": "M"}
 
 
 def usual_unit(text: str) -> str:
-    """Return a unit as this program writes it: ``A`` for ``Amps``, ``[A]`` or ``A_DC``, ``kW`` for ``KW``.
+    """Spell a unit as this program does: ``A`` for ``Amps``, ``[A]`` or ``A_DC``, ``kW`` for ``KW`` or ``kilowatt``.
 
     Any text that is no spelling of A, V or W is returned without the blanks and brackets around it.
     """
@@ -141,7 +141,7 @@ class BitPlace:
         return int.from_bytes(placed, "little")
 
     def shift_in(self, payload_bytes: int) -> int:
-        """Bits below the signal in a whole payload of some length [byte], read as one integer of the same order."""
+        """Count the bits below the signal in a payload of this length [byte], read as one integer of its byte order."""
         return self.shift + _BITS_PER_BYTE * (self.first if self.order == "little" else payload_bytes - self.end)
 
     def extract(self, payload: bytes | bytearray) -> int | None:
@@ -206,7 +206,7 @@ def bit_place(signal: Signal) -> BitPlace:
     """
     if signal.is_float:
         raise DatabaseError(f"signal {signal.name} is a floating-point number; the node corrects integer signals only")
-    low = start_bit(signal)  # of a big-endian signal its most significant bit, numbered from the top of its byte
+    low = start_bit(signal)  # for a big-endian signal the most significant bit, numbered from the top of its byte
     if low < 0 or not 1 <= signal.length <= _LONGEST:
         raise DatabaseError(
             f"signal {signal.name} has {signal.length} bits from bit {signal.start} on; 1 to {_LONGEST} bits from 0 on "

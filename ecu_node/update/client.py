@@ -156,7 +156,7 @@ def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
 
 
 def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, *, dry_run: bool = False) -> str:
-    """Take what a repository offers to this vehicle: a set goes on trial, a revocation holds at once.
+    """Take what a repository offers to this vehicle: a set goes on trial, a revocation takes effect at once.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ _LARGEST_KEY_BYTES = 100_000
 
 
 def public_key_of(path: Path) -> SSlibKey:
-    """Read a public key (PEM); raises UserError if it is none."""
+    """Read a public key (PEM); raise UserError if the file holds none."""
     try:
         return SSlibKey.from_crypto(load_pem_public_key(read_user_file(path, largest_bytes=_LARGEST_KEY_BYTES)))
     except OSError as error:

@@ -128,7 +128,7 @@ class _WebFetcher(Urllib3Fetcher):
     def _fetch(self, url: str) -> Iterator[bytes]:
         end_s = time.monotonic() + _LONGEST_DOWNLOAD_S
         chunks = super()._fetch(f"{self._base}/{quote(url)}")  # file names may contain a %, as V%201.json does
-        with closing(cast("Generator[bytes]", chunks)):  # gives the connection back
+        with closing(cast("Generator[bytes]", chunks)):  # returns the connection to its pool
             for chunk in chunks:
                 if time.monotonic() > end_s:
                     raise SlowRetrievalError(f"{url} took longer than {_LONGEST_DOWNLOAD_S:g} s")

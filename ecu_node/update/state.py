@@ -120,7 +120,7 @@ def read_state(folder: Path) -> VehicleState:
     Raises
     ------
     TrustError
-        If there is none, or it is damaged.
+        If there is no state, or it is damaged.
     """
     path = state_path(folder)
     try:
@@ -138,7 +138,7 @@ def read_state(folder: Path) -> VehicleState:
         if digest != hashlib.sha256(document).hexdigest().encode():
             raise ValueError("its digest is another one")
         return msgspec.json.decode(document, type=VehicleState)
-    except ValueError as error:  # msgspec's are such
+    except ValueError as error:  # also those of msgspec
         raise TrustError(
             Reason.MALFORMED_PARAMETERS, f"{path}: damaged, or of another version: {error}; {_REPLACE}"
         ) from None
