@@ -87,7 +87,7 @@ def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
         ("ixxat", CLASSIC_TIMING, {}, "python-can cannot set a bit timing there; take f_clock out"),
     ],
 )
-def test_wrong_speed_is_refused(
+def test_missing_or_contradictory_bit_rate_is_refused(
     interfaces: str, config: dict[str, object], settings: Any, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAN_CONFIG", json.dumps(config))
@@ -97,7 +97,7 @@ def test_wrong_speed_is_refused(
 
 
 @pytest.mark.parametrize("interface", ["kvaser", "neovi"])
-def test_driver_that_is_missing_is_reported(interface: str) -> None:
+def test_missing_driver_is_reported(interface: str) -> None:
     """python-can calls functions of a driver that it did not find."""
     with pytest.raises(BusError, match=f"^{interface} 0: cannot open the bus: .*; install the driver of the adapter"):
         connect(interface, "0", bitrate=500_000)
@@ -106,7 +106,7 @@ def test_driver_that_is_missing_is_reported(interface: str) -> None:
 # ---- python-can's configuration
 
 
-def test_command_line_overrides_the_section_of_a_channel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bit_rate_of_command_line_overrides_that_of_can_conf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "can.conf").write_text("[default]\nbitrate = 125000\n[1]\nbitrate = 250000\nserial = 1234\n")
     assert bus_config("vector", "1") == {"interface": "vector", "channel": 1, "bitrate": 250_000, "serial": 1234}
     assert bus_config("vector", "2")["bitrate"] == 125_000
@@ -120,7 +120,7 @@ def test_command_line_overrides_the_section_of_a_channel(tmp_path: Path, monkeyp
 @pytest.mark.parametrize(
     ("interface", "channel", "fd"), [("socketcan", "lo", True), ("socketcan", "none", False), ("virtual", "lo", False)]
 )
-def test_whether_an_interface_carries_can_fd_is_known_from_its_mtu(interface: str, channel: str, fd: bool) -> None:
+def test_can_fd_support_of_an_interface_is_read_from_its_mtu(interface: str, channel: str, fd: bool) -> None:
     assert carries_fd(interface, channel) == fd
 
 
@@ -144,7 +144,7 @@ def dry_run(node: list[str], capsys: pytest.CaptureFixture[str]) -> Callable[...
     return run
 
 
-def test_dry_run_prints_what_it_would_open(
+def test_dry_run_prints_the_bus_that_would_be_opened(
     node: list[str], dry_run: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     rate = ("--bitrate", "250000")
@@ -157,7 +157,7 @@ def test_dry_run_prints_what_it_would_open(
 
 
 @pytest.mark.parametrize("timing", [can.BitTiming(**CLASSIC_TIMING), can.BitTimingFd(**FD_TIMING)])
-def test_bit_timing_of_can_conf_is_opened_and_printed_once(
+def test_dry_run_prints_bit_timing_of_can_conf_once(
     timing: can.BitTiming | can.BitTimingFd, tmp_path: Path, dry_run: Callable[..., list[str]]
 ) -> None:
     lines = [f"{name} = {value}" for name, value in timing.items()]
@@ -168,7 +168,7 @@ def test_bit_timing_of_can_conf_is_opened_and_printed_once(
     assert "f_clock" not in opened
 
 
-def test_dry_run_of_a_gateway_prints_both_ways(dry_run: Callable[..., list[str]]) -> None:
+def test_dry_run_of_a_gateway_prints_both_directions(dry_run: Callable[..., list[str]]) -> None:
     assert dry_run("--interface", "virtual", "--channel", "a", "--gateway", "b") == [
         "would open virtual a: no settings",
         "  reads all frames; corrects Pair (0x100), Heater (0x200)",
@@ -191,7 +191,7 @@ def test_dry_run_of_a_gateway_prints_both_ways(dry_run: Callable[..., list[str]]
         ("virtual", "nothing is sent$"),
     ],
 )
-def test_listen_only_says_whether_the_adapter_acknowledges(
+def test_listen_only_reports_whether_the_adapter_acknowledges_frames(
     interface: str, words: str, dry_run: Callable[..., list[str]]
 ) -> None:
     rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
@@ -264,7 +264,9 @@ def answer(data: bytes) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("options", "opened"), [((), b"O"), (("--listen-only",), b"L")])
-def test_slcan_answers_corrected(node: list[str], line: SerialLine, options: tuple[str, ...], opened: bytes) -> None:
+def test_node_on_slcan_adapter_sends_corrected_currents_unless_listen_only(
+    node: list[str], line: SerialLine, options: tuple[str, ...], opened: bytes
+) -> None:
     bus = ("--interface", "slcan", "--channel", line.path, "--bitrate", "250000")
     with running(*node, *bus, *options) as log:
         for _ in range(10):
@@ -299,7 +301,7 @@ def test_unpublished_and_silent_branches_are_reported(
     assert "ecu-node: no branch sends\n" in log
 
 
-def test_serial_line_is_answered_corrected_also_after_a_disturbance(node: list[str], line: SerialLine) -> None:
+def test_node_on_serial_line_recovers_after_garbage_and_cut_off_frames(node: list[str], line: SerialLine) -> None:
     """A frame of python-can's serial bus is 0xAA, time, length, identifier, data and 0xBB."""
     too_long, cut_off = b"\xaa\0\0\0\0\x09", b"\xaa\0\0"
     with running(*node, "--interface", "serial", "--channel", line.path):

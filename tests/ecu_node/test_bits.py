@@ -32,7 +32,7 @@ def placed_signals(draw: st.DrawFn) -> tuple[Message, Signal]:
 
 
 @given(placed_signals(), st.data())
-def test_put_writes_what_cantools_encodes_and_no_other_bit(case: tuple[Message, Signal], data: st.DataObject) -> None:
+def test_put_writes_the_same_bits_as_cantools_and_no_others(case: tuple[Message, Signal], data: st.DataObject) -> None:
     message, signal = case
     place = bit_place(signal)
     before = data.draw(st.binary(min_size=message.length, max_size=message.length))
@@ -47,13 +47,13 @@ def test_put_writes_what_cantools_encodes_and_no_other_bit(case: tuple[Message, 
     assert place.extract(payload) == raw
 
 
-def test_a_code_beyond_the_width_is_refused_and_never_wraps() -> None:
+def test_code_too_large_for_its_signal_is_refused_and_never_wraps() -> None:
     place = bit_place(Signal("S", start=0, length=8, is_signed=True))
     with pytest.raises(ValueError, match="128 does not fit into 8 bits"):
         place.put(bytearray(1), 128)
 
 
-def test_signals_that_are_no_plain_integers_are_refused() -> None:
+def test_signals_that_are_not_integers_of_1_to_64_bits_are_refused() -> None:
     with pytest.raises(DatabaseError, match="S is a floating-point number"):
         bit_place(Signal("S", start=0, length=32, conversion=BaseConversion.factory(is_float=True)))
     for start, length in ((0, 65), (-8, 8)):
@@ -73,7 +73,7 @@ BA_ "SystemSignalLongSymbol" SG_ 1 {CUT_NAME} "{CUT_NAME}Index";
 """
 
 
-def test_name_of_a_multiplexer_cut_to_32_characters_means_the_whole_one(tmp_path: Path) -> None:
+def test_multiplexer_name_cut_to_32_characters_refers_to_the_full_name(tmp_path: Path) -> None:
     branches = "".join(
         f'[[branch]]\nname = "{name}"\nsignal = "{name}.Current"\nsign = 1\n' for name in ("Pack", "Motor")
     )
@@ -91,7 +91,7 @@ def test_name_of_a_multiplexer_cut_to_32_characters_means_the_whole_one(tmp_path
 @pytest.mark.parametrize(
     ("above", "words"), [("Page", "has no signal 'Page'"), ("S", "multiplexes in a circle by 'S'")]
 )
-def test_multiplexer_that_the_message_lacks_or_that_leads_back_is_named(above: str, words: str) -> None:
+def test_missing_or_circular_multiplexer_is_refused_by_name(above: str, words: str) -> None:
     signal = Signal("S", start=8, length=8, multiplexer_ids=[1], multiplexer_signal=above)
     message = Message(frame_id=1, name="M", length=8, signals=[signal], strict=False)
     with pytest.raises(DatabaseError, match=f"message M {words}, the multiplexer of its signal S"):

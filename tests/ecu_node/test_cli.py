@@ -27,7 +27,9 @@ def check(params: Path, *more: str, layout: Path = LAYOUT) -> list[str]:
     return ["check", "--params", str(params), "--layout", str(layout), *more]
 
 
-def test_fit_parameters_are_shown_with_their_integer_plan(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_shows_parameters_that_fit_with_their_integer_plan(
+    params: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_ecu_node(check(params, "--vehicle", "v1", "--json")) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["fit"], report["reason"], report["vehicle"], report["parameter_set"]) == (True, "NONE", "v1", 300)
@@ -69,7 +71,9 @@ RUN = "run --unsigned --params p --layout l --channel c0"
         ("template --layout l --vehicle=", "--vehicle: the identity of the vehicle is expected"),
     ],
 )
-def test_wrong_use_is_one_line_and_2(arguments: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_use_prints_one_line_and_exits_with_2(
+    arguments: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit, match="2"):
         run_ecu_node(arguments.split(" "))
     (line,) = capsys.readouterr().err.splitlines()
@@ -77,7 +81,7 @@ def test_wrong_use_is_one_line_and_2(arguments: str, words: str, capsys: pytest.
     assert words in line
 
 
-def test_layout_without_own_signals_needs_a_gateway(
+def test_layout_without_signals_for_corrected_currents_needs_a_gateway(
     make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The options of run are those of check."""
@@ -93,7 +97,7 @@ def test_layout_without_own_signals_needs_a_gateway(
     assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
 
 
-def test_check_says_which_fault_is_not_applied(
+def test_check_shows_which_fault_is_not_applied_and_why(
     database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parameters = msgspec.structs.replace(parameters_for(database, battery=(0.25, 5.0)), vehicle="v\x1b[2J")
@@ -105,14 +109,16 @@ def test_check_says_which_fault_is_not_applied(
     assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
 
 
-def test_check_warns_of_can_fd(make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_warns_that_can_fd_messages_need_the_fd_option(
+    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
     assert run_ecu_node(check(tmp_path / "v1.json", layout=database.layout.path)) == 0
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
 
 
-def test_check_of_unfit_parameters_ends_in_1_and_says_why(
+def test_check_of_unfit_parameters_exits_with_1_and_gives_the_reason(
     params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run_ecu_node(check(params, "--vehicle", "v2", "--json")) == 1
@@ -125,7 +131,7 @@ def test_check_of_unfit_parameters_ends_in_1_and_says_why(
 
 
 @pytest.mark.parametrize("command", ["check", "schema", "--help"])
-def test_a_reader_that_leaves_early_gets_no_traceback(params: Path, command: str) -> None:
+def test_closed_output_pipe_causes_no_traceback(params: Path, command: str) -> None:
     arguments = check(params) if command == "check" else [command]
     reading, writing = os.pipe()
     os.close(reading)
@@ -135,7 +141,7 @@ def test_a_reader_that_leaves_early_gets_no_traceback(params: Path, command: str
     assert (done.returncode, done.stderr) == (1, "")
 
 
-def test_the_node_brings_no_numpy_with_it(params: Path) -> None:
+def test_node_does_not_import_numpy_pandas_or_asammdf(params: Path) -> None:
     code = (
         "import sys; from ecu_node.cli import run_ecu_node; "
         f"assert 'can' not in sys.modules; run_ecu_node({check(params)!r}); import can; "

@@ -77,7 +77,9 @@ CASES = [
 
 
 @pytest.mark.parametrize(("source", "target", "sign", "drift", "offset"), CASES)
-def test_every_code_of_16_bits_is_exact(source: Codes, target: Codes, sign: int, drift: str, offset: str) -> None:
+def test_every_16_bit_code_is_corrected_exactly(
+    source: Codes, target: Codes, sign: int, drift: str, offset: str
+) -> None:
     plan = integer_plan(source, target, sign=sign, drift=float(drift), offset_a=float(offset))
     gain, bias, common = exact_line(source, target, sign=sign, drift=drift, offset_a=offset)
     low, high = writable_range(target, "test")
@@ -93,7 +95,7 @@ def test_every_code_of_16_bits_is_exact(source: Codes, target: Codes, sign: int,
     offset=st.floats(-150.0, 150.0),
     data=st.data(),
 )
-def test_any_width_keeps_error_bound(
+def test_correction_error_stays_within_its_bound_at_any_signal_width(
     length: int, signed: bool, drift: float, offset: float, data: st.DataObject
 ) -> None:
     source = current(0.02, -7.0, length=length, signed=signed)
@@ -112,7 +114,9 @@ def test_any_width_keeps_error_bound(
     offset=st.floats(-150, 150),
     sign=st.sampled_from([1, -1]),
 )
-def test_power_is_corrected_as_a_current(code: int, volts: int, drift: float, offset: float, sign: int) -> None:
+def test_power_is_corrected_with_the_offset_current_times_voltage(
+    code: int, volts: int, drift: float, offset: float, sign: int
+) -> None:
     power, voltage = current(2.0, limits=(-60000, 60000)), current(0.02, signed=False, limits=(0, 1000))
     signals = Signals(source=power, target=power, sign=sign, voltage=voltage)
     plan = correction_plan(signals, SensorFault(drift=drift, offset_a=offset))
@@ -123,18 +127,18 @@ def test_power_is_corrected_as_a_current(code: int, volts: int, drift: float, of
 
 
 @pytest.mark.parametrize("names", [{5: "SNA"}, {3: "Error", 5: "Signal not available"}, {5: "invalid", 9: "x"}])
-def test_the_code_for_no_value_is_found_by_its_name(names: dict[int, str]) -> None:
+def test_code_for_not_available_is_found_by_its_name(names: dict[int, str]) -> None:
     assert not_available_code(current(names=names), "test") == 5
 
 
-def test_a_name_on_the_code_of_zero_is_refused() -> None:
+def test_named_code_at_zero_current_is_refused() -> None:
     with pytest.raises(DatabaseError, match="the code of 0 of signal I is named 'Off'"):
         writable_range(current(names={0: "Off"}), "test")
 
 
 @pytest.mark.parametrize("scale", [0.02, -0.02])
 @pytest.mark.parametrize("code", [1, 19999, -1, -20000])
-def test_a_name_amid_the_values_is_refused(scale: float, code: int) -> None:
+def test_named_code_within_the_measuring_range_is_refused(scale: float, code: int) -> None:
     codes = current(scale, names={-32768: "SNA", code: "Odd"})
     with pytest.raises(DatabaseError, match=f"test: code {code} of signal I means 'Odd', .* and full scale is 400"):
         require_reach(codes, Fraction(400), "test")
@@ -149,12 +153,12 @@ def test_a_name_amid_the_values_is_refused(scale: float, code: int) -> None:
         ({"unit": "W"}, "signal I is in 'W'; expected A, mA, kA"),
     ],
 )
-def test_a_signal_that_can_be_no_current_is_refused(wrong: dict[str, Any], words: str) -> None:
+def test_signal_that_cannot_be_a_current_is_refused(wrong: dict[str, Any], words: str) -> None:
     with pytest.raises(DatabaseError, match=f"test: .*{words}"):
         current(**wrong)
 
 
-def test_limits_that_are_read_as_infinite_bound_nothing() -> None:
+def test_dbc_limits_of_the_largest_double_do_not_restrict_the_range() -> None:
     """The largest double, as tools write it in 15 digits."""
     largest = float("1.79769313486232E+308")
     assert whole_range(current(limits=(-largest, largest))) == whole_range(current())

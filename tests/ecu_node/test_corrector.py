@@ -78,13 +78,15 @@ def published(
 
 
 @pytest.mark.parametrize(("current", "quality"), [(-655.36, Quality.NOT_AVAILABLE), (655.0, Quality.INVALID)])
-def test_code_without_value_is_not_available(database: VehicleDatabase, current: float, quality: Quality) -> None:
+def test_code_without_value_is_published_as_not_available_or_invalid(
+    database: VehicleDatabase, current: float, quality: Quality
+) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0))
     assert published(database, corrector, battery(database, 3, current), 0.0) == (-655.36, quality)
     assert sums_at(corrector, 0.0) == (None, None)
 
 
-def test_a_result_beyond_the_signal_is_clamped_and_counted(database: VehicleDatabase) -> None:
+def test_corrected_value_beyond_the_signal_range_is_clamped_and_counted(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(-0.2, 0.0))
     frames = [battery(database, counter, current) for counter, current in enumerate((520.0, 520.02, -640.0))]
     found = [published(database, corrector, frame, 0.0) for frame in frames]
@@ -93,7 +95,7 @@ def test_a_result_beyond_the_signal_is_clamped_and_counted(database: VehicleData
     assert corrector.counters.text().endswith(", saturated 2")
 
 
-def test_the_status_says_starting_then_correcting(database: VehicleDatabase) -> None:
+def test_status_is_starting_until_branches_arrive_then_correcting(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     before = status_of(database, corrector, 0.01)
     assert (before["State"], before["Reason"], before["ParameterSet"]) == (State.STARTING, Reason.NONE, 300 % 256)
@@ -168,7 +170,7 @@ BOTH, LATE = ("battery", "motor"), ("motor",)
     ],
     ids=["silent branch", "tried again after the bus has slept", "never appears", "sleep is no fault"],
 )
-def test_silent_branch_ends_the_correction_until_sleep(
+def test_silent_branch_stops_the_correction_until_the_bus_has_slept(
     database: VehicleDatabase, phases: list[tuple[float, Collection[str], tuple[State, Reason]]]
 ) -> None:
     """For how long [s] which branches are silent, and what the node says of itself at the end."""
@@ -183,7 +185,9 @@ def test_silent_branch_ends_the_correction_until_sleep(
 
 
 @pytest.mark.parametrize(("fault", "state"), [((0.0, 0.0), State.PASSING_THROUGH), ((0.25, 5.0), State.CORRECTING)])
-def test_no_unnamed_branch_is_awaited(database: VehicleDatabase, fault: tuple[float, float], state: State) -> None:
+def test_node_does_not_wait_for_branches_without_parameters(
+    database: VehicleDatabase, fault: tuple[float, float], state: State
+) -> None:
     corrector = corrector_for(database, battery=fault)
     answers(corrector, battery(database, 0), 0.0)
     assert state_at(corrector, 0.05) == (state, Reason.NONE)
@@ -198,7 +202,7 @@ TWO_SOURCES = (
 )
 
 
-def test_a_value_from_before_the_sleep_is_never_published(make_database: MakeDatabase) -> None:
+def test_value_from_before_bus_sleep_or_reload_is_never_published(make_database: MakeDatabase) -> None:
     database = make_database(*TWO_SOURCES)
     faults = {"battery": (0.5, 3.0), "motor": (0.25, 0.0)}
     corrector = corrector_for(database, **faults)
@@ -215,7 +219,7 @@ def test_a_value_from_before_the_sleep_is_never_published(make_database: MakeDat
     assert published(database, corrector, pair, 3600.4, "motor")[0] == no_value
 
 
-def test_branches_that_fall_silent_one_after_the_other_are_no_fault(database: VehicleDatabase) -> None:
+def test_branches_going_silent_one_after_another_are_not_a_fault(database: VehicleDatabase) -> None:
     """Their timeouts differ."""
     corrector = corrector_for(database, battery=(0.25, 5.0), dcdc=(0.0, 0.0))
     seen = set()
@@ -228,7 +232,7 @@ def test_branches_that_fall_silent_one_after_the_other_are_no_fault(database: Ve
     assert corrector.state() == ASLEEP
 
 
-def test_a_stray_frame_of_a_branch_that_the_car_lacks_counts_for_one_drive_only(database: VehicleDatabase) -> None:
+def test_stray_frame_of_an_unfitted_branch_affects_only_the_current_drive(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     drive(database, corrector, 0.0, 1.0)
     data = protected(database, "HV_Dcdc", 0, DcdcCurrent=1.0)
@@ -240,7 +244,7 @@ def test_a_stray_frame_of_a_branch_that_the_car_lacks_counts_for_one_drive_only(
     assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
-def test_a_set_that_makes_the_sum_worse_is_given_up_and_a_new_one_is_tried(database: VehicleDatabase) -> None:
+def test_parameters_that_worsen_the_sum_are_dropped_until_others_are_loaded(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.2, 0.0), motor=(0.0, 0.0))
     balanced(database, corrector, 0.0, 9.0)
     assert corrector.state() == (State.CORRECTING, Reason.NONE)
@@ -258,7 +262,9 @@ WATCHED = '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
 
 
 @pytest.mark.parametrize(("contactor", "reason"), [(1, Reason.NONE), (2, Reason.CORRECTION_WORSE)])
-def test_sums_are_judged_only_in_valid_states(make_database: MakeDatabase, contactor: int, reason: Reason) -> None:
+def test_junction_sum_is_judged_only_in_the_valid_states_of_the_watch(
+    make_database: MakeDatabase, contactor: int, reason: Reason
+) -> None:
     own = whole_vehicle(make_database, WATCHED)
     corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
     balanced(own, corrector, 0.0, 12.0, ContactorState=contactor)
@@ -266,7 +272,7 @@ def test_sums_are_judged_only_in_valid_states(make_database: MakeDatabase, conta
     assert corrector.watch.sums is not None
 
 
-def test_missing_state_of_the_watch_is_reported(make_database: MakeDatabase) -> None:
+def test_missing_input_of_the_watch_is_reported(make_database: MakeDatabase) -> None:
     own = whole_vehicle(make_database, '\n[watch]\ninput = "speed"\nvalid = [0]\n')
     corrector, motion = corrector_for(own, battery=(0.01, 0.0), motor=(0.0, 0.0)), FrameKey(0x200, extended=False)
     missing = (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
@@ -280,14 +286,16 @@ def test_missing_state_of_the_watch_is_reported(make_database: MakeDatabase) -> 
 @pytest.mark.parametrize(
     ("key", "value"), [("[watch] valid", "4"), ("[watch] valid", "-1"), ("[contactor] open", "0.5")]
 )
-def test_a_value_that_an_input_cannot_have_is_refused(make_database: MakeDatabase, key: str, value: str) -> None:
+def test_layout_with_an_impossible_value_of_an_input_is_refused(
+    make_database: MakeDatabase, key: str, value: str
+) -> None:
     name = key.partition(" ")[2]
     words = rf"{re.escape(key)}: {value} is no value of HV_Battery\.ContactorState, which has 2 bits"
     with pytest.raises(LayoutError, match=words):
         whole_vehicle(make_database, WATCHED, (rf"{name} = \[.*\]", f"{name} = [2, {value}]"))
 
 
-def test_any_value_of_a_floating_point_input_can_be_waited_for(make_database: MakeDatabase) -> None:
+def test_layout_may_name_any_value_of_a_float_input(make_database: MakeDatabase) -> None:
     waiting = 'input = [{ name = "net", signal = "Net.Voltage" }]\ncontactor = { input = "net", open = [0.123] }\n'
     dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01,0) [0|650]", "0|32@1- (1,0) [0|650]")
     own = make_database(f"{SMALL_LAYOUT}{waiting}", f"{dbc}SIG_VALTYPE_ 258 Voltage : 1;\n")
@@ -307,7 +315,7 @@ LOADED = JunctionResidual(measured_a=0.0, corrected_a=3.0, measured_mean_a=0.0, 
         (-3.0, LOADED, Reason.CORRECTION_WORSE),
     ],
 )
-def test_sums_are_judged_about_the_expected_sum(
+def test_junction_sum_is_judged_relative_to_the_expected_sum(
     database: VehicleDatabase, offset_a: float, sums: JunctionResidual, reason: Reason
 ) -> None:
     parameters = parameters_for(database, battery=(0.0, offset_a), motor=(0.0, 0.0))
@@ -324,7 +332,7 @@ def test_sums_are_judged_about_the_expected_sum(
     ],
     ids=["stuck", "at rest"],
 )
-def test_branch_is_stuck_if_only_the_sum_moves(
+def test_branch_is_stuck_if_it_stays_constant_while_the_sum_moves(
     database: VehicleDatabase, drift: float, base_a: float, swing_a: float, motor_a: float, stuck: tuple[str, ...]
 ) -> None:
     corrector = corrector_for(database, battery=(drift, 0.0), motor=(0.0, 0.0))
@@ -333,7 +341,7 @@ def test_branch_is_stuck_if_only_the_sum_moves(
     assert corrector.latched_branches == stuck
 
 
-def test_a_branch_that_changes_now_and_then_is_not_stuck(make_database: MakeDatabase) -> None:
+def test_branch_that_changes_occasionally_is_not_stuck(make_database: MakeDatabase) -> None:
     own = whole_vehicle(make_database, "\n[watch]\nwindow_s = 60.0\n")
     corrector = corrector_for(own, battery=(0.1, 0.0), motor=(0.0, 0.0))
     swinging = partial(drive, battery_a=lambda k: 100.0 + 50.0 * math.sin(0.1 * k), period_s=0.1)
@@ -341,7 +349,7 @@ def test_a_branch_that_changes_now_and_then_is_not_stuck(make_database: MakeData
     assert corrector.latched is not Reason.BRANCH_STUCK
 
 
-def test_shadow_mode_computes_and_changes_nothing(database: VehicleDatabase) -> None:
+def test_shadow_mode_reports_the_corrected_sum_but_publishes_measured_values(database: VehicleDatabase) -> None:
     parameters = parameters_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     corrector = wire(database, InForce(parameters=parameters), start_s=0.0, shadow=True)
     assert published(database, corrector, battery(database, 0, 80.0), 0.0) == (80.0, Quality.PASSED_THROUGH)
@@ -352,7 +360,7 @@ def test_shadow_mode_computes_and_changes_nothing(database: VehicleDatabase) -> 
     assert status["JunctionSumCorrected"] == pytest.approx((80.0 - 5.0) / 1.25 - 60.0)
 
 
-def test_branches_that_lag_are_looked_at_in_the_same_instant(database: VehicleDatabase) -> None:
+def test_delayed_branches_are_summed_at_the_same_instant(database: VehicleDatabase) -> None:
     parameters = parameters_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
     late = {**parameters.branches, "motor": replace(parameters.branches["motor"], delay_s=0.2)}
     corrector = wire(database, InForce(parameters=replace(parameters, branches=late)), start_s=0.0)
@@ -366,7 +374,7 @@ def test_branches_that_lag_are_looked_at_in_the_same_instant(database: VehicleDa
     assert worst < 0.03
 
 
-def test_no_sum_is_interpolated_across_a_frame_without_value(database: VehicleDatabase) -> None:
+def test_junction_sum_is_not_interpolated_across_a_frame_without_value(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
     no_value_a = -655.36
     for k, current_a in enumerate((80.0, no_value_a, 80.0)):
@@ -377,7 +385,7 @@ def test_no_sum_is_interpolated_across_a_frame_without_value(database: VehicleDa
     assert sums_at(corrector, 0.07) == pytest.approx((-20.0, -20.0))
 
 
-def test_value_with_an_earlier_time_than_a_missing_one_is_used(database: VehicleDatabase) -> None:
+def test_value_is_used_though_its_timestamp_precedes_that_of_a_missing_one(database: VehicleDatabase) -> None:
     """As after the clock was set: the first frame counts as of when it was read, the next one as of when it came."""
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
     answers(corrector, battery(database, 0, -655.36), 0.02)
@@ -394,7 +402,7 @@ def test_dbc_names_all_status_codes(database: VehicleDatabase, signal: str, code
     assert names == {code.value: code.name.replace("_", "") for code in codes}
 
 
-def test_a_power_counts_in_the_sum_as_power_over_voltage(make_database: MakeDatabase) -> None:
+def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0), heater=(0.25, 0.0))
     answers(corrector, frame_of(database, "Pair", Battery=50.0, Motor=40.0), 0.0)
@@ -413,7 +421,7 @@ def test_a_power_counts_in_the_sum_as_power_over_voltage(make_database: MakeData
 
 
 @pytest.mark.parametrize(("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")])
-def test_unit_per_bit_counts_once_beside_the_scale(make_database: MakeDatabase, scale: str, unit: str) -> None:
+def test_scale_in_unit_and_in_factor_is_applied_once(make_database: MakeDatabase, scale: str, unit: str) -> None:
     dbc = SMALL_DBC.replace('(1,0) [0|60000] "W"', f'({scale},0) [0|60000] "{unit}"')
     corrector = corrector_for(make_database(SMALL_LAYOUT, dbc), heater=(0.0, 0.0))
     answers(corrector, Frame(HEATER, (80).to_bytes(4, "little")), 0.0)
@@ -522,7 +530,7 @@ def test_frame_without_the_current_repeats_its_last_value_until_stale(make_datab
 at_20_ms = partial(drive, period_s=0.02)
 
 
-def test_half_of_the_frames_corrupt_is_a_state_and_none_of_them_is_used(database: VehicleDatabase) -> None:
+def test_message_with_half_of_its_frames_corrupt_is_not_used_at_all(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.02, 3.0))
     assert set(at_20_ms(database, corrector, 0.0, 0.6)) == {Quality.CORRECTED}
     found = at_20_ms(database, corrector, 0.6, 1.4, spoil=2)
@@ -532,19 +540,19 @@ def test_half_of_the_frames_corrupt_is_a_state_and_none_of_them_is_used(database
     assert corrector.state() == CORRECTING
 
 
-def test_a_tenth_of_the_frames_corrupt_costs_these_only(database: VehicleDatabase) -> None:
+def test_message_with_a_tenth_of_its_frames_corrupt_loses_only_these(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.02, 3.0))
     assert at_20_ms(database, corrector, 0.0, 1.2, spoil=10) == [Quality.CORRECTED] * 54
     assert corrector.state() == CORRECTING
 
 
-def test_third_frame_after_a_silence_is_the_first_used(database: VehicleDatabase) -> None:
+def test_first_two_frames_after_a_silence_are_not_used(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.02, 3.0))
     at_20_ms(database, corrector, 0.0, 0.4)
     assert at_20_ms(database, corrector, 3.0, 3.1) == [Quality.INVALID] * 2 + [Quality.CORRECTED] * 3
 
 
-def test_a_gateway_goes_on_with_the_intact_frames_of_an_invalid_message(database: VehicleDatabase) -> None:
+def test_gateway_forwards_the_intact_frames_of_an_invalid_message(database: VehicleDatabase) -> None:
     source = corrector_for(database, Mode.GATEWAY, battery=(0.02, 3.0)).sources[BATTERY]
     for number in range(20):
         frame = bytearray(battery(database, number % 15).data)
@@ -556,7 +564,7 @@ def test_a_gateway_goes_on_with_the_intact_frames_of_an_invalid_message(database
 
 
 @pytest.mark.parametrize("mode", Mode)
-def test_frozen_control_unit_is_stale(make_database: MakeDatabase, mode: Mode) -> None:
+def test_branch_of_a_frozen_control_unit_becomes_stale(make_database: MakeDatabase, mode: Mode) -> None:
     own = whole_vehicle(make_database, "", ("timeout_s = .*", "timeout_s = 2.0"))
     corrector = corrector_for(own, mode, battery=(0.02, 3.0), motor=(0.0, 0.0))
     take = TAKE[mode]
@@ -589,7 +597,7 @@ def test_answer_is_corrected_if_parameters_name_the_branch(
 
 
 @pytest.mark.parametrize("window_s", [1.0, 60.0])
-def test_any_window_is_judged_at_ten_looks_per_second(make_database: MakeDatabase, window_s: float) -> None:
+def test_watch_window_of_any_length_works_at_ten_looks_per_second(make_database: MakeDatabase, window_s: float) -> None:
     own = whole_vehicle(make_database, f"\n[watch]\nwindow_s = {window_s}\n")
     corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
     balanced(own, corrector, 0.0, 0.85 * window_s, period_s=0.1)
@@ -599,7 +607,7 @@ def test_any_window_is_judged_at_ten_looks_per_second(make_database: MakeDatabas
 
 
 @pytest.mark.parametrize(("old", "new"), [("8 Corrector", "8 Vector__XXX"), ("8 Other", "8 Corrector")])
-def test_messages_of_one_control_unit_or_of_none_may_be_sent(make_database: MakeDatabase, old: str, new: str) -> None:
+def test_node_may_send_messages_of_one_dbc_sender_or_of_none(make_database: MakeDatabase, old: str, new: str) -> None:
     database = make_database(SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER.replace(old, new))
     assert corrector_for(database).status() is not None
 
@@ -612,7 +620,7 @@ def test_messages_of_one_control_unit_or_of_none_may_be_sent(make_database: Make
     ("sent", "unused", "counted"),
     [((0, 1, 3, 4, 7), None, "gaps 2"), ((0, 1, 1, 2), 2, "repeated 1"), ((0, 1, 9, 10), 2, "jumped 1")],
 )
-def test_repeated_or_jumping_frame_is_not_used(
+def test_frame_with_repeated_or_jumped_counter_is_not_used(
     database: VehicleDatabase, mode: Mode, sent: tuple[int, ...], unused: int | None, counted: str
 ) -> None:
     corrector, take = corrector_for(database, mode, battery=(0.25, 5.0)), TAKE[mode]
@@ -623,7 +631,7 @@ def test_repeated_or_jumping_frame_is_not_used(
 
 
 @pytest.mark.parametrize("mode", Mode)
-def test_frame_with_wrong_crc_counts_as_lost(database: VehicleDatabase, mode: Mode) -> None:
+def test_frame_with_wrong_crc_is_counted_and_otherwise_ignored(database: VehicleDatabase, mode: Mode) -> None:
     corrector, take = corrector_for(database, mode, battery=(0.25, 5.0)), TAKE[mode]
     first, second, third = (battery(database, counter) for counter in range(3))
     frames = (first, damaged(second), second, third, Frame(BATTERY, b""))

@@ -24,7 +24,7 @@ BO_ 272 INV_3: 8 Inverter
 @pytest.mark.parametrize(
     ("document", "head", "fewest"), [("safety.md", "| hazard |", 15), ("fault_table.md", "| fault |", 25)]
 )
-def test_every_row_names_tests_and_every_test_exists(document: str, head: str, fewest: int) -> None:
+def test_every_row_of_the_safety_tables_names_existing_tests(document: str, head: str, fewest: int) -> None:
     sections = (ROOT / "docs" / document).read_text().split("\n## ")
     lines = "\n".join(section for section in sections if head in section).splitlines()
     rows = [line for line in lines if line.startswith("| ") and not line.startswith(head)]
@@ -44,7 +44,9 @@ def test_every_code_of_the_status_is_documented_with_its_number(kind: type[IntEn
     assert in_dbc - documented == set()
 
 
-def test_overlay_lines_of_the_layout_document_suffice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_overlay_signals_shown_in_the_layout_document_are_sufficient(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """They are put in as the document says, and a template of the layout then fits."""
     document = (ROOT / "docs" / "layout.md").read_text()
     layout = re.findall(r"(?s)```toml\n(.*?)```", document.partition("\n## ")[0])[0]

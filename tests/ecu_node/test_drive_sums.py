@@ -67,7 +67,7 @@ def drive(make_database: MakeDatabase, tmp_path: Path) -> Drive:
     return Drive(tmp_path / "sums", make_database(WITH_CONTACTOR))
 
 
-def test_means_are_currents_and_open_contactors_show_the_offset(drive: Drive) -> None:
+def test_record_has_mean_currents_and_the_offset_at_open_contactors(drive: Drive) -> None:
     drive.go_on(120.0)
     for battery in (3000, 500):  # of two samples at one instant the last one counts
         drive.take(256, False, battery.to_bytes(2, "big") + bytes(6))
@@ -81,7 +81,7 @@ def test_means_are_currents_and_open_contactors_show_the_offset(drive: Drive) ->
     assert record.starts == [True]
 
 
-def test_step_of_the_time_of_day_begins_another_drive(drive: Drive) -> None:
+def test_clock_step_starts_a_new_drive(drive: Drive) -> None:
     drive.go_on(60.0)
     drive.stamp_s += 3600.0
     drive.go_on(60.0)
@@ -97,18 +97,18 @@ def test_silence_of_a_minute_ends_a_drive(drive: Drive) -> None:
     assert len(drive.records()) == 1
 
 
-def test_one_branch_alone_makes_no_record(drive: Drive) -> None:
+def test_single_branch_makes_no_record(drive: Drive) -> None:
     drive.go_on(400.0, battery_only=True)
     assert drive.ended() == []
 
 
 @pytest.mark.parametrize(("flows_s", "records"), [(2.0, 0), (5.5, 0), (6.5, 1)])
-def test_drive_counts_from_a_fifth_of_a_block_on(drive: Drive, flows_s: float, records: int) -> None:
+def test_drive_shorter_than_a_fifth_of_a_block_makes_no_record(drive: Drive, flows_s: float, records: int) -> None:
     drive.go_on(flows_s, open_s=0.0)
     assert len(drive.ended()) == records
 
 
-def test_noise_is_zero_where_no_four_samples_follow_each_other(drive: Drive) -> None:
+def test_noise_is_zero_without_four_consecutive_samples(drive: Drive) -> None:
     for _ in range(60):
         drive.go_on(0.3, open_s=0.0)
         drive.stamp_s += 0.7
@@ -116,7 +116,7 @@ def test_noise_is_zero_where_no_four_samples_follow_each_other(drive: Drive) -> 
     assert [*unpacked(record.noise_a2)] == [0.0, 0.0, 0.0]
 
 
-def test_full_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_record_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "MOST_BATCHES", 1)
     drive.go_on(400.0)
     records = drive.ended()
@@ -125,7 +125,7 @@ def test_full_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.Monk
     assert [record.zero_offset_a[0] for record in records] == [pytest.approx(OFFSET_A), None, None]
 
 
-def test_failure_to_write_is_reported_once_and_its_end(drive: Drive) -> None:
+def test_write_failure_and_its_end_are_each_reported_once(drive: Drive) -> None:
     shutil.rmtree(drive.folder)
     for _ in range(2):
         drive.go_on(60.0)
@@ -149,7 +149,9 @@ def test_record_of_another_version_is_refused(drive: Drive) -> None:
         decode_summary(encode_summary(other))
 
 
-def test_what_cannot_be_summed_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_unusable_summary_folder_vehicle_name_and_formula_are_refused(
+    make_database: MakeDatabase, tmp_path: Path
+) -> None:
     database = make_database(SMALL_LAYOUT)
     (tmp_path / "file").touch()
     options = argparse.Namespace(summary=tmp_path / "file", vehicle="V1")
@@ -165,7 +167,7 @@ def test_what_cannot_be_summed_is_refused(make_database: MakeDatabase, tmp_path:
         OnBoardSummary(tmp_path, "V1", database, delays={}, say=print)
 
 
-def test_node_that_sums_up_makes_the_folder_of_its_vehicle(tmp_path: Path) -> None:
+def test_node_with_summary_option_creates_the_folder_of_its_vehicle(tmp_path: Path) -> None:
     options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]
     bus = ["--interface", "virtual", "--channel", "sums", "--summary", str(tmp_path / "sums")]
     with running("run", *options, *bus) as log:

@@ -85,7 +85,7 @@ def damaged(frame: bytearray) -> bytearray:
     return frame[:-1] + bytes([frame[-1] ^ 1])
 
 
-def test_the_counter_starts_at_0_runs_through_and_every_frame_in_order_is_ok(kind: str, protection: Protection) -> None:
+def test_counter_starts_at_0_and_wraps_and_frames_in_order_are_ok(kind: str, protection: Protection) -> None:
     frames, (_, modulus, _) = stream(protection, 300), KINDS[kind]
     assert protection.modulus == modulus
     assert [protection.counter_of(frame) for frame in frames] == [k % modulus for k in range(300)]
@@ -93,7 +93,7 @@ def test_the_counter_starts_at_0_runs_through_and_every_frame_in_order_is_ok(kin
     assert {check(frame) for frame in frames} == {Check.OK}
 
 
-def test_the_header_is_crc_and_counter_and_no_other_bit_is_written(kind: str, protection: Protection) -> None:
+def test_protection_writes_only_the_bits_of_crc_and_counter(kind: str, protection: Protection) -> None:
     header = bytes.fromhex(KINDS[kind][2])
     assert protection.header_mask == int.from_bytes(header, "little")
     for frame in stream(protection, 20):
@@ -104,14 +104,14 @@ def test_the_header_is_crc_and_counter_and_no_other_bit_is_written(kind: str, pr
     assert {Receiver(protection).check(bytearray(size)) for size in range(len(header))} == {Check.CORRUPT}
 
 
-def test_a_corrupt_frame_changes_neither_counter_nor_a_state_that_nothing_has_set(protection: Protection) -> None:
+def test_corrupt_frame_changes_neither_counter_nor_initial_state(protection: Protection) -> None:
     (first, second), receiver = stream(protection, 2), Receiver(protection)
     found = [(receiver.check(frame), receiver.state) for frame in (damaged(first), first, damaged(second), second)]
     ok, corrupt = (Check.OK, E2EState.VALID), (Check.CORRUPT, E2EState.VALID)
     assert found == [(Check.CORRUPT, E2EState.INIT), ok, corrupt, ok]
 
 
-def test_any_flipped_bit_is_noticed_and_sealing_keeps_the_counter(protection: Protection) -> None:
+def test_any_flipped_bit_is_detected_and_sealing_keeps_the_counter(protection: Protection) -> None:
     (frame,) = stream(protection, 1)
     for bit in range(8 * SIZE):
         flipped = bytearray((int.from_bytes(frame, "little") ^ 1 << bit).to_bytes(SIZE, "little"))
@@ -168,7 +168,7 @@ def crc8(data: bytes, polynomial: int) -> int:
         (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 255 }", b"\xff", b"", 0x1D),
     ],
 )
-def test_crc_of_a_control_unit_is_as_described(
+def test_manufacturer_crc_covers_the_bytes_described_in_the_layout(
     protect: Callable[..., Protection], entry: str, before: bytes, after: bytes, polynomial: int
 ) -> None:
     protection = protect(entry)
@@ -181,7 +181,7 @@ def test_crc_of_a_control_unit_is_as_described(
 
 
 @pytest.mark.parametrize("first", [0, -1, -6, -8, -14])
-def test_repeated_frames_gaps_and_jumps_also_past_the_last_code(protection: Protection, first: int) -> None:
+def test_repeats_gaps_and_jumps_are_detected_across_counter_overflow(protection: Protection, first: int) -> None:
     frames = stream(protection, 17, first=protection.modulus + first)
     check = Receiver(protection).check
     found = [check(frames[k]) for k in (5, 5, 6, 9, 10, 14, 15, 16)]
@@ -192,7 +192,7 @@ def test_repeated_frames_gaps_and_jumps_also_past_the_last_code(protection: Prot
 @pytest.mark.parametrize(
     ("kind", "counter"), [("P04", 0x0100), ("P04", 0x0101), ("P07", 0x0101), ("P07", 0x010001), ("P07", 0x01000000)]
 )
-def test_every_byte_of_a_long_counter_is_compared_with_the_next_one(protection: Protection, counter: int) -> None:
+def test_every_byte_of_a_multi_byte_counter_is_compared(protection: Protection, counter: int) -> None:
     check = Receiver(protection).check
     assert {check(frame) for frame in stream(protection, 13, first=-12)} == {Check.OK}, "the next counter is 1"
     assert check(*stream(protection, 1, first=counter)) is Check.JUMPED
@@ -216,7 +216,7 @@ def test_every_byte_of_a_long_counter_is_compared_with_the_next_one(protection: 
     ],
     ids=["errors", "lost frames are no errors, nor a few at first", "repeated frames are not intact"],
 )
-def test_state_of_a_message_follows_its_last_frames(
+def test_e2e_state_follows_the_windows_of_recent_frames(
     kind: str, protect: Callable[..., Protection], windows: str, sent: Sequence[int], spoilt: Sequence[int], states: str
 ) -> None:
     """Initial, valid, or invalid (X) after each frame that was sent, by its place in a stream."""
@@ -238,7 +238,7 @@ WINDOW = st.integers(1, 12).flatmap(  # a layout asks for no more intact frames 
     windows=st.tuples(WINDOW, WINDOW, WINDOW),
     steps=st.lists(st.sampled_from(("corrupt", 0, 1, 1, 1, 1, 2, 3, 4, 7)), max_size=60),
 )
-def test_any_frames_are_judged_and_the_state_follows_as_autosar_says(
+def test_checks_and_e2e_state_of_random_frames_follow_autosar(
     protection: Protection, windows: tuple[E2EWindow, E2EWindow, E2EWindow], steps: list[int | str]
 ) -> None:
     protection = replace(protection, windows=windows)
@@ -293,7 +293,7 @@ HEADS = [("[e2e]", "[e2e]"), ('[[e2e]]\nprofile = "P01"\nmessages = ["Net"]\n[[e
     ],
 )
 @pytest.mark.parametrize(("head", "place"), HEADS)
-def test_wrong_entry_is_named_by_its_place(
+def test_mistake_in_an_e2e_entry_is_reported_with_its_place(
     protect: Callable[..., Protection], head: str, place: str, entry: str, words: str
 ) -> None:
     with pytest.raises(LayoutError, match=rf"small\.toml: {re.escape(place)}.*{re.escape(words)}") as caught:
@@ -310,14 +310,14 @@ def test_wrong_entry_is_named_by_its_place(
         (OEM, "36|4@1+", "36|4@1-", "signal Count cannot count from 0 to 7$"),
     ],
 )
-def test_unfit_message_is_refused(
+def test_message_that_cannot_carry_its_protection_is_refused(
     protect: Callable[..., Protection], entry: str, old: str, new: str, words: str
 ) -> None:
     with pytest.raises(LayoutError, match=f"message Room.* {words}"):
         protect(entry, room=ROOM.replace(old, new))
 
 
-def test_messages_may_be_protected_in_different_ways_but_each_in_one(make_database: MakeDatabase) -> None:
+def test_messages_may_have_different_protections_but_only_one_each(make_database: MakeDatabase) -> None:
     dbc = SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1)
     entries = f'\n[[e2e]]\n{ENTRIES["P05"]}\n\n[[e2e]]\nprofile = "P01"\nmessages = ["Net", "Heater"]\n'
     database = make_database(SMALL_LAYOUT + entries, dbc)

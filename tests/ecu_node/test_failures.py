@@ -21,7 +21,9 @@ from ecu_node.program import FAILED, INTERNAL_ERROR, end_of, split_debug
         (TypeError("a\nb"), INTERNAL_ERROR, "prog: internal error: TypeError: a b; run again with --debug and report "),
     ],
 )
-def test_each_error_is_one_line(error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_error_is_reported_in_one_line(
+    error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert end_of("prog", error, debug=False) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(text)
@@ -32,13 +34,15 @@ def test_trust_error_keeps_its_reason_when_pickled() -> None:
     assert (type(found), found.reason, str(found)) == (TrustError, Reason.REVOKED, "number 5 was revoked")
 
 
-def test_debug_is_taken_from_anywhere_before_two_dashes() -> None:
+def test_debug_option_works_anywhere_before_a_double_dash() -> None:
     assert split_debug(["run", "--debug", "x"]) == (["run", "x"], True)
     assert split_debug(["--debug", "run", "--", "--debug"]) == (["run", "--", "--debug"], True)
     assert split_debug(["run", "--", "--debug"]) == (["run", "--", "--debug"], False)
 
 
-def test_internal_error_names_its_place(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_internal_error_names_file_and_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("nobody thought of that")
 

@@ -62,7 +62,7 @@ def vehicle(tmp_path: Path) -> Vehicle:
     return Vehicle(tmp_path)
 
 
-def test_a_fault_is_kept_with_its_currents(vehicle: Vehicle, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fault_is_stored_with_its_currents(vehicle: Vehicle, capsys: pytest.CaptureFixture[str]) -> None:
     assert vehicle.faults() == []
     vehicle.junction.run(5.0, driving)
     vehicle.junction.wrong = {"battery": lambda shown_a: shown_a + 100.0}
@@ -89,7 +89,7 @@ def test_latched_fault_survives_a_restart_until_it_is_cleared(vehicle: Vehicle, 
     assert vehicle.faults() == []
 
 
-def test_a_short_gap_on_the_bus_releases_nothing_and_sleep_does(vehicle: Vehicle) -> None:
+def test_bus_sleep_releases_a_stale_branch_and_a_short_gap_does_not(vehicle: Vehicle) -> None:
     """Sleep does not release what the sums said."""
     for count in (1, 2):
         vehicle.latch(Reason.BRANCH_STALE, "motor")
@@ -105,7 +105,7 @@ def test_a_short_gap_on_the_bus_releases_nothing_and_sleep_does(vehicle: Vehicle
     assert [fault["active"] for fault in vehicle.faults()] == [True, False], "the last one first"
 
 
-def test_fault_that_cannot_be_kept_is_reported_and_kept_later(vehicle: Vehicle) -> None:
+def test_fault_that_cannot_be_stored_is_reported_and_stored_later(vehicle: Vehicle) -> None:
     vehicle.state.rmdir()
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.later(3.0)
@@ -119,14 +119,14 @@ def test_fault_that_cannot_be_kept_is_reported_and_kept_later(vehicle: Vehicle) 
     assert vehicle.latched() is Reason.NONE
 
 
-def test_a_state_folder_that_vanishes_clears_nothing(vehicle: Vehicle) -> None:
+def test_vanished_state_folder_does_not_clear_a_latched_fault(vehicle: Vehicle) -> None:
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.state.rename(vehicle.state.with_name("away"))
     vehicle.later(3.0)
     assert vehicle.latched() is Reason.SUM_IMPLAUSIBLE
 
 
-def test_faults_that_are_over_are_cleared_for_good(vehicle: Vehicle) -> None:
+def test_cleared_faults_do_not_return(vehicle: Vehicle) -> None:
     vehicle.latch(Reason.BRANCH_STALE, "motor")
     vehicle.latch(Reason.NONE)
     vehicle.clear()
@@ -142,7 +142,7 @@ def test_faults_that_are_over_are_cleared_for_good(vehicle: Vehicle) -> None:
         ("", None, "cannot read the fault memory: it is a folder"),
     ],
 )
-def test_damaged_memory_is_one_line(
+def test_damaged_fault_memory_is_reported_in_one_line(
     vehicle: Vehicle, old: str, new: str | None, why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicle.latch(Reason.BRANCH_STALE, "motor")
@@ -159,12 +159,14 @@ def test_damaged_memory_is_one_line(
 
 
 @pytest.mark.parametrize("command", ["faults", "clear"])
-def test_missing_state_folder_is_one_line(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_state_folder_is_reported_in_one_line(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_ecu_node([command, "--state", str(tmp_path / "none")]) == 1
     assert "no such state folder; name the one of 'ecu-node run --state'" in capsys.readouterr().err
 
 
-def test_a_node_without_the_state_of_a_vehicle_says_so_and_passes_values_through(tmp_path: Path) -> None:
+def test_node_without_vehicle_state_passes_values_through_and_reports_why(tmp_path: Path) -> None:
     bus = ["--interface", "virtual", "--channel", "state"]
     with running("run", "--state", str(tmp_path), "--layout", str(LAYOUT), *bus) as log:
         assert log[-1].endswith("running on virtual state, correcting nothing\n")

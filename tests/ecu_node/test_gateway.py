@@ -26,14 +26,14 @@ def gateway_for(database: VehicleDatabase, **faults: tuple[float, float]) -> Cor
     return corrector_for(database, Mode.GATEWAY, **faults)
 
 
-def test_only_rewritten_frames_are_counted_as_such(database: VehicleDatabase) -> None:
+def test_frames_passed_unchanged_are_not_counted_as_rewritten(database: VehicleDatabase) -> None:
     corrector = gateway_for(database, battery=(0.25, 5.0))
     for counter, current_a in enumerate((100.0, 90.0, -655.36)):
         passed_on(corrector, battery(database, counter, current_a), 0.0)
     assert (corrector.counters.frames_in, corrector.counters.rewritten, corrector.counters.answers) == (3, 2, 0)
 
 
-def test_foreign_frames_are_reported_for_10_s(database: VehicleDatabase) -> None:
+def test_foreign_branch_frames_are_reported_for_10_s(database: VehicleDatabase) -> None:
     corrector, found = gateway_for(database, battery=(0.25, 5.0)), []
     for k in range(1200):
         passed_on(corrector, battery(database, k % 15), 0.01 * k)
@@ -45,13 +45,13 @@ def test_foreign_frames_are_reported_for_10_s(database: VehicleDatabase) -> None
 
 
 @pytest.mark.parametrize("code", [-32768, 32501, -32501])
-def test_codes_that_are_no_values_are_passed_on_untouched(database: VehicleDatabase, code: int) -> None:
+def test_codes_for_no_value_are_forwarded_unchanged(database: VehicleDatabase, code: int) -> None:
     corrector = gateway_for(database, battery=(0.25, 5.0))
     frame = battery(database, 3, code * 0.02)
     assert passed_on(corrector, frame, 0.0) == frame.data
 
 
-def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_database: MakeDatabase) -> None:
+def test_codes_listed_as_no_value_in_the_layout_are_forwarded_unchanged(make_database: MakeDatabase) -> None:
     layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [32000, -8500]')
     database = make_database(layout)
     corrector = gateway_for(database, motor=(0.5, 3.0))
@@ -64,7 +64,7 @@ def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_datab
         gateway_for(make_database(layout.replace("32000", "32768")))
 
 
-def test_a_power_is_written_back_as_a_power(make_database: MakeDatabase) -> None:
+def test_gateway_writes_a_corrected_power_as_power(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = gateway_for(database, heater=(0.25, -2.0))
     heater = frame_of(database, "Heater", Power=4000)
@@ -88,13 +88,15 @@ def test_a_power_is_written_back_as_a_power(make_database: MakeDatabase) -> None
     ("profile", "offset", "branch"),
     [("P01", 0, "battery"), ("P04", 0, "battery"), ("P06", 1, "battery"), ("P07", 3, "motor"), ("P11", 2, "motor")],
 )
-def test_branch_over_header_is_refused(make_database: MakeDatabase, profile: str, offset: int, branch: str) -> None:
+def test_branch_that_overlaps_the_e2e_header_is_refused(
+    make_database: MakeDatabase, profile: str, offset: int, branch: str
+) -> None:
     layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'
     with pytest.raises(LayoutError, match=rf"branch {branch}: Pair\.{branch.title()} is written twice, or overlaps"):
         gateway_for(make_database(layout, SMALL_DBC.replace("Pair: 8", "Pair: 24")))
 
 
-def test_a_message_that_is_only_read_is_never_held_back(make_database: MakeDatabase) -> None:
+def test_message_without_branches_is_forwarded_even_if_corrupt(make_database: MakeDatabase) -> None:
     entry = '\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\n'
     dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "16|16@1+ (0.01")
     database = make_database(SMALL_LAYOUT + entry, dbc)
@@ -104,7 +106,7 @@ def test_a_message_that_is_only_read_is_never_held_back(make_database: MakeDatab
     assert (corrector.counters.corrupt, corrector.counters.held_back) == (1, 0)
 
 
-def test_a_name_amid_the_values_of_a_branch_is_refused_where_it_is_written_back(make_database: MakeDatabase) -> None:
+def test_gateway_refuses_a_named_code_within_the_range_of_a_branch(make_database: MakeDatabase) -> None:
     database = make_database(dbc=SMALL_DBC + 'VAL_ 2147484160 Power 100 "Limit";\n')
     corrector_for(database, battery=(0.1, 0.0))
     words = r"branch heater: code 100 of signal Power means 'Limit', .* beyond 99 could be .* full scale is 260000"

@@ -94,7 +94,7 @@ class BlockingBus(VirtualBus):
         super().send(msg, timeout)
 
 
-def test_watchdog_is_not_fed_while_the_way_back_is_stuck(
+def test_watchdog_is_not_fed_while_sending_towards_the_sensors_blocks(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)
@@ -136,7 +136,7 @@ def test_frames_from_before_the_start_are_not_passed_on(database: VehicleDatabas
                 assert early < 10, "those of the listening, more than 10, are not passed on"
 
 
-def test_a_remote_frame_passes_whatever_its_identifier(database: VehicleDatabase, ends: Ends, channel: str) -> None:
+def test_remote_frame_of_any_identifier_passes(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, vehicle = ends
     remote = partial(can.Message, is_extended_id=False, is_remote_frame=True, dlc=8)
     asked = [remote(arbitration_id=key) for key in (0x110, 0x5F0)]
@@ -169,7 +169,7 @@ def test_foreign_frames_are_dropped_and_counted(
     assert sensors.recv(0.0) is None, "none was passed on"
 
 
-def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, channel: str) -> None:
+def test_gateway_with_both_ends_on_one_bus_stops(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, _ = ends
     with gateway(database, channel, f"{channel} a") as (_, running):
         for counter in range(100):
@@ -180,7 +180,9 @@ def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, chan
             running.result(LONGEST_WAIT_S)
 
 
-def test_a_second_gateway_between_the_same_buses_refuses(database: VehicleDatabase, ends: Ends, channel: str) -> None:
+def test_second_gateway_between_the_same_buses_refuses_to_start(
+    database: VehicleDatabase, ends: Ends, channel: str
+) -> None:
     _, vehicle = ends
     with gateway(database, channel) as (_, first):
         receive(vehicle, STATUS, 1)

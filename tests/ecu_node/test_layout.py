@@ -9,7 +9,7 @@ from ecu_node.layout import file_digest, read_layout
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase
 
 
-def test_a_power_branch_is_named_by_its_power(make_database: MakeDatabase) -> None:
+def test_source_of_a_power_branch_is_its_power_signal(make_database: MakeDatabase) -> None:
     assert read_layout(LAYOUT).offset_limit_a == 150.0
     layout = make_database().layout
     assert layout.find_branch("heater").source == "Heater.Power"
@@ -17,7 +17,7 @@ def test_a_power_branch_is_named_by_its_power(make_database: MakeDatabase) -> No
     assert layout.offset_limit_a == pytest.approx(0.4 * 400.0)
 
 
-def test_a_byte_order_mark_is_left_out_and_line_ends_do_not_change_the_digest(tmp_path: Path) -> None:
+def test_byte_order_mark_and_line_ends_do_not_matter(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text(SMALL_LAYOUT, encoding="utf-8-sig")
     layout = read_layout(tmp_path / "x.toml")
     (tmp_path / "x.toml").write_text(SMALL_LAYOUT, encoding="utf-8-sig", newline="\r\n")
@@ -74,7 +74,7 @@ def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: st
     assert "\n" not in str(caught.value)
 
 
-def test_a_layout_that_is_no_text_is_refused(tmp_path: Path) -> None:
+def test_layout_that_is_not_utf_8_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_bytes(b"\xff")
     with pytest.raises(LayoutError, match=r"x\.toml: not a layout: the file is not UTF-8 text; see the page 'Layout'"):
         read_layout(tmp_path / "x.toml")
@@ -106,7 +106,9 @@ def test_a_diagnostics_database_is_refused(make_database: MakeDatabase, tmp_path
 
 @pytest.mark.parametrize("mark", [1 << 31, 0])
 @pytest.mark.parametrize("more", ["", 'VAL_ 258 Gone 1 "On";\n'])
-def test_unmarked_29_bit_ids_and_stray_names_are_read(make_database: MakeDatabase, mark: int, more: str) -> None:
+def test_dbc_with_unmarked_29_bit_ids_or_names_of_missing_signals_is_read(
+    make_database: MakeDatabase, mark: int, more: str
+) -> None:
     """As they stand in many public DBCs."""
     number = mark | 0x18FF0200
     texts = f'CM_ SG_ {number} Power "Taken up";\nVAL_ {number} Power 65535 "SNA";\n'

@@ -65,7 +65,7 @@ def currents(branch: View) -> list[Any]:
     return [branch[key] for key in ("measured_a", "corrected_a", "correction_a")]
 
 
-def test_branch_shows_measured_published_and_difference(bus: Bus) -> None:
+def test_monitor_shows_measured_and_published_currents_and_their_difference(bus: Bus) -> None:
     bus.pair("Battery", 0.01, 100.0, 95.5)
     bus.pair("Motor", 0.01, 80.0, 81.0)
     battery = bus.branch(0.05)
@@ -80,7 +80,7 @@ def test_branch_shows_measured_published_and_difference(bus: Bus) -> None:
     assert (battery["measured_a"], battery["corrected_is_stale"]) == (pytest.approx(200.0), True)
 
 
-def test_latency_is_from_a_frame_to_its_answer_on_the_bus(bus: Bus) -> None:
+def test_latency_is_measured_from_a_frame_to_its_answer_on_the_bus(bus: Bus) -> None:
     assert bus.monitor.look(0.0)["latency_us"] is None
     for k in range(10):
         bus.pair("Battery", 0.02 * k, 100.0, 95.0)
@@ -91,7 +91,7 @@ def test_latency_is_from_a_frame_to_its_answer_on_the_bus(bus: Bus) -> None:
     assert bus.monitor.look(3.0)["latency_us"]["max"] == 1000, "a frame that nobody answered"
 
 
-def test_sums_are_taken_in_one_instant_however_late_the_answers_come(bus: Bus) -> None:
+def test_sums_are_taken_at_one_instant_however_late_the_answers_are(bus: Bus) -> None:
     """Currents that rise by 1000 A/s with a sum of 5 A; the motor's frames are answered three at a time."""
     waiting: list[float] = []
     for k in range(30):
@@ -138,7 +138,7 @@ def test_frames_that_fail_their_check_are_counted_and_not_used(bus: Bus) -> None
     assert any(line.endswith("corrupt 2, repeated 1, lost 1, corrected: corrupt 1") for line in bus.lines(0.06))
 
 
-def test_status_is_read_as_the_node_wrote_it(bus: Bus) -> None:
+def test_monitor_shows_the_status_message_of_the_node(bus: Bus) -> None:
     bus.pair("Battery", 1.2, 100.0, 95.0)
     said: dict[str, Any] = {"State": State.PASSING_THROUGH, "Reason": Reason.BRANCH_STALE, "ParameterSet": 44}
     bus.send("HV_CorrectionStatus", 1.0, **said, JunctionSumMeasured=-12.3, JunctionSumCorrected=0.4)
@@ -182,7 +182,9 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("handlers")
-def test_once_prints_view_and_sends_nothing(database: VehicleDatabase, capsys: pytest.CaptureFixture[str]) -> None:
+def test_monitor_once_prints_a_view_and_sends_nothing(
+    database: VehicleDatabase, capsys: pytest.CaptureFixture[str]
+) -> None:
     counters = cycle(range(15))
 
     def count_on(message: can.Message) -> None:
@@ -209,7 +211,7 @@ def test_once_prints_view_and_sends_nothing(database: VehicleDatabase, capsys: p
     assert said.out.splitlines()[-1].startswith("no frame of any branch")
 
 
-def test_in_a_terminal_a_table_is_drawn_and_ctrl_c_ends_it_with_0() -> None:
+def test_monitor_draws_a_table_in_a_terminal_and_exits_with_0_on_ctrl_c() -> None:
     ours, theirs = pty.openpty()
     shown, environment = b"", {**os.environ, "TERM": "xterm", "COLUMNS": "60", "LINES": "7"}
     command = [sys.executable, "-m", "ecu_node", *MONITOR]

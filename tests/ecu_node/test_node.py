@@ -111,7 +111,7 @@ def test_second_node_on_the_bus_refuses_to_start(database: VehicleDatabase, peer
         receive(peer, 0x5F0, 1)
 
 
-def test_another_node_that_sends_its_frames_ends_it(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
+def test_node_stops_if_another_node_sends_its_frames(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
     with pytest.raises(BusError, match="another node sends frames 0x510"), node_on(database, channel):  # noqa: PT012
         receive(peer, 0x5F0, 1)
         peer.send(can.Message(arbitration_id=0x510, is_extended_id=False, data=bytes(8)))
@@ -145,7 +145,9 @@ class EchoingBus(VirtualBus):
         self.queue.put(deepcopy(msg))
 
 
-def test_own_frames_that_come_back_are_only_counted(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
+def test_echoes_of_own_frames_are_counted_and_ignored(
+    database: VehicleDatabase, peer: can.BusABC, channel: str
+) -> None:
     with node_on(database, "", lambda: EchoingBus(channel)) as corrector:
         receive(peer, 0x5F0, 1)
         peer.send(battery_frame(database, 0))
@@ -155,7 +157,7 @@ def test_own_frames_that_come_back_are_only_counted(database: VehicleDatabase, p
     assert (corrector.counters.frames_in, corrector.counters.answers) == (1, 1)
 
 
-def test_a_gateway_of_which_one_direction_fails_ends(database: VehicleDatabase, channel: str) -> None:
+def test_gateway_stops_if_one_direction_fails(database: VehicleDatabase, channel: str) -> None:
     corrector = corrector_for(database, Mode.GATEWAY, battery=(0.25, 5.0))
     near = SteadyBus(lambda: FailingBus(channel, sending=RuntimeError("defect")), corrector.counters)
     far = SteadyBus(lambda: VirtualBus(f"{channel} vehicle"), corrector.counters)
@@ -170,7 +172,7 @@ def test_a_gateway_of_which_one_direction_fails_ends(database: VehicleDatabase, 
             running.result(LONGEST_WAIT_S)
 
 
-def test_send_queue_that_stays_full_is_reported_until_it_is_free(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_send_queue_is_reported_until_it_is_free(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     said, states = list[str](), list[str]()
     full = FailingBus(channel, sending=can.CanOperationError("Transmit buffer full"))
     now_s, frame = time.monotonic(), can.Message(arbitration_id=1)
@@ -218,7 +220,7 @@ class DrivingBus(VirtualBus):
         return can.Message(due_s, identifier, is_extended_id=False, data=data)
 
 
-def test_a_pause_of_the_process_makes_no_branch_stale(database: VehicleDatabase, channel: str) -> None:
+def test_pause_of_the_process_makes_no_branch_stale(database: VehicleDatabase, channel: str) -> None:
     bus = DrivingBus(channel, database)
     with node_on(database, "", lambda: bus) as corrector:
         wait_until(lambda: corrector.counters.frames_in > 20)
@@ -229,7 +231,9 @@ def test_a_pause_of_the_process_makes_no_branch_stale(database: VehicleDatabase,
     assert corrector.counters.clock_steps == 0
 
 
-def test_a_pause_after_a_wait_does_not_count_as_heard(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pause_after_waiting_for_a_frame_does_not_count_as_listening(
+    channel: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     silent, now_s = VirtualBus(channel), time.monotonic()
     with closing(SteadyBus(lambda: silent, Counters())) as bus:
         clock = iter([now_s, now_s + 5.0])
@@ -271,7 +275,7 @@ class SetClockBus(VirtualBus):
         return frame
 
 
-def test_frame_after_a_clock_step_is_not_old(
+def test_frame_after_a_clock_step_is_not_taken_for_an_old_one(
     database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     bus = SetClockBus(channel)
@@ -292,7 +296,7 @@ def wait_until(done: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-def test_bus_that_is_down_is_not_reported_as_open(peer: can.BusABC, channel: str) -> None:
+def test_failed_bus_is_reported_as_open_only_when_it_works_again(peer: can.BusABC, channel: str) -> None:
     """A bus off that is told as it opens again is counted."""
     down = can.CanOperationError("Network is down", errno.ENETDOWN)
     opened = iter([*(FailingBus(f"{channel} down", receiving=down) for _ in range(3)), VirtualBus(channel)])
@@ -314,7 +318,7 @@ class ClassicBus(VirtualBus):
         super().send(msg, timeout)
 
 
-def test_a_frame_that_the_bus_never_takes_holds_up_none_behind_it(peer: can.BusABC, channel: str) -> None:
+def test_frame_that_the_bus_rejects_does_not_block_later_frames(peer: can.BusABC, channel: str) -> None:
     with closing(SteadyBus(lambda: ClassicBus(channel), Counters())) as bus:
         for identifier, is_fd in ((1, False), (2, True), (3, False)):
             bus.send(can.Message(arbitration_id=identifier, is_fd=is_fd))
@@ -340,7 +344,7 @@ def living_objects() -> int:
     return min(counts)
 
 
-def test_nothing_leaks(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
+def test_running_node_does_not_accumulate_objects(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
     frames, objects = [battery_frame(database, k) for k in range(15)], list[int]()
     with node_on(database, channel):
         for _ in range(3):  # after the first round all that remembers the last frames is full
@@ -352,7 +356,7 @@ def test_nothing_leaks(database: VehicleDatabase, peer: can.BusABC, channel: str
     assert objects[2] - objects[1] < 500
 
 
-def test_the_kernel_is_asked_for_branches_voltages_and_own_frames_only(make_database: MakeDatabase) -> None:
+def test_kernel_filter_passes_only_branches_voltages_and_own_frames(make_database: MakeDatabase) -> None:
     with overlay_bus(make_database(), "filters") as bus:
         filters = bus.filters or []
     assert {(item["can_id"], item["can_mask"], item["extended"]) for item in filters} == {
@@ -363,7 +367,7 @@ def test_the_kernel_is_asked_for_branches_voltages_and_own_frames_only(make_data
     }
 
 
-def test_a_can_fd_database_needs_fd(make_database: MakeDatabase) -> None:
+def test_dbc_with_can_fd_messages_needs_the_fd_option(make_database: MakeDatabase) -> None:
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 16"))
     with pytest.raises(BusError, match=r"CAN FD messages \(PairOut\); start with --fd"):
         open_bus(database, interface="virtual", channel="c0", fd=False, mode=Mode.OVERLAY)

@@ -28,7 +28,7 @@ from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
     ],
     ids=["empty", "one byte", "half written", "of another vehicle", "gone"],
 )
-def test_unfit_file_is_not_used(
+def test_unfit_parameter_file_is_not_used(
     database: VehicleDatabase, tmp_path: Path, spoil: Callable[[bytes], bytes | None], reason: Reason, words: str
 ) -> None:
     """The node passes measured values through, and publishes why."""
@@ -45,7 +45,7 @@ def test_unfit_file_is_not_used(
 
 
 @pytest.mark.parametrize("mode", [Mode.OVERLAY, Mode.GATEWAY])
-def test_after_a_change_all_is_as_after_a_start(make_database: MakeDatabase, mode: Mode) -> None:
+def test_changing_parameters_has_the_same_effect_as_starting_with_them(make_database: MakeDatabase, mode: Mode) -> None:
     """Measured and corrected signal count differently here."""
     database = make_database(dbc=SMALL_DBC.replace("SG_ Battery : 0|16@1- (0.1,0)", "SG_ Battery : 0|16@1- (0.2,0)"))
     before, after = (

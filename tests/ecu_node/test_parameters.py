@@ -46,7 +46,7 @@ def is_readable(content: object) -> bool:
     return True
 
 
-def test_the_published_schema_is_that_of_the_structures() -> None:
+def test_published_json_schema_matches_the_data_structures() -> None:
     assert json.loads(SCHEMA_FILE.read_text()) == parameter_schema()
 
 
@@ -73,7 +73,7 @@ SOUND = BranchParameters(drift=0.1, offset_a=-2.5, apply=True)
         ("number", lambda _: 0, r"\$\.number"),
     ],
 )
-def test_what_the_schema_refuses_is_not_written(
+def test_parameters_that_violate_the_schema_are_not_written(
     database: VehicleDatabase, tmp_path: Path, field: str, change: Callable[[float], object], words: str, number: float
 ) -> None:
     parameters = replace(parameters_for(database, battery=(0.1, 0.0)), **{field: change(number)})
@@ -125,7 +125,7 @@ SHA = "0" * 64
         ("fridge", {}, Reason.WRONG_LAYOUT, "branch 'fridge', which .* does not have"),
     ],
 )
-def test_parameters_that_do_not_belong_here_are_unfit(
+def test_parameters_of_another_vehicle_layout_or_dbc_are_unfit(
     database: VehicleDatabase, branch: str, change: dict[str, Any], reason: Reason, words: str
 ) -> None:
     document = as_document(parameters_for(database, **{branch: (0.1, 1.0)})) | change
@@ -136,7 +136,7 @@ def test_parameters_that_do_not_belong_here_are_unfit(
         check_fit(parameters_for(database, battery=(0.4, -150.0)), database, own)
 
 
-def test_sums_about_the_expected_one_are_those_of_the_samples() -> None:
+def test_rms_about_the_expected_sum_follows_from_rms_and_mean() -> None:
     measured_a, corrected_a, expected_a = [3.0, 5.0, -1.0, 7.0], [1.5, 2.0, 2.5, 1.0], 2.0
 
     def rms(values: list[float]) -> float:
@@ -152,7 +152,7 @@ def test_sums_about_the_expected_one_are_those_of_the_samples() -> None:
         assert replace(residual, **{unknown: None}).about_expected() == (residual.measured_a, residual.corrected_a)
 
 
-def test_a_file_of_version_1_0_is_read_unless_it_has_a_sensor_model(database: VehicleDatabase, tmp_path: Path) -> None:
+def test_file_of_version_1_0_is_read_unless_it_has_a_sensor_model(database: VehicleDatabase, tmp_path: Path) -> None:
     document = as_document(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)))
     document["branches"]["motor"]["sensor_model"] = None
     del document["findings"]
@@ -196,7 +196,7 @@ def test_values_beyond_limits_are_unfit(database: VehicleDatabase, change: dict[
 
 
 @pytest.mark.parametrize("verdict", ["cannot tell", "not enough data"])
-def test_what_was_not_decided_is_not_applied(database: VehicleDatabase, verdict: Verdict) -> None:
+def test_undecided_parameters_that_are_to_be_applied_are_unfit(database: VehicleDatabase, verdict: Verdict) -> None:
     parameters = replace(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)), verdict=verdict)
     withheld = {name: replace(branch, apply=False) for name, branch in parameters.branches.items()}
     check_fit(replace(parameters, branches=withheld), database, "v1")
@@ -256,7 +256,7 @@ NUMBER = b'"number":300'
     ],
     ids=count(),
 )
-def test_malformed_file_is_one_line(
+def test_malformed_parameter_file_is_reported_in_one_line(
     database: VehicleDatabase, tmp_path: Path, content: bytes | Callable[[bytes], bytes], words: str
 ) -> None:
     sound = msgspec.json.encode(parameters_for(database, battery=(0.1, -2.5), motor=(0.1, 1.0)))
@@ -283,7 +283,7 @@ def test_unreadable_parameter_file_is_named(tmp_path: Path, name: str, words: st
     assert caught.value.reason is reason
 
 
-def test_a_full_disk_leaves_the_parameter_file_as_it_was(database: VehicleDatabase, tmp_path: Path) -> None:
+def test_full_disk_keeps_the_previous_parameter_file(database: VehicleDatabase, tmp_path: Path) -> None:
     path = tmp_path / "v1.json"
     write_parameters(parameters_for(database, battery=(0.25, 5.0)), path)
     before = path.read_bytes()

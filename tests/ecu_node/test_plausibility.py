@@ -16,7 +16,7 @@ def junction(tmp_path: Path) -> Junction:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("jump_a", [50.0, -200.0])
-def test_jump_of_a_sensor_ends_the_correction_within_100_ms(junction: Junction, name: str, jump_a: float) -> None:
+def test_jump_of_a_sensor_stops_the_correction_within_100_ms(junction: Junction, name: str, jump_a: float) -> None:
     junction.break_sensors(10.0, driving, **{name: lambda shown_a: shown_a + jump_a})
     assert junction.corrected_for_s <= 0.1
     assert junction.corrector.state() == (State.PASSING_THROUGH, Reason.SUM_IMPLAUSIBLE)
@@ -30,7 +30,7 @@ def test_jump_of_a_sensor_ends_the_correction_within_100_ms(junction: Junction, 
     ("name", "gain", "growth_per_s", "within_s"),
     [("motor", 1.2, 0, 5), ("battery", 0.8, 0, 5), ("battery", 3, 0, 5), ("battery", 1, 0.01, 30)],
 )
-def test_gain_that_changes_ends_the_correction(
+def test_gain_change_of_a_sensor_stops_the_correction(
     junction: Junction, name: str, gain: float, growth_per_s: float, within_s: float
 ) -> None:
     junction.break_sensors(
@@ -41,7 +41,7 @@ def test_gain_that_changes_ends_the_correction(
     assert junction.corrected_after == 0
 
 
-def test_creeping_offset_names_all_branches_that_may_have_it(junction: Junction) -> None:
+def test_branch_with_a_creeping_offset_is_among_those_named(junction: Junction) -> None:
     def parked(_: float) -> dict[str, float]:
         return {"battery": 6.0, "motor": 0.0, "heater": 6.0}
 
@@ -51,7 +51,7 @@ def test_creeping_offset_names_all_branches_that_may_have_it(junction: Junction)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_jump_at_constant_currents_names_whoever_may_have_it(tmp_path: Path, name: str) -> None:
+def test_branch_that_jumps_at_constant_currents_is_among_those_named(tmp_path: Path, name: str) -> None:
     def charging(_: float) -> dict[str, float]:
         return {"battery": -80.0, "motor": -92.0, "heater": 12.0}
 
@@ -63,7 +63,7 @@ def test_jump_at_constant_currents_names_whoever_may_have_it(tmp_path: Path, nam
 
 
 @pytest.mark.parametrize("forged_a", [50.0, -120.0])
-def test_forged_frames_before_each_real_one_end_the_correction(junction: Junction, forged_a: float) -> None:
+def test_forged_frame_before_each_real_one_stops_the_correction(junction: Junction, forged_a: float) -> None:
     junction.break_sensors(0.0, driving)
     junction.forged = {"battery": forged_a}
     junction.run(5.0, driving)
@@ -72,7 +72,7 @@ def test_forged_frames_before_each_real_one_end_the_correction(junction: Junctio
     assert junction.corrected_after == 0
 
 
-def test_a_steady_load_beside_a_broken_battery_is_not_named(junction: Junction) -> None:
+def test_broken_battery_sensor_is_named_before_a_steady_load(junction: Junction) -> None:
     def steady_heater(time_s: float) -> dict[str, float]:
         return driving(time_s) | {"battery": driving(time_s)["motor"] + 10.0, "heater": 10.0}
 
@@ -82,7 +82,7 @@ def test_a_steady_load_beside_a_broken_battery_is_not_named(junction: Junction) 
     assert junction.corrector.latched_branches[0] == "battery"
 
 
-def test_a_sensor_that_stays_where_it_is_while_the_others_move_is_stuck(junction: Junction) -> None:
+def test_sensor_that_stays_constant_while_the_others_move_is_stuck(junction: Junction) -> None:
     def accelerating(time_s: float) -> dict[str, float]:
         motor_a = 40.0 + max(time_s - 15.0, 0.0) * 10.0
         return {"battery": motor_a + 10.0, "motor": motor_a, "heater": 10.0}
@@ -93,7 +93,7 @@ def test_a_sensor_that_stays_where_it_is_while_the_others_move_is_stuck(junction
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_stuck_branch_is_named_where_the_sum_may_vary_much(tmp_path: Path, name: str) -> None:
+def test_stuck_branch_is_named_even_if_the_sum_may_vary_widely(tmp_path: Path, name: str) -> None:
     """Neither a jump nor a gain error or an offset shows; that one code never changes does, after a while."""
 
     def swinging(time_s: float) -> dict[str, float]:
@@ -108,7 +108,7 @@ def test_stuck_branch_is_named_where_the_sum_may_vary_much(tmp_path: Path, name:
     assert (junction.corrector.latched, junction.corrector.latched_branches) == (Reason.BRANCH_STUCK, (name,))
 
 
-def test_a_steady_load_beside_a_gain_error_that_is_corrected_is_not_stuck(junction: Junction) -> None:
+def test_steady_load_beside_a_corrected_gain_error_is_not_stuck(junction: Junction) -> None:
     def swinging(time_s: float) -> dict[str, float]:
         motor_a = 350.0 * math.sin(0.7 * time_s)
         return {"battery": motor_a + 20.0, "motor": motor_a, "heater": 20.0}
@@ -118,7 +118,7 @@ def test_a_steady_load_beside_a_gain_error_that_is_corrected_is_not_stuck(juncti
     assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
-def test_narrow_quality_says_invalid(tmp_path: Path) -> None:
+def test_quality_signal_of_two_bits_reports_implausible_as_invalid(tmp_path: Path) -> None:
     junction = Junction(three_branches(tmp_path, quality_bits=2))
     junction.run(5.0, driving)
     junction.wrong = {"battery": lambda shown_a: shown_a + 100.0}
@@ -126,7 +126,7 @@ def test_narrow_quality_says_invalid(tmp_path: Path) -> None:
     assert junction.qualities["battery"] == Quality.INVALID
 
 
-def test_steps_of_loads_are_no_fault(junction: Junction) -> None:
+def test_load_steps_are_not_a_fault(junction: Junction) -> None:
     """Frames come one after the other, and the motor's sensor is 20 ms late: a moment long one branch moves alone."""
 
     def steps(time_s: float) -> dict[str, float]:

@@ -24,7 +24,7 @@ VEHICLES = [
 
 
 @pytest.mark.parametrize("seed", VEHICLES)
-def test_frames_of_a_random_vehicle_are_right_in_both_modes(seed: int, tmp_path: Path) -> None:
+def test_frames_of_random_vehicles_match_the_oracle_in_both_modes(seed: int, tmp_path: Path) -> None:
     rng = Random(seed)
     database, parameters = draw_vehicle(rng, tmp_path)
     drawn = [(identifier, data) for identifier, data in frames(database, rng, EACH) if data is not None]
@@ -33,7 +33,7 @@ def test_frames_of_a_random_vehicle_are_right_in_both_modes(seed: int, tmp_path:
 
 
 @pytest.mark.parametrize(("mode", "method"), [(Mode.OVERLAY, "answer"), (Mode.GATEWAY, "forward")])
-def test_a_wrong_bit_is_noticed(monkeypatch: pytest.MonkeyPatch, mode: Mode, method: str, tmp_path: Path) -> None:
+def test_oracle_detects_a_wrong_bit(monkeypatch: pytest.MonkeyPatch, mode: Mode, method: str, tmp_path: Path) -> None:
     right = getattr(Source, method)
 
     def damaged(source: Source, payload: bytearray, now_s: float) -> object:

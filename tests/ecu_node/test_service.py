@@ -14,7 +14,7 @@ from ecu_node.bus.service import Log, ServiceManager
 WATCHDOG_S = 4.0
 
 
-def test_a_log_that_nobody_reads_holds_nothing_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_that_nobody_reads_does_not_block_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
     reader, writer = os.pipe()
     with os.fdopen(writer, "w") as full, os.fdopen(reader, "rb") as reading:
         monkeypatch.setattr(sys, "stderr", full)
@@ -60,7 +60,7 @@ def managed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
     manager.socket.close()
 
 
-def test_the_watchdog_is_fed_at_half_its_time(managed: Manager) -> None:
+def test_watchdog_is_fed_at_half_its_timeout(managed: Manager) -> None:
     service = ServiceManager()
     fed_s = []
     for tick in range(100):
@@ -71,7 +71,7 @@ def test_the_watchdog_is_fed_at_half_its_time(managed: Manager) -> None:
     assert fed_s == pytest.approx([1000.0, 1002.0, 1004.0, 1006.0, 1008.0], abs=0.11)
 
 
-def test_a_manager_that_does_not_read_does_not_hold_the_node_up(managed: Manager) -> None:
+def test_service_manager_that_does_not_read_does_not_block_the_node(managed: Manager) -> None:
     service = ServiceManager()
     start_s = time.monotonic()
     told = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text()) + 3
@@ -81,7 +81,9 @@ def test_a_manager_that_does_not_read_does_not_hold_the_node_up(managed: Manager
     assert len(managed.told()) < told
 
 
-def test_repeated_line_comes_once_in_10_s(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_repeated_log_line_is_limited_to_three_in_10_s(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     log = Log()
     for tenth in range(201):
         monkeypatch.setattr("ecu_node.bus.service.time.monotonic", lambda now_s=0.1 * tenth: now_s)
@@ -94,7 +96,7 @@ def test_repeated_line_comes_once_in_10_s(monkeypatch: pytest.MonkeyPatch, capsy
     ]
 
 
-def test_a_log_that_is_gone_does_not_end_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closed_log_does_not_end_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w", buffering=1) as gone:

@@ -78,7 +78,7 @@ def test_frames_of_all_kinds_are_read_and_written_as_python_can_does(ends: Ends)
             assert frame.is_remote_frame or data == bytes(frame.data)
 
 
-def test_error_frame_is_read_as_one(ends: Ends) -> None:
+def test_error_frame_is_read_as_an_error_frame(ends: Ends) -> None:
     link, far = ends
     far.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))
     (message,) = received(link, 1)
@@ -86,7 +86,7 @@ def test_error_frame_is_read_as_one(ends: Ends) -> None:
     assert message.arbitration_id == 0x40
 
 
-def test_more_frames_than_one_call_takes_come_whole_and_in_order(ends: Ends) -> None:
+def test_more_frames_than_fit_one_system_call_arrive_complete_and_in_order(ends: Ends) -> None:
     link, far = ends
     count = 2 * MOST_AT_ONCE + 5
     for number in range(count):
@@ -97,7 +97,7 @@ def test_more_frames_than_one_call_takes_come_whole_and_in_order(ends: Ends) -> 
     assert came == list(range(count))
 
 
-def test_frames_are_dated_by_the_kernel_and_none_with_the_time_of_another(ends: Ends) -> None:
+def test_frames_have_kernel_timestamps_and_never_that_of_another_frame(ends: Ends) -> None:
     link, far = ends
     frame, before_s = build_can_frame(can.Message(arbitration_id=1)), time.time()
     far.send(frame)
@@ -110,13 +110,13 @@ def test_frames_are_dated_by_the_kernel_and_none_with_the_time_of_another(ends: 
     assert undated.timestamp == 0.0
 
 
-def test_a_closed_bus_has_dropped_nothing(ends: Ends) -> None:
+def test_closed_bus_reports_no_dropped_frames(ends: Ends) -> None:
     link, _ = ends
     link.close()
     assert link.newly_dropped() == 0
 
 
-def test_a_bus_that_takes_no_more_says_how_many_it_took(ends: Ends) -> None:
+def test_sending_to_a_full_queue_returns_the_number_of_accepted_frames(ends: Ends) -> None:
     link, far = ends
     frames = [can.Message(arbitration_id=number) for number in range(1000)]
     done = 0

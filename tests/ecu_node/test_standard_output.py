@@ -17,7 +17,7 @@ LINE = ": standard output: cannot write the result: No space left on device; giv
     ("arguments", "unbuffered"),
     [(["check", "--params", "p", "--layout", str(LAYOUT)], ""), (["--help"], ""), (["--version"], "1"), (MONITOR, "1")],
 )
-def test_unwritable_result_is_one_line_and_1(arguments: list[str], unbuffered: str) -> None:
+def test_unwritable_output_prints_one_line_and_exits_with_1(arguments: list[str], unbuffered: str) -> None:
     command = [sys.executable, "-m", "ecu_node", *arguments]
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with Path("/dev/full").open("w") as full:
@@ -27,7 +27,7 @@ def test_unwritable_result_is_one_line_and_1(arguments: list[str], unbuffered: s
     assert (done.returncode, done.stderr) == (1, f"ecu-node{LINE}")
 
 
-def test_wrong_use_ends_in_2_though_nobody_can_be_told() -> None:
+def test_wrong_use_exits_with_2_even_if_stderr_cannot_be_written() -> None:
     with Path("/dev/full").open("w") as full:
         assert subprocess.run([sys.executable, "-m", "ecu_node", "run"], stderr=full, check=False).returncode == 2
 

@@ -36,7 +36,7 @@ def files(tmp_path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(("event", "what"), [("import", "ecu_node.cli"), *MOMENTS])
-def test_ctrl_c_at_start_is_one_line_and_130(tmp_path: Path, event: str, what: str) -> None:
+def test_ctrl_c_during_startup_prints_one_line_and_exits_with_130(tmp_path: Path, event: str, what: str) -> None:
     command = program(event, what, signal.SIGINT, ["check", *files(tmp_path)])
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ecu-node: interrupted\n")
@@ -48,14 +48,14 @@ def test_ctrl_c_at_start_is_one_line_and_130(tmp_path: Path, event: str, what: s
 
 
 @pytest.mark.parametrize(("event", "what"), MOMENTS)
-def test_sighup_at_start_does_not_end_a_node(tmp_path: Path, event: str, what: str) -> None:
+def test_sighup_during_startup_does_not_end_a_node(tmp_path: Path, event: str, what: str) -> None:
     bus = ["--interface", "virtual", "--channel", "hangup"]
     _, *program_text = program(event, what, signal.SIGHUP, ["run", "--unsigned", *files(tmp_path), *bus])
     with running(program=program_text) as log:
         assert "running on virtual hangup" in log[-1]
 
 
-def test_sighup_ends_a_command_that_is_no_node(tmp_path: Path) -> None:
+def test_sighup_ends_commands_other_than_run(tmp_path: Path) -> None:
     command = program("open", str(LAYOUT), signal.SIGHUP, ["check", *files(tmp_path)])
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == -signal.SIGHUP

@@ -41,7 +41,7 @@ class Node:
 
 @pytest.mark.parametrize("before", [Reason.NONE, Reason.BRANCH_STALE])
 @pytest.mark.parametrize("revoked", [False, True])
-def test_every_silence_and_its_end_is_reported(database: VehicleDatabase, before: Reason, revoked: bool) -> None:
+def test_every_bus_silence_and_its_end_are_reported(database: VehicleDatabase, before: Reason, revoked: bool) -> None:
     """After a fall-back, or without parameters, in the same way."""
     node = Node(database)
     assert node.drive() is None
@@ -52,7 +52,7 @@ def test_every_silence_and_its_end_is_reported(database: VehicleDatabase, before
         assert [node.later(1.0), node.later(6.0), node.drive()] == ["no branch sends", None, "branches send again"]
 
 
-def test_a_fall_back_says_why_until_when_and_that_it_corrects_again(database: VehicleDatabase) -> None:
+def test_fall_back_is_reported_with_reason_end_and_resumption(database: VehicleDatabase) -> None:
     node = Node(database)
     stuck = node.latch(Reason.BRANCH_STUCK, "motor", "dcdc")
     assert stuck == f"{FALLS_BACK} the bus has slept: {Reason.BRANCH_STUCK.words} (motor, dcdc)"
@@ -66,7 +66,7 @@ def test_a_fall_back_says_why_until_when_and_that_it_corrects_again(database: Ve
     assert f"{FALLS_BACK} a restart: " in (alone.latch(Reason.CORRECTION_WORSE) or "")
 
 
-def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(database: VehicleDatabase) -> None:
+def test_revocation_during_bus_sleep_is_not_reported_as_waking_up(database: VehicleDatabase) -> None:
     node = Node(database)
     assert [node.drive(), node.later(1.0)] == [None, "no branch sends"]
     assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None

@@ -74,7 +74,7 @@ def lines_of(path: Path, count: int) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_line_has_currents_by_vss_name_sums_state_and_counters(make_outlet: Any, tmp_path: Path) -> None:
+def test_telemetry_line_has_currents_by_vss_name_sums_state_and_counters(make_outlet: Any, tmp_path: Path) -> None:
     outlet = make_outlet(tmp_path / "node.jsonl")
     outlet.telemetry.latency.add(100e-6)
     outlet.second()
@@ -94,7 +94,7 @@ def test_line_has_currents_by_vss_name_sums_state_and_counters(make_outlet: Any,
     assert abs((datetime.now(UTC) - datetime.fromisoformat(line["time"])).total_seconds()) < 60.0
 
 
-def test_spoilt_frame_has_no_value_as_on_the_bus(make_outlet: Any, tmp_path: Path) -> None:
+def test_telemetry_of_an_invalid_frame_has_no_value(make_outlet: Any, tmp_path: Path) -> None:
     outlet = make_outlet(tmp_path / "node.jsonl")
     outlet.second()
     lines_of(tmp_path / "node.jsonl", 1)
@@ -105,7 +105,7 @@ def test_spoilt_frame_has_no_value_as_on_the_bus(make_outlet: Any, tmp_path: Pat
     assert line["branches"][VSS] == {"measured_a": None, "corrected_a": None, "quality": "INVALID"}
 
 
-def test_lines_come_by_udp(make_outlet: Any) -> None:
+def test_telemetry_lines_are_sent_by_udp(make_outlet: Any) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(10.0)
@@ -113,7 +113,7 @@ def test_lines_come_by_udp(make_outlet: Any) -> None:
         assert json.loads(receiver.recv(65536))["branches"][VSS]["corrected_a"] == 60.0
 
 
-def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tmp_path: Path) -> None:
+def test_telemetry_lines_lost_on_a_full_disk_are_counted_and_reported_once(make_outlet: Any, tmp_path: Path) -> None:
     path = tmp_path / "link"
     path.symlink_to("/dev/full")
     outlet = make_outlet(path)
@@ -129,7 +129,7 @@ def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tm
 
 
 @pytest.mark.parametrize("target", [".", "pipe", ("no-such-host.invalid", 5000), ("a" * 64, 5000)])
-def test_unusable_target_is_reported(target: str | tuple[str, int], make_outlet: Any, tmp_path: Path) -> None:
+def test_unusable_telemetry_target_is_reported(target: str | tuple[str, int], make_outlet: Any, tmp_path: Path) -> None:
     """A folder, a pipe without a reader, a host without an address, and one that no name server could know."""
     os.mkfifo(tmp_path / "pipe")
     outlet = make_outlet(tmp_path / target if isinstance(target, str) else target)
@@ -142,7 +142,7 @@ def test_unusable_target_is_reported(target: str | tuple[str, int], make_outlet:
     assert outlet.said[0].endswith("; lines are lost until that has changed")
 
 
-def test_line_that_finds_the_writer_busy_is_lost(make_outlet: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_telemetry_line_is_dropped_while_the_writer_is_busy(make_outlet: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def look_up(*_: object, **__: object) -> None:
         """As where no name server answers."""
         answered.wait(10.0)
@@ -157,14 +157,16 @@ def test_line_that_finds_the_writer_busy_is_lost(make_outlet: Any, monkeypatch: 
     answered.set()
 
 
-def test_example_takes_the_currents_out_of_a_line(make_outlet: Any, tmp_path: Path) -> None:
+def test_mqtt_example_extracts_the_currents_from_a_line(make_outlet: Any, tmp_path: Path) -> None:
     make_outlet(tmp_path / "node.jsonl").second()
     lines_of(tmp_path / "node.jsonl", 1)
     currents = runpy.run_path(str(ROOT / "examples" / "telemetry_to_mqtt.py"))["currents"]
     assert currents((tmp_path / "node.jsonl").read_text()) == {VSS: -60.0, "motor": -80.0}
 
 
-def test_line_written_in_part_is_removed(make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partly_written_telemetry_line_is_removed(
+    make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, write = tmp_path / "node.jsonl", os.write
     outlet = make_outlet(path)
     monkeypatch.setattr(os, "write", lambda file, line: write(file, line[:7] if line.startswith(b'{"time"') else line))
@@ -173,7 +175,7 @@ def test_line_written_in_part_is_removed(make_outlet: Any, tmp_path: Path, monke
     assert path.read_bytes() == b""
 
 
-def test_latency_is_counted_by_bits_of_microseconds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_latency_histogram_has_bins_of_powers_of_two_in_microseconds(monkeypatch: pytest.MonkeyPatch) -> None:
     latency = Latency()
     monkeypatch.setattr(time, "monotonic", lambda: 100.0)
     for later_s, frames in ((3.0, 1), (0.1, 1), (100e-6, 900), (100e-6, 98)):
@@ -190,7 +192,7 @@ def test_latency_is_counted_by_bits_of_microseconds(monkeypatch: pytest.MonkeyPa
     assert sum(latency.counts) == 1000
 
 
-def test_fault_of_the_program_in_what_only_records_ends_no_correction(tmp_path: Path) -> None:
+def test_internal_error_in_telemetry_does_not_stop_the_correction(tmp_path: Path) -> None:
     broken = "from ecu_node.bus.telemetry import Telemetry; Telemetry._record = lambda *_: 1 / 0"
     code = f"import sys; from ecu_node.cli import run_ecu_node; {broken}; sys.exit(run_ecu_node(sys.argv[1:]))"
     options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]

@@ -37,7 +37,7 @@ KINDS = [(pipe, "it is a pipe; a file is expected"), (endless, "it is a device; 
         ("p.json", r"NOT FIT \(MALFORMED_PARAMETERS\): .*p\.json: not a parameter file: "),
     ],
 )
-def test_input_that_is_no_file_is_one_line(
+def test_input_that_is_not_a_regular_file_is_reported_in_one_line(
     tmp_path: Path, make: Callable[[Path], None], words: str, role: str, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make(tmp_path / role)
