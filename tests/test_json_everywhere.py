@@ -52,7 +52,7 @@ COMMANDS = dict([*calibrator_commands(), *node_commands()])
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_json_or_a_reason(command: str) -> None:
+def test_every_command_has_json_unless_listed_as_an_exception(command: str) -> None:
     assert ("--json" in COMMANDS[command]) is (command not in WITHOUT)
 
 
@@ -60,7 +60,9 @@ def documented() -> set[str]:
     return set(re.findall(r"`([a-z0-9_]+)`", DOCUMENT.read_text()))
 
 
-def test_life_of_a_set_in_json(database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_of_each_step_of_an_update_has_documented_keys(
+    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Each step prints one document whose keys are documented, and which names what the next step needs."""
     params = tmp_path / "v1.json"
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), params)
@@ -100,7 +102,7 @@ def test_life_of_a_set_in_json(database: VehicleDatabase, tmp_path: Path, capsys
     assert (after["ended"], after["trusted"]["root"], after["problems"]) == ("revoked", 2, [])
 
 
-def test_a_refusal_prints_no_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refused_command_prints_no_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["repository", "add", str(tmp_path), str(tmp_path / "none.json"), "--json"]
     assert run_app(app, "calibrator", words) == 1
     printed = capsys.readouterr()

@@ -169,7 +169,7 @@ def run(command: str) -> int:
 
 
 @pytest.mark.parametrize(("command", "code", "words"), MISTAKES)
-def test_a_mistake_is_one_line_and_writes_nothing(
+def test_user_mistake_is_reported_in_one_line_and_writes_nothing(
     command: str, code: int, words: str, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = sorted(path.name for path in place.rglob("*"))

@@ -68,7 +68,7 @@ def names(browser: webdriver.Chrome) -> list[str]:
     return [row[0] for row in rows(browser)]
 
 
-def test_it_opens_without_an_error_and_fetches_nothing(page: webdriver.Chrome) -> None:
+def test_report_opens_without_an_error_and_loads_nothing_from_the_network(page: webdriver.Chrome) -> None:
     until(
         page,
         "return document.querySelectorAll('.plot[data-drawn]').length === 2",
@@ -96,7 +96,7 @@ def test_the_table_shows_the_numbers_of_the_result(page: webdriver.Chrome, resul
         assert cells[8] == "30.0 min"
 
 
-def test_an_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
+def test_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     text = vehicle_text(page, "V4")
     assert "battery 0.00 ± 2.00 +8.00 ± 2.00 (60 %) or none (40 %)" in text
     assert "60.0 % +8.00 A no fault no fault" in text
@@ -113,7 +113,7 @@ def test_an_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     assert peaks[0][2] > peaks[1][2], "the more probable, the larger"
 
 
-def test_other_explanations_of_an_undecided_sensor_are_drawn(
+def test_alternative_explanations_of_an_undecided_sensor_are_drawn(
     browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
 ) -> None:
     vehicles = six_vehicles(database)
@@ -132,7 +132,9 @@ def test_other_explanations_of_an_undecided_sensor_are_drawn(
     assert layout["yaxis"]["range"] == pytest.approx([-13.2, 13.2])
 
 
-def test_what_is_not_known_is_no_zero(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
+def test_unknown_values_are_not_shown_as_zero(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
     lost = replace(sensor(), drift_sd=None, offset_sd_a=None, fault_probability=None, delay_s=None)
     items = [
         vehicle(database, "V1", lost, lost, verdict="cannot tell"),
@@ -145,7 +147,7 @@ def test_what_is_not_known_is_no_zero(browser: webdriver.Chrome, database: Vehic
     assert "motor not known 0.00 ± 0.10" in vehicle_text(browser, "V2")
 
 
-def test_filters_leave_the_vehicles_that_are_asked_for(page: webdriver.Chrome) -> None:
+def test_filters_show_only_matching_vehicles(page: webdriver.Chrome) -> None:
     page.find_element(By.ID, "find").send_keys("v1")
     until(page, "return document.getElementById('count').textContent.startsWith('2 of 6')")
     assert sorted(names(page)) == ["V1", "V10"]
@@ -162,7 +164,7 @@ def test_filters_leave_the_vehicles_that_are_asked_for(page: webdriver.Chrome) -
     assert sorted(names(page)) == ["V1", "V10"]
 
 
-def test_headings_sort_and_say_so(page: webdriver.Chrome) -> None:
+def test_column_headings_sort_the_table_and_set_aria_sort(page: webdriver.Chrome) -> None:
     heads = {head.text: head for head in page.find_elements(By.CSS_SELECTOR, "#table th button")}
     heads["vehicle"].click()
     assert names(page) == ["V1", "V2", "V3", "V4", "V5", "V10"], "numbers in names count as numbers"
@@ -174,7 +176,7 @@ def test_headings_sort_and_say_so(page: webdriver.Chrome) -> None:
     assert heads["vehicle"].find_element(By.XPATH, "..").get_attribute("aria-sort") is None
 
 
-def test_the_keyboard_reaches_a_vehicle(page: webdriver.Chrome) -> None:
+def test_vehicle_can_be_chosen_with_the_keyboard(page: webdriver.Chrome) -> None:
     page.find_element(By.ID, "find").send_keys("V10")
     until(page, "return document.getElementById('count').textContent.startsWith('1 of 6')")
     focused = page.switch_to.active_element
@@ -189,7 +191,7 @@ def test_the_keyboard_reaches_a_vehicle(page: webdriver.Chrome) -> None:
     assert page.switch_to.active_element.get_attribute("id") == "vehicle"
 
 
-def test_headings_are_in_order_and_controls_have_names(page: webdriver.Chrome) -> None:
+def test_heading_levels_are_in_order_and_controls_have_names(page: webdriver.Chrome) -> None:
     levels = [int(head.tag_name[1]) for head in page.find_elements(By.CSS_SELECTOR, "h1, h2, h3, h4")]
     assert levels[0] == 1
     assert levels.count(1) == 1
@@ -200,7 +202,9 @@ def test_headings_are_in_order_and_controls_have_names(page: webdriver.Chrome) -
     assert "at hand" in page.title
 
 
-def test_junction_opens_without_an_error(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
+def test_report_of_a_junction_opens_without_an_error(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
     rivals = [Explanation(probability=0.6), Explanation(probability=0.4, offset_a={"motor": 2.2})]
     mixed = replace(sensor(0.0, 0.9, sd=0.011), identifiable=False)
     item = vehicle(database, "car", sensor(0.1, 4.0, apply=True), mixed, explanations=rivals)
@@ -227,7 +231,7 @@ def test_junction_opens_without_an_error(browser: webdriver.Chrome, database: Ve
     assert "Not known: this calibration" not in text
 
 
-def test_it_prints_on_a4_with_its_figures_whole(page: webdriver.Chrome) -> None:
+def test_report_prints_on_a4_with_complete_figures(page: webdriver.Chrome) -> None:
     vehicle_text(page, "V4")
     until(page, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 2")
     printed = base64.b64decode(page.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"])

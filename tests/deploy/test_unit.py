@@ -44,7 +44,7 @@ def run(*command: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("additions", [[], [*DEPLOY.glob("*.conf")]], ids=["alone", "with its additions"])
-def test_systemd_finds_nothing_wrong_with_it(analyze: str, unit: Path, additions: list[Path]) -> None:
+def test_systemd_finds_no_mistake_in_the_unit(analyze: str, unit: Path, additions: list[Path]) -> None:
     folder = unit.with_name(f"{unit.name}.d")
     folder.mkdir()
     for path in additions:
@@ -54,13 +54,13 @@ def test_systemd_finds_nothing_wrong_with_it(analyze: str, unit: Path, additions
     assert (result.returncode, about_it) == (0, []), result.stderr
 
 
-def test_it_may_do_next_to_nothing(analyze: str, unit: Path) -> None:
+def test_unit_has_few_privileges_according_to_systemd(analyze: str, unit: Path) -> None:
     threshold = str(int(10 * LARGEST_EXPOSURE))
     result = run(analyze, "security", "--offline=true", "--no-pager", f"--threshold={threshold}", str(unit))
     assert result.returncode == 0, result.stdout
 
 
-def test_the_command_of_the_unit_is_one_that_the_node_takes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_node_accepts_the_command_line_of_the_unit(capsys: pytest.CaptureFixture[str]) -> None:
     """With the example environment: all that keeps it from running is the layout that is not there."""
     values = dict(re.findall(r"(?m)^(\w+)=(.*)$", (DEPLOY / "ecu-node.env").read_text()))
     (line,) = re.findall(r"(?m)^ExecStart=(.*)$", UNIT.read_text())
@@ -73,6 +73,6 @@ def test_the_command_of_the_unit_is_one_that_the_node_takes(capsys: pytest.Captu
     assert capsys.readouterr().err.startswith("ecu-node: /etc/ecu-node/my_car.toml: cannot read the layout: ")
 
 
-def test_the_files_are_in_step_with_the_constraints() -> None:
+def test_deployed_requirements_match_the_constraints() -> None:
     for path, text in runpy.run_path(str(DEPLOY / "requirements.py"))["files"]().items():
         assert path.read_text() == text, f"{path} is out of date: run deploy/requirements.py"

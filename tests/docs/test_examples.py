@@ -38,7 +38,7 @@ def test_chargers_disagree_with_one_battery(run: Any) -> None:
     assert ratio["efacec"] == pytest.approx(1.012, abs=0.003)
 
 
-def test_table_of_the_chargers_is_that_of_its_logs(shared_data: Path, tmp_path: Path) -> None:
+def test_table_of_the_chargers_equals_kirchhoff_output_for_its_logs(shared_data: Path, tmp_path: Path) -> None:
     """The command that the head of the table names gives its rows."""
     (tmp_path / "i3.dbc").write_text(I3_DBC)
     (tmp_path / "i3.toml").write_text(I3_LAYOUT)
@@ -58,7 +58,7 @@ def test_spreadsheet_in_german_is_calibrated(run: Any) -> None:
     assert rows.corrected["motor"]
 
 
-def test_node_takes_the_offset_out_of_another_drive(run: Any) -> None:
+def test_node_removes_the_offset_from_another_drive(run: Any) -> None:
     sums = pd.read_csv(run("replay_and_node.py")["out"] / "sums.csv").filter(regex="^sum")
     before, after = (float((sums[name] ** 2).mean() ** 0.5) for name in sums)
     assert before > 40.0

@@ -29,7 +29,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.long
 @pytest.mark.usefixtures("small")
-def test_it_stands_beside_the_published_method_and_the_default_also_on_recorded_trips(
+def test_example_estimator_is_compared_with_built_in_methods(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     names = runpy.run_path(str(EXAMPLE))

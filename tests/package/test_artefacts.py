@@ -26,12 +26,12 @@ def files(folder: Path) -> set[str]:
     return {str(path.relative_to(ROOT)) for path in kept}
 
 
-def test_the_wheel_has_every_file_of_the_packages_and_no_other(in_wheel: set[str]) -> None:
+def test_wheel_contains_the_files_of_the_packages_and_no_others(in_wheel: set[str]) -> None:
     own = {name for name in in_wheel if ".dist-info/" not in name}
     assert own == {name for package in PACKAGES for name in files(ROOT / package)}
 
 
-def test_the_source_has_every_file_that_is_kept(unpacked: Path) -> None:
+def test_source_distribution_contains_every_tracked_file(unpacked: Path) -> None:
     folders = ("calibrator", "dbc", "deploy", "docs", "ecu_node", "examples", "tests", "tools", ".ci")
     kept = set().union(*(files(ROOT / folder) for folder in folders))
     kept |= {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile", "README.md"}
@@ -39,7 +39,7 @@ def test_the_source_has_every_file_that_is_kept(unpacked: Path) -> None:
     assert {name for name in kept if not (unpacked / name).is_file()} == set()
 
 
-def test_the_tests_of_the_source_are_all_found_and_can_be_run(unpacked: Path) -> None:
+def test_tests_in_the_source_distribution_are_complete_and_run(unpacked: Path) -> None:
     def pytest_in(folder: Path, *options: str) -> str:
         command = [sys.executable, "-m", "pytest", "--quiet", "-p", "no:cacheprovider", *options]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=600)

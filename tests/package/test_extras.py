@@ -26,14 +26,16 @@ def calibrator(venv: CleanVenv, folder: Path, *arguments: object) -> str:
 
 
 @pytest.mark.parametrize("extra", EXTRAS)
-def test_an_extra_alone_is_whole(installed: Installed, extra: str, car: Path) -> None:
+def test_each_extra_alone_installs_without_conflicts(installed: Installed, extra: str, car: Path) -> None:
     venv = installed(extra)
     done = venv.run("python", "-m", "pip", "check", folder=car)
     assert done.returncode == 0, done.stdout
     assert venv.run("ecu-node", "schema", folder=car).returncode == 0
 
 
-def test_fleet_from_logs_to_exports(installed: Installed, car: Path, fleet: Path, drive: Path, tmp_path: Path) -> None:
+def test_calibrator_extra_covers_all_steps_from_logs_to_exports(
+    installed: Installed, car: Path, fleet: Path, drive: Path, tmp_path: Path
+) -> None:
     venv, result = installed("calibrator"), tmp_path / "result"
     layout = ("--layout", car / "my_car.toml")
     calibrator(venv, tmp_path, "import", fleet / "logs", *layout, "--out", "store")
@@ -119,7 +121,7 @@ def test_bench_compares_with_its_peer(installed: Installed, unpacked: Path) -> N
     assert any("basis pursuit" in (row["peer"] or "") for row in found)
 
 
-def test_docs_are_built_from_the_source(installed: Installed, unpacked: Path) -> None:
+def test_docs_are_built_from_the_source_distribution(installed: Installed, unpacked: Path) -> None:
     venv = installed("docs")
     path = os.pathsep.join([str(venv.folder / "bin"), venv.environment["PATH"]])
     environment = {**venv.environment, "PYTHONPATH": str(unpacked / "tools"), "PATH": path}
@@ -156,7 +158,7 @@ def mf4(car: Path, drive: Path) -> None:
 
 
 @pytest.mark.usefixtures("mf4")
-def test_doing_what_a_command_without_its_extra_says_makes_it_work(wheel: Path, car: Path, tmp_path: Path) -> None:
+def test_command_works_after_installing_the_extra_that_it_asks_for(wheel: Path, car: Path, tmp_path: Path) -> None:
     venv = new_venv(tmp_path / "growing", wheel)
     for extra, (arguments, words) in STEPS.items():
         done = venv.run("calibrator", *arguments, folder=car)

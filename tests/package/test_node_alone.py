@@ -54,7 +54,7 @@ def test_updates_without_their_extra_are_refused_in_one_line(node: CleanVenv, ca
         assert "pip install 'hv-current-correction[update]'" in done.stderr
 
 
-def test_the_start_is_quick_enough_for_a_service(node: CleanVenv) -> None:
+def test_node_starts_quickly_enough_for_a_service(node: CleanVenv) -> None:
     modules = node.run(
         "python", "-c", "import ecu_node.cli, sys; print(*sys.modules)", folder=node.folder
     ).stdout.split()

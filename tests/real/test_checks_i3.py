@@ -66,13 +66,13 @@ def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Ben
 
 
 @pytest.mark.parametrize("branches", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_of_linear_sensors_at_most_1_percent_have_a_finding(fleet: RecordedFleet, branches: int) -> None:
+def test_at_most_1_percent_of_vehicles_with_linear_sensors_have_a_finding(fleet: RecordedFleet, branches: int) -> None:
     found = [mine for seed in range(4) for mine in checked(fleet, branches, seed, {})]
     assert sum(map(bool, found)) <= 0.01 * len(found)
 
 
 @pytest.mark.parametrize("branches", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_sensors_that_are_not_linear_are_named(fleet: RecordedFleet, branches: int) -> None:
+def test_nonlinear_sensors_are_named(fleet: RecordedFleet, branches: int) -> None:
     vehicles = [int(j) for j in np.argsort([-np.ptp(trip.matrix_a()[:, 0]) for trip in fleet.with_branches(branches)])]
     put = dict(zip(vehicles[::3], BENDS, strict=False))
     found = checked(fleet, branches, 5, {j: BENDS[cause] for j, cause in put.items()})
@@ -82,7 +82,7 @@ def test_sensors_that_are_not_linear_are_named(fleet: RecordedFleet, branches: i
 
 
 @pytest.mark.parametrize("seed", [5, 13])
-def test_small_errors_of_sound_sensors_make_no_correction_harmful(fleet: RecordedFleet, seed: int) -> None:
+def test_corrections_do_no_harm_if_sound_sensors_have_small_errors(fleet: RecordedFleet, seed: int) -> None:
     trial = recorded_trial(fleet, RecordedCase(world="small errors in 30%"), seed)
     found = judge(POSTERIOR.estimate(trial), trial)
     assert np.all(found["recovery_rate"])

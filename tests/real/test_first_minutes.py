@@ -37,7 +37,7 @@ def tesla(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_three_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> None:
+def test_documented_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> None:
     """Those of docs/first_minutes.md."""
     made = calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "my_car.toml"])
     assert (made.returncode, made.stdout.partition(";")[0]) == (
@@ -62,7 +62,7 @@ def test_three_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> Non
 
 
 @pytest.mark.long
-def test_with_one_car_the_template_of_the_guessed_layout_fits_as_the_document_types_it(tesla: Path) -> None:
+def test_documented_node_commands_work_with_the_guessed_layout(tesla: Path) -> None:
     """The commands of docs/first_minutes.md that need no bus; before them the load that it names."""
     calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "one_car.toml"])
     with (tesla / "one_car.toml").open("a") as file:
@@ -119,7 +119,7 @@ def tenfold_voltage(dbc: str) -> str:
      [("error", "sign", "battery"), ("error", "unit", "motor_rear")]),
     (str, tenfold_voltage, [("error", "unit", "ID132HVBattAmpVolt.BattVoltage132")]),
 ])  # fmt: skip
-def test_doctor_names_what_is_wrong_and_nothing_else(
+def test_doctor_finds_each_injected_mistake_and_no_other(
     change_layout: Change, change_dbc: Change, findings: list[tuple[str, str, str]], tesla: Path, tmp_path: Path
 ) -> None:
     dbc, layout = (tesla / "Model3CAN.dbc").read_text(encoding="cp1252"), LAYOUT.read_text()
@@ -133,7 +133,7 @@ def test_doctor_names_what_is_wrong_and_nothing_else(
 
 
 @pytest.mark.parametrize("trip", ["TripA07", "TripA24"])
-def test_trips_of_a_bmw_i3_are_sound_and_an_inverted_motor_is_named(trip: str, i3_store: Path, tmp_path: Path) -> None:
+def test_doctor_finds_i3_trips_sound_and_an_inverted_motor_wrong(trip: str, i3_store: Path, tmp_path: Path) -> None:
     """Its motor current is what the others leave, so the sum is exact; the voltage tells motor from battery."""
     database = vehicle_database(I3_LAYOUT)
     drive = next(d for d in iterate_drives(i3_store, database.layout) if d.name == trip)

@@ -27,7 +27,7 @@ def test_all_32_trips_are_imported_and_the_stuck_heaters_named(i3_notices: dict[
     assert all(any("default of 5.52 kW" in text for text in texts) for texts in i3_notices.values())
 
 
-def test_the_other_trips_give_valid_samples_whose_currents_sum_to_zero(i3_store: Path) -> None:
+def test_trips_without_stuck_heater_have_valid_samples_that_sum_to_zero(i3_store: Path) -> None:
     layout = read_layout(LAYOUT)
     drives = [drive for drive in iterate_drives(i3_store, layout) if drive.name not in STUCK_HEATER]
     inputs, left_out = choose_inputs(layout, {name for drive in drives for name in drive.inputs})
@@ -47,7 +47,7 @@ def trips(i3_store: Path) -> RecordedFleet:
 
 @pytest.mark.long
 @pytest.mark.parametrize("balanced", [True, False])
-def test_fleet_with_many_faults_is_not_left_alone(trips: RecordedFleet, balanced: bool) -> None:
+def test_fleet_with_many_faults_is_partly_corrected_and_not_harmed(trips: RecordedFleet, balanced: bool) -> None:
     """Three branches, S = 60: some vehicles of every fleet are corrected, and none is made worse."""
     for seed in (400, 401):
         trial = recorded_trial(trips, RecordedCase(branches=3, sparsity=60.0, balanced=balanced, world=""), seed)
@@ -62,7 +62,9 @@ def test_fleet_with_many_faults_is_not_left_alone(trips: RecordedFleet, balanced
     pytest.param(6, 3, 0.5, marks=pytest.mark.long),
     (12, 3, 0.5),
 ])  # fmt: skip
-def test_small_fleet_is_corrected(trips: RecordedFleet, vehicles: int, branches: int, least: float) -> None:
+def test_small_fleet_is_corrected_and_not_harmed(
+    trips: RecordedFleet, vehicles: int, branches: int, least: float
+) -> None:
     """Of S = 80: of four fleets so many of the faulty vehicles, and no vehicle is made worse."""
     found = []
     for seed in range(420, 424):

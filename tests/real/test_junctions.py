@@ -58,7 +58,7 @@ def stations(i3: Path) -> JunctionCalibrator:
     return JunctionCalibrator(meter="charger", trusted=["battery"]).fit(i3 / "car", i3 / "layout.toml")
 
 
-def test_stations_differ_by_their_gains(stations: JunctionCalibrator) -> None:
+def test_charging_stations_differ_by_their_gains(stations: JunctionCalibrator) -> None:
     """At 124 A the battery reads 2.5 A less than one station, and 1.0 A more than the other."""
     rows = stations.parameters_.set_index(["vehicle", "branch"]).xs("charger", level="branch")
     ratio = 1.0 / (1.0 + rows.gain_error)  # battery over charger
@@ -68,7 +68,7 @@ def test_stations_differ_by_their_gains(stations: JunctionCalibrator) -> None:
     assert not any(each.parameters.findings for each in stations.vehicles_.values()), "a ramp is no fault of a sensor"
 
 
-def test_battery_against_both_stations_is_a_contradiction(i3: Path, tmp_path: Path) -> None:
+def test_two_trusted_stations_that_differ_are_reported_as_a_contradiction(i3: Path, tmp_path: Path) -> None:
     """Two meters that are both called right differ by 2.4 %: that is said, and nothing is corrected."""
     done = command(
         "calibrate", i3 / "car", "--layout", i3 / "layout.toml", "--meter", "charger", "--trusted", "charger",

@@ -29,14 +29,16 @@ def kirchhoff(*arguments: object) -> Any:
 
 
 @pytest.mark.parametrize(("name", "mean_a"), [("2019_Circontrol_midpoint", 2.6), ("2019_efacaec_mida", -1.0)])
-def test_sum_of_car_and_station_is_their_disagreement(name: str, mean_a: float, i3: Path, shared_data: Path) -> None:
+def test_kirchhoff_sum_of_car_and_station_is_their_difference(
+    name: str, mean_a: float, i3: Path, shared_data: Path
+) -> None:
     found = kirchhoff(shared_data / "bmw_i3_charging" / f"{name}.csv.gz", "--layout", i3)
     assert found["before"]["sum"]["mean_a"] == pytest.approx(mean_a, abs=0.3)
     assert found["expected"]["parts_a"]["quantisation"] == pytest.approx(0.1 * 2**0.5 / 12**0.5, rel=0.01)
     assert found["expected"]["in_band"]["before"] < 0.3
 
 
-def test_doctor_sees_that_a_charge_at_full_current_stands_still(i3: Path, shared_data: Path) -> None:
+def test_doctor_reports_constant_currents_of_a_charge_as_hint(i3: Path, shared_data: Path) -> None:
     doctor = examined(i3, shared_data / "bmw_i3_charging" / "2019_efacaec_mida.csv.gz")
     assert doctor.errors == []
     (still,) = doctor.findings("stands still")
@@ -44,14 +46,14 @@ def test_doctor_sees_that_a_charge_at_full_current_stands_still(i3: Path, shared
     assert "calibrate --trusted" in doctor.report["ready"]
 
 
-def test_end_of_a_charge_has_frames_without_a_value_and_no_error(i3: Path, shared_data: Path) -> None:
+def test_doctor_reports_no_error_at_the_end_of_a_charge(i3: Path, shared_data: Path) -> None:
     doctor = examined(i3, shared_data / "bmw_i3_charging" / "2019_Circontrol_end.csv.gz")
     assert doctor.errors == []
     assert {item.code for item in doctor.findings()} == {"bad frames", "too short", "mean"}
     assert "19 of 153 frames (12 %) cannot be used: not available 19" in doctor.findings("bad frames")[0].text
 
 
-def test_tesla_sum_is_a_constant_for_the_most_part(shared_data: Path, tmp_path: Path) -> None:
+def test_most_of_the_tesla_sum_is_a_constant(shared_data: Path, tmp_path: Path) -> None:
     """Steps of 0.5 kW in both powers are 1.4 A each; a gain error of 2 % explains a third of how the sum varies."""
     (tmp_path / "layout.toml").write_text((ROOT / "dbc" / "tesla_model3.toml").read_text())
     (tmp_path / "Model3CAN.dbc").symlink_to(shared_data / "tesla_model3" / "Model3CAN.dbc")

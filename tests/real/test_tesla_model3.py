@@ -29,7 +29,7 @@ def tesla(folder: Path) -> VehicleDatabase:
     return read_database(layout)
 
 
-def test_every_frame_is_read_as_python_can_reads_it(folder: Path) -> None:
+def test_tesla_frames_are_read_as_python_can_reads_them(folder: Path) -> None:
     frames = read_frames(folder / "drive.log.gz")
     messages = list(can.LogReader(folder / "drive.log.gz"))
     assert frames.key.tolist() == [message.arbitration_id for message in messages]
@@ -37,7 +37,7 @@ def test_every_frame_is_read_as_python_can_reads_it(folder: Path) -> None:
     assert frames.damaged == 0
 
 
-def test_battery_and_inverters_decode_as_cantools_decodes_them(folder: Path, tesla: VehicleDatabase) -> None:
+def test_tesla_currents_decode_as_cantools_decodes_them(folder: Path, tesla: VehicleDatabase) -> None:
     recording = read_recording(folder / "drive.log.gz", tesla, vehicle="model3", name="drive")
     database = cantools.database.load_file(folder / "Model3CAN.dbc", strict=False)
     assert isinstance(database, Database)

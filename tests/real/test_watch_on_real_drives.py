@@ -71,7 +71,7 @@ def watched(folder: Path, paths: list[Path], duration_s: float, period_s: float,
 
 
 @pytest.mark.parametrize("period_s", [0.02, 0.1])
-def test_a_right_set_stays_in_force_on_real_drives(tmp_path: Path, shared_data: Path, period_s: float) -> None:
+def test_right_set_stays_in_force_on_real_drives(tmp_path: Path, shared_data: Path, period_s: float) -> None:
     paths = sorted((shared_data / "bmw_i3_summer").glob("*.csv.gz"))[3 : 6 if HOURS < 1.0 else None]
     junction = watched(tmp_path, paths, 3600.0 * HOURS, period_s, seed=1)
     assert junction.corrector.latched_branches == ()
@@ -79,7 +79,9 @@ def test_a_right_set_stays_in_force_on_real_drives(tmp_path: Path, shared_data: 
 
 
 @pytest.mark.parametrize("name", ["battery", "motor"])
-def test_a_sensor_that_breaks_on_a_real_drive_is_named(tmp_path: Path, shared_data: Path, name: str) -> None:
+def test_sensor_that_breaks_on_a_real_drive_is_named_within_100_ms(
+    tmp_path: Path, shared_data: Path, name: str
+) -> None:
     paths = sorted((shared_data / "bmw_i3_summer").glob("*.csv.gz"))[3:4]
     drives = RecordedDrives(paths, seed=1)
     junction = Junction(three_branches(tmp_path), sd_a=1.2, sd_per_a=0.012, period_s=0.02)

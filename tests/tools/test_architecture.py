@@ -24,7 +24,7 @@ def imported(path: Path) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
 
 
-def test_node_imports_nothing_heavy_and_nothing_of_the_calibrator() -> None:
+def test_node_imports_only_its_base_install_and_not_the_calibrator() -> None:
     heavy = []
     for path in sorted((ROOT / "ecu_node").rglob("*.py")):
         extras = set[str]().union(*(NODE_EXTRAS.get(name, ()) for name in (path.parent.name, path.stem)))
@@ -34,7 +34,7 @@ def test_node_imports_nothing_heavy_and_nothing_of_the_calibrator() -> None:
     assert heavy == []
 
 
-def test_packages_import_only_packages_that_are_named_before_them() -> None:
+def test_packages_import_only_packages_listed_before_them() -> None:
     page = (ROOT / "docs" / "architecture.md").read_text()
     rows = re.findall(r"(?m)^\| (`.+?`) \|", page.partition("| package of `calibrator`")[2])
     level = {package: number for number, row in enumerate(rows) for package in re.findall(r"`(\w+)`", row)}

@@ -13,7 +13,7 @@ from bench.fleet_run import resident_bytes
 from bench.node import core_rows, process_rows
 
 
-def test_memory_is_that_of_the_process_and_its_children() -> None:
+def test_measured_memory_includes_child_processes() -> None:
     alone = resident_bytes(os.getpid())
     code = "import sys; ballast = b'x' * 200_000_000; print(flush=True); sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
@@ -24,20 +24,20 @@ def test_memory_is_that_of_the_process_and_its_children() -> None:
     assert together > alone + 200_000_000
 
 
-def test_both_modes_of_the_node_stand_beside_cantools() -> None:
+def test_benchmark_compares_both_modes_of_the_node_with_cantools() -> None:
     found = core_rows(2)  # which compares what the two make of each frame
     assert [row.name.split(", ")[1] for row in found] == ["overlay", "gateway"]
     assert all(row.ratio is not None and "cantools" in (row.peer or "") for row in found)
 
 
-def test_a_real_process_starts_and_keeps_its_memory() -> None:
+def test_benchmark_measures_start_time_and_memory_of_a_real_process() -> None:
     found = process_rows(300)
     assert [row.unit for row in found] == ["s", "MiB", "MiB"]
     assert all(row.value > 0.0 for row in found if "growth" not in row.name)
 
 
 @pytest.mark.long
-def test_both_ways_of_reading_give_the_same_channels_and_a_figure_each() -> None:
+def test_benchmark_compares_reading_of_logs_with_python_can_and_cantools() -> None:
     reload(can.io.mf4)  # with its writer: tests/conftest.py imports it without asammdf
     found = {row.name: row for row in ingest.rows(quick=True)}  # compares the channels of both ways
     assert [row.unit for row in found.values()] == ["frames/s"] * 4 + ["h/s"] * 2
@@ -45,5 +45,5 @@ def test_both_ways_of_reading_give_the_same_channels_and_a_figure_each() -> None
 
 
 @pytest.mark.long
-def test_posterior_stands_beside_basis_pursuit() -> None:
+def test_benchmark_compares_the_posterior_with_basis_pursuit() -> None:
     assert all("basis pursuit" in (row.peer or "") for row in posterior.rows(quick=True))

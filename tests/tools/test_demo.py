@@ -9,7 +9,9 @@ from ecu_node.errors import UserError
 
 
 @pytest.mark.long
-def test_every_step_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_every_step_of_the_demo_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     for name, value in {"VEHICLES": 8, "BRANCHES": 2, "SECONDS": 1.0}.items():
         monkeypatch.setattr(demo, name, value)
     out = tmp_path / "demo"
@@ -23,13 +25,13 @@ def test_every_step_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd:
     assert "#" in (out / "live.log").read_text()
 
 
-def test_a_folder_that_is_not_the_demos_is_not_emptied(tmp_path: Path) -> None:
+def test_demo_does_not_empty_a_folder_that_it_did_not_make(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("1")
     with pytest.raises(UserError, match="is not empty and was not made by the demo; choose another folder"):
         demo.main(drives="builtin", out=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
+def test_demo_refuses_a_folder_without_recordings(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="not the BMW i3 recordings; give their folder, or leave DRIVES out"):
         demo.main(drives=str(tmp_path), out=tmp_path / "out")

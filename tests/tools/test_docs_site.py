@@ -7,7 +7,7 @@ from docs_site.docstrings import with_formulas
 from docs_site.mathml import block_equation
 
 
-def test_an_equation_becomes_mathml_with_its_number_as_anchor() -> None:
+def test_equation_becomes_mathml_with_its_number_as_anchor() -> None:
     html = block_equation(r"i_m = (1 + d)\, i + o \tag{M2}")
     assert html.startswith('<div class="math"><math display="block">')
     assert '<a class="eqno" id="eq-M2" href="#eq-M2">(M2)</a>' in html

@@ -75,7 +75,7 @@ def test_currents_are_positive_into_the_junction_and_sum_to_zero(tmp_path: Path)
     assert trip.drive.inputs["aircon_demand"].value[0] == 1000.0
 
 
-def test_the_heaters_default_and_the_lines_beside_it_are_labelled(tmp_path: Path) -> None:
+def test_default_value_of_the_heater_and_adjacent_lines_are_labelled(tmp_path: Path) -> None:
     values = columns()
     values["heater"][200:210] = 5.52
     values["heater"][400:405] = [1.0, 2.0, 3.0, 4.0, 5.0]
@@ -90,7 +90,7 @@ def test_the_heaters_default_and_the_lines_beside_it_are_labelled(tmp_path: Path
     )
 
 
-def test_a_heater_power_that_the_battery_does_not_give_is_implausible(tmp_path: Path) -> None:
+def test_heater_power_above_battery_power_is_implausible(tmp_path: Path) -> None:
     trip = imported(write_csv(tmp_path / "a.csv", columns() | {"heater": np.full(SAMPLES, 1.4)}))
     assert not trip.drive.branches["auxiliary"].good.any()
     assert trip.drive.branches["battery"].good.all()
@@ -161,7 +161,7 @@ def test_values_beyond_the_range_of_the_dbc_are_labelled_with_what_is_computed_f
     assert "accelerator: 1 samples beyond the DBC's 0 to 100; labelled as not good" in trip.notices
 
 
-def test_trips_that_are_there_stay_as_they_are(tmp_path: Path) -> None:
+def test_existing_trips_are_not_overwritten(tmp_path: Path) -> None:
     path, store = write_csv(tmp_path / "A.csv", columns()), tmp_path / "store"
     done = run(path, "--layout", LAYOUT, "--out", store, "--json")
     assert done.exit_code == 0

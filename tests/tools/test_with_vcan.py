@@ -13,7 +13,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("arguments", [[], ["--or-skip"], ["--nonsense", "true"], ["--or-skip", "--nonsense"]])
-def test_wrong_use_ends_in_2(arguments: list[str]) -> None:
+def test_with_vcan_exits_with_2_on_wrong_use(arguments: list[str]) -> None:
     result = run(*arguments)
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith("usage: tools/with_vcan [--or-skip] COMMAND")

@@ -37,7 +37,7 @@ def keys(repo: Repo, *names: str) -> list[object]:
     return [word for name in names for word in ("--key", repo.key(name))]
 
 
-def test_signers_sign_one_after_the_other(repo: Repo, new: Path, other: VehicleParameters) -> None:
+def test_several_signers_can_sign_one_after_another(repo: Repo, new: Path, other: VehicleParameters) -> None:
     repo.updated(new)
     repo.add(other)
     lacking = f"not published: {repo.bin} has 1 of 2 signatures, not of {keyid(repo, 't2')}; snapshot has 0 of 1"
@@ -48,7 +48,7 @@ def test_signers_sign_one_after_the_other(repo: Repo, new: Path, other: VehicleP
     assert repo.updated(new).startswith("on trial: parameter set 301")
 
 
-def test_change_after_a_signature_needs_all_signatures_anew(repo: Repo, other: VehicleParameters) -> None:
+def test_change_after_a_signature_invalidates_all_signatures(repo: Repo, other: VehicleParameters) -> None:
     repo.add(other)
     failed(repo, "has 1 of 2 signatures", "publish", repo.path, *keys(repo, "t1"))
     repo.done("revoke", repo.path, "v1")
@@ -56,7 +56,9 @@ def test_change_after_a_signature_needs_all_signatures_anew(repo: Repo, other: V
     assert f"what is staged is not published: {repo.bin} has 1 of 2 signatures" in out
 
 
-def test_staged_roles_do_not_block_a_new_timestamp(repo: Repo, state: Path, other: VehicleParameters) -> None:
+def test_staged_but_unsigned_roles_do_not_block_a_new_timestamp(
+    repo: Repo, state: Path, other: VehicleParameters
+) -> None:
     """Else a signer who is away for 30 days would end the updates of the whole fleet."""
     repo.updated(state)
     repo.add(other)
@@ -72,7 +74,7 @@ def test_staged_roles_do_not_block_a_new_timestamp(repo: Repo, state: Path, othe
     assert "root 1, timestamp 3" in repo.node("inspect", "--state", state)[1]
 
 
-def test_rotation_keeps_the_threshold(repo: Repo) -> None:
+def test_key_rotation_keeps_the_threshold_unless_another_is_given(repo: Repo) -> None:
     public = [word for name in ("t1", "t2", "new") for word in ("--public", repo.folder / "keys" / f"{name}.pub")]
     assert "targets 2 of 3; " in repo.done("rotate", repo.path, "targets", *public)
     failed(repo, "targets: 2 signatures of 1 keys", "rotate", repo.path, "targets", *public[:2], code=2)
@@ -90,7 +92,7 @@ def test_revoked_file_that_is_added_again_is_no_longer_revoked_and_add_says_so(r
     assert repo.updated(state).startswith("on trial: ")
 
 
-def test_interrupted_publication_goes_on(
+def test_interrupted_publication_can_be_completed(
     repo: Repo, new: Path, other: VehicleParameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Up to the new timestamp vehicles see what was there before."""
@@ -104,7 +106,7 @@ def test_interrupted_publication_goes_on(
     assert repo.updated(new).startswith("on trial: parameter set 301")
 
 
-def test_key_by_uri_signs_as_its_file_does(repo: Repo, new: Path, other: VehicleParameters) -> None:
+def test_key_given_by_uri_signs_like_a_key_file(repo: Repo, new: Path, other: VehicleParameters) -> None:
     """The same way leads to security modules and cloud services."""
     repo.add(other)
     private = generate_private_key(SECP256R1())
@@ -117,7 +119,7 @@ def test_key_by_uri_signs_as_its_file_does(repo: Repo, new: Path, other: Vehicle
     assert repo.updated(new).startswith("on trial: parameter set 301")
 
 
-def test_key_that_cannot_be_had_is_one_line(repo: Repo) -> None:
+def test_unusable_key_is_reported_in_one_line(repo: Repo) -> None:
     public, none = repo.folder / "keys" / "t1.pub", repo.folder / "none"
     (repo.folder / "empty").touch()
     repo.key("t1").chmod(0o644)
@@ -150,7 +152,7 @@ def test_encrypted_key_needs_its_own_passphrase(repo: Repo, monkeypatch: pytest.
     failed(repo, "give either a passphrase", "key", "e", "--out", tmp_path, code=2)
 
 
-def test_passphrase_is_asked_for_at_a_terminal(repo: Repo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_passphrase_is_asked_for_in_a_terminal(repo: Repo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with monkeypatch.context() as patch:
         patch.setenv(PASSPHRASE_VARIABLE, "a long passphrase")
         repo.done("key", "dora", "--out", tmp_path)
@@ -170,7 +172,7 @@ def test_passphrase_is_asked_for_at_a_terminal(repo: Repo, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("kind", ["key", "pub"])
-def test_key_is_never_replaced(kind: str, repo: Repo) -> None:
+def test_existing_key_is_never_overwritten(kind: str, repo: Repo) -> None:
     path = repo.folder / f"anna.{kind}"
     path.write_text("of somebody else")
     failed(repo, f"{path}: there is a key already", "key", "anna", "--no-passphrase", "--out", repo.folder)
@@ -178,13 +180,15 @@ def test_key_is_never_replaced(kind: str, repo: Repo) -> None:
 
 
 @pytest.mark.parametrize("free_bytes", [0, 115])
-def test_key_that_is_not_whole_is_not_left(free_bytes: int, repo: Repo) -> None:
+def test_partly_written_key_is_removed(free_bytes: int, repo: Repo) -> None:
     with full_disk(free_bytes):
         failed(repo, "cannot be written: File too large", "key", "anna", "--no-passphrase", "--out", repo.folder)
     assert not list(repo.folder.glob("*anna*"))
 
 
-def test_mistakes_are_one_line_and_change_nothing(repo: Repo, other: VehicleParameters, tmp_path: Path) -> None:
+def test_mistakes_are_reported_in_one_line_and_change_nothing(
+    repo: Repo, other: VehicleParameters, tmp_path: Path
+) -> None:
     def files() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in repo.path.rglob("*") if path.is_file()}
 
@@ -211,7 +215,7 @@ def test_mistakes_are_one_line_and_change_nothing(repo: Repo, other: VehiclePara
     assert files() == before
 
 
-def test_full_disk_leaves_what_vehicles_see(repo: Repo, new: Path, other: VehicleParameters) -> None:
+def test_full_disk_does_not_change_what_vehicles_receive(repo: Repo, new: Path, other: VehicleParameters) -> None:
     repo.updated(new)
     repo.add(other)
     with full_disk(300):
@@ -230,7 +234,7 @@ def test_root_that_expires_before_the_timestamp_is_reported(repo: Repo) -> None:
     assert f"valid until {day}; 1 roles staged: root has 0 of 2 signatures" in repo.done("status", repo.path)
 
 
-def test_damaged_or_expired_repository_is_one_line(repo: Repo) -> None:
+def test_damaged_or_expired_repository_is_reported_in_one_line(repo: Repo) -> None:
     bundle, publish = ("bundle", repo.path, "v1", "--out", repo.folder / "b"), ("publish", repo.path, *keys(repo, *ALL))
     repo.forge("timestamp", expired, "timestamp")
     failed(repo, "when its metadata expired; publish first", *bundle)
@@ -247,7 +251,7 @@ def test_damaged_or_expired_repository_is_one_line(repo: Repo) -> None:
     failed(repo, "cannot be read as metadata", "status", repo.path)
 
 
-def test_commands_that_write_wait_for_each_other(repo: Repo) -> None:
+def test_command_waits_while_another_one_writes_the_repository(repo: Repo) -> None:
     command = [sys.executable, "-m", "calibrator", "repository", "unstage", str(repo.path)]
     with open_storage(repo.path).locked():
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

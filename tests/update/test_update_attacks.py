@@ -38,7 +38,7 @@ def evil_target(repo: Repo) -> Callable[[Targets], None]:
     return change
 
 
-def test_arbitrary_file_is_refused(repo: Repo, new: Path) -> None:
+def test_changed_parameter_file_is_refused(repo: Repo, new: Path) -> None:
     (target,) = (repo.path / "targets").glob("*.v1.json")
     content = target.read_bytes()
     target.write_bytes(content.replace(b"0.05", b"0.06"))
@@ -66,7 +66,7 @@ def test_rollback_is_refused(repo: Repo, state: Path) -> None:
     repo.refused(state, "older than what was accepted before", repo.folder / "bundles" / "v1.json.xz")
 
 
-def test_rollback_of_one_bin_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
+def test_rollback_of_a_single_bin_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
     """By somebody who has the keys of snapshot and timestamp."""
     repo.offer(other)
     repo.updated(state)
@@ -80,7 +80,7 @@ def test_rollback_of_one_bin_is_refused(repo: Repo, state: Path, other: VehicleP
 
 
 @pytest.mark.parametrize("role", ["timestamp", "snapshot", "targets", "bin", "root"])
-def test_freeze_is_noticed_when_metadata_expires(role: str, repo: Repo, new: Path) -> None:
+def test_freeze_is_detected_when_metadata_expires(role: str, repo: Repo, new: Path) -> None:
     role = repo.bin if role == "bin" else role
     repo.forge(role, expired, "r1", "r2", "t1", "t2", "snapshot", "timestamp", bump=role in ("root", "timestamp"))
     if role == "snapshot":
@@ -88,7 +88,7 @@ def test_freeze_is_noticed_when_metadata_expires(role: str, repo: Repo, new: Pat
     repo.refused(new, "expired")
 
 
-def test_freeze_with_the_clock_set_back_is_noticed(repo: Repo, state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_freeze_with_the_clock_set_back_is_detected(repo: Repo, state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The time of an earlier update is kept, and no clock before it is believed."""
     later = replace(read_state(state), latest=datetime(2099, 1, 1, tzinfo=UTC))
     monkeypatch.setattr("ecu_node.update.client.read_state", lambda _: later)
@@ -108,7 +108,7 @@ def test_endless_data_is_refused(repo: Repo, new: Path) -> None:
     repo.refused(new, "larger than", bomb)
 
 
-def test_mix_and_match_is_refused(repo: Repo, new: Path, other: VehicleParameters) -> None:
+def test_mixture_of_old_and_new_metadata_is_refused(repo: Repo, new: Path, other: VehicleParameters) -> None:
     """Old metadata of a bin under a new snapshot, and a new target under an old bin."""
     old = repo.live(repo.bin).read_bytes()
     repo.offer(other)
@@ -123,7 +123,7 @@ def test_mix_and_match_is_refused(repo: Repo, new: Path, other: VehicleParameter
     repo.refused(new, "Observed ")
 
 
-def test_what_has_no_parameters_of_this_vehicle_is_refused(repo: Repo, new: Path, tmp_path: Path) -> None:
+def test_bundle_or_repository_without_this_vehicle_is_refused(repo: Repo, new: Path, tmp_path: Path) -> None:
     words = "is not in the bundle, which has v2.json; is it complete, and for vehicle 'v1', which this is?"
     repo.refused(new, words, repo.bundle("v2"))
     repo.provision(tmp_path / "v9", "v9")
@@ -147,7 +147,7 @@ def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, n
 @pytest.mark.parametrize(
     "keys", [("timestamp", "mallory"), ("snapshot", "mallory"), ("t1", "mallory"), ("r1",), ("snapshot", "timestamp")]
 )
-def test_one_stolen_key_brings_no_parameters(keys: tuple[str, ...], repo: Repo, new: Path) -> None:
+def test_one_stolen_key_cannot_deliver_parameters(keys: tuple[str, ...], repo: Repo, new: Path) -> None:
     """Nor do all online keys: their thief signs all that they can sign."""
     repo.forge(repo.bin, evil_target(repo), *keys)
     repo.relist(repo.bin, *keys)
@@ -161,7 +161,7 @@ def test_one_stolen_key_brings_no_parameters(keys: tuple[str, ...], repo: Repo, 
         ("../../../secret", "leads out of the repository"),
     ],
 )
-def test_no_name_in_metadata_leads_out_of_the_repository(name: str, words: str, repo: Repo, new: Path) -> None:
+def test_names_in_metadata_cannot_lead_out_of_the_repository(name: str, words: str, repo: Repo, new: Path) -> None:
     """By somebody who has the keys of targets."""
     (repo.folder / "secret").write_bytes(EVIL)
 
@@ -216,7 +216,9 @@ def server(repo: Repo) -> Any:
         thread.join()
 
 
-def test_web_server(repo: Repo, new: Path, server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_update_from_a_web_server_is_limited_in_size_and_time(
+    repo: Repo, new: Path, server: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     url, handler = server
     handler.is_endless = True
     repo.refused(new, "exceeding the maximum allowed length", url)
@@ -230,7 +232,7 @@ def test_web_server(repo: Repo, new: Path, server: Any, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("vehicle", ["V 1", "Ü#1", "a/b", "50%"])
-def test_vehicle_may_have_any_name(
+def test_vehicle_of_any_name_updates_from_a_web_server(
     vehicle: str, repo: Repo, server: Any, parameters: VehicleParameters, tmp_path: Path
 ) -> None:
     path = tmp_path / "parameters.json"
@@ -241,14 +243,14 @@ def test_vehicle_may_have_any_name(
     assert repo.updated(tmp_path / "state", server[0]).startswith("on trial: ")
 
 
-def test_web_server_that_is_not_there_is_one_line(repo: Repo, new: Path) -> None:
+def test_unreachable_web_server_is_reported_in_one_line(repo: Repo, new: Path) -> None:
     repo.refused(
         new, "Connection refused; check address and connection, or whether it can be read", "http://127.0.0.1:1/x"
     )
     repo.refused(new, "only http:// and https:// are known", "ftp://127.0.0.1/x")
 
 
-def test_bundle_with_more_files_changes_nothing_more(repo: Repo, new: Path, parameters: VehicleParameters) -> None:
+def test_additional_files_in_a_bundle_are_not_written(repo: Repo, new: Path, parameters: VehicleParameters) -> None:
     """Names in a bundle are looked up, never written."""
     files = msgspec.json.decode(lzma.decompress(repo.bundle().read_bytes()), type=dict[str, str])
     evil = {"../../evil": "x", "/tmp/evil": "x", "targets/v1.json": encode_parameters(parameters, "f").decode()}

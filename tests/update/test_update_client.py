@@ -46,7 +46,9 @@ def numbers(state: Path) -> list[int | None]:
     return [item.parameters.number if item else None for item in (found.in_force, found.on_trial, found.before)]
 
 
-def test_set_is_on_trial_then_in_force_and_the_last_is_kept(repo: Repo, new: Path, other: VehicleParameters) -> None:
+def test_set_is_on_trial_then_in_force_and_the_previous_one_is_kept(
+    repo: Repo, new: Path, other: VehicleParameters
+) -> None:
     repo.updated(new)
     assert numbers(new)[:2] == [None, 300]
     pass_trial(new)
@@ -58,7 +60,7 @@ def test_set_is_on_trial_then_in_force_and_the_last_is_kept(repo: Repo, new: Pat
     assert numbers(new) == [301, None, 300]
 
 
-def test_failed_set_is_gone_and_not_tried_again(repo: Repo, state: Path, other: VehicleParameters) -> None:
+def test_failed_set_is_removed_and_not_tried_again(repo: Repo, state: Path, other: VehicleParameters) -> None:
     repo.offer(other)
     repo.updated(state)
     pass_trial(state, passed=False)
@@ -68,7 +70,7 @@ def test_failed_set_is_gone_and_not_tried_again(repo: Repo, state: Path, other: 
     assert repo.updated(state).startswith("on trial: ")
 
 
-def test_end_of_a_replaced_trial_changes_nothing(repo: Repo, state: Path, other: VehicleParameters) -> None:
+def test_result_of_a_replaced_trial_is_ignored(repo: Repo, state: Path, other: VehicleParameters) -> None:
     repo.offer(other)
     repo.updated(state)
     tried = held_set(state, "on_trial")
@@ -105,12 +107,12 @@ def drifting(parameters: VehicleParameters, drift: float) -> VehicleParameters:
     return replace(parameters, branches={**parameters.branches, "battery": battery})
 
 
-def test_large_step_needs_the_signers_word(repo: Repo, state: Path, parameters: VehicleParameters) -> None:
+def test_large_step_is_taken_if_the_signers_allow_it(repo: Repo, state: Path, parameters: VehicleParameters) -> None:
     repo.offer(drifting(parameters, -0.17), "--allow-large-step")
     assert repo.updated(state).startswith("on trial: ")
 
 
-def test_revoked_set_gives_way_to_the_one_before(repo: Repo, state: Path, other: VehicleParameters) -> None:
+def test_previous_set_replaces_a_revoked_one(repo: Repo, state: Path, other: VehicleParameters) -> None:
     repo.offer(other)
     repo.updated(state)
     pass_trial(state)
@@ -120,7 +122,7 @@ def test_revoked_set_gives_way_to_the_one_before(repo: Repo, state: Path, other:
     assert repo.updated(state).startswith("nothing new: ")
 
 
-def test_revoked_set_ends_and_a_new_one_goes_on_trial(repo: Repo, state: Path, other: VehicleParameters) -> None:
+def test_revoked_set_ends_while_a_new_one_goes_on_trial(repo: Repo, state: Path, other: VehicleParameters) -> None:
     repo.add(other)
     repo.revoke("--sha256", held_set(state).sha256)
     text = repo.updated(state)
@@ -129,7 +131,9 @@ def test_revoked_set_ends_and_a_new_one_goes_on_trial(repo: Repo, state: Path, o
     assert numbers(state)[:2] == [None, 301]
 
 
-def test_revocation_holds_though_the_new_set_is_refused(repo: Repo, state: Path, parameters: VehicleParameters) -> None:
+def test_revocation_applies_even_if_the_new_set_is_refused(
+    repo: Repo, state: Path, parameters: VehicleParameters
+) -> None:
     repo.add(drifting(parameters, 0.5))
     repo.revoke("--sha256", held_set(state).sha256)
     one_line(repo.update(state), "nothing is in force now")
@@ -139,7 +143,7 @@ def test_revocation_holds_though_the_new_set_is_refused(repo: Repo, state: Path,
     assert events == [("revoked", None), ("refused", "ImplausibleParameters")]
 
 
-def test_many_revocations_push_none_out(repo: Repo, state: Path) -> None:
+def test_none_of_many_revocations_is_forgotten(repo: Repo, state: Path) -> None:
     """Version 1.0 forgot the first of 65."""
     repo.done("revoke", repo.path, "v1")
     for number in range(65):
@@ -161,7 +165,7 @@ def test_later_expiry_needs_no_trial(
     assert held_set(state).expires > datetime.now(UTC) + timedelta(days=799)
 
 
-def test_dry_run_says_the_same_and_writes_nothing(repo: Repo, new: Path) -> None:
+def test_dry_run_of_an_update_writes_nothing(repo: Repo, new: Path) -> None:
     before = {path.name: path.read_bytes() for path in new.iterdir()}
     code, out, _ = repo.update(new, None, "--dry-run")
     assert code == 0
@@ -169,7 +173,9 @@ def test_dry_run_says_the_same_and_writes_nothing(repo: Repo, new: Path) -> None
     assert {path.name: path.read_bytes() for path in new.iterdir()} == before
 
 
-def test_set_expires_for_good(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
+def test_expired_set_ends_on_trial_and_in_force(
+    repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters
+) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
     update(state, str(repo.path), database, now)
@@ -189,7 +195,9 @@ def test_set_expires_for_good(repo: Repo, state: Path, database: VehicleDatabase
     assert read_state(state).ended == "expired"
 
 
-def test_update_time_is_kept(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
+def test_latest_time_seen_is_kept_when_the_clock_is_set_back(
+    repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters
+) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
     with pytest.raises(TrustError, match="expired at"):
@@ -198,7 +206,7 @@ def test_update_time_is_kept(repo: Repo, state: Path, database: VehicleDatabase,
         update(state, str(repo.path), database, now)
 
 
-def test_canonical_json_is_that_of_securesystemslib(offered: Repo) -> None:
+def test_canonical_json_equals_that_of_securesystemslib(offered: Repo) -> None:
     """What is signed is written quickly here; keys, numbers, escapes and odd letters come out the same."""
     documents = [Metadata.from_file(str(path)).signed.to_dict() for path in offered.metadata.glob("*.json")]
     odd = {"b": [], "a": {}, "é": "\x7f€\U0001f697/<&'", "": [True, False, 0, -1, 2**63], "A": [[{"z": "", "y": 1}]]}
@@ -208,7 +216,7 @@ def test_canonical_json_is_that_of_securesystemslib(offered: Repo) -> None:
         tuf_json.encode_canonical({"length": math.nan})
 
 
-def test_vehicle_is_provisioned_once_with_a_root_that_is_signed(repo: Repo, state: Path, tmp_path: Path) -> None:
+def test_vehicle_is_provisioned_once_and_with_a_signed_root(repo: Repo, state: Path, tmp_path: Path) -> None:
     place, root = tmp_path / "fresh", tmp_path / "root.json"
 
     def refused(words: str, path: Path = root, folder: Path = place) -> None:
@@ -239,7 +247,9 @@ def test_vehicle_is_provisioned_once_with_a_root_that_is_signed(repo: Repo, stat
         (lambda file: file.hashes.update(sha512=DIGEST), "v1.json is no parameter file"),
     ],
 )
-def test_signed_misfit_is_refused(change: Callable[[TargetFile], object], words: str, repo: Repo, new: Path) -> None:
+def test_signed_but_inconsistent_description_is_refused(
+    change: Callable[[TargetFile], object], words: str, repo: Repo, new: Path
+) -> None:
     repo.forge(repo.bin, lambda targets: change(targets.targets["v1.json"]), "t1", "t2")
     repo.relist(repo.bin, "snapshot", "timestamp")
     one_line(repo.update(new), words)
@@ -247,7 +257,7 @@ def test_signed_misfit_is_refused(change: Callable[[TargetFile], object], words:
 
 
 @pytest.mark.parametrize("damage", [without, cut, zeros, a_folder, a_pipe, huge])
-def test_damaged_state_is_one_line(damage: Callable[[Path], None], repo: Repo, state: Path) -> None:
+def test_damaged_state_is_reported_in_one_line(damage: Callable[[Path], None], repo: Repo, state: Path) -> None:
     bundle = repo.bundle()
     damage(bundle)
     repo.refused(state, str(bundle), bundle)
@@ -256,7 +266,7 @@ def test_damaged_state_is_one_line(damage: Callable[[Path], None], repo: Repo, s
         one_line(found, "provision")
 
 
-def test_no_bit_of_the_state_can_be_another_one(state: Path) -> None:
+def test_flipped_bit_in_the_state_is_detected(state: Path) -> None:
     content = (state / "state.json").read_bytes()
     for place in range(0, len(content), 61):
         damaged = bytearray(content)
@@ -266,7 +276,7 @@ def test_no_bit_of_the_state_can_be_another_one(state: Path) -> None:
             read_state(state)
 
 
-def test_every_byte_of_a_bundle_counts(repo: Repo, new: Path) -> None:
+def test_change_of_any_byte_of_a_bundle_is_detected(repo: Repo, new: Path) -> None:
     """Of head and tail each is changed or the last, of those between every seventh."""
     content, path = repo.bundle().read_bytes(), repo.folder / "changed"
     places = sorted({*range(64), *range(0, len(content), 7), *range(len(content) - 64, len(content))})
@@ -280,19 +290,19 @@ def test_every_byte_of_a_bundle_counts(repo: Repo, new: Path) -> None:
     repo.refused(new, "not a whole bundle", path)
 
 
-def test_names_break_no_line(repo: Repo, state: Path) -> None:
+def test_odd_source_names_do_not_break_the_line_of_an_error(repo: Repo, state: Path) -> None:
     path = repo.folder / "a\nb\x1b[2J"
     for source in (path, "x" * 5000, b"a\xff"):
         one_line(repo.update(state, source))
 
 
-def test_folder_that_cannot_be_a_state_is_one_line(repo: Repo, state: Path) -> None:
+def test_unusable_state_folder_is_reported_in_one_line(repo: Repo, state: Path) -> None:
     one_line(repo.node("inspect", "--state", state / "state.json"), "cannot read the state: Not a directory")
     a_pipe(state / "lock")
     one_line(repo.update(state), f"{state}: cannot be used as state: it is no file; remove it\n")
 
 
-def test_updates_without_their_packages_are_one_line(state: Path) -> None:
+def test_update_without_package_tuf_is_refused_in_one_line(state: Path) -> None:
     code = "import sys; sys.modules['tuf'] = None; from ecu_node.__main__ import ecu_node_program as run; exit(run())"
     command = [sys.executable, "-c", code, "update", "none", "--state", state, "--layout", LAYOUT]
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=120, check=False)
@@ -301,7 +311,7 @@ def test_updates_without_their_packages_are_one_line(state: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
-def test_root_leaves_files_to_the_owner_of_the_folder_and_follows_no_link(repo: Repo, new: Path) -> None:
+def test_root_gives_files_to_the_owner_of_the_folder_and_follows_no_link(repo: Repo, new: Path) -> None:
     os.chown(new, 65534, 65534)
     repo.updated(new)
     assert {(new / name).stat().st_uid for name in ("state.json", "decisions.log")} == {65534}
@@ -318,13 +328,15 @@ def test_root_leaves_files_to_the_owner_of_the_folder_and_follows_no_link(repo: 
     assert (repo.folder / "of root").stat().st_uid == 0
 
 
-def test_two_commands_at_once_are_both_done(repo: Repo, new: Path) -> None:
+def test_two_simultaneous_updates_do_not_disturb_each_other(repo: Repo, new: Path) -> None:
     command = [sys.executable, "-m", "ecu_node", "update", repo.path, "--state", new, "--layout", LAYOUT]
     both = [subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE) for _ in range(2)]
     assert sorted(process.communicate(timeout=120)[0][:8] for process in both) == [b"nothing ", b"on trial"]
 
 
-def test_inspect_and_report_say_what_the_vehicle_holds(repo: Repo, state: Path, other: VehicleParameters) -> None:
+def test_inspect_and_report_show_the_sets_and_root_of_the_vehicle(
+    repo: Repo, state: Path, other: VehicleParameters
+) -> None:
     repo.offer(other)
     repo.updated(state)
     code, out, _ = repo.node("inspect", "--state", state)
@@ -339,7 +351,9 @@ def test_inspect_and_report_say_what_the_vehicle_holds(repo: Repo, state: Path, 
     assert msgspec.json.decode(repo.node("report", "--state", state)[1])["on_trial"] == facts["on_trial"]
 
 
-def test_inspect_fails_if_the_set_in_force_expired(state: Path, repo: Repo, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inspect_fails_if_the_set_in_force_has_expired(
+    state: Path, repo: Repo, monkeypatch: pytest.MonkeyPatch
+) -> None:
     late = replace(read_state(state), latest=held_set(state).expires)
     monkeypatch.setattr("ecu_node.update.state.read_state", lambda _: late)
     code, _, err = repo.node("inspect", "--state", state)

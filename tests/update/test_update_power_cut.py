@@ -77,7 +77,9 @@ def cuts(folder: Path, files: list[Path], place: Path) -> Iterator[Path]:
     ["conclude", *(pytest.param(name, marks=pytest.mark.long) for name in ("update", "revoke"))],
     indirect=True,
 )
-def test_power_cut_leaves_old_or_new_state(command: Callable[[Path], list[str]], state: Path, tmp_path: Path) -> None:
+def test_power_cut_leaves_the_old_or_the_new_state(
+    command: Callable[[Path], list[str]], state: Path, tmp_path: Path
+) -> None:
     work, log = tmp_path / "work", tmp_path / "log"
     calls = calls_of(command(started(state, work)), work, FILES, log)
     before, after = timeless(state), timeless(work)
@@ -103,7 +105,9 @@ ERRORS = {"openat": "ENOSPC", "write": "ENOSPC", "fsync": "EIO", "rename": "EIO"
 
 
 @pytest.mark.parametrize("command", ["update"], indirect=True)
-def test_broken_disk_keeps_state_or_says_so(command: Callable[[Path], list[str]], state: Path, tmp_path: Path) -> None:
+def test_failed_disk_write_keeps_the_state_or_is_reported(
+    command: Callable[[Path], list[str]], state: Path, tmp_path: Path
+) -> None:
     work, log = tmp_path / "work", tmp_path / "log"
     calls = calls_of(command(started(state, work)), work, FILES, log)
     before, after = timeless(state), timeless(work)

@@ -73,7 +73,7 @@ def publish(place: Repo, *names: str) -> None:
     place.publish(*names)
 
 
-def test_commands_of_the_document_and_recovery_from_each_stolen_key(place: Repo) -> None:
+def test_documented_commands_work_and_recover_from_each_stolen_key(place: Repo) -> None:
     first, _, recovery = TEXT.partition("## When a key is stolen or lost")
     lines = commands(first)
     revoking = next(k for k, line in enumerate(lines) if " revoke " in line)

@@ -68,7 +68,7 @@ def ended(
 
 
 @pytest.mark.parametrize("damage", [without, cut, a_folder])
-def test_damaged_state_changes_nothing_until_it_is_mended(
+def test_running_node_keeps_its_parameters_while_the_state_is_damaged(
     damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
 ) -> None:
     """In a running node what was in force stays; one that starts with it passes through."""
@@ -102,7 +102,7 @@ def test_state_of_another_vehicle_is_not_used(correcting: Path, database: Vehicl
     assert store.in_force.why_not is not None
 
 
-def test_end_of_a_trial_that_cannot_be_written_now_is_written_later(correcting: Path, ended: Running) -> None:
+def test_end_of_a_trial_is_written_later_if_the_state_is_locked(correcting: Path, ended: Running) -> None:
     with locked(correcting):
         ended.look(*range(0, 59, 2))
     assert (ended.drift, read_state(correcting).on_trial is None) == (DRIFT, False)
@@ -113,7 +113,7 @@ def test_end_of_a_trial_that_cannot_be_written_now_is_written_later(correcting: 
     assert (ended.drift, read_state(correcting).on_trial) == (OTHER_DRIFT, None)
 
 
-def test_who_changes_a_state_waits_for_another_one(correcting: Path) -> None:
+def test_writer_waits_while_another_one_changes_the_state(correcting: Path) -> None:
     def change() -> None:
         with locked(correcting):
             pass
@@ -126,14 +126,16 @@ def test_who_changes_a_state_waits_for_another_one(correcting: Path) -> None:
         waiting.result(30.0)
 
 
-def test_trial_in_a_damaged_state_does_not_end_the_node(correcting: Path, ended: Running) -> None:
+def test_end_of_a_trial_in_a_damaged_state_does_not_end_the_node(correcting: Path, ended: Running) -> None:
     cut(correcting / "state.json")
     ended.look(1.0, 3.0, 5.0)
     assert ended.drift == DRIFT
     assert all(line.isprintable() for line in ended.said)
 
 
-def test_state_is_read_again(correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changed_state_is_read_again_after_a_read_error(
+    correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Else a revocation would not be heeded before the next start."""
 
     def broken_disk(folder: Path) -> VehicleState:
@@ -148,7 +150,7 @@ def test_state_is_read_again(correcting: Path, database: VehicleDatabase, monkey
     assert running.corrector.reason is Reason.REVOKED
 
 
-def test_slow_disk_does_not_hold_the_node_up(
+def test_slow_disk_does_not_block_the_node(
     correcting: Path, ended: Running, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writing, may_go_on = threading.Event(), threading.Event()
@@ -172,7 +174,9 @@ def test_slow_disk_does_not_hold_the_node_up(
     assert any("has passed its trial: seen" in line for line in running.said)
 
 
-def test_set_expiring_on_trial_changes_nothing(correcting: Path, ended: Running, other: VehicleParameters) -> None:
+def test_set_that_expires_on_trial_does_not_come_in_force(
+    correcting: Path, ended: Running, other: VehicleParameters
+) -> None:
     put_on_trial(correcting, other, days=1)
     ended.look(2.0, 2.1)
     ended.now = NOW + timedelta(days=2)
@@ -182,7 +186,9 @@ def test_set_expiring_on_trial_changes_nothing(correcting: Path, ended: Running,
     assert ended.said[-1].split(" is ")[1].startswith("not in force, though its trial went well")
 
 
-def test_trial_needs_a_valid_set(correcting: Path, other: VehicleParameters, database: VehicleDatabase) -> None:
+def test_trial_starts_only_once_the_set_is_valid(
+    correcting: Path, other: VehicleParameters, database: VehicleDatabase
+) -> None:
     put_on_trial(correcting, other, days=-1)
     running = Running(correcting, database)
     running.look(*range(0, 110, 2))
@@ -193,7 +199,7 @@ def test_trial_needs_a_valid_set(correcting: Path, other: VehicleParameters, dat
     assert running.said[-1].endswith(" is on trial")
 
 
-def test_running_node_takes_a_set_that_comes_into_its_state(
+def test_running_node_loads_a_set_written_to_its_state(
     vehicle: Path, parameters: VehicleParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And says so to the service manager."""

@@ -108,7 +108,7 @@ def tried(vehicle: Path, parameters: VehicleParameters, database: VehicleDatabas
     return drive
 
 
-def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, database: VehicleDatabase) -> None:
+def test_right_set_comes_in_force_after_its_trial_and_not_before(vehicle: Path, database: VehicleDatabase) -> None:
     put_on_trial(vehicle, right(database))
     drive = Drive(vehicle, database)
     drive.go_on(0.9 * TRIAL_S)
@@ -136,7 +136,7 @@ def test_wrong_set_fails_its_trial(
     assert drive.has_said(FAILED)
 
 
-def test_set_before_stays_in_force_during_a_trial(vehicle: Path, database: VehicleDatabase) -> None:
+def test_previous_set_stays_in_force_during_and_after_a_failed_trial(vehicle: Path, database: VehicleDatabase) -> None:
     drive = tried(vehicle, right(database), database)
     put_on_trial(vehicle, right(database, -DRIFT, 0.0))
     drive.go_on(0.5 * TRIAL_S)
@@ -147,7 +147,7 @@ def test_set_before_stays_in_force_during_a_trial(vehicle: Path, database: Vehic
     assert drive.has_said(FAILED)
 
 
-def test_set_that_promises_less_passes_with_less(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_that_predicts_a_smaller_change_passes_with_a_smaller_one(vehicle: Path, database: VehicleDatabase) -> None:
     """A load that no sensor sees is half of the change: the share is about 0."""
     residual = JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0)
     promising_half = replace(right(database), junction_residual=residual)
@@ -155,7 +155,7 @@ def test_set_that_promises_less_passes_with_less(vehicle: Path, database: Vehicl
     assert tried(vehicle, promising_half, database, load_a=-3.0).has_said(PASSED)
 
 
-def test_set_is_tried_about_the_expected_sum(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_on_trial_is_judged_relative_to_the_expected_sum(vehicle: Path, database: VehicleDatabase) -> None:
     """A load that no sensor sees hides no error, and is no error itself."""
     expected = replace(right(database).junction_residual, expected_a=3.0, measured_mean_a=7.0, corrected_mean_a=3.0)
     found = replace(right(database), junction_residual=expected)
@@ -167,26 +167,26 @@ def test_set_is_tried_about_the_expected_sum(vehicle: Path, database: VehicleDat
     assert drive.has_said(FAILED)
 
 
-def test_set_that_leaves_an_error_fails(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_that_corrects_half_of_the_error_fails_its_trial(vehicle: Path, database: VehicleDatabase) -> None:
     drive = tried(vehicle, right(database, DRIFT / 2.0, OFFSET_A / 2.0), database)
     (told,) = (line for line in drive.said if FAILED in line)
     assert "at most 2 A were to be left" in told
 
 
-def test_set_that_changes_nothing_passes(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_without_a_change_passes_its_trial(vehicle: Path, database: VehicleDatabase) -> None:
     drive = tried(vehicle, right(database, 0.0, 0.0), database, drift=0.0, offset_a=0.0)
     (told,) = (line for line in drive.said if PASSED in line)
     assert "no change that counts" in told
 
 
-def test_set_without_a_predicted_change_may_leave_anything(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_without_a_predicted_change_may_leave_a_residual(vehicle: Path, database: VehicleDatabase) -> None:
     """As one that was written by hand: what is taken away is measured all the same."""
     unknown = JunctionResidual(measured_a=4.0, corrected_a=0.5)
     parameters = replace(right(database), junction_residual=unknown)
     assert tried(vehicle, parameters, database, load_a=-0.5).has_said(PASSED)
 
 
-def test_trial_waits_while_a_current_is_not_measured_and_while_none_flows(vehicle: Path, tmp_path: Path) -> None:
+def test_trial_waits_in_invalid_states_and_while_no_current_flows(vehicle: Path, tmp_path: Path) -> None:
     """As while the vehicle charges, where the layout says so."""
     own = own_vehicle(tmp_path, '[watch]\ninput = "contactor_state"\nvalid = [2]\n')
     drive = tried(vehicle, right(own), own, contactor=1)
@@ -196,7 +196,7 @@ def test_trial_waits_while_a_current_is_not_measured_and_while_none_flows(vehicl
     assert drive.told == (State.CORRECTING, Reason.NONE)
 
 
-def test_revocation_holds_at_once_in_a_running_node(vehicle: Path, database: VehicleDatabase) -> None:
+def test_revocation_takes_effect_at_once_in_a_running_node(vehicle: Path, database: VehicleDatabase) -> None:
     drive = tried(vehicle, right(database), database)
     write_state(vehicle, replace(read_state(vehicle), in_force=None, ended="revoked"))
     drive.go_on(2.0)
@@ -204,7 +204,9 @@ def test_revocation_holds_at_once_in_a_running_node(vehicle: Path, database: Veh
     assert drive.said[-1].startswith("passing measured values through: ")
 
 
-def test_expired_set_does_not_return_when_the_clock_goes_back(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_expired_for_two_minutes_does_not_return_if_the_clock_goes_back(
+    vehicle: Path, database: VehicleDatabase
+) -> None:
     drive = tried(vehicle, right(database), database)
     drive.time = NOW + timedelta(days=366)
     drive.go_on(2.0)

@@ -48,7 +48,7 @@ def write_start_of_unseen_drive(fleet: Path, vehicle: str, target: Path) -> None
     target.write_text("\n".join(line for line in lines if float(line[1 : line.index(")")]) < SECONDS) + "\n")
 
 
-def test_calibrated_kirchhoff_sum_falls_tenfold_on_an_unseen_drive(
+def test_correction_reduces_kirchhoff_sum_tenfold_on_an_unseen_drive(
     fleet: Path, database: VehicleDatabase, tmp_path: Path, start_node: StartNode, recording: Recording
 ) -> None:
     vehicle, parameters = faulty_vehicle(fleet)

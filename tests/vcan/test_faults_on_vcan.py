@@ -71,7 +71,7 @@ def bus_is_back() -> Iterator[None]:
 
 @pytest.mark.parametrize("how", ["down", "deleted"])
 @pytest.mark.usefixtures("bus_is_back")
-def test_bus_that_was_away_is_used_again(
+def test_bus_that_was_down_or_deleted_is_used_again(
     params: Path, tmp_path: Path, drive: Path, start_node: StartNode, how: str
 ) -> None:
     with start_node(params) as node:
@@ -99,7 +99,7 @@ def test_bus_that_was_away_is_used_again(
     assert "reopened 1" in lines[-1]
 
 
-def test_full_send_queue_loses_only_what_it_refuses(
+def test_full_send_queue_loses_frames_but_does_not_stop_the_gateway(
     database: VehicleDatabase, params: Path, drive: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     expected = expected_battery(database, drive)
@@ -133,7 +133,7 @@ def test_error_frames_are_not_passed_on(
     assert {item.identifier for item in other_recording.frames} == {"110", "120", "130", "5F0"}
 
 
-def test_second_gateway_refuses_and_the_first_goes_on(
+def test_second_gateway_refuses_to_start_and_the_first_continues(
     params: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY) as first:
@@ -147,7 +147,7 @@ def test_second_gateway_refuses_and_the_first_goes_on(
     assert counters == [k % 15 for k in range(len(counters))], "all of the first one"
 
 
-def test_clock_step_is_no_fault(
+def test_clock_step_is_not_a_fault(
     database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
 ) -> None:
     k = 0
@@ -169,7 +169,9 @@ def test_clock_step_is_no_fault(
     assert {state_of(data)[0] for data in recording.data_of(STATUS)} <= {State.STARTING, State.CORRECTING}
 
 
-def test_killed_node_corrects_again(params: Path, drive: Path, start_node: StartNode, recording: Recording) -> None:
+def test_restarted_node_corrects_again_after_a_kill(
+    params: Path, drive: Path, start_node: StartNode, recording: Recording
+) -> None:
     with playing(drive, endlessly=True):
         with start_node(params) as node:
             recording.wait_for(BATTERY_CORRECTED, 5)

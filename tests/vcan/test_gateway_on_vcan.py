@@ -54,7 +54,7 @@ def rewritten(database: VehicleDatabase, frames: Iterable[LoggedFrame]) -> list[
     return [LoggedFrame(identifier, data.hex().upper()) for identifier, data in found if data is not None]
 
 
-def test_a_gateway_changes_currents_and_crcs_and_nothing_else(
+def test_gateway_changes_currents_and_crcs_and_nothing_else(
     database: VehicleDatabase,
     params: Path,
     drive: Path,
@@ -90,7 +90,7 @@ def test_a_gateway_changes_currents_and_crcs_and_nothing_else(
     assert node.messages.endswith(f"{counted}\n")
 
 
-def test_way_back_passes_all_frames_once(
+def test_frames_towards_the_sensors_all_pass_once(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, "--gateway", OTHER_CHANNEL) as node:

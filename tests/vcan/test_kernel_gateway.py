@@ -116,7 +116,9 @@ def test_frames_pass_while_the_gateway_is_killed(
     assert again.process.returncode is not None
 
 
-def test_rules_end_with_the_gateway(params: Path, start_node: StartNode, other_recording: Recording) -> None:
+def test_kernel_rules_are_removed_when_the_gateway_ends(
+    params: Path, start_node: StartNode, other_recording: Recording
+) -> None:
     with start_node(params, *GATEWAY, "--fd") as node:
         other_recording.wait_for(STATUS, 1)
         assert len(rules()) == 2 * RULES, "both ways, classic and FD"
@@ -131,7 +133,7 @@ def test_rules_end_with_the_gateway(params: Path, start_node: StartNode, other_r
     assert other_recording.data_of(NOISE) == []
 
 
-def test_rules_that_vanish_are_set_again(params: Path, start_node: StartNode) -> None:
+def test_removed_kernel_rules_are_restored(params: Path, start_node: StartNode) -> None:
     mine = ("-s", CHANNEL, "-d", OTHER_CHANNEL, "-f", "345:7FF", "-X")
     with start_node(params, *GATEWAY) as node:
         before = rules()
@@ -151,7 +153,7 @@ def test_rules_that_vanish_are_set_again(params: Path, start_node: StartNode) ->
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin")
 
 
-def test_node_carries_frames_without_rights(
+def test_node_forwards_frames_itself_without_kernel_rights(
     params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY, by=WITHOUT_RIGHTS) as node:
@@ -167,7 +169,9 @@ def test_node_carries_frames_without_rights(
     ) in node.messages
 
 
-def test_node_carries_frames_without_module(params: Path, start_node: StartNode, other_recording: Recording) -> None:
+def test_node_forwards_frames_itself_without_module_can_gw(
+    params: Path, start_node: StartNode, other_recording: Recording
+) -> None:
     run_tool("rmmod", "can-gw")
     try:
         with start_node(params, *GATEWAY) as node:
@@ -181,7 +185,7 @@ def test_node_carries_frames_without_module(params: Path, start_node: StartNode,
     assert "the kernel carries no frames (its module can-gw is needed)" in node.messages
 
 
-def test_rules_left_by_a_privileged_gateway_refuse_start(
+def test_gateway_refuses_to_start_if_rules_are_left_that_it_cannot_change(
     params: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
     with start_node(params, *GATEWAY) as node:
@@ -193,7 +197,7 @@ def test_rules_left_by_a_privileged_gateway_refuse_start(
     assert len(rules()) == RULES, "others are still carried"
 
 
-def test_a_fault_of_the_program_leaves_the_rules_as_a_kill_does() -> None:
+def test_internal_error_leaves_the_kernel_rules_in_place() -> None:
     routes = KernelRoutes((CHANNEL, OTHER_CHANNEL), {(BATTERY, False)}, fd=False, say=print)
     with suppress(ZeroDivisionError), routes:
         routes.set()
@@ -201,7 +205,7 @@ def test_a_fault_of_the_program_leaves_the_rules_as_a_kill_does() -> None:
     assert len(rules()) == 2 * (11 + 1)
 
 
-def test_rules_for_an_interface_that_has_just_gone_are_refused_in_one_line() -> None:
+def test_rules_for_a_vanished_interface_are_refused_in_one_line() -> None:
     ip_link("add", "vcan9", "type", "vcan")
     with KernelRoutes((CHANNEL, "vcan9"), {(BATTERY, False)}, fd=False, say=print) as routes:
         ip_link("delete", "vcan9")
@@ -209,7 +213,7 @@ def test_rules_for_an_interface_that_has_just_gone_are_refused_in_one_line() -> 
             routes.set()
 
 
-def test_foreign_branch_frames_are_reported(
+def test_foreign_branch_frames_are_reported_and_dropped(
     params: Path, drive: Path, start_node: StartNode, recording: Recording, other_recording: Recording
 ) -> None:
     command = ["cangen", OTHER_CHANNEL, "-I", f"{BATTERY:X}", "-D", FOREIGN, "-L", "8", "-g", "1"]
@@ -234,7 +238,7 @@ def test_foreign_branch_frames_are_reported(
     )
 
 
-def test_a_gateway_whose_log_nobody_reads_goes_on_both_ways_and_ends(
+def test_gateway_with_a_blocked_log_forwards_frames_and_can_be_ended(
     database: VehicleDatabase, params: Path, drive: Path, recording: Recording, other_recording: Recording
 ) -> None:
     read, write = os.pipe()
@@ -291,7 +295,7 @@ def joined() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("killed", [False, True], ids=["at work", "killed before"])
-def test_joined_buses_end_the_gateway_without_a_storm(
+def test_joined_buses_stop_the_gateway_and_no_frame_circulates(
     params: Path, drive: Path, tmp_path: Path, start_node: StartNode, other_recording: Recording, killed: bool
 ) -> None:
     words = "which only this one may send there; two nodes on one bus, or two buses that are joined? Stop one"

@@ -48,7 +48,7 @@ def kirchhoff_rmse(database: VehicleDatabase, recording: Recording, *, corrected
     return math.sqrt(sum(value * value for value in sums) / INSTANTS)
 
 
-def test_a_drive_is_corrected_bit_by_bit_and_everything_else_left_alone(
+def test_drive_is_corrected_exactly_and_other_frames_are_unchanged(
     database: VehicleDatabase, params: Path, tmp_path: Path, start_node: StartNode, recording: Recording
 ) -> None:
     drive = tmp_path / "drive.log"
@@ -76,7 +76,7 @@ def test_a_drive_is_corrected_bit_by_bit_and_everything_else_left_alone(
     assert before >= 10.0 * after
 
 
-def test_with_unfit_parameters_the_measured_values_pass_through(
+def test_measured_values_pass_through_with_unfit_parameters(
     database: VehicleDatabase, params: Path, tmp_path: Path, start_node: StartNode, recording: Recording
 ) -> None:
     measured = write_drive(tmp_path / "drive.log", database, 20)
@@ -94,13 +94,15 @@ def test_with_unfit_parameters_the_measured_values_pass_through(
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_node_within_a_second(params: Path, start_node: StartNode, how: signal.Signals) -> None:
+def test_sigterm_or_sigint_ends_the_node_within_a_second(
+    params: Path, start_node: StartNode, how: signal.Signals
+) -> None:
     with start_node(params) as node:
         assert node.stop(how, within_s=1.0) == 0
     assert node.messages.splitlines()[-1] == "ecu-node: ended: no frames"
 
 
-def test_an_interface_that_does_not_exist_is_one_line(params: Path, tmp_path: Path, start_node: StartNode) -> None:
+def test_nonexistent_interface_is_reported_in_one_line(params: Path, tmp_path: Path, start_node: StartNode) -> None:
     with pytest.raises(AssertionError, match="nocan0: cannot open the bus: no such interface"):  # noqa: SIM117
         with start_node(params, "--channel", "nocan0"):
             pass

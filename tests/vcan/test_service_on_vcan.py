@@ -33,7 +33,7 @@ def patient(tmp_path: Path) -> VehicleDatabase:
     return read_database(read_layout(write_patient_layout(tmp_path, timeout_s=30.0)))
 
 
-def test_the_monitor_shows_branches_sums_and_node(patient: VehicleDatabase, tmp_path: Path) -> None:
+def test_monitor_shows_branches_sums_and_node_status(patient: VehicleDatabase, tmp_path: Path) -> None:
     write_drive(tmp_path / "drive.log", patient, 500, standing_at_s=1.0)
     write_parameters(true_parameters(patient), tmp_path / "params.json")
     files = ["--layout", str(patient.layout.path), "--channel", CHANNEL]
