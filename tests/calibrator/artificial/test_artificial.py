@@ -49,7 +49,7 @@ def decoded(database: VehicleDatabase, noise_a: float, message: str, signal: str
     return item.time_s, np.array(values, dtype=float)
 
 
-def test_frames_show_true_currents_through_faulty_late_and_noisy_sensors(database: VehicleDatabase) -> None:
+def test_frames_contain_true_currents_with_fault_delay_and_noise(database: VehicleDatabase) -> None:
     instants = []
     for name, message, signal, sign in BRANCHES:
         time_s, value = decoded(database, 0.0, message, signal)
@@ -65,7 +65,7 @@ def test_frames_show_true_currents_through_faulty_late_and_noisy_sensors(databas
     assert not np.intersect1d(instants[0], instants[1]).size
 
 
-def test_drive_made_without_frames_is_what_the_frames_decode_to(database: VehicleDatabase) -> None:
+def test_drive_made_directly_equals_the_drive_decoded_from_frames(database: VehicleDatabase) -> None:
     drive = vehicle_drive(np.random.default_rng(3), database, vehicle(1.0), TRIP)
     for name, message, signal, sign in BRANCHES:
         time_s, value = decoded(database, 1.0, message, signal)
@@ -76,7 +76,7 @@ def test_drive_made_without_frames_is_what_the_frames_decode_to(database: Vehicl
     np.testing.assert_allclose(drive.inputs["speed"].value, speed, atol=1e-9)
 
 
-def test_truth_of_a_fleet_is_written_beside_its_logs_and_read_back(database: VehicleDatabase, tmp_path: Path) -> None:
+def test_truth_of_a_fleet_is_written_and_read_back(database: VehicleDatabase, tmp_path: Path) -> None:
     plan = FleetPlan(vehicles=1, currents=2, sparsity=20.0, unmeasured_a=(3.0, 0.0))
     trips = RecordedTrips(seed=0, recorded=[TRIP, TRIP], vehicles=1, unseen_s=30.0)
     fleet = simulate_fleet(plan, trips, database, tmp_path / "fleet", workers=1)

@@ -51,7 +51,7 @@ def test_balancing_branch_is_minus_the_sum_of_the_others() -> None:
     np.testing.assert_array_equal(two.currents_a["motor"], -recorded(10.0).currents_a["battery"])
 
 
-def test_rejoined_trip_is_made_of_pieces_between_standstills() -> None:
+def test_rejoined_trip_has_jumps_only_at_standstills() -> None:
     joined = cut_and_rejoin(np.random.default_rng(0), [recorded(0.0, rise=1.0)], duration_s=50.0, name="new")
     assert len(joined) >= 500
     jumps = np.flatnonzero(np.abs(np.diff(joined.currents_a["battery"])) > 1.0)
@@ -76,7 +76,7 @@ def test_recorded_drive_becomes_a_trip_over_the_span_of_all_channels() -> None:
     assert ground_truth_from_drive(without_good, 0.1) is None
 
 
-def test_recordings_serve_as_own_trips_while_they_last_and_never_for_both_purposes() -> None:
+def test_no_recording_serves_both_calibration_and_judging() -> None:
     trips = [recorded(float(k)) for k in range(4)]
     enough = RecordedTrips(seed=0, recorded=trips, vehicles=4, unseen_s=30.0)
     for k in range(4):
@@ -99,7 +99,7 @@ def test_builtin_trip_obeys_the_junction_law_with_branches_and_inputs_of_the_lay
     assert set(trip.inputs) == {item.name for item in database.layout.input} - NOT_MODELLED
 
 
-def test_common_trips_are_the_same_for_all_and_differ_by_purpose() -> None:
+def test_common_trip_is_the_same_for_all_vehicles_but_not_for_judging() -> None:
     trips = BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0, common=True)
     first, second = trips.trip(0, "calibration"), trips.trip(5, "calibration")
     np.testing.assert_array_equal(first.currents_a["battery"], second.currents_a["battery"])
@@ -107,7 +107,7 @@ def test_common_trips_are_the_same_for_all_and_differ_by_purpose() -> None:
     assert len(unseen) != len(first) or not np.array_equal(unseen.inputs["speed"], first.inputs["speed"])
 
 
-def test_without_fastsim_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_builtin_trips_without_fastsim_report_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fastsim", None)  # makes its import fail
     with pytest.raises(FleetError, match=r"need fastsim; .*: pip install 'hv-current-correction\[demo\]'$"):
         builtin_trip(np.random.default_rng(0), duration_s=60.0, name="trip")
@@ -165,7 +165,7 @@ def test_every_vehicle_has_as_many_faults_as_the_paper_counts(branches: int, spa
     assert np.all(np.count_nonzero(free_parameters(faults), axis=1) == count)
 
 
-def test_balanced_fleet_has_hardware_faults_in_half_of_those_that_drew_any() -> None:
+def test_balanced_fleet_has_hardware_faults_in_half_of_the_drawn_cases() -> None:
     assert np.mean(draw(balanced=True, vehicles=20_000).has_hardware_fault) == pytest.approx(0.30, abs=0.01)
 
 
@@ -177,7 +177,7 @@ def test_mean_of_a_symmetric_fleet_is_the_ideal_current() -> None:
 
 
 @pytest.mark.parametrize(("bias", "positive"), [(0.0, 0.5), (0.2, 0.7), (0.5, 1.0)])
-def test_sizes_lie_in_their_range_and_sign_bias_is_the_excess_of_positive_faults(bias: float, positive: float) -> None:
+def test_fault_sizes_lie_in_their_range_and_signs_follow_the_bias(bias: float, positive: float) -> None:
     faults = draw(vehicles=4000, sparsity=40.0, sign_bias=bias)
     values = free_parameters(faults)
     values = values[values != 0.0]
@@ -197,7 +197,7 @@ def test_fleet_that_cannot_be_drawn_is_refused(changes: dict[str, Any], message:
         draw(**{"vehicles": 4} | changes)
 
 
-def test_stream_is_decided_by_its_purpose_and_numbers_and_differs_from_all_others() -> None:
+def test_random_streams_are_reproducible_and_differ_by_purpose_and_numbers() -> None:
     numbers = [(), (0,), (7,), (7, 0), (7, 0, 0), (0, 7)]
     first, again = ([random_stream(p, *n).random() for p, n in product(Purpose, numbers)] for _ in range(2))
     assert first == again

@@ -46,7 +46,7 @@ def calibrated(folder: Path, log: Path, layout: Path, *arguments: object) -> tup
 # ---- a sound log
 
 
-def test_sound_log_is_ready_for_all(log: Path, layout: Path) -> None:
+def test_sound_log_is_ready_for_all_commands(log: Path, layout: Path) -> None:
     doctor = examined(layout, log)
     assert doctor.errors == []
     assert doctor.findings("sign", "unit", "delay", "sum", "stuck", "clipped", "gap", "gain", "stands still") == []
@@ -60,7 +60,7 @@ def test_sound_log_is_ready_for_all(log: Path, layout: Path) -> None:
     assert [item.subject for item in doctor.findings("not in log") if "Rear" in item.text] == ["motor_rear"]
 
 
-def test_text_names_the_next_commands_in_people_s_figures(log: Path, layout: Path) -> None:
+def test_text_of_doctor_names_the_next_commands_within_80_columns(log: Path, layout: Path) -> None:
     done = calibrator("doctor", "--layout", layout, "--log", log)
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
@@ -98,7 +98,7 @@ def at_rest(
 
 
 @pytest.mark.parametrize(("noise_a", "offset_a"), [(0.0, 0.0), (0.7, 0.0), (0.3, 2.0)])
-def test_car_at_rest_is_no_error(
+def test_car_at_rest_is_not_an_error(
     noise_a: float, offset_a: float, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
     log = at_rest(database, tmp_path, noise_a=noise_a, offset_a=offset_a)
@@ -117,7 +117,7 @@ def test_car_at_rest_is_no_error(
     assert calibrated(tmp_path, log, layout, "--trusted", "battery")[0] == 0
 
 
-def test_constant_current_at_speed_is_no_standstill(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+def test_constant_current_at_speed_is_not_a_standstill(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     doctor = examined(layout, at_rest(database, tmp_path, noise_a=0.02, speed=50.0))
     assert doctor.findings("stands still") == []
     assert [item.subject for item in doctor.findings("full scale")] == ["all branches"]
@@ -127,7 +127,7 @@ def test_constant_current_at_speed_is_no_standstill(tmp_path: Path, layout: Path
 
 
 @pytest.mark.parametrize("branch", ["battery", "motor", "auxiliary"])
-def test_inverted_sign_is_found_of_the_right_branch(branch: str, log: Path, tmp_path: Path) -> None:
+def test_inverted_sign_is_found_in_the_right_branch(branch: str, log: Path, tmp_path: Path) -> None:
     doctor = examined(write_layout(tmp_path, inverted=(branch,)), log)
     assert doctor.errors == [("sign", branch)]
     error = doctor.findings("sign")[0]
@@ -136,7 +136,7 @@ def test_inverted_sign_is_found_of_the_right_branch(branch: str, log: Path, tmp_
     assert doctor.report["ready"] == ["kirchhoff"]
 
 
-def test_all_signs_inverted_are_found_by_the_voltage(log: Path, tmp_path: Path) -> None:
+def test_inversion_of_all_signs_is_found_by_the_voltage(log: Path, tmp_path: Path) -> None:
     layout = write_layout(tmp_path, inverted=("battery", "motor", "auxiliary", "dcdc", "motor_rear"))
     doctor = examined(layout, log)
     assert [(item.subject, item.severity) for item in doctor.findings("sign")] == [("all branches", "warning")]
@@ -148,14 +148,16 @@ def test_all_signs_inverted_are_found_by_the_voltage(log: Path, tmp_path: Path) 
     ("auxiliary", "AuxiliaryCurrent", "mA", 1000.0),
     ("auxiliary", "AuxiliaryCurrent", "kA", 0.001),
 ])  # fmt: skip
-def test_unit_slip_gives_factor(branch: str, signal: str, unit: str, factor: float, log: Path, tmp_path: Path) -> None:
+def test_wrong_unit_is_reported_with_its_factor(
+    branch: str, signal: str, unit: str, factor: float, log: Path, tmp_path: Path
+) -> None:
     doctor = examined(write_layout(tmp_path, units={signal: unit}), log)
     assert doctor.errors == [("unit", branch)]
     assert doctor.findings("unit")[0].number == factor
     assert doctor.findings("full scale") == []
 
 
-def test_sign_of_a_branch_too_small_to_tell_is_not_guessed(log: Path, tmp_path: Path) -> None:
+def test_sign_of_a_very_small_branch_is_not_guessed(log: Path, tmp_path: Path) -> None:
     """The converter's current changes too slowly to be seen in the sum."""
     doctor = examined(write_layout(tmp_path, inverted=("dcdc",)), log)
     assert doctor.errors == []
@@ -179,14 +181,16 @@ def branch(name: str, **keys: str) -> str:
     return f'[[branch]]\nname = "{name}"\nsign = 1\n{"".join(lines)}'
 
 
-def test_unrelated_currents_are_an_error_of_the_sum(tmp_path: Path) -> None:
+def test_unrelated_currents_are_reported_as_an_error_of_the_sum(tmp_path: Path) -> None:
     battery, motor, heater = 30.0 * RNG.normal(size=(3, 300))
     branches = "".join(branch(name, signal=name) for name in ("battery", "motor", "heater"))
     assert errors_of_table(tmp_path, branches, battery=battery, motor=motor, heater=heater) == [("sum", "sum")]
 
 
 @pytest.mark.parametrize(("factor", "wrong"), [(1.0, []), (1000.0, [("unit", "U [V]")]), (0.01, [("unit", "U [V]")])])
-def test_impossible_voltage_is_blamed_for_powers(factor: float, wrong: list[tuple[str, str]], tmp_path: Path) -> None:
+def test_wrong_unit_of_a_voltage_is_not_blamed_on_the_power(
+    factor: float, wrong: list[tuple[str, str]], tmp_path: Path
+) -> None:
     current = 40.0 * RNG.normal(size=300)
     volts = 400.0 - 0.1 * current
     branches = branch("battery", signal="I") + branch("motor", power="P [W]", voltage="U [V]")
@@ -198,7 +202,9 @@ def test_impossible_voltage_is_blamed_for_powers(factor: float, wrong: list[tupl
 
 
 @pytest.mark.parametrize("delay_s", [0.06, 0.2, -0.3])
-def test_delay_is_found_as_no_error(delay_s: float, tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+def test_delay_is_reported_as_warning_or_hint(
+    delay_s: float, tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
     late = {"motor": 0.4 + delay_s, "battery": 0.4, "auxiliary": 0.4, "dcdc": 0.4}
     doctor = examined(layout, write_log(tmp_path, true_drive(delay_s=late), database))
     assert doctor.errors == []
@@ -207,7 +213,7 @@ def test_delay_is_found_as_no_error(delay_s: float, tmp_path: Path, layout: Path
     assert delay.number == pytest.approx(delay_s, abs=0.005)
 
 
-def test_gain_below_a_slip_of_units_is_in_percent(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+def test_gain_error_is_reported_with_its_size(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     drive = true_drive()
     short = write_log(tmp_path, cut(drive, 12.0), database).rename(tmp_path / "short.log")
     log = write_log(tmp_path, with_branch(drive, "motor", 1.08 * drive.branches["motor"].value), database)
@@ -244,7 +250,7 @@ def test_branch_without_plausible_values_is_found(
 
 
 @pytest.mark.parametrize(("lost", "severity"), [(0.7, "error"), (0.2, "warning")])
-def test_branch_of_which_most_frames_cannot_be_used_is_an_error(
+def test_branch_with_mostly_unusable_frames_is_an_error(
     lost: float, severity: str, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
     """As with the wrong byte order in the DBC: what is left of it is no current."""
@@ -269,7 +275,7 @@ def test_gaps_and_failed_checks_are_counted(log: Path, tmp_path: Path, layout: P
     assert "E2E check failed" in bad.text
 
 
-def test_time_out_shorter_than_the_period_is_an_error(log: Path, layout: Path) -> None:
+def test_timeout_shorter_than_the_frame_period_is_an_error(log: Path, layout: Path) -> None:
     layout.write_text(layout.read_text().replace("timeout_s = 0.25", "timeout_s = 0.03"))
     doctor = examined(layout, log)
     assert doctor.errors == [("rate", "auxiliary")]
@@ -288,7 +294,7 @@ def test_full_scale_that_is_exceeded_or_never_approached_is_reported(log: Path, 
 # ---- layout and logs that do not fit
 
 
-def test_log_of_another_vehicle_is_an_error_that_names_what_it_has(tmp_path: Path, layout: Path) -> None:
+def test_log_of_another_vehicle_is_an_error_that_names_its_identifiers(tmp_path: Path, layout: Path) -> None:
     (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n(1.100000) can0 7FF#01\n")
     doctor = examined(layout, tmp_path / "other.log")
     (error,) = doctor.findings("no branch")
@@ -297,7 +303,7 @@ def test_log_of_another_vehicle_is_an_error_that_names_what_it_has(tmp_path: Pat
     assert doctor.report["ready"] == []
 
 
-def test_branch_that_some_logs_lack_is_reported(log: Path, layout: Path, tmp_path: Path) -> None:
+def test_branch_missing_in_some_logs_is_reported(log: Path, layout: Path, tmp_path: Path) -> None:
     without = [line for line in log.read_text().splitlines() if "can0 120#" not in line]
     (tmp_path / "other.log").write_text("\n".join(without))
     (lacks,) = [
@@ -311,7 +317,9 @@ def test_branch_that_some_logs_lack_is_reported(log: Path, layout: Path, tmp_pat
 
 
 @pytest.mark.parametrize("seconds", [3.0, 12.0, 40.0])
-def test_short_log_is_reported_by_all(seconds: float, tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+def test_short_log_is_reported_alike_by_doctor_kirchhoff_and_calibrate(
+    seconds: float, tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
     log = write_log(tmp_path, cut(true_drive(), seconds), database)
     doctor = examined(layout, log)
     assert doctor.errors == []
@@ -341,7 +349,7 @@ def exchange(layout: Path, one: str, other: str) -> None:
     layout.write_text(mark.replace("signal = @", f"signal = {second[1]}"))
 
 
-def test_exchanged_branches_of_other_signs_are_an_error(log: Path, layout: Path, tmp_path: Path) -> None:
+def test_exchanged_branches_of_opposite_signs_are_an_error(log: Path, layout: Path, tmp_path: Path) -> None:
     exchange(layout, "battery", "motor")
     doctor = examined(layout, log)
     assert doctor.errors == [("exchanged", "battery")]
@@ -355,7 +363,7 @@ def test_exchanged_branches_of_other_signs_are_an_error(log: Path, layout: Path,
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0)])
-def test_one_log_with_a_sum_is_enough_for_kirchhoff_in_any_order(
+def test_one_log_with_two_branches_is_enough_for_kirchhoff_in_any_order(
     order: tuple[int, ...], layout: Path, tmp_path: Path, database: VehicleDatabase
 ) -> None:
     logs, whole = [], cut(true_drive(), 60.0)

@@ -37,7 +37,7 @@ def aligned(layout: Layout, branches: dict[str, Channel], inputs: dict[str, Chan
     return align(drive_of(branches, inputs), layout, tuple(branches), inputs=tuple(inputs or {}))
 
 
-def test_a_line_sampled_at_any_instants_is_found_exactly(layout: Layout) -> None:
+def test_linear_signal_is_interpolated_exactly(layout: Layout) -> None:
     samples = aligned(layout, {"battery": ramp(0.013, 5.0, 0.02), "dcdc": ramp(0.031, 5.0, 0.1, -2.0)})
     assert samples.valid.all()
     np.testing.assert_allclose(samples.currents_a[:, 0], samples.time_s, atol=1e-12)
@@ -47,7 +47,7 @@ def test_a_line_sampled_at_any_instants_is_found_exactly(layout: Layout) -> None
 
 
 @given(st.lists(st.floats(0.0, 30.0), min_size=2, max_size=60), st.floats(0.05, 3.0))
-def test_nothing_is_extrapolated_or_valid_across_a_longer_gap(times: list[float], limit_s: float) -> None:
+def test_samples_are_not_extrapolated_and_not_valid_across_long_gaps(times: list[float], limit_s: float) -> None:
     known_s = np.array(sorted(times))
     value = np.sin(known_s)
     try:
@@ -68,7 +68,7 @@ def test_nothing_is_extrapolated_or_valid_across_a_longer_gap(times: list[float]
             assert stale == (gap_s > limit_s)
 
 
-def test_bad_samples_are_masked_in_place_with_their_reason(layout: Layout) -> None:
+def test_bad_samples_are_masked_with_their_reason_and_not_dropped(layout: Layout) -> None:
     time_s = np.arange(0.0, 2.0, 0.1)
     bad = channel(time_s, time_s, bad=[5, 6])
     samples = aligned(layout, {"battery": bad})
@@ -78,7 +78,7 @@ def test_bad_samples_are_masked_in_place_with_their_reason(layout: Layout) -> No
     assert {reason: int(mask.sum()) for reason, mask in reasons.items()} == {"stale": 0, "not good": 2}
 
 
-def test_a_derived_input_without_value_masks_the_instant(layout: Layout) -> None:
+def test_undefined_derived_input_masks_the_sample(layout: Layout) -> None:
     time_s = np.arange(0.0, 2.0, 0.1)
     voltage = np.where(np.arange(20) == 7, 0.0, 400.0)
     inputs = {"voltage": channel(time_s, voltage), "aircon_demand": channel(time_s, 800.0 + 0.0 * time_s)}
@@ -89,7 +89,7 @@ def test_a_derived_input_without_value_masks_the_instant(layout: Layout) -> None
     assert np.isnan(samples.inputs[7, 0])
 
 
-def test_a_missing_channel_is_named_with_those_there_are(layout: Layout) -> None:
+def test_missing_channel_is_named_with_the_available_ones(layout: Layout) -> None:
     with pytest.raises(DriveError, match="vehicle V1, drive d: no motor, voltage; it has battery"):
         align(drive_of({"battery": ramp(0.0, 1.0, 0.1)}), layout, ["battery", "motor"], inputs=["voltage"])
 
@@ -103,12 +103,12 @@ def test_channels_that_cannot_be_aligned_are_refused(layout: Layout, dcdc: Chann
         aligned(layout, {"battery": ramp(0.0, 1.0, 0.1), "dcdc": dcdc})
 
 
-def test_a_drive_of_years_is_refused(layout: Layout) -> None:
+def test_drive_longer_than_years_is_refused(layout: Layout) -> None:
     with pytest.raises(DriveError, match="the time stamps are wrong"):
         aligned(layout, {"battery": channel(np.array([0.0, 1e9]), np.zeros(2))})
 
 
-def test_model_inputs_that_no_drive_has_are_left_out_and_named(layout: Layout) -> None:
+def test_model_inputs_missing_in_all_drives_are_left_out_and_named(layout: Layout) -> None:
     available = {item.name for item in layout.input} - {"low_voltage_demand"}
     kept, left_out = choose_inputs(layout, available)
     assert left_out == ("low_voltage_current",)
@@ -116,7 +116,7 @@ def test_model_inputs_that_no_drive_has_are_left_out_and_named(layout: Layout) -
     assert choose_inputs(layout, set()) == ((), tuple(layout.model_inputs))
 
 
-def test_base_inputs_are_found_through_derived_ones(layout: Layout) -> None:
+def test_base_inputs_of_derived_inputs_are_found(layout: Layout) -> None:
     assert layout.base_inputs(["copper_loss", "accelerator"]) == {"torque", "voltage", "accelerator"}
     doubled = msgspec.structs.replace(layout.derived[0], name="doubled", formula="2 * copper_loss + speed")
     nested = msgspec.structs.replace(layout, derived=[*layout.derived, doubled])

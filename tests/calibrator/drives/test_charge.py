@@ -19,7 +19,7 @@ def uneven(seed: int, duration_s: float = 20.0) -> tuple[Array, Array]:
     return time_s, rng.normal(0.0, 30.0, len(time_s))
 
 
-def test_the_slope_is_the_derivative_of_the_band() -> None:
+def test_slope_is_the_derivative_of_the_band() -> None:
     curve = curve_of(*uneven(2))
     instants_s, h = np.linspace(3.0, 17.0, 50), 1e-4
     _, slope = curve.band(instants_s, BAND)
@@ -27,7 +27,7 @@ def test_the_slope_is_the_derivative_of_the_band() -> None:
     np.testing.assert_allclose(slope, difference, rtol=1e-3, atol=0.05)
 
 
-def test_covered_is_what_has_samples_around_and_no_gap_near() -> None:
+def test_instants_near_a_gap_or_an_end_are_not_covered() -> None:
     time_s = np.concatenate([np.arange(0.0, 5.0, 0.1), np.arange(7.0, 12.0, 0.1)])
     curve = curve_of(time_s, np.zeros(len(time_s)))
     instants_s = np.array([0.5, 1.5, 3.8, 4.5, 6.0, 7.5, 8.5, 10.5, 11.5])
@@ -43,7 +43,7 @@ def test_one_or_two_lost_frames_are_bridged_and_bad_samples_make_gaps() -> None:
         assert curve.covers(np.array([5.0]), 1.0).tolist() == [bridged]
 
 
-def test_the_band_of_a_straight_line_is_zero_even_after_hours() -> None:
+def test_band_of_a_straight_line_is_zero_even_after_hours() -> None:
     time_s, _ = uneven(3)
     time_s = time_s + 36_000.0
     x, slope = curve_of(time_s, 200.0 + 3.0 * (time_s - 36_000.0)).band(36_000.0 + np.linspace(3.0, 17.0, 50), BAND)
@@ -51,7 +51,7 @@ def test_the_band_of_a_straight_line_is_zero_even_after_hours() -> None:
     np.testing.assert_allclose(slope, 0.0, atol=1e-6)
 
 
-def test_of_several_samples_at_one_instant_the_last_counts() -> None:
+def test_last_of_several_samples_at_one_instant_counts() -> None:
     time_s, value = np.array([0.0, 1.0, 1.0, 2.0]), np.array([0.0, 9.0, 1.0, 2.0])
     curve = curve_of(time_s, value)
     assert curve.time_s.tolist() == [0.0, 1.0, 2.0]

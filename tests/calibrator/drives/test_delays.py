@@ -40,7 +40,7 @@ def kept(channel: Channel, which: Mask) -> Channel:
     return Channel(time_s=channel.time_s[which], value=channel.value[which], good=channel.good[which])
 
 
-def test_a_delay_is_found_whatever_gain_and_offset_the_sensors_have() -> None:
+def test_delay_is_found_whatever_gain_and_offset_the_sensors_have() -> None:
     found = estimate_delays([made_up_drive(1, PAIR)], TWO)
     assert found.branches == TWO
     assert found.known.all()
@@ -50,14 +50,14 @@ def test_a_delay_is_found_whatever_gain_and_offset_the_sensors_have() -> None:
 
 
 @pytest.mark.parametrize("delay_s", [-0.49, -0.301, 0.0, 0.0137, 0.49])
-def test_delays_up_to_the_longest_are_found_ahead_and_behind(delay_s: float) -> None:
+def test_positive_and_negative_delays_up_to_the_longest_are_found(delay_s: float) -> None:
     vehicle = replace(PAIR, delay_s={"battery": 0.5, "motor": 0.5 + delay_s})
     found = estimate_delays([made_up_drive(3, vehicle)], TWO)
     assert found.known.all()
     assert found.delay_s[1] == pytest.approx(delay_s, abs=1e-3)
 
 
-def test_two_motors_that_do_much_the_same_and_a_slow_converter_are_distinguished() -> None:
+def test_delays_of_two_similar_motors_and_a_slow_converter_are_found() -> None:
     vehicle = MadeUp(
         size_a={"motor": 50.0, "motor_rear": 80.0, "dcdc": 20.0},
         delay_s={"battery": 0.1, "motor": 0.28, "motor_rear": 0.0, "dcdc": 0.2},
@@ -80,13 +80,13 @@ def honest_sd_s(vehicles: list[MadeUp], branches: tuple[str, ...]) -> Array:
     return np.asarray(sd_s)
 
 
-def test_noise_at_any_phase_of_the_frames_pulls_the_delay_nowhere() -> None:
+def test_noise_does_not_bias_the_delay_at_any_phase_of_the_frames() -> None:
     """Frames of 50 and 100 Hz whose phases stay put: the mean error over many phases and noises is zero."""
     small = replace(PAIR, size_a={"motor": 5.0}, duration_s=100.0)
     honest_sd_s([replace(small, delay_s={"motor": 0.1 + 0.02 * k / 40.0}) for k in range(40)], TWO)
 
 
-def test_branch_of_little_more_than_its_noise_is_found_without_bias_and_with_an_honest_deviation() -> None:
+def test_delay_of_a_noisy_branch_is_unbiased_with_a_correct_deviation() -> None:
     """Steps of 1.5 A under noise of 0.4 A."""
     small = replace(TRIO, size_a={"motor": 50.0, "auxiliary": 1.5}, duration_s=600.0)
     sd_s = honest_sd_s([replace(small, delay_s={"auxiliary": 0.1 + 0.05 * k / 30.0}) for k in range(30)], THREE)
@@ -94,20 +94,20 @@ def test_branch_of_little_more_than_its_noise_is_found_without_bias_and_with_an_
     assert np.median(sd_s) < 5.3e-3
 
 
-def test_a_channel_seen_later_by_some_time_has_its_delay_longer_by_that() -> None:
+def test_shifting_a_channel_in_time_shifts_its_delay_by_as_much() -> None:
     later = changed("motor", lambda c: replace(c, time_s=c.time_s + 0.0731))
     before, after = estimate_delays([made_up_drive(1, PAIR)], TWO), estimate_delays([later], TWO)
     assert after.delay_s[1] - before.delay_s[1] == pytest.approx(0.0731, abs=2e-4)
 
 
-def test_more_drives_of_the_vehicle_make_the_delay_surer() -> None:
+def test_more_drives_reduce_the_standard_deviation_of_the_delay() -> None:
     drives = [made_up_drive(seed, TRIO, name=f"d{seed}") for seed in range(4)]
     one, four = estimate_delays(drives[:1], THREE), estimate_delays(drives, THREE)
     assert np.all(four.sd_s[1:] < 0.8 * one.sd_s[1:])
     np.testing.assert_allclose(four.delay_s, [0.0, -0.23, -0.067], atol=4e-3)
 
 
-def test_what_is_taken_out_is_gone() -> None:
+def test_no_delay_remains_after_delays_are_removed() -> None:
     drive = made_up_drive(1, PAIR)
     value, time_s = drive.branches["motor"].value.copy(), drive.branches["motor"].time_s.copy()
     aligned = without_delays(drive, estimate_delays([drive], TWO).by_branch())
@@ -133,7 +133,7 @@ def without_some(channel: Channel) -> Channel:
     (changed("battery", lambda c: replace(c, value=c.value + 4.0 * (np.floor(c.time_s / 17.0) % 2))), 2e-3),
     (with_value("motor", lambda a: np.where(a > 60.0, 1.15, 0.95) * (a - 60.0)), 3e-3),  # a gain for each sign
 ])  # fmt: skip
-def test_what_a_recording_lacks_or_has_besides_moves_the_delay_little(drive: Drive, within_s: float) -> None:
+def test_gaps_outliers_steps_and_sensor_faults_hardly_change_the_delay(drive: Drive, within_s: float) -> None:
     found = estimate_delays([drive], TWO, max_sd_s=0.02)
     assert found.known.all()
     assert found.delay_s[1] == pytest.approx(0.187, abs=within_s)
@@ -152,20 +152,20 @@ SHORT = made_up_drive(1, replace(PAIR, duration_s=30.0))
     NO_SAMPLES,
     SHORT,
 ])  # fmt: skip
-def test_drive_that_tells_no_delay_is_flagged(drive: Drive) -> None:
+def test_drive_without_information_on_a_delay_is_flagged(drive: Drive) -> None:
     found = estimate_delays([drive], TWO)
     assert found.known.tolist() == [True, False]
     assert found.delay_s.tolist() == [0.0, 0.0]
     assert found.sd_s.tolist() == [0.0, np.inf]
 
 
-def test_drives_that_tell_nothing_leave_those_of_the_others() -> None:
+def test_drives_without_information_do_not_change_the_delay() -> None:
     found = estimate_delays([NO_SAMPLES, made_up_drive(1, PAIR), SHORT], TWO)
     assert found.delay_s[1] == pytest.approx(0.187, abs=1e-3)
 
 
 @pytest.mark.parametrize("duration_s", [300.0, 1500.0])
-def test_a_branch_lost_in_noise_is_flagged_and_the_others_are_still_found(duration_s: float) -> None:
+def test_branch_lost_in_noise_is_flagged_and_other_delays_are_found(duration_s: float) -> None:
     vehicle = replace(TRIO, size_a={"motor": 50.0, "auxiliary": 0.05}, duration_s=duration_s)
     found = estimate_delays([made_up_drive(2, vehicle)], THREE)
     assert found.known.tolist() == [True, True, False]
@@ -175,7 +175,7 @@ def test_a_branch_lost_in_noise_is_flagged_and_the_others_are_still_found(durati
     assert np.isinf(found.sd_s[2])
 
 
-def test_drives_or_branches_that_are_not_there_are_refused() -> None:
+def test_missing_drives_or_branches_are_refused() -> None:
     drive = made_up_drive(1, replace(PAIR, duration_s=1.0))
     with pytest.raises(DriveError, match="no drive to estimate delays from"):
         estimate_delays([], TWO)
@@ -187,26 +187,26 @@ def test_drives_or_branches_that_are_not_there_are_refused() -> None:
         without_delays(drive, {"heater": 0.1})
 
 
-def test_without_noise_delays_are_exact_those_of_slow_frames_to_a_hundredth_of_the_period() -> None:
+def test_delays_are_exact_without_noise() -> None:
     found = estimate_delays([made_up_drive(5, replace(TRIO, noise_a=0.0, duration_s=900.0))], THREE)
     np.testing.assert_allclose(found.delay_s, [0.0, -0.23, -0.067], atol=5e-4)
     found = estimate_delays([made_up_drive(1, replace(PAIR, noise_a=0.0))], TWO)
     assert found.delay_s[1] == pytest.approx(0.187, abs=1e-4)
 
 
-def test_scaling_a_branch_or_adding_to_it_does_not_move_its_delay() -> None:
+def test_scaling_or_offsetting_a_branch_does_not_change_its_delay() -> None:
     before = estimate_delays([made_up_drive(1, PAIR)], TWO)
     after = estimate_delays([with_value("motor", lambda a: 1.3 * a - 40.0)], TWO)
     np.testing.assert_allclose(after.delay_s, before.delay_s, atol=1e-6)
 
 
-def test_the_order_of_the_branches_after_the_first_does_not_matter() -> None:
+def test_delays_do_not_depend_on_the_order_of_branches_after_the_first() -> None:
     drive = made_up_drive(2, TRIO)
     found, swapped = estimate_delays([drive], THREE), estimate_delays([drive], ("battery", "auxiliary", "motor"))
     np.testing.assert_allclose(swapped.delay_s, found.delay_s[[0, 2, 1]], atol=1e-5)
 
 
-def test_the_other_branch_as_reference_turns_the_sign() -> None:
+def test_exchanging_the_reference_branch_reverses_the_sign_of_the_delay() -> None:
     drive = made_up_drive(1, PAIR)
     found, turned = estimate_delays([drive], TWO), estimate_delays([drive], TWO[::-1])
     assert turned.delay_s[1] == pytest.approx(-found.delay_s[1], abs=2e-4)

@@ -27,7 +27,7 @@ def some_drive(vehicle: str = "V1", name: str = "monday") -> Drive:
     return Drive(vehicle=vehicle, name=name, branches={"battery": channel, "motor": empty}, inputs={"voltage": channel})
 
 
-def test_a_drive_comes_back_to_the_bit(tmp_path: Path, layout: Layout) -> None:
+def test_stored_drive_is_read_back_exactly(tmp_path: Path, layout: Layout) -> None:
     drive = some_drive()
     read = read_drive_file(Path(write_drive(tmp_path, drive, layout)), layout)
     assert (read.vehicle, read.name) == ("V1", "monday")
@@ -51,7 +51,7 @@ def test_drives_are_listed_and_read_in_order(tmp_path: Path, layout: Layout) -> 
 
 
 @pytest.mark.parametrize("name", ["", "..", "../x", "/etc/x", "a/b", "a\\b", ".hidden", "x" * 65, "a\nb", "a.", "ä"])
-def test_a_name_that_is_no_file_name_is_refused(tmp_path: Path, layout: Layout, name: str) -> None:
+def test_drive_name_unusable_as_file_name_is_refused(tmp_path: Path, layout: Layout, name: str) -> None:
     for drive in (some_drive(vehicle=name), some_drive(name=name)):
         with pytest.raises(DriveError, match="cannot be used; expected 1 to 64 letters"):
             write_drive(tmp_path / "store", drive, layout)
@@ -75,7 +75,7 @@ def test_a_store_made_with_another_layout_or_dbc_is_refused(
 
 
 @pytest.mark.parametrize("size", [0, 3, 100, -10])
-def test_a_cut_file_is_refused(tmp_path: Path, layout: Layout, size: int) -> None:
+def test_truncated_drive_file_is_refused(tmp_path: Path, layout: Layout, size: int) -> None:
     path = Path(write_drive(tmp_path, some_drive(), layout))
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(DriveError, match=r"monday\.parquet: (not a drive|cannot read the drive): .*import it again"):
@@ -91,12 +91,12 @@ def test_another_schema_version_is_refused(tmp_path: Path, layout: Layout) -> No
         read_drive_file(path, layout)
 
 
-def test_a_folder_that_is_no_store_is_refused(tmp_path: Path) -> None:
+def test_folder_that_is_not_a_store_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DriveError, match="not a drive store"):
         list_drives(tmp_path)
 
 
-def test_a_store_that_cannot_be_written_is_named(tmp_path: Path, layout: Layout) -> None:
+def test_store_that_cannot_be_written_is_named(tmp_path: Path, layout: Layout) -> None:
     (tmp_path / "store").write_text("a file")
     with pytest.raises(StorageError, match=r"cannot write it: .*; choose another folder"):
         write_drive(tmp_path / "store", some_drive(), layout)

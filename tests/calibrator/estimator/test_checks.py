@@ -77,7 +77,7 @@ def checked(summaries: Sequence[DriveSummary], K: int) -> list[tuple[SensorFindi
 @pytest.mark.parametrize("K", [2, 3])
 @pytest.mark.parametrize("branch", [0, 1])
 @pytest.mark.parametrize("cause", CAUSES)
-def test_sensor_that_is_not_linear_is_found_and_named(cause: str, branch: int, K: int) -> None:
+def test_nonlinear_sensor_is_found_and_named(cause: str, branch: int, K: int) -> None:
     found = checked(a_fleet(K, CAUSES[cause], branch), K)
     if (cause, branch, K) == ("clipped", 1, 3):
         cause, branch = "switching", -1  # the level beyond which it is clipped shows in no single other current
@@ -88,14 +88,14 @@ def test_sensor_that_is_not_linear_is_found_and_named(cause: str, branch: int, K
 
 
 @pytest.mark.parametrize("K", [2, 3])
-def test_switched_load_is_found_and_no_sensor_blamed(K: int) -> None:
+def test_switched_load_is_found_without_blaming_a_sensor(K: int) -> None:
     on = np.repeat(np.random.default_rng(0).random(SAMPLES // 50) < 0.5, 50)
     found = checked(a_fleet(K, load_a=15.0 * on), K)
     assert [(each.cause, each.branch) for each in found[BAD]] == [("switching", None)]
     assert "load without a sensor" in found[BAD][0].text
 
 
-def test_load_in_proportion_to_a_current_looks_like_two_gains() -> None:
+def test_load_proportional_to_a_current_is_mentioned_beside_two_gains() -> None:
     faults = no_faults(9, 2)
     drives = [a_drive(10 + j, faults.take(j), None) for j in range(9)]
     loaded = drives[BAD].currents_a.copy()
@@ -107,17 +107,17 @@ def test_load_in_proportion_to_a_current_looks_like_two_gains() -> None:
 
 
 @pytest.mark.parametrize("K", [2, 3])
-def test_gain_errors_offsets_and_a_constant_load_are_no_finding(K: int) -> None:
+def test_gain_errors_offsets_and_a_constant_load_are_not_findings(K: int) -> None:
     assert checked(a_fleet(K, load_a=8.0), K) == [()] * 9
 
 
-def test_misfit_that_all_vehicles_have_is_usual() -> None:
+def test_misfit_common_to_all_vehicles_is_not_a_finding() -> None:
     faults = no_faults(9, 2)
     bent = [a_drive(j, faults.take(j), lambda x, _: x + 0.03 * x**2 / FULL_SCALE_A) for j in range(9)]
     assert checked([summarise_samples([drive], period_s=PERIOD_S) for drive in bent], 2) == [()] * 9
 
 
-def test_finding_does_not_depend_on_the_order_of_the_branches() -> None:
+def test_findings_do_not_depend_on_the_order_of_the_branches() -> None:
     summaries, order = a_fleet(3, CAUSES["quadratic"], 1), [2, 0, 1]
     (first,) = checked(summaries, 3)[BAD]
     turned = [summary.take_branches(order) for summary in summaries]
@@ -127,7 +127,7 @@ def test_finding_does_not_depend_on_the_order_of_the_branches() -> None:
     assert (second.cause, second.branch, second.text) == (first.cause, first.branch, first.text)
 
 
-def test_vehicle_that_stands_still_has_no_findings() -> None:
+def test_standing_vehicle_has_no_findings() -> None:
     summaries = a_fleet(2)
     still = samples_of(np.zeros((SAMPLES, INPUTS)), np.zeros((SAMPLES, 2)))
     found = checked([*summaries, summarise_samples([still], period_s=PERIOD_S)], 2)

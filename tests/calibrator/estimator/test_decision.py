@@ -51,7 +51,7 @@ def as_faults(values: Array) -> Faults:
 
 
 @pytest.mark.parametrize("sd", [1e-4, 0.005, 0.03])
-def test_confidence_is_the_probability_to_be_recovered(sd: float) -> None:
+def test_confidence_is_the_probability_of_being_recovered(sd: float) -> None:
     found = points(TWO_EXPLANATIONS, sd=sd)
     estimate, confidence = best_estimate(found, LEAST)
     near = recovered(
@@ -64,14 +64,14 @@ def test_confidence_is_the_probability_to_be_recovered(sd: float) -> None:
     assert confidence <= 0.7 + 1e-9
 
 
-def test_of_equally_good_estimates_the_more_probable_explanation_is_taken_whatever_its_place() -> None:
+def test_more_probable_explanation_becomes_the_estimate_in_any_order() -> None:
     found = points([(0.499, [0.1, 0, 0, 0]), (0.501, [0, 0.1, 0, 0])], sd=1e-6, draws=50)
     reverse = Points(found.faults[::-1], found.weight[::-1], 1 - found.explanation[::-1], found.model, found.fit)
     for each in (found, reverse):
         np.testing.assert_allclose(best_estimate(each, LEAST)[0], [0, 0.1, 0, 0], atol=1e-5)
 
 
-def test_harm_is_that_of_simulated_currents() -> None:
+def test_harm_probability_equals_that_of_simulated_currents() -> None:
     """(25) on drawn true currents, against the moments of (M19)."""
     rng = np.random.default_rng(1)
     estimate = np.array([0.1, -0.08, 0.03, -0.02])
@@ -89,20 +89,20 @@ def test_harm_is_that_of_simulated_currents() -> None:
 MEAN, SQUARE = np.array([[0.1, -0.1]]), np.array([[0.05, 0.05]])
 
 
-def test_explanations_within_tolerance_of_each_other_count_together() -> None:
+def test_confidence_adds_up_explanations_within_tolerance() -> None:
     found = points([(0.4, [0.2, 0, 0, 0]), (0.3, [0, 0.1, 0, 0]), (0.3, [0, 0.1004, 0, 0])], sd=1e-6)
     estimate, confidence = best_estimate(found, LEAST)
     assert estimate[1] == pytest.approx(0.1, abs=1e-3)
     assert confidence == pytest.approx(0.6)
 
 
-def test_small_faults_are_counted_with_the_smallest_of_the_fleet() -> None:
+def test_confidence_tolerates_errors_below_the_smallest_fault() -> None:
     found = points([(0.5, [0, 0, 0, 0]), (0.5, [0.004, 0, 0, 0])])
     assert best_estimate(found, np.array([0.05, 0.05]))[1] == pytest.approx(1.0)
     assert best_estimate(found, np.array([0.005, 0.05]))[1] == pytest.approx(0.5)
 
 
-def test_harm_on_any_drive_counts_once_and_a_branch_without_a_correction_has_none() -> None:
+def test_harm_counts_once_over_several_drives_and_needs_a_correction() -> None:
     found, estimate = points(TWO_EXPLANATIONS, sd=0.05), np.array([0.12, 0.0, 0.0, 0.0])
     still = np.zeros((1, K)), np.full((1, K), 1e-4)
     one, other = (harm_probability(found, estimate, *drive) for drive in ((MEAN, SQUARE), still))
@@ -143,7 +143,7 @@ def group_prior() -> Prior:
 
 
 @pytest.mark.parametrize("of_sensor", [False, True])
-def test_what_a_group_shares_is_an_offset_where_it_is_one_of_the_sensors(of_sensor: bool) -> None:
+def test_constant_of_a_group_is_an_offset_only_if_sensors_cause_it(of_sensor: bool) -> None:
     truth, load = no_faults(1, K), 0.0
     if of_sensor:
         truth.offset_a[0, 0] = 0.03
@@ -155,7 +155,7 @@ def test_what_a_group_shares_is_an_offset_where_it_is_one_of_the_sensors(of_sens
 
 
 @pytest.mark.parametrize("of_sensor", [False, True])
-def test_offset_beside_what_a_group_shares_is_that_of_the_sensor(of_sensor: bool) -> None:
+def test_estimated_offset_includes_the_group_constant_only_if_of_sensors(of_sensor: bool) -> None:
     truth = no_faults(1, K)
     truth.offset_a[0, 0], truth.drift[0, 0] = (0.18 if of_sensor else 0.15), 0.1
     prior, shared = group_prior(), np.append(np.zeros(4), of_sensor)
@@ -166,7 +166,7 @@ def test_offset_beside_what_a_group_shares_is_that_of_the_sensor(of_sensor: bool
     np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)
 
 
-def test_offset_that_all_sensors_of_a_branch_share_is_known_no_better_than_a_sensor_resolves() -> None:
+def test_shared_offset_is_no_more_certain_than_sensor_resolution() -> None:
     shared = np.array([0.03, 0.0, 0.0, 0.0, 0.0])
     truth, centre = no_faults(3, K), np.zeros(5 * K)
     truth.offset_a[:, 0] = 0.03
@@ -179,7 +179,7 @@ def test_offset_that_all_sensors_of_a_branch_share_is_known_no_better_than_a_sen
     assert not found.offset_sd_a[:, 1].any()
 
 
-def test_group_is_the_same_whatever_its_place_in_a_fault_model() -> None:
+def test_groups_are_matched_across_fault_models_in_any_order() -> None:
     rows, prior = rows_of(no_faults(2, K), load=np.array([0.03, 0.0])), group_prior()
     prior = replace(prior, group_share=np.array([0.3, 0.2]), group_sd=np.array([0.001, 0.001]))
     spread = Spread(mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(5))
@@ -221,7 +221,7 @@ def worse(deployed: Faults, faults: Faults) -> Mask:
 
 @pytest.mark.parametrize("magnitude", [(0.01, 0.05), (0.3, 0.6), pytest.param((0.05, 0.25), marks=pytest.mark.long)])
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitude: tuple[float, float]) -> None:
+def test_faults_of_any_size_are_recovered_and_corrected(K: int, magnitude: tuple[float, float]) -> None:
     faults = random_faults(1, vehicles=40, branches=K, magnitude=magnitude)
     found, deployed = estimated(faults, seed=1)
     estimate = replace(no_faults(40, K), drift=found.drift, offset_a=found.offset_a)
@@ -239,7 +239,7 @@ def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitud
     pytest.param("offset", 0.0125, 1.0, marks=pytest.mark.long),
     pytest.param("load", 0.0125, 1.0, marks=pytest.mark.long),
 ])  # fmt: skip
-def test_fault_of_a_whole_batch_or_a_load_harms_no_vehicle(shared: str, size: float, share: float) -> None:
+def test_corrections_harm_no_vehicle_despite_a_batch_fault_or_a_load(shared: str, size: float, share: float) -> None:
     faults, some = random_faults(2, vehicles=24, branches=2), np.arange(24) < 24 * share
     if shared == "offset":
         faults.offset_a[some, 0] += size
@@ -250,7 +250,7 @@ def test_fault_of_a_whole_batch_or_a_load_harms_no_vehicle(shared: str, size: fl
     assert shared == "gain" or np.abs(found.offset_a[:, 1] - faults.offset_a[:, 1]).max() < 0.01
 
 
-def test_standard_deviations_are_those_of_the_errors() -> None:
+def test_standard_deviations_match_the_actual_errors() -> None:
     faults = random_faults(6, vehicles=80, branches=2)
     found, _ = estimated(faults, seed=6)
     truth = np.hstack([faults.drift, faults.offset_a])
@@ -261,7 +261,7 @@ def test_standard_deviations_are_those_of_the_errors() -> None:
     assert (within > 3.5).mean() < 0.02
 
 
-def test_vehicle_of_which_nothing_is_known_has_no_confidence() -> None:
+def test_vehicle_without_information_has_no_confidence() -> None:
     """As drives of a minute are: the prior alone is no evidence."""
     rows = rows_of(no_faults(2, K), seed=1)
     covariance = rows.covariance.copy()

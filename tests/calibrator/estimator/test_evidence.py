@@ -19,7 +19,7 @@ W = simulated_drives.read_out_of(K)
 
 
 @pytest.mark.parametrize(("good", "faulty"), [(20, 80), (300, 700), (12, 8)])
-def test_cluster_is_that_of_agreeing_values_however_many_are_faulty(good: int, faulty: int) -> None:
+def test_cluster_contains_the_agreeing_values_however_many_are_faulty(good: int, faulty: int) -> None:
     """All faults are positive: mean and median are far off."""
     rng = np.random.default_rng(1)
     values = 1.0 + np.concatenate([rng.normal(0.0, 0.002, size=good), rng.uniform(0.05, 0.25, size=faulty)])
@@ -54,14 +54,14 @@ def largest_error(read_out: Array) -> float:
     return float(np.max(np.abs(read_out[:-1] - W) / np.abs(W).max(axis=0)))
 
 
-def test_read_outs_are_those_of_faultless_vehicles_however_lopsided_the_faults() -> None:
+def test_fleet_model_is_unbiased_even_if_all_faults_have_one_sign() -> None:
     read_out = model_of(simulated_drives.summaries_of(one_sided_faults(40, 0.5)))
     assert largest_error(read_out) < 0.005
     assert np.abs(read_out[-1]).max() < 0.5
     np.testing.assert_allclose(read_out.sum(axis=1), 0.0, atol=1e-9)
 
 
-def test_order_of_vehicles_units_and_copies_of_inputs_do_not_matter() -> None:
+def test_fleet_model_is_invariant_to_vehicle_order_units_and_input_copies() -> None:
     summaries = list(simulated_drives.summaries_of(one_sided_faults(20, 0.3)))
     plain = model_of(summaries)
     np.testing.assert_allclose(model_of(summaries[::-1]), plain, atol=1e-6)
@@ -79,7 +79,7 @@ def test_order_of_vehicles_units_and_copies_of_inputs_do_not_matter() -> None:
 
 
 @pytest.mark.parametrize("varying", [0, 3])
-def test_input_that_stands_still_in_most_vehicles_is_learnt_from_the_others(varying: int) -> None:
+def test_effect_of_an_input_is_learnt_from_vehicles_where_it_varies(varying: int) -> None:
     """Of the mass of a vehicle, say: where it stands still its variance is rounding, which must not be divided by."""
     rng, summaries, told = np.random.default_rng(8), [], np.array([0.1, -0.1, 0.0])
     for j in range(12):
@@ -92,7 +92,7 @@ def test_input_that_stands_still_in_most_vehicles_is_learnt_from_the_others(vary
     np.testing.assert_allclose(model_of(summaries)[-2], told * bool(varying), atol=2e-4)  # [A] per kg
 
 
-def test_vehicle_with_an_input_in_another_unit_does_not_bend_the_model() -> None:
+def test_vehicle_with_an_input_in_a_wrong_unit_does_not_bias_the_fleet_model() -> None:
     summaries = list(simulated_drives.summaries_of(simulated_drives.no_faults(20, K), seed=4))
     plain = largest_error(model_of(summaries))
     summaries[3] = scaled(summaries[3], 0, 1000.0)
@@ -131,14 +131,14 @@ def test_standardised_errors_of_the_junction_law_are_standard_normal() -> None:
     assert ((rms > 0.75) & (rms < 1.3)).all(), rms
 
 
-def test_noise_on_a_small_branch_does_not_draw_its_gain_to_zero() -> None:
+def test_noise_on_a_small_branch_does_not_bias_its_gain_to_zero() -> None:
     """Least squares would by 7 % and more."""
     currents, truths = zip(*(currents_of(seed, (80.0, 6.0), (0.5, 0.5, 2.0), 3600) for seed in range(60)), strict=True)
     ratio = law_of(*currents).estimate[:, 1] / np.array(truths)[:, 1]
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.006)
 
 
-def test_branch_that_never_moves_keeps_the_prior_and_one_of_noise_gets_no_sensor_s_gain() -> None:
+def test_constant_branch_keeps_prior_gain_and_pure_noise_gets_none() -> None:
     still = law_of(currents_of(6, (80.0, 0.0), (0.5, 0.5, 0.0), 3600)[0])
     assert still.estimate[0, 1] == pytest.approx(-1.0, abs=0.05)
     assert still.sd[0, 1] == pytest.approx(0.4, rel=0.1)
@@ -166,7 +166,7 @@ def errors_of(rows: evidence.EvidenceRows, faults: Faults) -> Array:
     pytest.param(simulated_drives.Conditions(), marks=pytest.mark.long),
     pytest.param(simulated_drives.Conditions(model_error_a=1.0), marks=pytest.mark.long),
 ])  # fmt: skip
-def test_standardised_errors_of_rows_are_normal(
+def test_standardised_errors_of_evidence_rows_are_standard_normal(
     conditions: simulated_drives.Conditions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evidence, "LEAST_SD", np.array([5e-5, 1e-5]))  # these sensors are exact
@@ -186,7 +186,7 @@ def test_standardised_errors_of_rows_are_normal(
 
 @pytest.mark.parametrize("feed", [0, 1])
 @pytest.mark.parametrize("branches", [2, 3, 5])
-def test_design_is_logarithms_and_true_currents_of_what_is_measured(branches: int, feed: int) -> None:
+def test_design_matrix_is_exact_in_logarithms_and_true_currents(branches: int, feed: int) -> None:
     d, o, o_h = np.random.default_rng(branches).uniform(-0.2, 0.2, (3, branches))
     d_h, o_h, load = 0.1, o_h - o_h.mean(), 0.03
     carried = load * (np.arange(branches) == feed)

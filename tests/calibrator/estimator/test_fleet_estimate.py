@@ -48,7 +48,9 @@ def reference(summaries: Summaries) -> FleetReference:
     return learned(summaries)
 
 
-def test_faults_beyond_the_limits_are_found_and_not_corrected(summaries: Summaries, reference: FleetReference) -> None:
+def test_faults_beyond_the_limits_are_estimated_but_not_corrected(
+    summaries: Summaries, reference: FleetReference
+) -> None:
     free, limited = (estimate_vehicles(summaries, reference, limits=limits) for limits in (None, (0.1, 1e3)))
     beyond = free.corrected & (np.abs(free.drift) > 0.1)
     assert beyond.any()
@@ -61,7 +63,7 @@ def test_faults_beyond_the_limits_are_found_and_not_corrected(summaries: Summari
     (-1.0, "1 A in branch battery goes with +1 A in branch motor"),
     (0.1, "1 A in branch motor goes with -10 A in branch battery"),
 ])  # fmt: skip
-def test_a_wrong_sign_or_unit_in_most_vehicles_is_refused(summaries: Summaries, factor: float, told: str) -> None:
+def test_wrong_sign_or_unit_in_most_vehicles_is_refused(summaries: Summaries, factor: float, told: str) -> None:
     def wrong(summary: DriveSummary) -> DriveSummary:
         moments = summary.moments.copy()
         moments[:, -2, :] *= factor  # of the motor
@@ -75,7 +77,7 @@ def test_a_wrong_sign_or_unit_in_most_vehicles_is_refused(summaries: Summaries, 
         assert learned(few).vehicles == VEHICLES
 
 
-def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_reported(truth: Faults) -> None:
+def test_offset_of_all_battery_sensors_is_reported_and_harms_no_vehicle(truth: Faults) -> None:
     batch = replace(truth, offset_a=truth.offset_a + np.array([12.0, 0.0]))
     summaries = summaries_of(batch, Conditions(model_error_a=0.3), seed=4)
     learnt = learned(summaries)
@@ -101,7 +103,7 @@ def test_gain_error_shared_by_a_branch_is_reported_but_not_corrected(vehicles: i
 
 
 @pytest.mark.parametrize("larger", [0.0, 0.1])
-def test_two_variants_of_the_vehicle_are_reported_and_named(larger: float) -> None:
+def test_two_variants_of_the_vehicle_are_reported(larger: float) -> None:
     fleet = no_faults(12, K)
     fleet.hardware_drift[6:] = larger
     summaries = summaries_of(fleet, Conditions(samples=900, model_error_a=0.3), seed=6)
@@ -114,7 +116,9 @@ def test_two_variants_of_the_vehicle_are_reported_and_named(larger: float) -> No
     assert not found.corrected.any()
 
 
-def test_pit_of_the_truth_is_a_probability(truth: Faults, summaries: Summaries, reference: FleetReference) -> None:
+def test_probability_integral_transform_of_the_truth_lies_in_0_to_1(
+    truth: Faults, summaries: Summaries, reference: FleetReference
+) -> None:
     for pit in estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
         assert pit.shape == (VEHICLES, K)
         assert ((pit >= 0.0) & (pit <= 1.0 + 1e-9)).all()
@@ -122,7 +126,7 @@ def test_pit_of_the_truth_is_a_probability(truth: Faults, summaries: Summaries, 
 
 
 @pytest.mark.parametrize("step_a", [0.0, 0.37])
-def test_branch_that_shows_a_constant_in_each_vehicle_blames_nobody(step_a: float) -> None:
+def test_branch_with_constant_values_leads_to_no_correction(step_a: float) -> None:
     """Its gain is open, though its variance and that of its model are not zero but rounding."""
     rng, summaries = np.random.default_rng(6), []
     for j in range(8):
@@ -165,7 +169,7 @@ def first(count: int, of: int = 16) -> Mask:
     return np.arange(of) < count
 
 
-def test_trusted_vehicles_carry_the_reference_where_most_of_the_fleet_share_an_offset() -> None:
+def test_trusted_vehicles_set_the_reference_of_a_fleet_with_a_shared_offset() -> None:
     reference, found = trusting(drives("batch"), first(3))
     assert reference.distrusted == {}
     assert not found.offset_a[:3].any()
@@ -173,13 +177,13 @@ def test_trusted_vehicles_carry_the_reference_where_most_of_the_fleet_share_an_o
 
 
 @pytest.mark.parametrize(("trusted", "doubt"), [(None, True), (first(2, 4), True), (first(3, 4), False)])
-def test_trusted_vehicles_carry_the_reference_of_a_fleet_however_small(trusted: Mask | None, doubt: bool) -> None:
+def test_three_trusted_vehicles_set_the_reference_of_a_small_fleet(trusted: Mask | None, doubt: bool) -> None:
     learnt = learned(drives("none")[:4], trusted=trusted)
     assert (learnt.vehicles, learnt.in_doubt) == (4, doubt)
     assert any("few for a fleet" in text for text in learnt.notices) == doubt
 
 
-def test_trusted_vehicle_whose_sensors_disagree_is_not_trusted() -> None:
+def test_trusted_vehicle_with_contradicting_sensors_is_not_trusted() -> None:
     reference, found = trusting(drives("drift"), first(4))
     assert list(reference.distrusted) == [0]
     assert found.fault_probability[0].max() > 0.9
@@ -187,13 +191,13 @@ def test_trusted_vehicle_whose_sensors_disagree_is_not_trusted() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 4])
-def test_trusted_vehicle_with_a_hardware_fault_does_not_turn_the_reference(count: int) -> None:
+def test_trusted_vehicle_with_hardware_fault_does_not_bias_the_reference(count: int) -> None:
     _, found = trusting(drives("hardware"), first(count))
     assert found.hardware_probability[2] > 0.9
     assert (np.delete(found.hardware_probability, 2) < 0.5).all()
 
 
-def test_load_is_found_from_the_fleet_or_taken_as_declared() -> None:
+def test_load_is_estimated_from_the_fleet_or_taken_as_declared() -> None:
     summaries = drives("none", 3.0)
     found, load = learned(summaries), UnmeasuredLoad(mean_a=3.0, sd_a=0.1)
     assert found.expected_a == pytest.approx(3.0, abs=0.3)
@@ -213,7 +217,7 @@ def test_expected_share_and_known_distribution_of_the_faults_are_used() -> None:
     assert learned(summaries, known=prior).models[0].prior is prior
 
 
-def test_trusted_vehicles_that_do_not_carry_the_reference_are_named() -> None:
+def test_untrusted_and_insufficient_trusted_vehicles_are_reported() -> None:
     shown = SimpleNamespace(offset_a=np.array([5.0, NAN]), sd_a=np.array([0.1, NAN]))
     vehicles = cast("Any", [SimpleNamespace(vehicle=f"V{j}", zero_current=shown) for j in range(2)])
     known = {"branches": NAMES, "full_scale_a": SCALE_A}

@@ -59,7 +59,7 @@ def differing_vehicle(number: int, samples: int) -> Samples:
     return recorded(number, *lags, resonance, snr_db=60.0, samples=samples)
 
 
-def test_vehicles_whose_poles_differ_are_followed_by_the_bank_of_others() -> None:
+def test_filter_bank_of_some_vehicles_fits_others_with_different_poles() -> None:
     bank = choose_filter_bank([[differing_vehicle(j, 6000)] for j in range(100, 104)], period_s=PERIOD_S)
     plain = FilterBank(input_names=bank.input_names, period_s=PERIOD_S)
     drives = [differing_vehicle(j, 12_000) for j in range(4)]
@@ -72,7 +72,7 @@ def test_vehicles_whose_poles_differ_are_followed_by_the_bank_of_others() -> Non
     assert with_bank.min() > 40.0
 
 
-def test_one_common_pole_is_found_through_the_noise_and_beside_an_input_that_stands_still() -> None:
+def test_common_pole_is_found_despite_noise_and_a_constant_input() -> None:
     drives = [recorded(j, 0.95 + 0.0j, snr_db=20.0) for j in range(3)]
     ((pole, imag),) = choose_filter_bank([[each] for each in drives], period_s=PERIOD_S).poles
     assert pole == pytest.approx(0.95, abs=0.002)
@@ -139,7 +139,7 @@ def test_parked_and_hardly_recorded_vehicles_are_refused(database: VehicleDataba
         model_of(database, tmp_path, drive("b", 30))
 
 
-def test_junction_residual_from_moments_is_that_of_the_samples() -> None:
+def test_junction_residual_from_moments_equals_that_of_the_samples() -> None:
     measured = np.random.default_rng(1).normal(2.0, 20.0, size=(500, 2))
     drift, offset_a = np.array([0.1, -0.05]), np.array([2.0, -1.0])
     corrected = (measured - offset_a) / (1.0 + drift)
@@ -170,7 +170,7 @@ def run_identify(store: Path, *options: object) -> Result:
     return CliRunner().invoke(app, arguments)
 
 
-def test_bank_is_written_and_the_vehicle_that_it_does_not_fit_is_named(store: Path, tmp_path: Path) -> None:
+def test_identify_writes_the_bank_and_names_the_worst_fitted_vehicle(store: Path, tmp_path: Path) -> None:
     bank = tmp_path / "new" / "bank.json"
     run = run_identify(store, "--out", bank, "--json")
     assert run.exit_code == 0, run.output

@@ -70,7 +70,7 @@ def test_well_known_faults_are_corrected(fault: dict[str, Any], known: dict[str,
 
 
 @pytest.mark.parametrize(("missing", "gain"), [(0.0, 0.1), (25.0, 0.1), (0.0, 0.4)])
-def test_charge_balance_tells_an_offset(missing: float, gain: float) -> None:
+def test_charge_balance_determines_an_offset(missing: float, gain: float) -> None:
     """Also of a sensor with a gain error, and where a tenth of the samples of another branch are missing."""
     frame = recording(offset_a=(5.0, 0.0, 0.0), gain=(gain, 0.0, 0.0), load_a=30.0)
     true_ah = float((frame["battery"] - 5.0).mean()) / (1.0 + gain) * SECONDS / 3600.0
@@ -80,7 +80,7 @@ def test_charge_balance_tells_an_offset(missing: float, gain: float) -> None:
     assert row.offset_sd_a < 0.5
 
 
-def test_any_number_of_junctions_is_calibrated_each_by_itself() -> None:
+def test_several_junctions_are_calibrated_independently() -> None:
     """From six on they are read vehicle by vehicle, and their drives are not kept."""
     frames = {f"V{number}": recording(number, gain=(0.0, 0.05, 0.0), seconds=60.0) for number in range(6)}
     rows = found(frames, trusted=["battery"]).xs("motor", level="branch")
@@ -89,7 +89,7 @@ def test_any_number_of_junctions_is_calibrated_each_by_itself() -> None:
     pd.testing.assert_series_equal(rows.loc["V0"], alone, check_names=False)
 
 
-def test_branch_that_is_off_keeps_its_gain_open() -> None:
+def test_gain_of_a_branch_that_is_off_stays_undetermined() -> None:
     frame = recording().assign(heater=0.0)
     frame["battery"] = -frame["motor"] + np.random.default_rng(2).normal(0.0, 0.2, len(frame))
     rows = found(frame, trusted=["battery"]).loc["vehicle"]
@@ -98,7 +98,7 @@ def test_branch_that_is_off_keeps_its_gain_open() -> None:
     assert not rows.corrected["heater"]
 
 
-def test_ratios_alone_have_no_scale(motor_off: pd.DataFrame) -> None:
+def test_gain_ratios_without_a_trusted_sensor_correct_nothing(motor_off: pd.DataFrame) -> None:
     calibrator = JunctionCalibrator().fit(motor_off, JUNCTION)
     assert not calibrator.parameters_.corrected.any()
     assert calibrator.parameters_.gain_error_sd.min() > 0.1
@@ -138,7 +138,7 @@ def test_offset_of_one_of_two_has_two_explanations() -> None:
     assert "the offset of motor, heater needs a zero-current window" in deciding
 
 
-def test_car_at_rest_tells_an_offset_and_no_gain() -> None:
+def test_car_at_rest_determines_an_offset_but_no_gain() -> None:
     frame = 0.01 * recording(gain=(0.0, 0.1, 0.0))[["battery", "motor"]] + [0.0, 5.0]
     junction = Junction(branches=["battery", "motor"], full_scale_a=400.0)
     calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(frame, junction)
@@ -173,7 +173,7 @@ def test_misfit_is_found_from_the_documented_size(spoil: Any, share: float) -> N
         assert not calibrator.parameters_.corrected.any()
 
 
-def test_meters_of_one_car_are_one_system() -> None:
+def test_meters_of_one_car_are_estimated_together() -> None:
     """The battery is known by the first meter, so the second meter is known by the battery."""
     junction = Junction(branches=["battery", "charger"], full_scale_a=400.0)
     frames = {}
@@ -188,14 +188,14 @@ def test_meters_of_one_car_are_one_system() -> None:
     assert rows.gain_error["station_2", "charger"] == pytest.approx(0.03, abs=0.012)
 
 
-def test_error_of_the_trusted_sensor_is_the_same_in_all_others_and_said() -> None:
+def test_equal_gain_error_of_all_others_is_reported_against_the_trusted_sensor() -> None:
     wrong = JunctionCalibrator(trusted=["battery"]).fit(recording(gain=(0.05, 0.0, 0.0), seconds=1200.0), JUNCTION)
     assert any("against battery: a gain error of its own of +5." in notice for notice in wrong.notices_)
     right = JunctionCalibrator(trusted=["battery"]).fit(recording(gain=(0.0, 0.05, 0.0), seconds=1200.0), JUNCTION)
     assert not any("against battery" in notice for notice in right.notices_)
 
 
-def test_contradicting_knowledge_corrects_nothing() -> None:
+def test_contradicting_trusted_sensors_correct_nothing() -> None:
     calibrator = JunctionCalibrator(trusted=["battery", "motor"]).fit(recording(gain=(0.0, 0.05, 0.2)), JUNCTION)
     assert any("contradicts itself" in notice for notice in calibrator.notices_)
     assert not calibrator.parameters_.corrected.any()
@@ -207,7 +207,7 @@ def test_contradicting_knowledge_corrects_nothing() -> None:
     (lambda motor: motor.where(motor > 0.0, 1.1 * motor), "sign"),
     (lambda motor: motor * (1.0 + 0.0005 * motor.abs()), "saturating"),
 ])  # fmt: skip
-def test_sensor_that_is_not_linear_is_found_and_not_corrected(change: Any, cause: str) -> None:
+def test_nonlinear_sensor_is_reported_and_not_corrected(change: Any, cause: str) -> None:
     frame = recording()
     calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame.assign(motor=change(frame["motor"])), JUNCTION)
     findings = calibrator.vehicles_["vehicle"].parameters.findings
@@ -246,7 +246,7 @@ def second_motor(rng: np.random.Generator, frame: pd.DataFrame) -> None:
     (noisy("motor", 0.0), set()), (noisy("motor", 10.0), set()), (noisy("battery", 10.0), set()),
     (steady_heater, set()), (switched_heater, set()), (second_motor, {"switching"}),
 ])  # fmt: skip
-def test_noise_and_unmeasured_or_switched_branches_blame_no_sensor(spoil: Any, causes: set[str]) -> None:
+def test_noise_and_loads_are_not_taken_for_nonlinear_sensors(spoil: Any, causes: set[str]) -> None:
     for seed in range(2):
         frame = recording(seed, gain=(0.0, 0.1, -0.2), offset_a=(0.0, 3.0, 0.0))
         spoil(np.random.default_rng(seed + 100), frame)
@@ -254,7 +254,7 @@ def test_noise_and_unmeasured_or_switched_branches_blame_no_sensor(spoil: Any, c
         assert {each.cause for each in calibrator.vehicles_["vehicle"].parameters.findings} == causes
 
 
-def test_standard_deviations_are_right() -> None:
+def test_gain_errors_lie_within_their_standard_deviations() -> None:
     """Gains of twelve junctions are within their deviation about as often as normal errors, and never far."""
     errors = []
     for seed in range(12):
@@ -284,7 +284,9 @@ def test_standard_deviations_are_right() -> None:
         for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
     ),
 ])  # fmt: skip
-def test_mistake_is_one_line(motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str) -> None:
+def test_mistake_in_calling_the_junction_calibrator_is_one_line(
+    motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str
+) -> None:
     with pytest.raises((FleetError, DriveError, ContradictionError), match=match) as raised:
         JunctionCalibrator(**known).fit(change(motor_off), JUNCTION)
     assert "\n" not in str(raised.value)
@@ -296,7 +298,7 @@ def write_layout(folder: Path, frame: pd.DataFrame) -> Path:
     return folder / "layout.toml"
 
 
-def test_declared_load_is_no_error_of_the_corrected_sum(tmp_path: Path) -> None:
+def test_declared_load_is_not_counted_as_error_of_the_sum(tmp_path: Path) -> None:
     frame = recording(gain=(0.0, 0.05, 0.0), offset_a=(0.0, -1.5, 0.0), load_a=2.0)
     frame.rename_axis("time_s").to_csv(tmp_path / "drive.csv")
     drive, layout = tmp_path / "drive.csv", write_layout(tmp_path, frame)

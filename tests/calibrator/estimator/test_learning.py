@@ -49,7 +49,7 @@ def same(one: FaultModel, other: FaultModel, rtol: float) -> None:
 
 @pytest.mark.parametrize("magnitude", [(0.05, 0.25), pytest.param((0.3, 0.6), marks=pytest.mark.long)])
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magnitude: tuple[float, float]) -> None:
+def test_learnt_prior_matches_sizes_and_numbers_of_the_faults(K: int, magnitude: tuple[float, float]) -> None:
     faults = random_faults(1, vehicles=48, branches=K, magnitude=magnitude)
     model = learned(rows_of(faults, seed=1))
     for slab, values in ((model.prior.gain, faults.drift), (model.prior.offset, faults.offset_a)):
@@ -65,14 +65,14 @@ def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magni
     assert model.prior.load_share < 0.02
 
 
-def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learnt_model_is_invariant_to_vehicle_order_even_if_subsampled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "MOST_LEARNT", 25)
     rows = rows_of(random_faults(6, vehicles=40, branches=2), seed=6)
     same(learned(rows.take(np.random.default_rng(6).permutation(40))), learned(rows), rtol=1e-6)
 
 
 @pytest.mark.parametrize("expected", [0.0, 1.0])
-def test_expected_share_of_none_or_all_vehicles_leaves_a_prior(expected: float) -> None:
+def test_expected_faulty_share_of_0_or_1_gives_a_valid_prior(expected: float) -> None:
     faults = no_faults(8, 2)
     faults.drift[0, 1] = 0.1
     models = learn_fault_models(rows_of(faults, seed=3), feed=0, expected_faults=expected)
@@ -81,7 +81,7 @@ def test_expected_share_of_none_or_all_vehicles_leaves_a_prior(expected: float) 
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.04])
-def test_vague_gain_ratios_neither_move_the_centre_nor_are_a_shared_gain_error(bias: float) -> None:
+def test_uncertain_gain_ratios_are_not_taken_for_a_shared_gain_error(bias: float) -> None:
     """A ratio of a branch that hardly moves is biased alike in all vehicles, by less than its standard deviation."""
     rows = rows_of(no_faults(24, 3), seed=4, errors=Errors(ratio=0.1))
     by = np.zeros(15)
@@ -92,7 +92,7 @@ def test_vague_gain_ratios_neither_move_the_centre_nor_are_a_shared_gain_error(b
 
 
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K: int) -> None:
+def test_negative_junction_constant_is_an_offset_shared_by_a_branch(K: int) -> None:
     """Currents that sum to less than zero: no load gives current."""
     faults = random_faults(12, vehicles=24, branches=K)
     faults.offset_a[:, 0] -= 0.03
@@ -102,7 +102,7 @@ def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K:
 
 
 @pytest.mark.parametrize(("offset", "load"), [(0.02, 0.0), (0.15, None)])
-def test_whose_offset_all_vehicles_have_is_open_if_it_is_no_load(offset: float, load: float | None) -> None:
+def test_branch_of_a_shared_offset_stays_open_if_it_is_not_a_load(offset: float, load: float | None) -> None:
     """The load is declared, or the offset is larger than any load that a fleet shares."""
     faults = no_faults(12, 3)
     faults.offset_a[:, 1] += offset
@@ -113,7 +113,7 @@ def test_whose_offset_all_vehicles_have_is_open_if_it_is_no_load(offset: float, 
     assert by_branch.max() < 0.9
 
 
-def test_most_vehicles_are_no_group_beside_a_declared_load() -> None:
+def test_offset_of_most_vehicles_is_not_a_group_beside_a_declared_load() -> None:
     """What eight of twelve sensors share is their offset: the four others show the load that is declared."""
     faults = no_faults(12, 3)
     faults.offset_a[:8, 1] += 0.02
@@ -123,7 +123,7 @@ def test_most_vehicles_are_no_group_beside_a_declared_load() -> None:
 
 
 @pytest.mark.parametrize("seed", [8, 10])
-def test_intercepts_that_two_vehicles_share_by_chance_are_no_reference(seed: int) -> None:
+def test_intercepts_equal_by_chance_in_two_vehicles_set_no_reference(seed: int) -> None:
     """Where most vehicles are faulty: a whole fleet's sensors were then off by 15 % of full scale, for certain."""
     faults = random_faults(seed, vehicles=24, branches=3, sparsity=50.0, balanced=False)
     spread, at = learned(rows_of(faults, seed=seed)).spread, RowPlaces(3)
@@ -131,7 +131,7 @@ def test_intercepts_that_two_vehicles_share_by_chance_are_no_reference(seed: int
     assert not spread.shared.any()
 
 
-def test_two_references_that_explain_a_fleet_as_well_are_both_kept() -> None:
+def test_equally_good_references_of_a_fleet_are_both_kept() -> None:
     """Half of the vehicles share a hardware offset: nothing says which half is right."""
     faults = no_faults(8, 2)
     faults.hardware_offset_a[:4] = [0.1, -0.1]
@@ -142,7 +142,7 @@ def test_two_references_that_explain_a_fleet_as_well_are_both_kept() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 2, 3])
-def test_sound_vehicles_that_differ_by_half_a_percent_have_no_hardware_faults(seed: int) -> None:
+def test_scatter_of_half_a_percent_is_not_taken_for_hardware_faults(seed: int) -> None:
     faults = no_faults(8, 3)
     faults.hardware_drift[:] = np.random.default_rng(seed).normal(0.0, 0.005, 8)
     faults.drift[0, 0] = faults.offset_a[1, 1] = 0.1
@@ -152,7 +152,7 @@ def test_sound_vehicles_that_differ_by_half_a_percent_have_no_hardware_faults(se
     np.testing.assert_allclose(spread, np.std(faults.hardware_drift), rtol=0.6)
 
 
-def test_vehicle_with_two_gain_errors_that_are_alike_is_no_reference() -> None:
+def test_vehicle_with_two_equal_gain_errors_does_not_set_the_reference() -> None:
     """Each of the eleven others would have the same hardware fault of 11 %."""
     faults = no_faults(12, 3)
     faults.hardware_drift[:] = np.random.default_rng(0).normal(0.0, 0.005, 12)
@@ -162,14 +162,14 @@ def test_vehicle_with_two_gain_errors_that_are_alike_is_no_reference() -> None:
     assert sum(model.probability for model, near in zip(models, right, strict=True) if near) > 0.95
 
 
-def test_one_fault_does_not_say_how_large_faults_are() -> None:
+def test_single_fault_does_not_determine_the_prior_of_fault_sizes() -> None:
     faults = no_faults(6, 2)
     faults.offset_a[0, 0] = 0.25
     density = learned(rows_of(faults, seed=3)).prior.offset.density
     assert np.interp(0.03, GRID, density) > 0.3 * np.interp(0.25, GRID, density)
 
 
-def test_vehicle_does_not_confirm_its_own_number_of_faults() -> None:
+def test_single_vehicle_does_not_reinforce_its_own_number_of_faults() -> None:
     """One vehicle is judged by the guess alone, whatever numbers it has made likely before."""
     errors = Errors(slope=0.1, ratio=0.03, intercept=0.05, junction=0.03)
     rows = rows_of(random_faults(3, vehicles=1, branches=2), seed=3, errors=errors)
@@ -188,7 +188,7 @@ def test_vehicle_does_not_confirm_its_own_number_of_faults() -> None:
 
 
 @pytest.mark.parametrize("of_sensor", [False, True])
-def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(of_sensor: bool) -> None:
+def test_vehicles_sharing_a_constant_form_a_group_of_open_cause(of_sensor: bool) -> None:
     faults, some = random_faults(13, vehicles=24, branches=2), np.arange(24) < 8
     faults.offset_a[some, 0] += 0.03 * of_sensor
     models = learn_fault_models(rows_of(faults, seed=13, load=0.0 if of_sensor else 0.03 * some), feed=0)
@@ -198,7 +198,7 @@ def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(o
     assert {model.spread.shared[-1] for model in models} == {0.0, 1.0}
 
 
-def test_batch_of_sensors_whose_gains_differ_is_no_number_of_loads() -> None:
+def test_batch_offset_with_different_gains_is_not_taken_for_a_load() -> None:
     """The sensors read the same offset; the loads that it would be differ."""
     faults = no_faults(8, 2)
     faults.drift[:3, 0], faults.offset_a[:3, 0] = [-0.2, -0.1, 0.15], 0.03
@@ -210,7 +210,7 @@ def test_batch_of_sensors_whose_gains_differ_is_no_number_of_loads() -> None:
 
 
 @pytest.mark.parametrize(("K", "branch"), [(3, 0), pytest.param(3, 2, marks=pytest.mark.long), (2, 1)])
-def test_shared_gain_is_found_but_not_which_of_two_branches_has_it(K: int, branch: int) -> None:
+def test_shared_gain_error_is_found_but_not_in_which_of_two_branches(K: int, branch: int) -> None:
     gain, faults = 0.08, random_faults(14, vehicles=16, branches=K)
     faults.drift[:, branch] = (1.0 + gain) * (1.0 + faults.drift[:, branch]) - 1.0
     rows = rows_of(faults, seed=14)
@@ -230,7 +230,7 @@ def law_of(K: int, prior: Prior | None = None) -> FaultModel:
     return FaultModel(spread=spread, priors=((1.0, prior or first_prior(K)),))
 
 
-def test_vehicle_that_no_explanation_fits_is_known_less_well_and_others_are_as_before() -> None:
+def test_unexplained_vehicle_gets_wider_uncertainty_and_others_do_not() -> None:
     K = 2
     rows = rows_of(random_faults(15, vehicles=6, branches=K), seed=15)
     by = np.zeros((6, 5 * K))
@@ -247,7 +247,7 @@ def test_vehicle_that_no_explanation_fits_is_known_less_well_and_others_are_as_b
         np.testing.assert_array_equal(odd.fits.theta[j, :n], plain.fits.theta[j, :n])
 
 
-def test_one_vehicle_and_a_branch_that_nobody_used_are_learned_from_without_failing() -> None:
+def test_learning_works_with_one_vehicle_and_with_an_unused_branch() -> None:
     K = 3
     rows = rows_of(Faults(**{name: values[:1] for name, values in vars(no_faults(2, K)).items()}), seed=17)
     assert len(learn_fault_models(rows, feed=0)) >= 1
@@ -262,7 +262,7 @@ def test_one_vehicle_and_a_branch_that_nobody_used_are_learned_from_without_fail
     assert model.spread.mean[K - 1] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> None:
+def test_learning_finds_intercept_errors_larger_than_stated() -> None:
     K = 2
     rows = rows_of(random_faults(4, vehicles=30, branches=K), seed=4, errors=Errors(intercept=0.004))
     stated = rows.covariance.copy()
@@ -274,7 +274,7 @@ def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> N
     assert (wide.dispersion > 2.0 * plain.dispersion).all()
 
 
-def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors() -> None:
+def test_loads_that_differ_between_vehicles_are_not_sensor_offsets() -> None:
     K, load = 2, np.random.default_rng(15).normal(0.0075, 0.0025, 30).clip(0.0)
     errors = Errors(intercept=0.0003, junction=0.0001)  # as on recorded trips
     model = learned(rows_of(random_faults(15, vehicles=30, branches=K), seed=15, errors=errors, load=load))
@@ -283,7 +283,7 @@ def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors() -> None:
     assert not model.spread.shared.any()
 
 
-def test_fleet_of_which_no_slope_is_known_is_learnt_all_the_same() -> None:
+def test_learning_works_without_any_known_slope() -> None:
     """As drives of a minute are: it was an error of the program."""
     rows = rows_of(random_faults(1, vehicles=12, branches=2), seed=1)
     covariance = rows.covariance.copy()

@@ -53,7 +53,7 @@ def random_parameters(seed: int, shape: tuple[int, ...], K: int) -> Array:
 
 
 @BRANCHES
-def test_residuals_are_those_of_the_equations_of_the_rows(K: int) -> None:
+def test_row_residuals_equal_those_of_the_equations(K: int) -> None:
     rows = rows_of(random_faults(K, vehicles=8, branches=K, sparsity=50.0), seed=K, errors=READ)
     theta = random_parameters(K, (8, 5), K)
     left = posterior.row_residuals(plain_evidence(rows), theta)
@@ -61,7 +61,7 @@ def test_residuals_are_those_of_the_equations_of_the_rows(K: int) -> None:
         np.testing.assert_allclose(left[j], plain_residual(rows.take(slice(j, j + 1)), theta[j]), atol=1e-13)
 
 
-def test_fits_of_two_branches_are_those_of_all_supports_one_by_one() -> None:
+def test_fits_of_two_branches_equal_separate_fits_of_all_supports() -> None:
     rows = rows_of(random_faults(4, vehicles=8, branches=2, sparsity=60.0), seed=4, errors=READ)
     fits, log_prior = fitted(plain_evidence(rows)), first_prior(2).log_supports
     for j in range(len(rows)):  # none has both a load and an offset of the feeding sensor
@@ -88,7 +88,7 @@ def test_fits_of_two_branches_are_those_of_all_supports_one_by_one() -> None:
 
 @pytest.mark.parametrize("of_sensor", [False, True])
 @BRANCHES
-def test_what_all_sensors_share_leaves_nothing_either(K: int, of_sensor: bool) -> None:
+def test_residuals_are_zero_for_true_faults_beside_shared_errors(K: int, of_sensor: bool) -> None:
     """Offset and gain of every sensor of a branch beside the vehicle's own; what a group shares is offset or load."""
     own = random_faults(K, vehicles=20, branches=K, sparsity=50.0)
     group = np.where(np.arange(20) % 2 == 0, 0.02, 0.0)
@@ -120,7 +120,7 @@ def test_large_offset_behind_a_small_gain_is_fitted() -> None:
     assert fits.chi2[0, place] < 1.0
 
 
-def test_rows_that_nothing_explains_and_rows_that_say_nothing_are_fitted_without_failing() -> None:
+def test_contradicting_and_uninformative_rows_are_fitted_without_failure() -> None:
     rows = rows_of(random_faults(10, vehicles=3, branches=2))
     rows.relative[0, :2], rows.constant[1, :2] = 3.0, -40.0
     rows.covariance[2] = 100.0 * np.eye(10)
@@ -207,7 +207,7 @@ def of_supports(draws: posterior.Draws, weight: Array, vehicle: int) -> dict[tup
     return found
 
 
-def test_weights_are_those_of_integration_on_a_grid() -> None:
+def test_posterior_weights_equal_integration_on_a_grid() -> None:
     """Vague rows: the posterior is cut by the bounds of the sizes, and offsets depend on gains."""
     prior = paper_prior(2, 0, 1)
     truth = random_faults(2, vehicles=6, branches=2, sparsity=100.0 * (1.0 - 1.0 / 6.0))
@@ -228,7 +228,7 @@ def test_weights_are_those_of_integration_on_a_grid() -> None:
                 np.testing.assert_allclose(found[on][1], mean, atol=0.004)
 
 
-def test_explanation_of_many_faults_is_found_though_no_vehicle_has_fewer() -> None:
+def test_explanation_of_four_faults_is_found_by_the_search() -> None:
     """A hardware offset looks like one of two sensors; that alone, two of the four faults, would be too few."""
     truth = no_faults(1, 3)
     truth.hardware_offset_a[0], truth.drift[0, 1], truth.offset_a[0] = [0.16, 0.0, -0.16], 0.24, [-0.12, 0.0, 0.24]
@@ -239,7 +239,7 @@ def test_explanation_of_many_faults_is_found_though_no_vehicle_has_fewer() -> No
 
 @pytest.mark.parametrize("kind", [posterior.GAIN, posterior.OFFSET])
 @pytest.mark.parametrize("every", [1, 4])
-def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None:
+def test_evidence_of_fault_sizes_equals_that_of_the_weights(kind: int, every: int) -> None:
     prior = paper_prior(2, 0, 1, 2)
     draws = drawn(rows_of(random_faults(9, vehicles=20, branches=2, sparsity=70.0), seed=9), prior)
     slabs = [Slab(low=low, high=high, tail=0.02) for low, high in ((0.02, 0.3), (0.05, 0.25), (0.1, 0.5))]
@@ -250,7 +250,7 @@ def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None
     assert np.argmax(found) == np.argmax(exact) == 1
 
 
-def test_an_offset_is_known_though_the_gain_of_its_branch_is_not() -> None:
+def test_offset_is_known_even_if_the_gain_of_its_branch_is_not() -> None:
     """A current that hardly changed: o = (1 + d) omega is exact, so d and omega lie on a narrow curve."""
     prior, truth = paper_prior(2, 1, 2), no_faults(1, 2)
     truth.offset_a[0, 1] = 0.19
@@ -273,7 +273,7 @@ def test_an_offset_is_known_though_the_gain_of_its_branch_is_not() -> None:
     assert found[2, 5][0] / found[5,][0] == pytest.approx(odds, rel=0.15)
 
 
-def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
+def test_posterior_of_a_load_equals_a_grid_and_is_never_negative() -> None:
     prior = Prior(
         counts=paper_prior(2, 0, 1).counts,
         gain=Slab(low=0.05, high=0.25, tail=1e-6),
@@ -306,7 +306,7 @@ def counted(K: int, sparsity: float, vehicles: int = 4000) -> Array:
 
 @BRANCHES
 @pytest.mark.parametrize("sparsity", [80.0, 60.0])
-def test_law_of_sparse_faults_is_that_of_the_fleet(K: int, sparsity: float) -> None:
+def test_prior_of_fault_counts_matches_a_sparse_fleet(K: int, sparsity: float) -> None:
     tally = counted(K, sparsity)
     np.testing.assert_allclose(sparse_counts(tally), tally / tally.sum(), atol=0.02)
 

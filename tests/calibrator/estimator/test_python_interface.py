@@ -62,7 +62,7 @@ def fitted(example: Any) -> FleetCalibrator:
 # What it offers
 
 
-def test_package_offers_its_interface_and_imports_nothing_heavy() -> None:
+def test_package_exports_its_interface_and_imports_nothing_heavy() -> None:
     offered = ["Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "read_log"]
     assert sorted(calibrator.__all__) == dir(calibrator) == offered
     with pytest.raises(AttributeError, match="no attribute 'fit'; it offers Fleet, FleetCalibrator"):
@@ -73,7 +73,7 @@ def test_package_offers_its_interface_and_imports_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_twelve_vehicles_from_frames_to_parameters(fitted: FleetCalibrator, example: Any) -> None:
+def test_twelve_vehicles_are_calibrated_from_data_frames(fitted: FleetCalibrator, example: Any) -> None:
     found = fitted.parameters_
     assert len(found) == 12 * 3
     assert set(found.loc[found["corrected"], "vehicle"]) == set(example.FAULTS)
@@ -111,7 +111,7 @@ def test_fitted_calibrator_pickles_and_is_shown_as_text_and_html(fitted: FleetCa
     assert "V02: corrected" in again.vehicles_["V02"]._repr_html_()
 
 
-def test_constructor_only_stores_as_in_scikit_learn() -> None:
+def test_constructor_only_stores_parameters_as_in_scikit_learn() -> None:
     plain = FleetCalibrator(harm_limit=0.01, trusted=["V1"])
     assert repr(plain) == "FleetCalibrator(harm_limit=0.01, trusted=['V1'])"
     assert clone(plain).get_params() == plain.get_params()
@@ -135,7 +135,7 @@ def test_results_of_frames_without_a_layout_have_no_files_for_the_node(fitted: F
 # The way of the command
 
 
-def test_summaries_give_what_the_command_writes(
+def test_python_interface_writes_the_same_result_as_the_command(
     database: VehicleDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
@@ -156,7 +156,7 @@ def test_summaries_give_what_the_command_writes(
     assert capsys.readouterr() == ("", "")
 
 
-def test_frames_of_a_layout_have_derived_inputs_limits_and_files_for_the_node(tmp_path: Path) -> None:
+def test_data_frames_with_a_layout_give_parameter_files_for_the_node(tmp_path: Path) -> None:
     trips = [builtin_trip(np.random.default_rng(seed), duration_s=240.0, name="trip") for seed in range(3)]
     given = {
         f"V{n}": pd.DataFrame({**trip.currents_a, **trip.inputs}, index=trip.time_s) for n, trip in enumerate(trips)
@@ -169,7 +169,7 @@ def test_frames_of_a_layout_have_derived_inputs_limits_and_files_for_the_node(tm
         Fleet.from_frames(given, junction, inputs=["wind"])
 
 
-def test_log_reads_as_a_frame_that_makes_a_fleet(two_vehicles: Path) -> None:
+def test_log_converts_to_a_data_frame_usable_for_a_fleet(two_vehicles: Path) -> None:
     paths = sorted((two_vehicles / "logs").rglob("*.log*"))
     log = read_log(paths[0], LAYOUT)
     found = log.to_frame()
@@ -196,7 +196,7 @@ def test_script_without_main_guard_reads_logs_in_processes(two_vehicles: Path, t
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, ["begun", "2"], "")
 
 
-def test_fault_of_the_program_in_one_vehicle_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_in_one_vehicle_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     failing_for("V2", ZeroDivisionError("by nothing"), monkeypatch)
     with pytest.warns(RuntimeWarning, match="left out: V2: internal error: ZeroDivisionError: by nothing"):
         found = FleetCalibrator().fit(Fleet.from_frames(frames(), JUNCTION))
@@ -206,7 +206,7 @@ def test_fault_of_the_program_in_one_vehicle_is_a_warning(monkeypatch: pytest.Mo
 # What frames may be
 
 
-def test_time_of_day_and_seconds_are_the_same() -> None:
+def test_index_of_timestamps_or_seconds_gives_the_same_result() -> None:
     seconds = frames()
     clock = {
         name: each.set_index(pd.Timestamp("2026-01-01T12:00Z") + pd.to_timedelta(each.index, unit="s"))
@@ -216,7 +216,7 @@ def test_time_of_day_and_seconds_are_the_same() -> None:
     pd.testing.assert_frame_equal(one.parameters_, other.parameters_)
 
 
-def test_several_frames_and_bad_samples_are_taken_as_they_are() -> None:
+def test_several_frames_per_vehicle_and_missing_samples_are_accepted() -> None:
     given = {**frames(5), "V9": [frame(90, gain_error=0.1), frame(91, gain_error=0.1)]}
     given["V9"][0].iloc[20:40, 0] = np.nan
     given["V8"] = frame(80, minutes=1.0)
@@ -228,7 +228,7 @@ def test_several_frames_and_bad_samples_are_taken_as_they_are() -> None:
     assert "at least 120 s are needed" in found.left_out_["V8"]
 
 
-def test_readings_and_trust_that_the_drives_contradict_are_named_and_the_others_are_used() -> None:
+def test_readings_and_trust_contradicted_by_drives_are_reported() -> None:
     given = {**frames(8), "V4": frame(4, gain_error=0.1), "V5": frame(5, gain_error=0.1)}
     offset = pd.DataFrame({"vehicle": ["V3"], "branch": "motor", "offset_a": 40.0, "offset_sd_a": 0.1})
     readings = pd.concat([bench_rows(["V4", "V7"], 0.1), offset])  # the reading of V7 is of V4
@@ -246,7 +246,7 @@ def test_readings_and_trust_that_the_drives_contradict_are_named_and_the_others_
 @pytest.mark.parametrize(
     ("column", "factor", "said"), [("battery", -1.0, "reads with the wrong sign"), ("motor", 0.0, "does not follow")]
 )
-def test_currents_that_do_not_balance_are_explained(column: str, factor: float, said: str) -> None:
+def test_explanation_names_wrong_signs_and_unrelated_currents(column: str, factor: float, said: str) -> None:
     given = frames(6)
     given["V6"][column] = factor * given["V6"][column] + np.sin(given["V6"].index)
     found = FleetCalibrator().fit(Fleet.from_frames(given, JUNCTION))
@@ -292,7 +292,7 @@ def of_all(change: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     (retimed(lambda time: 1e-3 * time), r"V2, frame 1: rows are 0.001 s apart, .* fleet 1 s; if the index is not in"),
     (of_all(lambda each: each[["battery", "motor"]]), r"inputs none: expected one or more"),
 ])  # fmt: skip
-def test_unusable_frames_are_refused_in_one_line(given: Callable[[], Frames], message: str) -> None:
+def test_unusable_data_frames_are_refused_in_one_line(given: Callable[[], Frames], message: str) -> None:
     with pytest.raises(UserError, match=message) as caught:
         Fleet.from_frames(given(), JUNCTION)
     assert "\n" not in str(caught.value)
@@ -315,7 +315,7 @@ def bench_rows(vehicles: list[str], drift: float) -> pd.DataFrame:
     return pd.DataFrame({"vehicle": vehicles, "branch": "battery", "drift": drift, "drift_sd": 0.01})
 
 
-def test_wrong_places_and_parameters_are_refused(tmp_path: Path) -> None:
+def test_wrong_paths_and_parameters_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match="no such folder, store of drives or store of summaries"):
         Fleet.from_folder(tmp_path / "nothing", LAYOUT)
     with pytest.raises(LayoutError, match=r"none\.toml"):

@@ -54,7 +54,7 @@ def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> Ev
     return rows
 
 
-def test_table_is_read_in_any_order_and_empty_cells_are_not_read(tmp_path: Path) -> None:
+def test_table_of_readings_may_have_any_column_order_and_empty_cells(tmp_path: Path) -> None:
     bench = read(tmp_path, HEADER, "V2, motor, 0.02, 0.001, , ", "", "V1,battery,,,-1.5,0.2")
     check(bench)
     (drift, offset_a), (drift_sd, offset_sd_a) = bench_readings(bench, VEHICLES, BRANCHES)
@@ -80,13 +80,15 @@ def test_table_is_read_in_any_order_and_empty_cells_are_not_read(tmp_path: Path)
     ([HEADER, "V1,motor,0,0.1,,", "V1,motor,0,0.1,,"], r"line 3: the motor sensor of V1 stands there twice"),
     ([HEADER, "V1,motor,0,0.1,,,,7"], r"line 2: 8 cells, and the header has 6 columns"),
 ])  # fmt: skip
-def test_slip_is_named_with_its_line(tmp_path: Path, lines: list[str], message: str) -> None:
+def test_mistake_in_a_table_of_readings_is_reported_with_its_line(
+    tmp_path: Path, lines: list[str], message: str
+) -> None:
     with pytest.raises(FleetError, match=message):
         check(read(tmp_path, *lines))
 
 
 @pytest.mark.parametrize("reading", [(0.05, 0.002, NAN, NAN), (NAN, NAN, 3.0, 0.2)])
-def test_trusted_vehicle_that_was_read_as_faulty_is_refused(reading: tuple[float, float, float, float]) -> None:
+def test_trusted_vehicle_with_a_faulty_bench_reading_is_refused(reading: tuple[float, float, float, float]) -> None:
     bench = bench_of(*reading)
     with pytest.raises(FleetError, match=r"line 2: the battery sensor of V1 was read as faulty, and V1 is trusted"):
         check(bench, "V1")
@@ -94,7 +96,7 @@ def test_trusted_vehicle_that_was_read_as_faulty_is_refused(reading: tuple[float
     check(bench_of(0.001, 0.002, 0.1, 0.2), "V1")
 
 
-def test_zero_current_and_bench_readings_combine_or_both_drop_out_if_contradictory() -> None:
+def test_readings_are_combined_or_all_dropped_if_contradictory() -> None:
     shown = {"V1": (4.9, 0.1), "V2": (5.0, 0.1), "V3": (NAN, NAN)}  # by the battery sensor with open contactors
     windows = (ZeroCurrent(offset_a=np.array([o, NAN]), sd_a=np.array([sd, NAN])) for o, sd in shown.values())
     summaries = [SimpleNamespace(vehicle=name, zero_current=each) for name, each in zip(shown, windows, strict=True)]
@@ -114,7 +116,7 @@ def test_zero_current_and_bench_readings_combine_or_both_drop_out_if_contradicto
 
 
 @pytest.mark.parametrize("others_a", [0.0, 5.0, -12.0])
-def test_trusted_vehicle_that_breaks_the_junction_law_is_found_whatever_others_have(others_a: float) -> None:
+def test_trusted_vehicle_violating_the_junction_law_is_found(others_a: float) -> None:
     names = (*BRANCHES, "auxiliary")
     rows = rows_of(0.05, (0.0, 0.0, 3.0, -9.0, others_a))
     found = untrusted_vehicles(rows, np.arange(5) < 4, names, full_scale_a=FULL_SCALE_A)

@@ -43,7 +43,7 @@ def result(request: pytest.FixtureRequest, tmp_path: Path, database: VehicleData
     return folder
 
 
-def test_parameters_of_a_vehicle_are_found_however_many_there_are(result: Path) -> None:
+def test_parameters_are_found_in_results_of_few_and_of_many_vehicles(result: Path) -> None:
     for name in ("v1", "v2"):
         assert decode_parameters(results.written_of(result, name).text, name).vehicle == name
     assert results.read_run(result) == RUN
@@ -64,7 +64,7 @@ def test_command_writes_parameter_files(result: Path, tmp_path: Path, capsys: py
     assert not (tmp_path / "none").exists()
 
 
-def test_parameters_that_cannot_be_written_leave_their_vehicle_out(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_vehicle_with_invalid_parameters_is_left_out(tmp_path: Path, database: VehicleDatabase) -> None:
     good = vehicle(database, "v1")
     bad = replace(good, vehicle="v2", branches={"battery": replace(good.branches["battery"], offset_a=float("nan"))})
     (tmp_path / results.PARTS).mkdir()
@@ -74,7 +74,7 @@ def test_parameters_that_cannot_be_written_leave_their_vehicle_out(tmp_path: Pat
     assert reason.endswith("; look at its recordings")
 
 
-def test_folder_that_is_no_result_is_named(tmp_path: Path) -> None:
+def test_folder_that_is_not_a_result_is_named(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match=r"run\.json: not a result of 'calibrator calibrate': No such file"):
         results.read_run(tmp_path)
     with pytest.raises(FleetError, match=r"results\.parquet: not a result of 'calibrator calibrate'"):
@@ -84,7 +84,7 @@ def test_folder_that_is_no_result_is_named(tmp_path: Path) -> None:
         results.read_run(tmp_path)
 
 
-def test_counts_of_result_and_report_page_are_equal(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_counts_printed_by_calibrate_equal_those_of_the_report(tmp_path: Path, database: VehicleDatabase) -> None:
     folder = six_vehicle_result(tmp_path / "result", database)
     report = results.report_of(folder, results.read_run(folder), parameters="p", shown=folder)
     page = overview_of(read_fleet_table(folder))

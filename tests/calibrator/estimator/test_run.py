@@ -76,7 +76,9 @@ def task(store: SummaryStore, database: VehicleDatabase) -> FleetTask:
     return learn_task(sample, settings, {}, branches=BRANCHES, identity=identity, fleet_size=VEHICLES)[0]
 
 
-def test_no_more_blocks_are_learnt_from_than_memory_holds(store: SummaryStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learning_sample_is_limited_to_the_largest_number_of_blocks(
+    store: SummaryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     census, settings = take_census(store, ONE), CalibrationSettings()
     whole = read_sample(store, census, settings, ())
     monkeypatch.setattr(run, "MOST_BLOCKS", sum(len(item.summary.moments) for item in whole[:10]))
@@ -130,7 +132,9 @@ def test_result_is_the_same_for_any_number_of_workers(
     assert contents(tmp_path / "two") == contents(result)
 
 
-def test_few_vehicles_start_no_processes(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_fleet_is_calibrated_without_worker_processes(
+    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(run_many, "_outcomes", None)  # which starts processes
     assert calibrate(store.url, tmp_path / "out", "--workers", 2).returncode == 0
 
@@ -166,7 +170,7 @@ def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) -> None:
+def test_place_without_a_fleet_is_refused(store: SummaryStore, tmp_path: Path) -> None:
     shutil.copytree(store.url, tmp_path / "both")
     (tmp_path / "both" / "drives").mkdir()
     shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
@@ -183,7 +187,9 @@ def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) 
 # Second pass
 
 
-def test_same_parameters_in_any_company(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+def test_parameters_of_a_vehicle_do_not_depend_on_others_in_its_bucket(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
     bucket = fullest(store)
     records = store.read(bucket)
     together = texts(calibrate_bucket(bucket, store=store, task=task))
@@ -194,7 +200,9 @@ def test_same_parameters_in_any_company(store: SummaryStore, task: FleetTask, tm
         assert found.decode().splitlines() == together[name].decode().splitlines()
 
 
-def test_impossible_numbers_stop_neither_pass(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+def test_vehicle_with_impossible_numbers_is_left_out_of_both_passes(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
     expected = texts(calibrate_bucket(bucket, store=store, task=task))
@@ -250,7 +258,7 @@ def test_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
     assert left_out(chunk)[bad].startswith(reason)
 
 
-def test_internal_error_ends_with_70(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_exits_with_70(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failing_for("V012", ZeroDivisionError("by nothing"), monkeypatch)
     done = calibrate(store.url, tmp_path / "out", "--workers", 1)
     assert done.returncode == 70
@@ -265,7 +273,7 @@ def test_internal_error_ends_with_70(store: SummaryStore, tmp_path: Path, monkey
 @pytest.mark.parametrize(
     ("drift", "offset_a", "moved"), [(0.0, 0.0, None), (0.08, 0.0, "battery drift"), (0.0, 30.0, "battery")]
 )
-def test_only_those_who_drove_since_are_calibrated_and_moved_sensors_from_their_new_drives(
+def test_since_recalibrates_changed_vehicles_and_detects_moved_sensors(
     store: SummaryStore, result: Path, tmp_path: Path, drift: float, offset_a: float, moved: str | None
 ) -> None:
     faults = random_faults(VEHICLES).take(slice(9, 10))
@@ -289,7 +297,7 @@ def test_only_those_who_drove_since_are_calibrated_and_moved_sensors_from_their_
     assert abs(battery["offset_a"] - faults.offset_a[0, 0]) <= 4.0 * battery["offset_sd_a"]
 
 
-def test_vehicle_that_left_the_store_is_named(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+def test_vehicle_removed_from_the_store_is_named(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     """Also if it was the only one of its bucket."""
     shutil.copytree(store.url, tmp_path / "store")
     gone = {name for name in (f"V{j:03d}" for j in range(VEHICLES)) if store.bucket_of(name) == fullest(store)}
@@ -307,7 +315,7 @@ def test_vehicle_that_left_the_store_is_named(store: SummaryStore, result: Path,
     ("layout_sha256", "0", "its version of "),
     ("buckets", 32, "its number of buckets is 32, that of this run 16"),
 ])  # fmt: skip
-def test_since_a_result_of_something_else_is_refused(
+def test_since_with_an_incompatible_result_is_refused(
     store: SummaryStore, result: Path, tmp_path: Path, key: str, value: object, message: str
 ) -> None:
     shutil.copytree(result, tmp_path / "earlier")

@@ -88,7 +88,9 @@ CHECK = "a check of the {} sensor against a reference would decide: its gain is 
     ((of(1.0, drift=(0.9, 0)),), ("reference in doubt", ""),
      "bench-checked vehicles would decide: the fleet's reference is in doubt for branch battery"),
 ])  # fmt: skip
-def test_what_would_decide(explanations: tuple[Explanation, ...], held_back: tuple[str, str], text: str) -> None:
+def test_deciding_evidence_is_named_for_each_open_question(
+    explanations: tuple[Explanation, ...], held_back: tuple[str, str], text: str
+) -> None:
     assert advice(estimate(*explanations, held_back=held_back)).startswith(text)
 
 
@@ -131,7 +133,7 @@ def test_explanation_in_words_names_sensors_vehicle_and_findings(database: Vehic
         assert part in text
 
 
-def test_evidence_without_errors_is_what_the_true_faults_make_of_it_in_the_units_of_the_sensors() -> None:
+def test_reported_evidence_without_noise_equals_that_of_the_true_faults() -> None:
     faults, scale = random_faults(3, vehicles=10, branches=2, sparsity=50.0), FULL_SCALE_A
     rows = rows_of(faults, noise=0.0, errors=Errors(offset_read=0.001))
     centre = np.zeros(10)
