@@ -30,7 +30,7 @@ def largest(values: Array) -> float:
 
 
 @pytest.mark.parametrize("writable", [True, False])
-def test_code_is_kept_where_that_is_possible(tmp_path: Path, writable: bool) -> None:
+def test_compiled_code_is_cached_if_the_folder_is_writable(tmp_path: Path, writable: bool) -> None:
     (tmp_path / "file").touch()
     cache = tmp_path / "cache" if writable else tmp_path / "file" / "cache"
     program = "from tests.calibrator.test_compiled import is_compiled, largest, np; " + (
@@ -44,7 +44,7 @@ def test_code_is_kept_where_that_is_possible(tmp_path: Path, writable: bool) -> 
     assert any(cache.rglob("*.nbc")) == writable
 
 
-def test_every_file_with_compiled_functions_or_their_constants_is_among_those_whose_change_is_noticed() -> None:
+def test_all_sources_of_compiled_functions_invalidate_the_cache() -> None:
     needed = set[str]()
     for path in (ROOT / "calibrator").rglob("*.py"):
         tree = ast.parse(path.read_text("utf-8"))
@@ -60,7 +60,7 @@ def test_every_file_with_compiled_functions_or_their_constants_is_among_those_wh
     assert own - set(SOURCES) == set()
 
 
-def test_division_by_zero_gives_infinity_as_in_arrays() -> None:
+def test_compiled_division_by_zero_gives_infinity_as_in_numpy() -> None:
     @compiled
     def inverse(value: float) -> float:
         return 1.0 / value

@@ -43,7 +43,7 @@ def test_symmetric_fleet_is_recovered(fleet: Path, result: Path) -> None:
     assert all(row["junction_rms_corrected_a"] < 0.5 * row["junction_rms_measured_a"] for row in corrected)
 
 
-def test_parameter_files_fit_their_vehicle_and_equal_the_table_which_is_plain_parquet(result: Path) -> None:
+def test_parameter_files_fit_their_vehicle_and_equal_the_results_table(result: Path) -> None:
     database, table = read_database(read_layout(LAYOUT)), pq.read_table(result / "results.parquet")
     assert table.num_rows == 24
     assert table.schema.field("offset_a").metadata == {b"unit": b"A"}
@@ -55,7 +55,7 @@ def test_parameter_files_fit_their_vehicle_and_equal_the_table_which_is_plain_pa
 
 
 @pytest.mark.long
-def test_nothing_is_learnt_from_a_vehicle_that_is_held_out(fleet: Path, tmp_path: Path) -> None:
+def test_nothing_is_learnt_from_a_held_out_vehicle(fleet: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(fleet / "logs", other)
     lines = calibrator_lines(fleet)
@@ -100,7 +100,7 @@ def calibrator_lines(fleet: Path) -> list[bytes]:
     return gzip.decompress((fleet / "logs" / "V001" / "drive.log.gz").read_bytes()).splitlines(keepends=True)
 
 
-def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Path, tmp_path: Path) -> None:
+def test_unusable_vehicles_are_left_out_and_named(broken_fleet: Path, tmp_path: Path) -> None:
     out = tmp_path / "result"
     run = calibrator("calibrate", broken_fleet, "--layout", LAYOUT, "--out", out, "--json", "--workers", 1)
     assert run.returncode == 0, run.stderr
@@ -122,7 +122,7 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
 
 
-def test_only_vehicle_that_drove_since_is_one_of_its_fleet(fleet: Path, tmp_path: Path) -> None:
+def test_since_works_for_a_single_vehicle_with_new_drives(fleet: Path, tmp_path: Path) -> None:
     layout, store, one = ("--layout", LAYOUT), tmp_path / "store", ("--workers", 1)
     assert calibrator("summarise", fleet / "logs", *layout, "--out", store, *one).returncode == 0
     first = calibrator("calibrate", store, *layout, "--out", tmp_path / "first", *one)
@@ -141,7 +141,7 @@ def test_only_vehicle_that_drove_since_is_one_of_its_fleet(fleet: Path, tmp_path
     }
 
 
-def test_one_car_alone_and_copies_of_one_are_no_fleet(fleet: Path, tmp_path: Path) -> None:
+def test_single_vehicle_or_copies_of_one_are_not_a_fleet(fleet: Path, tmp_path: Path) -> None:
     files = ["--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1]
     shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "one")
     run = calibrator("calibrate", tmp_path / "logs", "--method", "published", *files)

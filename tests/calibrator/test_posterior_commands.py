@@ -38,9 +38,7 @@ def parameters(result: Path) -> list[VehicleParameters]:
     return [read_parameters(path) for path in sorted((result / "params").iterdir())]
 
 
-def test_asymmetric_fleet_with_delays_and_an_unmeasured_load_is_recovered_and_nobody_is_harmed(
-    fleet: Path, result: Path
-) -> None:
+def test_asymmetric_fleet_with_delays_and_load_is_recovered_without_harm(fleet: Path, result: Path) -> None:
     run = calibrator("score", result, "--truth", fleet / "truth.json", "--json")
     figures = json.loads(run.stdout)
     assert figures["recovery_rate"] >= 0.9
@@ -57,7 +55,7 @@ def test_delay_of_the_motor_is_in_the_parameter_file(fleet: Path, parameters: li
         assert abs(found - actual) < DELAY_TOLERANCE_S
 
 
-def test_every_file_fits_its_vehicle_and_applies_only_what_hardly_harms(parameters: list[VehicleParameters]) -> None:
+def test_parameter_files_apply_only_corrections_below_the_harm_limit(parameters: list[VehicleParameters]) -> None:
     database = read_database(read_layout(LAYOUT))
     for item in parameters:
         check_fit(item, database, item.vehicle)
@@ -66,7 +64,7 @@ def test_every_file_fits_its_vehicle_and_applies_only_what_hardly_harms(paramete
             assert not branch.apply or branch.harm_probability < 0.001
 
 
-def test_unmeasured_load_is_estimated_from_the_fleet_and_named(fleet: Path, result: Path) -> None:
+def test_unmeasured_load_is_estimated_from_the_fleet_and_reported(fleet: Path, result: Path) -> None:
     run = read_run(result)
     truth = [vehicle.unmeasured_a for vehicle in read_truth(fleet / "truth.json").vehicles.values()]
     assert run.details["reference"]["unmeasured_a"] == pytest.approx(sum(truth) / len(truth), abs=1.0)
@@ -79,7 +77,7 @@ def strict(summaries: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made_once(tmp_path_factory, "strict_result", "calibrate", summaries, "--harm-limit", 0)
 
 
-def test_a_harm_limit_of_zero_corrects_nothing_and_every_fault_says_why(result: Path, strict: Path) -> None:
+def test_harm_limit_of_zero_corrects_nothing_and_reasons_are_given(result: Path, strict: Path) -> None:
     chosen, rows, usual = read_run(strict).settings, read_results(strict), read_results(result)
     assert (chosen["harm_limit"], chosen["trusted"], chosen["hold_out"]) == (0.0, [], [])
     assert not any(row["applied"] for row in rows)
@@ -94,7 +92,7 @@ def test_a_harm_limit_of_zero_corrects_nothing_and_every_fault_says_why(result: 
     assert all(item.explanations and item.deciding_evidence for item in unknown)
 
 
-def test_slip_in_the_bench_readings_ends_the_run_before_the_drives_are_read(fleet: Path, tmp_path: Path) -> None:
+def test_mistake_in_bench_readings_is_reported_before_drives_are_read(fleet: Path, tmp_path: Path) -> None:
     table, out = tmp_path / "bench.csv", tmp_path / "result"
     table.write_text("vehicle,branch,offset_a,offset_sd_a\nV001,battery,1 A,0.02\n")
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)

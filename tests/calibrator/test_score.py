@@ -34,7 +34,7 @@ def test_vehicle_is_recovered_if_drift_and_offset_are_close(
         assert mask.tolist() == [expected]
 
 
-def test_f2_follows_its_definition() -> None:
+def test_f2_score_follows_its_definition() -> None:
     actual = np.array([True] * 10 + [False] * 10)
     predicted = np.array([True] * 8 + [False] * 2 + [True] * 4 + [False] * 6)
     precision, recall = 8 / 12, 8 / 10
@@ -52,7 +52,7 @@ def test_error_from_moments_equals_the_error_of_corrected_currents() -> None:
         np.testing.assert_allclose(unseen.rms_a(drift, offset_a)[0], expected)
 
 
-def test_one_worse_branch_is_harm_and_no_or_a_true_correction_is_none() -> None:
+def test_one_worsened_branch_is_harm_but_none_or_a_true_correction_is_not() -> None:
     rng = np.random.default_rng(2)
     truth = sensor_faults(*rng.uniform(-0.2, 0.2, (2, 50, 2)))
     moments = {"mean_a": MEAN_A, "mean_square_a2": MEAN_SQUARE_A2}
@@ -80,7 +80,7 @@ def test_slopes_and_intercepts_reproduce_the_measured_currents() -> None:
         np.testing.assert_allclose(measured, a[j] * i_s + b[j])
 
 
-def test_kinds_of_faults_are_distinguished() -> None:
+def test_hardware_and_sensor_faults_are_distinguished() -> None:
     assert FAULTS.has_hardware_fault.tolist() == [True, False]
     assert FAULTS.has_sensor_fault.tolist() == [True, False]
     assert len(FAULTS) == 2

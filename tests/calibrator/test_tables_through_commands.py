@@ -59,14 +59,14 @@ def result(place: Path) -> Path:
     return place / "result"
 
 
-def test_faults_of_the_fleet_are_found(result: Path) -> None:
+def test_faults_of_a_fleet_recorded_as_tables_are_found(result: Path) -> None:
     rows = pd.DataFrame(read_results(result)).set_index(["vehicle", "branch"])
     assert set(rows.index[rows.applied]) == {(vehicle, "motor") for vehicle in GAIN}
     for vehicle, gain in GAIN.items():
         assert rows.drift[vehicle, "motor"] == pytest.approx(gain, abs=0.01)
 
 
-def test_drives_and_summaries_of_tables_give_the_same(place: Path, result: Path, tmp_path: Path) -> None:
+def test_calibration_from_drives_or_summaries_of_tables_is_the_same(place: Path, result: Path, tmp_path: Path) -> None:
     run(place, "import", place / "logs", "--out", tmp_path / "drives", "--workers", "1")
     run(place, "summarise", tmp_path / "drives", "--out", tmp_path / "summaries", "--workers", "1")
     run(place, "calibrate", tmp_path / "summaries", "--out", tmp_path / "result", "--workers", "1")
@@ -74,7 +74,7 @@ def test_drives_and_summaries_of_tables_give_the_same(place: Path, result: Path,
         assert row["drift"] == pytest.approx(expected["drift"], abs=1e-6)
 
 
-def test_table_is_looked_at(place: Path) -> None:
+def test_doctor_finds_no_error_in_a_good_table(place: Path) -> None:
     drive = place / "logs" / "V2" / "drive.csv"
     findings = json.loads(run(place, "doctor", "--log", drive, "--json"))
     assert not [each for each in findings["findings"] if each["level"] == "error"]
@@ -119,7 +119,7 @@ def test_rows_a_minute_apart_go_through_every_command(tmp_path: Path) -> None:
     assert results.index[results.applied].to_list() == ["string1"]
 
 
-def test_two_currents_that_close_the_sum_together_are_branches(tmp_path: Path) -> None:
+def test_two_currents_that_together_close_the_sum_are_branches(tmp_path: Path) -> None:
     found = json.loads(calibrator("layout", "init", solar_plant(tmp_path), "--json").stdout)
     taken = {each["signal"]: (each["branch"], each["sign"]) for each in found["candidates"]}
     wanted = {"Ibat": ("battery", 1), "Iinv": ("motor", -1), "I1": ("auxiliary", 1), "I2": ("auxiliary_3", 1)}

@@ -29,7 +29,7 @@ def rates(case: CommonCase, *methods: ComparedMethod, figure: str = "recovery_ra
     return [float(figures.loc[figure, "value"]) for figures in judged]
 
 
-def test_artificial_trial_has_the_signal_to_noise_ratio_asked_for() -> None:
+def test_artificial_trial_has_the_requested_signal_to_noise_ratio() -> None:
     drive = smooth_drive()
     trial = common_trial(drive, replace(CASE, vehicles=400, snr_db=20.0), 0)
     noise_a2 = np.mean(trial.evidence.slope_variances * np.sum((drive.unity - drive.unity.mean(axis=0)) ** 2, axis=0))
@@ -44,7 +44,7 @@ def test_state_space_models_of_a_symmetric_fleet_give_the_slopes_of_the_faults()
 
 
 @pytest.mark.parametrize("branches", [2, 3])
-def test_junction_rows_of_a_common_drive_are_those_of_the_faults(branches: int) -> None:
+def test_junction_rows_of_a_common_drive_follow_from_the_faults(branches: int) -> None:
     drive = smooth_drive(branches=branches)
     trial = common_trial(drive, replace(CASE, branches=branches), 0)
     moments = measured_moments(drive.unity, trial.truth)
@@ -56,7 +56,7 @@ def test_junction_rows_of_a_common_drive_are_those_of_the_faults(branches: int) 
     np.testing.assert_allclose(rows.constant[:, branches], constant, atol=1e-9)
 
 
-def test_rows_over_the_densest_cluster_do_not_feel_that_the_fleet_is_not_symmetric() -> None:
+def test_cluster_reference_is_unbiased_in_an_asymmetric_fleet() -> None:
     drive = smooth_drive()
     trial = common_trial(drive, replace(CASE, vehicles=300, symmetric=False, sign_bias=0.4), 0)
     (a, b), evidence = slopes_and_intercepts(trial.truth), trial.evidence
@@ -73,7 +73,7 @@ def test_rows_over_the_densest_cluster_do_not_feel_that_the_fleet_is_not_symmetr
 
 
 @pytest.mark.long
-def test_better_classifiers_sparser_faults_and_less_noise_recover_more_and_the_default_as_many_as_the_best() -> None:
+def test_recovery_rate_rises_with_sparsity_snr_and_better_classifiers() -> None:
     f2 = rates(CASE, PERFECT, TREE, THRESHOLD, figure="f2")
     assert f2[0] == 1.0
     assert f2 == sorted(f2, reverse=True)
@@ -91,13 +91,13 @@ def test_better_classifiers_sparser_faults_and_less_noise_recover_more_and_the_d
     assert rates(CASE, POSTERIOR, figure="harmed") < [0.05]
 
 
-def test_fleet_that_is_not_symmetric_defeats_the_mean_and_not_the_default() -> None:
+def test_asymmetric_fleet_defeats_the_mean_reference_but_not_the_default() -> None:
     published, default = rates(replace(CASE, vehicles=60, symmetric=False, sign_bias=0.4), PERFECT, POSTERIOR)
     assert published < 0.3
     assert default > 0.8
 
 
-def test_ceiling_knows_how_the_faults_were_drawn_or_is_refused() -> None:
+def test_ceiling_method_needs_the_distribution_of_the_faults() -> None:
     case = replace(CASE, vehicles=12)
     trial = common_trial(smooth_drive(), case, 0)
     ceiling, default = (method.estimate(trial).confidence for method in (CEILING, POSTERIOR))
@@ -107,7 +107,7 @@ def test_ceiling_knows_how_the_faults_were_drawn_or_is_refused() -> None:
         CEILING.estimate(biased)
 
 
-def test_builtin_drive_has_the_branches_asked_for_and_another_unseen_drive() -> None:
+def test_builtin_drive_has_the_requested_branches_and_a_different_unseen_drive() -> None:
     builtin = builtin_common_drive(120.0)
     drive = builtin.with_branches(3)
     for currents, all_branches in ((drive.i_s, builtin.i_s), (drive.unseen, builtin.unseen)):
@@ -140,7 +140,7 @@ def test_best_subset_lasso_and_median_recover_single_faults() -> None:
 
 
 @pytest.mark.parametrize("baseline", BASELINES[3:], ids=lambda baseline: baseline.name)
-def test_methods_on_the_junction_law_alone_know_ratios_of_gains(baseline: MethodRow) -> None:
+def test_methods_using_only_the_junction_law_find_the_gain_ratio(baseline: MethodRow) -> None:
     trial = common_trial(smooth_drive(), CommonCase(vehicles=40, sparsity=80.0), 0)
     found = baseline.estimate(trial)
     np.testing.assert_array_equal(found.hardware, False)

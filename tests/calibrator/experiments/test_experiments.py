@@ -61,7 +61,7 @@ def printed(result: ExperimentResult, width: int = 200) -> str:
     return capture.get()
 
 
-def test_new_experiment_is_one_row_and_says_before_it_runs_what_it_lacks(fleet: RecordedFleet, tmp_path: Path) -> None:
+def test_new_experiment_needs_one_table_row_and_is_checked_before_it_runs(fleet: RecordedFleet, tmp_path: Path) -> None:
     row = Experiment(
         name="loads",
         title="Loads without a sensor",
@@ -86,7 +86,7 @@ def test_new_experiment_is_one_row_and_says_before_it_runs_what_it_lacks(fleet: 
 @pytest.mark.parametrize(
     "name", ["delay", *(pytest.param(n, marks=pytest.mark.long) for n in RUN if n not in {"delay", "snr"})]
 )
-def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
+def test_experiments_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
     row = EXPERIMENTS[name].small()
     result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")
@@ -113,7 +113,7 @@ def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet,
         assert "by tenths of their probability integral transform" in page
 
 
-def test_figures_depend_on_the_seed_and_not_on_the_number_of_processes(snr: ExperimentResult) -> None:
+def test_results_depend_on_the_seed_but_not_on_the_number_of_processes(snr: ExperimentResult) -> None:
     row = replace(snr.experiment, methods=(PERFECT,))
     again = run_experiment(row, smooth_drive(), repetitions=1, workers=2)
     before = only(snr, "method", PERFECT.name).figures.reset_index(drop=True)
@@ -123,7 +123,7 @@ def test_figures_depend_on_the_seed_and_not_on_the_number_of_processes(snr: Expe
     assert other.figures["of"].max() == 2 * again.figures["of"].max(), "all trials of a setting count"
 
 
-def test_tables_put_paper_and_methods_side_by_side_and_explain_columns(snr: ExperimentResult) -> None:
+def test_tables_compare_the_paper_with_methods_and_explain_columns(snr: ExperimentResult) -> None:
     table = headline(snr)
     assert list(table.columns[:5]) == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
     assert table[["SNR [dB]", "paper"]].to_numpy().tolist() == [["10", "-"], ["20", "0.91"]]
@@ -136,13 +136,13 @@ def test_tables_put_paper_and_methods_side_by_side_and_explain_columns(snr: Expe
         assert not any(absent in text for absent in ("confidence", "calibration error", "delays", "failed:"))
 
 
-def test_damaged_record_is_named(tmp_path: Path) -> None:
+def test_damaged_experiment_record_is_named(tmp_path: Path) -> None:
     (tmp_path / "snr.json").write_bytes(b'{"name": 3}')
     with pytest.raises(FleetError, match=r"snr\.json: not a record of an experiment: .*run the experiment again"):
         read_records(tmp_path, ["real", "snr"])
 
 
-def test_calibration_pools_the_confidences_and_counts_shared_trials_once(snr: ExperimentResult) -> None:
+def test_calibration_pools_confidences_and_counts_shared_trials_once(snr: ExperimentResult) -> None:
     shared = replace(only(snr, "x", 20.0), experiment=EXPERIMENTS["classifier"])
     other = replace(snr, experiment=EXPERIMENTS["sparsity"], settings={**snr.settings, "seed": 100})
     result = pool_confidences([shared, snr, other])
@@ -178,18 +178,18 @@ NO_TABLE = "^snr: expected a method, and settings that differ in x or series$"
     ({"methods": ()}, 1, NO_TABLE),
     ({"methods": (PERFECT, POSTERIOR, PERFECT)}, 1, "^2 methods are called 'published/perfect'; give each method"),
 ])  # fmt: skip
-def test_what_makes_no_table_is_refused(change: dict[str, Any], repetitions: int, message: str) -> None:
+def test_experiment_that_cannot_give_a_table_is_refused(change: dict[str, Any], repetitions: int, message: str) -> None:
     with pytest.raises(FleetError, match=message):
         run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive(), repetitions=repetitions)
 
 
-def test_small_experiment_keeps_few_settings_and_small_fleets_that_are_as_large_as_the_table_says() -> None:
+def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
     small = EXPERIMENTS["asymmetry"].small()
     assert [(each.series, each.x) for each in small.settings] == [("0", 20.0), ("0.4", 20.0)]
     assert {each.case.vehicles for each in small.settings} == {20}
 
 
-def test_command_runs_records_and_pools(tmp_path: Path) -> None:
+def test_experiment_command_runs_records_and_pools(tmp_path: Path) -> None:
     out = ("--out", str(tmp_path / "results"))
     ran = CliRunner().invoke(app, ["experiment", "calibration", *out])
     assert "no experiment has a confidence to check; run 'calibrator experiment all --out" in str(ran.exception)
@@ -235,7 +235,7 @@ def run(*methods: ComparedMethod) -> ExperimentResult:
     return run_experiment(EXPERIMENTS["classifier"].small(), smooth_drive(), methods=methods, repetitions=1)
 
 
-def test_own_methods_stand_beside_the_paper_and_confidence_is_of_the_first_that_has_one() -> None:
+def test_table_shows_own_methods_and_the_first_available_confidence() -> None:
     sure = Own(change=lambda estimate: replace(estimate, confidence=np.full(N, 0.8)))
     result = run(PERFECT, Own("silent"), sure)
     table = headline(result)
@@ -262,6 +262,6 @@ def test_own_methods_stand_beside_the_paper_and_confidence_is_of_the_first_that_
     (lambda e: replace(e, drift_sd=MANY[:3], offset_sd_a=MANY), r"drift_sd is .* \(3, 2\), expected .*\(20, 2\)"),
     (lambda e: replace(e, findings=[["load"]]), "findings of 1 vehicles is list, expected those of 20, or none"),
 ])  # fmt: skip
-def test_what_is_no_estimate_is_refused_with_the_name_of_the_method(change: Change, message: str) -> None:
+def test_invalid_estimate_is_refused_with_the_name_of_the_method(change: Change, message: str) -> None:
     with pytest.raises(FleetError, match=f"^method 'mine': {message}"):
         run(Own("mine", change))

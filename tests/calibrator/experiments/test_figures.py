@@ -58,7 +58,7 @@ def two_vehicles(*, drift: float, harm_second: float) -> tuple[Estimate, Trial]:
     return one_of(drift=found, truth=np.array([[0.1, 0.0], [0.1, 0.0]]))
 
 
-def test_calibration_error_of_an_honest_confidence_is_that_of_chance_and_of_boasting_its_excess() -> None:
+def test_calibration_error_equals_the_excess_of_confidence_over_recovery() -> None:
     rng = np.random.default_rng(0)
     confidence = rng.random(100 * N)
     honest = figures_of(confident(confidence, rng.random(100 * N) < confidence))
@@ -71,7 +71,7 @@ def test_calibration_error_of_an_honest_confidence_is_that_of_chance_and_of_boas
     assert np.isnan(calibration_errors(tenths_of({}))).all()
 
 
-def test_calibration_error_by_chance_is_the_usual_one_of_an_exact_confidence() -> None:
+def test_calibration_error_by_chance_equals_that_of_exact_confidences() -> None:
     rng = np.random.default_rng(1)
     confidence = rng.beta(4.0, 1.0, 300)
     drawn = [calibration_errors(tenths_of({"ece": np.column_stack([confidence, rng.random(300) < confidence])}))
@@ -84,7 +84,9 @@ def test_calibration_error_by_chance_is_the_usual_one_of_an_exact_confidence() -
     [(0.1, 0.0, 1.0, 0.0), (0.1, 0.2, 0.5, 0.5), (0.1, -1.0, 0.5, 0.5)],
     ids=["truth", "a sound branch is corrected", "a gain of zero cannot be corrected"],
 )
-def test_worse_branch_is_harm(drift: float, harm_second: float, recovery_rate: float, harmed: float) -> None:
+def test_vehicle_with_a_worsened_branch_is_harmed(
+    drift: float, harm_second: float, recovery_rate: float, harmed: float
+) -> None:
     figures = figures_of(judge(*two_vehicles(drift=drift, harm_second=harm_second)))
     assert (figures["recovery_rate"].value, figures["harmed"].value) == (recovery_rate, harmed)
     assert figures["deployed"].value == 1.0
@@ -93,7 +95,7 @@ def test_worse_branch_is_harm(drift: float, harm_second: float, recovery_rate: f
         assert figures["worst_a"].value == pytest.approx(rms_a * (1.0 - 1.0 / 1.2))
 
 
-def test_branch_that_passes_through_can_do_no_harm() -> None:
+def test_uncorrected_branch_does_no_harm() -> None:
     estimate, trial = two_vehicles(drift=0.1, harm_second=0.2)
     only_first = replace(estimate, corrected=estimate.corrected & np.array([True, False]))
     assert figures_of(judge(only_first, trial))["harmed"].value == 0.0
@@ -102,7 +104,7 @@ def test_branch_that_passes_through_can_do_no_harm() -> None:
     assert "harmed" not in nothing
 
 
-def test_shares_have_an_exact_interval() -> None:
+def test_shares_have_exact_binomial_intervals() -> None:
     for hits, of in ((0, 100), (3, 175), (5, 5)):
         row = figures_of({"harmed": np.arange(of) < hits})["harmed"]
         assert (round(row.value * row.of), row.of) == (hits, of)
@@ -110,7 +112,7 @@ def test_shares_have_an_exact_interval() -> None:
     assert np.isnan(figures_of({"confidence": np.array([0.3])})["confidence"].low)
 
 
-def test_standard_deviations_that_are_right_have_normal_scores() -> None:
+def test_correct_standard_deviations_give_normal_scores() -> None:
     rng, true = np.random.default_rng(0), np.full((4000, 2), 0.2)
     sd = rng.uniform(0.01, 0.03, true.shape)
     estimate, trial = one_of(drift=true + sd * rng.standard_normal(sd.shape), truth=true)
@@ -125,7 +127,7 @@ def test_standard_deviations_that_are_right_have_normal_scores() -> None:
     assert tenths_of(judge(own, trial))["pit"][5] == true.size
 
 
-def test_causes_that_findings_name_are_counted_where_there_is_an_attack() -> None:
+def test_rightly_and_wrongly_named_causes_are_counted_in_attacked_trials() -> None:
     estimate, trial = two_vehicles(drift=0.1, harm_second=0.0)
     attacked = replace(trial, attacked=np.array([True, False]), causes=("inverted",))
     for findings, named, misnamed in (((["inverted"], []), 1, 0), (([], ["step"]), 0, 1), ((), 0, 0)):

@@ -46,7 +46,7 @@ def drawn(result: ExperimentResult) -> Figure:
     return figure
 
 
-def test_equal_curves_do_not_hide_each_other(equal: ExperimentResult) -> None:
+def test_identical_curves_do_not_hide_each_other(equal: ExperimentResult) -> None:
     for axes in drawn(equal).axes:
         curves = [container.lines[0] for container in axes.containers if isinstance(container, ErrorbarContainer)]
         assert len(curves) == len(BIASES)
@@ -56,7 +56,7 @@ def test_equal_curves_do_not_hide_each_other(equal: ExperimentResult) -> None:
         assert np.all(np.diff(places[:, 0]) > 5.0)
 
 
-def test_bars_are_the_95_percent_intervals(equal: ExperimentResult) -> None:
+def test_error_bars_are_the_95_percent_intervals(equal: ExperimentResult) -> None:
     single = replace(equal, figures=equal.figures.query("series == '0'").assign(series=""))
     for result, across in ((equal, 1), (shown_as(single, "snr"), 1), (shown_as(equal, "real"), 0)):
         axes = drawn(result).axes[0]

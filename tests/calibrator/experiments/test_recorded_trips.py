@@ -19,7 +19,7 @@ def fleet() -> RecordedFleet:
     return small_fleet()
 
 
-def test_samples_obey_the_fault_model_within_noise_and_steps(fleet: RecordedFleet) -> None:
+def test_recorded_samples_obey_the_fault_model_within_noise_and_quantisation(fleet: RecordedFleet) -> None:
     case = RecordedCase(branches=3, sparsity=60.0, unmeasured_a=(3.0, 1.0))
     trips = fleet.with_branches(3)
     vehicles = record_vehicles(fleet, case, trips, 0)
@@ -46,7 +46,7 @@ def test_default_recovers_recorded_vehicles_that_defeat_the_published_method(fle
 
 
 @pytest.mark.parametrize(("branches", "sparsity", "balanced"), [(2, 20.0, True), (2, 80.0, False), (3, 60.0, True)])
-def test_distribution_is_that_of_drawn_fleets(branches: int, sparsity: float, balanced: bool) -> None:
+def test_known_distribution_of_faults_matches_drawn_fleets(branches: int, sparsity: float, balanced: bool) -> None:
     rng, vehicles = np.random.default_rng(1), 40_000
     settings = FaultSettings(sparsity=sparsity, balanced=balanced)
     known = drawn_distribution(settings, branches)
@@ -65,7 +65,7 @@ def test_distribution_is_that_of_drawn_fleets(branches: int, sparsity: float, ba
 
 
 @pytest.mark.long
-def test_faults_of_the_own_prior_are_drawn_anew_for_the_same_trips(fleet: RecordedFleet) -> None:
+def test_faults_can_be_drawn_from_the_learnt_prior_for_the_same_trips(fleet: RecordedFleet) -> None:
     first, own = (recorded_trial(fleet, RecordedCase(own_prior=prior), 0) for prior in (None, POSTERIOR))
     assert not np.array_equal(own.truth.drift, first.truth.drift)
     learnt = POSTERIOR.estimate(first).learnt
@@ -75,14 +75,14 @@ def test_faults_of_the_own_prior_are_drawn_anew_for_the_same_trips(fleet: Record
     assert judge(POSTERIOR.estimate(own), own)["recovery_rate"].mean() >= 0.8
 
 
-def test_case_with_minutes_has_the_vehicles_asked_for(fleet: RecordedFleet) -> None:
+def test_case_with_minutes_has_the_requested_number_of_vehicles(fleet: RecordedFleet) -> None:
     trial = recorded_trial(fleet, RecordedCase(vehicles=15, minutes=2.0), 0)
     assert len(trial.truth) == len(trial.evidence.slopes) == 15
     with pytest.raises(FleetError, match="3 usable trips, at least 4 are needed"):
         recorded_trial(fleet, RecordedCase(vehicles=3, minutes=2.0), 0)
 
 
-def test_delays_are_found_and_taken_out_or_left_in(fleet: RecordedFleet) -> None:
+def test_delays_are_removed_unless_they_are_to_be_left_in(fleet: RecordedFleet) -> None:
     few, case = fleet.take(4, duration_s=150.0), RecordedCase(delay_max_s=0.3)
     trial, left_in = (recorded_trial(few, replace(case, delays_left_in=left), 0) for left in (False, True))
     assert trial.delay_error_s is not None
@@ -104,7 +104,7 @@ def many() -> RecordedFleet:
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_world_changes_the_currents_of_those_that_have_it_alone(many: RecordedFleet, world: str) -> None:
+def test_world_changes_only_the_currents_of_affected_vehicles(many: RecordedFleet, world: str) -> None:
     trips, case = many.with_branches(2), RecordedCase(sparsity=100.0, world=world)
     plain, attacked = (record_vehicles(many, one, trips, 2) for one in (SOUND, case))
     pairs = zip(plain.samples, attacked.samples, strict=True)
@@ -114,7 +114,7 @@ def test_world_changes_the_currents_of_those_that_have_it_alone(many: RecordedFl
     assert any(changed) == bool(WORLDS[world].share)
 
 
-def test_truth_and_unseen_drive_are_those_of_the_world(many: RecordedFleet) -> None:
+def test_truth_and_unseen_drive_follow_the_world(many: RecordedFleet) -> None:
     sound, inverted, load, quadratic = (
         recorded_trial(many, RecordedCase(sparsity=100.0, world=world), 2)
         for world in ("", "inverted in 10%", "load 5 A in 30%", "quadratic 5-20 %")
@@ -131,7 +131,7 @@ def test_truth_and_unseen_drive_are_those_of_the_world(many: RecordedFleet) -> N
     assert sized.smallest_fault == 0.3 <= sizes.min() <= sizes.max() <= 0.6
 
 
-def test_step_is_half_way_and_over_on_the_unseen_drive(many: RecordedFleet) -> None:
+def test_gain_step_occurs_midway_and_persists_on_the_unseen_drive(many: RecordedFleet) -> None:
     trips = many.with_branches(2)
     vehicles = record_vehicles(many, RecordedCase(sparsity=100.0, world="gain step of 15 % midway"), trips, 2)
     assert vehicles.attack is not None

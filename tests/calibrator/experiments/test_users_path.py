@@ -26,7 +26,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_store(tmp_path_factory.mktemp("trips") / "store", small_fleet(VEHICLES).trips)
 
 
-def test_trips_that_differ_have_what_all_of_them_have_and_without_model_inputs_are_refused(tmp_path: Path) -> None:
+def test_trips_are_reduced_to_channels_common_to_all(tmp_path: Path) -> None:
     database, trips = read_database(read_layout(LAYOUT)), small_fleet(5, samples=1800).trips
     fleet = read_fleet(write_store(tmp_path / "some", trips, lacking=["motor", "speed"]), database)
     assert {frozenset(trip.currents_a) for trip in fleet.trips} == {frozenset({"battery", "auxiliary"})}
@@ -50,7 +50,7 @@ def calibrated(store: Path, out: Path) -> pd.DataFrame:
     return rows[rows["branch"].notna()].pivot_table(index="vehicle", columns="branch", aggfunc="first", sort=True)
 
 
-def test_recovery_and_deployment_are_those_of_the_commands(store: Path, tmp_path: Path) -> None:
+def test_experiment_gives_the_same_estimate_as_simulate_and_calibrate(store: Path, tmp_path: Path) -> None:
     fleet, case = read_fleet(store, read_database(read_layout(LAYOUT))), RecordedCase()
     trial = recorded_trial(fleet, case, 0)
     estimate = POSTERIOR.estimate(trial)

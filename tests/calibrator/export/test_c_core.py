@@ -52,7 +52,7 @@ def test_c_core_matches_the_node_for_random_frames(part: int, tmp_path: Path) ->
 
 @needs("clang")
 @pytest.mark.parametrize("part", PARTS)
-def test_random_vehicles_are_the_same_and_nothing_is_undefined(part: int, tmp_path: Path) -> None:
+def test_c_core_matches_the_node_for_random_vehicles_without_undefined_behaviour(part: int, tmp_path: Path) -> None:
     vehicles, rng, changed = drawn_vehicles(Random(part), tmp_path), Random(part), 0
     for _ in range(6):
         checked = next(vehicles)
@@ -61,13 +61,13 @@ def test_random_vehicles_are_the_same_and_nothing_is_undefined(part: int, tmp_pa
 
 
 @needs("clang")
-def test_fuzzing_finds_nothing(tmp_path: Path) -> None:
+def test_fuzzing_of_the_c_core_finds_no_error(tmp_path: Path) -> None:
     fuzz(tmp_path, 60)
 
 
 @needs("gcc", "clang", "nm")
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_core_is_plain_c99_that_needs_no_library(compiler: str, tmp_path: Path) -> None:
+def test_c_core_is_plain_c99_without_libraries(compiler: str, tmp_path: Path) -> None:
     build(vehicle(), tmp_path, compiler=compiler, flags=("-Os",))
     names = subprocess.run(["nm", tmp_path / "hv_correction.o"], capture_output=True, text=True, check=True).stdout
     assert {line.split()[-2] for line in names.splitlines()} <= {"T", "t"}, "no symbol of others, no variable"
@@ -76,7 +76,7 @@ def test_core_is_plain_c99_that_needs_no_library(compiler: str, tmp_path: Path) 
 
 
 @needs("cppcheck")
-def test_only_the_written_down_rule_of_misra_is_deviated_from(tmp_path: Path) -> None:
+def test_c_core_deviates_only_from_the_documented_misra_rule(tmp_path: Path) -> None:
     (tmp_path / "hv_calibration.c").write_text(c_text(vehicle()))
     options = ["--addon=misra", "--std=c99", "--enable=all", "--quiet", f"-I{CORE}", "--template={file}:{id}"]
     options += ["--suppress=missingIncludeSystem", "--suppress=unusedFunction", f"--cppcheck-build-dir={tmp_path}"]
@@ -87,7 +87,7 @@ def test_only_the_written_down_rule_of_misra_is_deviated_from(tmp_path: Path) ->
 
 
 @needs("gcc")
-def test_calibration_of_another_layout_and_erased_memory_pass_everything_through(tmp_path: Path) -> None:
+def test_c_core_passes_frames_through_with_a_foreign_or_erased_calibration(tmp_path: Path) -> None:
     checked = vehicle()
     text = c_text(checked)
     build(checked, tmp_path)
@@ -100,7 +100,7 @@ def test_calibration_of_another_layout_and_erased_memory_pass_everything_through
 
 
 @needs("gcc")
-def test_any_name_of_a_vehicle_compiles(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_exported_c_compiles_with_any_vehicle_name(make_database: MakeDatabase, tmp_path: Path) -> None:
     parameters = replace(parameters_for(make_database(), battery=(0.05, 2.3)), vehicle='Zoë\n*/ #error /*/ ??/ "\\')
     build(checked_with(make_database(), parameters, tmp_path), tmp_path)
 
@@ -118,7 +118,7 @@ def test_signal_too_wide_to_be_corrected_is_refused_by_name(
     assert "battery" in c_text(checked_with(database, parameters_for(database, motor=(0.05, 2.3)), tmp_path))
 
 
-def test_what_the_gateway_refuses_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_export_refuses_layouts_that_the_gateway_refuses(make_database: MakeDatabase, tmp_path: Path) -> None:
     database = make_database(SMALL_LAYOUT + '\n[e2e]\nprofile = "P01"\nmessages = ["Pair"]\n')
     checked = checked_with(database, parameters_for(database, battery=(0.05, 2.3)), tmp_path)
     for write in (c_text, lambda item: image_bytes(item, "big")):
@@ -127,7 +127,7 @@ def test_what_the_gateway_refuses_is_refused(make_database: MakeDatabase, tmp_pa
 
 
 @needs("gcc", "size", "valgrind")
-def test_size_and_instructions_are_those_of_a_small_program(tmp_path: Path) -> None:
+def test_c_core_is_small_and_needs_few_instructions_per_frame(tmp_path: Path) -> None:
     found = {row.name: row.value for row in measure(tmp_path, 100, ["-Os"])}
     assert 1_000 < found["C core, gcc -Os, hv_correction.o"] < 4_000
     assert all(100 < value < 2_000 for name, value in found.items() if "frame" in name)

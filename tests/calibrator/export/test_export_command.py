@@ -21,7 +21,7 @@ def params(database: VehicleDatabase, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("form", ["c", "dcm", "cdfx"])
-def test_file_is_written_where_asked_and_replaced_only_if_asked(form: str, params: Path, tmp_path: Path) -> None:
+def test_export_replaces_a_different_file_only_with_replace(form: str, params: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / f"v1.{form}"
     arguments = (params, "--format", form, "--output", out)
     for _ in range(2):  # the same again is no error
@@ -43,7 +43,7 @@ def test_file_is_written_where_asked_and_replaced_only_if_asked(form: str, param
         (("--format", "dcm", "--elf", "v1.json"), "--format dcm takes no --elf PROGRAM"),
     ],
 )
-def test_contradictions_of_the_command_line_are_refused(words: tuple[str, ...], message: str, params: Path) -> None:
+def test_contradictory_export_options_are_refused(words: tuple[str, ...], message: str, params: Path) -> None:
     words = tuple(str(params) if word == "v1.json" else word for word in words)
     with pytest.raises(ContradictionError, match=message):
         raise refused(params, *words, "--output", params.with_name("out"))
@@ -59,7 +59,7 @@ def test_parameters_that_do_not_fit_are_refused(params: Path, tmp_path: Path, ma
     assert not (tmp_path / "out").exists()
 
 
-def test_protection_that_the_core_does_not_know_is_reported(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_e2e_profile_unknown_to_the_c_core_is_reported(make_database: MakeDatabase, tmp_path: Path) -> None:
     layout = SMALL_LAYOUT + '\n[e2e]\nprofile = "P05"\noffset = 4\nmessages = ["Pair"]\n'
     database = make_database(layout)
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), tmp_path / "v1.json")

@@ -108,6 +108,8 @@ def test_dcm_and_cdfx_hold_the_provenance(checked: Checked) -> None:
 
 @pytest.mark.parametrize("write", [dcm_text, cdfx_text])
 @pytest.mark.parametrize("vehicle", ['a "b"', "a\\b", "a\nb"])
-def test_text_with_quotation_is_refused(write: Callable[[Checked], object], vehicle: str, checked: Checked) -> None:
+def test_vehicle_name_with_quotation_mark_or_control_character_is_refused(
+    write: Callable[[Checked], object], vehicle: str, checked: Checked
+) -> None:
     with pytest.raises(ExportError, match=r"^v1\.json: vehicle '.*' has a quotation mark, a backslash or a control"):
         write(renamed(checked, vehicle))

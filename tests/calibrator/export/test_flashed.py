@@ -61,7 +61,9 @@ def flashed(program: Path, out: Path, memory: Mapping[int, bytes]) -> Path:
     return out
 
 
-def test_hex_flashes_the_vehicle(vehicles: tuple[Path, Checked], tmp_path: Path) -> None:
+def test_hex_file_flashed_into_the_program_gives_the_right_correction(
+    vehicles: tuple[Path, Checked], tmp_path: Path
+) -> None:
     program, checked = vehicles
     with pytest.raises(ValueError, match="C core"):
         check_frames(checked, program, Random(1), 1_000)
@@ -71,7 +73,9 @@ def test_hex_flashes_the_vehicle(vehicles: tuple[Path, Checked], tmp_path: Path)
 
 
 @pytest.mark.parametrize("form", ["dcm", "cdfx"])
-def test_dcm_and_cdfx_flash_the_vehicle_by_the_a2l(form: str, vehicles: tuple[Path, Checked], tmp_path: Path) -> None:
+def test_dcm_and_cdfx_flashed_by_the_a2l_give_the_right_correction(
+    form: str, vehicles: tuple[Path, Checked], tmp_path: Path
+) -> None:
     program, checked = vehicles
     file, a2l = written(vehicles, form, tmp_path / "values"), written(vehicles, "a2l", tmp_path / "core.a2l")
     values = by_dcm_reader(file) if form == "dcm" else by_xml(file)
@@ -115,7 +119,7 @@ def test_a2l_is_the_same_for_all_vehicles_of_a_layout(vehicles: tuple[Path, Chec
 
 
 @pytest.mark.parametrize("address", [0, 0xFFF0, 0x00FF_FFF0, 0x8000_FFF1, (1 << 32) - 656])
-def test_hex_holds_any_address(address: int) -> None:
+def test_hex_file_can_hold_any_32_bit_address(address: int) -> None:
     data = Random(1).randbytes(656)
     file = bincopy.BinFile()
     file.add(intel_hex(address, data))
@@ -124,12 +128,14 @@ def test_hex_holds_any_address(address: int) -> None:
         intel_hex((1 << 32) - 100, data)
 
 
-def test_image_of_big_endian_units_is_mirrored_word_by_word(vehicles: tuple[Path, Checked]) -> None:
+def test_image_for_big_endian_units_has_its_64_bit_words_reversed(vehicles: tuple[Path, Checked]) -> None:
     little, big = (image_bytes(vehicles[1], order) for order in ("little", "big"))
     assert b"".join(little[at : at + 8][::-1] for at in range(0, len(little), 8)) == big
 
 
-def test_unfit_program_is_refused(vehicles: tuple[Path, Checked], make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_program_without_a_matching_calibration_symbol_is_refused(
+    vehicles: tuple[Path, Checked], make_database: MakeDatabase, tmp_path: Path
+) -> None:
     program, checked = vehicles
     (tmp_path / "text").write_text("no ELF")
     cases = [
@@ -146,7 +152,7 @@ def test_unfit_program_is_refused(vehicles: tuple[Path, Checked], make_database:
         find_image(program, make_database())
 
 
-def test_numbers_that_tools_cannot_hold_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_numbers_too_large_for_calibration_tools_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
     dbc = Path(make_database().layout.dbc_path).read_text().replace("[-3000|3000]", "[-0.3|0.3]")
     database = make_database(dbc=dbc)
     checked = checked_with(database, parameters_for(database, battery=(0.051, 0.0)), tmp_path)

@@ -21,7 +21,7 @@ from calibrator.files.storage import Storage, StorageError, open_storage, walk
 from ecu_node.errors import UserError
 
 
-def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
+def test_folder_appears_only_when_it_is_complete(tmp_path: Path) -> None:
     out = tmp_path / "a" / "out"
     with whole_folder(out) as partial:
         (partial / "x").write_text("1")
@@ -30,7 +30,7 @@ def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
-def test_folder_in_use_is_refused_untouched(tmp_path: Path) -> None:
+def test_folder_that_is_not_empty_is_refused_and_unchanged(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("1")
     with pytest.raises(FleetError, match="exists and is not empty"), whole_folder(tmp_path / "out"):
@@ -38,7 +38,7 @@ def test_folder_in_use_is_refused_untouched(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "mine").read_text() == "1"
 
 
-def test_full_disk_says_what_to_do_and_leaves_nothing(tmp_path: Path) -> None:
+def test_full_disk_is_reported_and_no_partial_folder_remains(tmp_path: Path) -> None:
     message = rf"^{tmp_path}/out: cannot write it: No space left on device; make room, or choose another --out"
     with pytest.raises(FleetError, match=message), whole_folder(tmp_path / "out"):
         raise OSError(errno.ENOSPC, "Error writing bytes to file. Detail: [errno 28] No space left on device")
@@ -46,7 +46,7 @@ def test_full_disk_says_what_to_do_and_leaves_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["out", "out[1]"])
-def test_what_a_killed_process_left_is_removed_and_that_of_a_running_one_stays(tmp_path: Path, name: str) -> None:
+def test_partial_folder_of_a_killed_process_is_removed(tmp_path: Path, name: str) -> None:
     gone = subprocess.Popen([sys.executable, "-c", "pass"])
     gone.wait()
     (tmp_path / f".{name}.partial-{gone.pid}").mkdir()
@@ -58,7 +58,7 @@ def test_what_a_killed_process_left_is_removed_and_that_of_a_running_one_stays(t
 
 @pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
 @pytest.mark.parametrize("name", ["x", "x/y/z"])
-def test_folder_in_which_the_system_makes_nothing_is_refused(require: Callable[[Path], None], name: str) -> None:
+def test_folder_in_an_unwritable_file_system_is_refused(require: Callable[[Path], None], name: str) -> None:
     # No right forbids it to root; only trying tells.
     with pytest.raises(FleetError, match=rf"^/proc/{name}: nothing can be made in /proc: .*; choose another folder$"):
         require(Path("/proc") / name)
@@ -71,7 +71,7 @@ def test_url_is_refused_where_only_a_path_can_be_written(require: Callable[[Path
         require(Path("s3://bucket/result"))
 
 
-def test_link_is_not_replaced_wherever_it_leads(tmp_path: Path) -> None:
+def test_symbolic_link_is_not_replaced_by_a_folder(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     (tmp_path / "out").symlink_to(tmp_path / "there")
     (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
@@ -90,20 +90,20 @@ def fill_while_the_place_is_taken(out: Path) -> None:
         (out / "in the way").write_text("")
 
 
-def test_what_was_made_stays_if_it_cannot_be_put_in_its_place(tmp_path: Path) -> None:
+def test_result_is_kept_if_it_cannot_be_moved_to_its_place(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match=r"out: cannot be replaced: .*; what was made stands in") as caught:
         fill_while_the_place_is_taken(tmp_path / "out")
     kept = Path(str(caught.value).rpartition("stands in ")[2])
     assert (kept / "result").read_text() == "hours of work"
 
 
-def test_new_folder_is_not_made_over_a_mounted_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mount_point_is_refused_as_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "is_mount", lambda _: True)
     with pytest.raises(FleetError, match="a disk is mounted there"):
         require_new_folder(tmp_path)
 
 
-def test_files_change_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_files_are_written_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "old").write_bytes(b"old")
     (tmp_path / "folder").mkdir()
     with pytest.raises(UserError, match=f"^{tmp_path}/folder: cannot be written: it is a folder$"):
@@ -124,7 +124,7 @@ def test_files_change_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("place", ["", " ", "file://", "s3://"])
-def test_no_place_is_refused(place: str) -> None:
+def test_empty_path_or_url_is_refused(place: str) -> None:
     with pytest.raises(StorageError, match=f"^{place!r}: names no place; give the path of a folder or a URL"):
         open_storage(place)
 
@@ -144,7 +144,7 @@ def test_unknown_kind_of_storage_is_refused() -> None:
         open_storage("nokind://x").names()
 
 
-def test_vanishing_file_hides_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_that_vanishes_while_listing_does_not_hide_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "there").touch()
 
     class Vanishing:
@@ -162,7 +162,9 @@ def test_vanishing_file_hides_no_others(tmp_path: Path, monkeypatch: pytest.Monk
     assert open_storage(tmp_path).names() == ["there"]
 
 
-def test_unreadable_inner_folder_is_a_problem_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_inner_folder_is_reported_and_others_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("V1", "lost+found", "vehicle 2"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.log").touch()
@@ -182,7 +184,7 @@ def test_unreadable_inner_folder_is_a_problem_of_its_own(tmp_path: Path, monkeyp
     assert problems == ["lost+found: cannot read it: Permission denied"]
 
 
-def test_a_folder_on_a_disk_without_locks_is_used_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_on_a_file_system_without_locks_is_usable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_locks(handle: int, operation: int) -> None:
         raise OSError(errno.EBADF, "Bad file descriptor")
 
@@ -191,7 +193,7 @@ def test_a_folder_on_a_disk_without_locks_is_used_without(tmp_path: Path, monkey
         pass
 
 
-def test_storage_that_lets_nobody_in_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_storage_that_denies_access_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_credentials(*_: object) -> None:
         raise RuntimeError("Unable to locate credentials")
 

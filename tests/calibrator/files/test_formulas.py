@@ -19,7 +19,7 @@ VALUES = {"a": np.array([1.0, -2.0, 4.0]), "b": np.array([2.0, 0.0, -1.0])}
     ("+a", [1.0, -2.0, 4.0]), ("positive(a)", [1.0, 0.0, 4.0]), ("negative(a)", [0.0, -2.0, 0.0]),
     ("abs(a)", [1.0, 2.0, 4.0]), ("sqrt(abs(a))", [1.0, 2**0.5, 2.0]), ("3", [3.0, 3.0, 3.0]),
 ])  # fmt: skip
-def test_a_formula_is_evaluated_at_each_sample(formula: str, expected: list[float]) -> None:
+def test_formula_is_evaluated_at_each_sample(formula: str, expected: list[float]) -> None:
     np.testing.assert_allclose(evaluate_formula(formula, VALUES), expected)
 
 
@@ -35,7 +35,7 @@ def test_undefined_formula_gives_a_non_finite_value_without_warning(formula: str
     ("speed * 2", r"speed is no \[\[input\]\]"), ("d + 1", r"d is no \[\[input\]\]"), ("open(1)", "not allowed"),
     ("a b", "not arithmetic"),
 ])  # fmt: skip
-def test_layout_with_wrong_formula_is_refused(tmp_path: Path, formula: str, words: str) -> None:
+def test_layout_with_an_invalid_formula_is_refused(tmp_path: Path, formula: str, words: str) -> None:
     path = tmp_path / "small.toml"
     derived = f'derived = [{{ name = "d", formula = "{formula}" }}]\nfull_scale_a'
     path.write_text(SMALL_LAYOUT.replace("full_scale_a", derived))
@@ -50,7 +50,7 @@ def test_layout_with_wrong_formula_is_refused(tmp_path: Path, formula: str, word
      "lambda: 1", "__import__('os')", "a < b", "a // b", "(" * 500 + "a" + ")" * 500, "-" * 5000 + "a", "\0",
      "a" + " + a" * 1500],
 )  # fmt: skip
-def test_everything_else_is_refused(text: str) -> None:
+def test_formula_with_anything_but_arithmetic_is_refused(text: str) -> None:
     with pytest.raises(LayoutError, match="formula") as caught:
         parse_formula(text)
     assert "\n" not in str(caught.value)

@@ -62,7 +62,7 @@ def log(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> 
 # ---- figures
 
 
-def test_offset_is_the_mean_of_the_sum_before_and_gone_after(log: Path) -> None:
+def test_sum_shows_the_offset_before_and_not_after_correction(log: Path) -> None:
     found = figures(log, "--layout", LAYOUT)
     assert found["before"]["sum"]["rmse_a"] == pytest.approx(12.0, abs=0.02)
     assert found["before"]["sum"]["rmse_percent"] == pytest.approx(3.0, abs=0.005)
@@ -72,7 +72,7 @@ def test_offset_is_the_mean_of_the_sum_before_and_gone_after(log: Path) -> None:
     assert found["left_out"] == ["auxiliary", "dcdc", "motor_rear"]
 
 
-def test_figures_are_those_of_their_definition(tmp_path: Path) -> None:
+def test_rmse_maximum_and_mean_follow_their_definitions(tmp_path: Path) -> None:
     run = figures(*table(tmp_path, battery=MOTOR_A + 3.0, motor=-MOTOR_A))
     found = run["before"]
     battery = MOTOR_A + 3.0
@@ -83,7 +83,7 @@ def test_figures_are_those_of_their_definition(tmp_path: Path) -> None:
     assert total["rmse_percent"] == pytest.approx(100.0 * total["rmse_a"] / run["full_scale_a"])
 
 
-def test_rows_without_a_number_are_counted_and_not_used(tmp_path: Path) -> None:
+def test_rows_with_missing_numbers_are_counted_and_not_used(tmp_path: Path) -> None:
     battery = MOTOR_A + 12.0
     battery[100:110] = np.nan
     found = figures(*table(tmp_path, battery=battery, motor=-MOTOR_A))
@@ -96,7 +96,7 @@ def test_rows_without_a_number_are_counted_and_not_used(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("digits", [0, 1, 2])
-def test_quantisation_alone_lies_in_the_band(digits: int, tmp_path: Path) -> None:
+def test_sum_due_to_quantisation_alone_lies_in_the_expected_band(digits: int, tmp_path: Path) -> None:
     expected = figures(*table(tmp_path, digits, battery=MOTOR_A, motor=-0.4 * MOTOR_A, heater=-0.6 * MOTOR_A))[
         "expected"
     ]
@@ -105,7 +105,7 @@ def test_quantisation_alone_lies_in_the_band(digits: int, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("noise_a", [0.3, 1.0])
-def test_noise_of_the_sensors_widens_the_band(noise_a: float, tmp_path: Path) -> None:
+def test_sensor_noise_widens_the_expected_band(noise_a: float, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     battery, motor = MOTOR_A + noise_a * rng.normal(size=1200), -MOTOR_A
     expected = figures(*table(tmp_path, battery=battery, motor=motor))["expected"]
@@ -151,7 +151,7 @@ def test_missing_value_widens_the_expected_deviation_at_that_row_only(tmp_path: 
     (10.0, "its current is 10 times too large", "multiply motor [A] by 0.1, in the table or in --branches",
      "motor", "", 0.1),
 ])  # fmt: skip
-def test_slip_of_sign_or_unit_is_gone_when_its_advice_is_followed(
+def test_advice_on_a_wrong_sign_or_unit_removes_the_error(
     factor: float, text: str, advice: str, column: str, sign: str, times: float, tmp_path: Path
 ) -> None:
     heater = 5.0 * np.sin(2.0 * TABLE_S)
@@ -168,7 +168,7 @@ def test_slip_of_sign_or_unit_is_gone_when_its_advice_is_followed(
     assert errors("motor", "", -1.2 * MOTOR_A) == []
 
 
-def test_next_step_is_one_that_works(tmp_path: Path) -> None:
+def test_layout_init_is_suggested_only_where_it_works(tmp_path: Path) -> None:
     path, *_ = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
     for column, is_told in (("motor", True), ("motor*1", False)):  # a layout is not made of formulas
         done = run(path, "--branches", f"battery=battery,motor={column}")
@@ -212,7 +212,7 @@ def test_parameters_of_another_layout_are_refused(log: Path, tmp_path: Path) -> 
 # ---- text, pictures and tables
 
 
-def test_text_has_80_columns_and_ends_with_the_sum(log: Path) -> None:
+def test_output_fits_80_columns_and_ends_with_the_sum(log: Path) -> None:
     lines = run(log, "--layout", LAYOUT).stdout.splitlines()
     assert all(len(line) <= 80 for line in lines[:6]), lines
     assert "\x1b" not in "".join(lines)
@@ -220,7 +220,7 @@ def test_text_has_80_columns_and_ends_with_the_sum(log: Path) -> None:
     assert lines[-1].startswith("RMSE of the sum: 12.00 A measured, 0.0")
 
 
-def test_page_needs_no_other_file(log: Path, tmp_path: Path) -> None:
+def test_plot_page_needs_no_other_file(log: Path, tmp_path: Path) -> None:
     assert run(log, "--layout", LAYOUT, "--plot", tmp_path / "out.html").returncode == 0
     page = (tmp_path / "out.html").read_text()
     assert "<title>Branch currents, positive into the junction: drive.log.gz</title>" in page
@@ -230,7 +230,7 @@ def test_page_needs_no_other_file(log: Path, tmp_path: Path) -> None:
     assert "<link" not in page.partition("<body>")[0]
 
 
-def test_long_recording_is_thinned_out_in_the_picture(tmp_path: Path) -> None:
+def test_long_recording_is_thinned_out_in_the_plot(tmp_path: Path) -> None:
     times, motor = np.arange(0.0, 6000.0, 0.1), np.tile(MOTOR_A, 50)
     frame = pd.DataFrame({"time [s]": times, "battery": motor + 1.0, "motor": -motor}).round(2)
     frame.to_parquet(tmp_path / "long.parquet", index=False)
@@ -241,7 +241,7 @@ def test_long_recording_is_thinned_out_in_the_picture(tmp_path: Path) -> None:
     assert len(page) < 10e6
 
 
-def test_table_has_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> None:
+def test_table_contains_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> None:
     for name, read in (("out.csv", pd.read_csv), ("out.parquet", pd.read_parquet)):
         assert run(log, "--layout", LAYOUT, "--table", tmp_path / name).returncode == 0
         frame = read(tmp_path / name)
@@ -253,7 +253,7 @@ def test_table_has_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("option", "name"), [("--plot", "out.html"), ("--table", "out.csv")])
-def test_link_is_no_place_for_a_file(option: str, name: str, log: Path, tmp_path: Path) -> None:
+def test_symbolic_link_is_not_overwritten_by_plot_or_table(option: str, name: str, log: Path, tmp_path: Path) -> None:
     (tmp_path / name).symlink_to(tmp_path / "elsewhere")
     done = run(log, "--layout", LAYOUT, option, tmp_path / name)
     assert (done.returncode, done.stdout) == (1, "")

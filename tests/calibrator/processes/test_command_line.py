@@ -41,12 +41,12 @@ IMPORTING = (
     (START.format("--version") + SWALLOWED, INTERRUPTED, f"{interrupted_message([])}\n"),
     (START.format("summarise") + IMPORTING, INTERRUPTED, f"{interrupted_message(['summarise'])}\n"),
 ], ids=["base install", "Ctrl-C during start-up", "Ctrl-C during imports"])  # fmt: skip
-def test_program_that_cannot_start_says_why_in_one_line(code: str, exit_code: int, said: str) -> None:
+def test_failure_to_start_is_reported_in_one_line(code: str, exit_code: int, said: str) -> None:
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert (run.returncode, run.stdout, run.stderr) == (exit_code, "", said)
 
 
-def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(tmp_path: Path) -> None:
+def test_ctrl_c_ends_workers_too_and_leaves_no_partial_result(tmp_path: Path) -> None:
     command = [
         *(sys.executable, "-m", "calibrator", "simulate", "--vehicles", "200", "--minutes", "2"),
         *("--layout", str(LAYOUT), "--out", str(tmp_path / "x")),
@@ -64,7 +64,9 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(tmp_path:
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.0])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_signal_ends_readers_too(how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path) -> None:
+def test_ctrl_c_or_sigterm_ends_reader_processes_too(
+    how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path
+) -> None:
     log, temporary = tmp_path / "V1" / "endless.log.gz", short_folder
     log.parent.mkdir()
     log.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
@@ -90,7 +92,7 @@ def test_signal_ends_readers_too(how: signal.Signals, delay_s: float, tmp_path: 
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["simulate", "--help"]])
-def test_closed_pipe_gives_no_traceback(arguments: list[str]) -> None:
+def test_closed_output_pipe_of_calibrator_causes_no_traceback(arguments: list[str]) -> None:
     reader, writer = os.pipe()
     os.close(reader)
     command = [sys.executable, "-m", "calibrator", *arguments]
@@ -104,7 +106,7 @@ def handler() -> "Callable[..., object] | int | None":
 
 
 @pytest.mark.parametrize("before", [signal.default_int_handler, signal.SIG_IGN])
-def test_ctrl_c_is_handled_as_before_afterwards_and_stays_ignored(before: "Callable[..., object] | int") -> None:
+def test_previous_handler_of_ctrl_c_is_restored_after_imports(before: "Callable[..., object] | int") -> None:
     of_pytest = signal.signal(signal.SIGINT, before)
     try:
         with importing():
@@ -114,7 +116,7 @@ def test_ctrl_c_is_handled_as_before_afterwards_and_stays_ignored(before: "Calla
         signal.signal(signal.SIGINT, of_pytest)
 
 
-def test_message_says_whether_a_command_goes_on_where_it_was() -> None:
+def test_message_on_interruption_tells_whether_the_command_can_resume() -> None:
     goes_on = "; it goes on with what it had read"
     for arguments, kept in ((["--debug", "import", "x"], goes_on), (["simulate", "--out", "import"], ""), ([], "")):
         assert interrupted_message(arguments) == f"calibrator: interrupted; run the same command again{kept}"

@@ -53,7 +53,9 @@ def fleet_of(vehicles: int, folder: Path, database: VehicleDatabase) -> Path:
 
 
 @pytest.mark.long
-def test_hostile_log_is_left_out_with_its_reason_within_its_limits(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_log_exceeding_time_or_memory_limits_is_left_out_with_its_reason(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
     logs = fleet_of(1, tmp_path, database)
     lines = b"(1.000000) can0 123#\n" * 900_000
     bombs = {"blank lines": b"\n" * (1 << 24), "one line": b"0" * (1 << 24), "frames": lines}
@@ -76,7 +78,7 @@ def test_hostile_log_is_left_out_with_its_reason_within_its_limits(tmp_path: Pat
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["import", "summarise", "calibrate"])
-def test_command_killed_at_any_moment_gives_the_identical_result_when_run_again(
+def test_command_rerun_after_a_kill_gives_the_identical_result(
     tmp_path: Path, database: VehicleDatabase, command: str
 ) -> None:
     if command == "calibrate":
@@ -108,7 +110,9 @@ def test_command_killed_at_any_moment_gives_the_identical_result_when_run_again(
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["import", "summarise"])
-def test_lost_worker_and_scheduler_change_nothing(tmp_path: Path, database: VehicleDatabase, command: str) -> None:
+def test_results_are_identical_after_loss_of_a_worker_and_the_scheduler(
+    tmp_path: Path, database: VehicleDatabase, command: str
+) -> None:
     logs = fleet_of(24, tmp_path, database)
     with started(command, logs, tmp_path / "here", "--workers", 1) as here:
         here.communicate()

@@ -106,7 +106,7 @@ def test_results_come_in_the_order_of_the_items(workers: Workers) -> None:
     assert list(try_many(doubled, [], workers)) == []
 
 
-def test_few_items_are_in_flight() -> None:
+def test_number_of_items_taken_in_advance_is_bounded() -> None:
     taken: list[int] = []
 
     def items() -> Iterator[int]:
@@ -122,7 +122,7 @@ def test_few_items_are_in_flight() -> None:
     assert not children()
 
 
-def test_worker_that_begins_as_the_run_is_ended_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worker_started_while_the_run_is_closing_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
     made, is_ending = list[ProcessPool](), threading.Event()
 
     def pool(**options: Any) -> ProcessPool:
@@ -139,7 +139,7 @@ def test_worker_that_begins_as_the_run_is_ended_is_ended_too(monkeypatch: pytest
     assert not children()
 
 
-def hostile_items_cost_themselves_only(workers: Workers, folder: Path, knows_signals: bool = True) -> None:
+def require_failing_items_affect_no_others(workers: Workers, folder: Path, knows_signals: bool = True) -> None:
     os.mkfifo(folder / "endless")
     read = partial(hostile, endless=folder / "endless")
     first, *failed, last = (outcome for _, outcome in try_many(read, range(8), workers, limit_s=LIMIT_S))
@@ -149,17 +149,17 @@ def hostile_items_cost_themselves_only(workers: Workers, folder: Path, knows_sig
         assert outcome.reason.startswith(cause if knows_signals else cause.partition(" by ")[0])
 
 
-def test_hostile_items_cost_themselves_only(tmp_path: Path) -> None:
+def test_failing_or_crashing_items_do_not_affect_others(tmp_path: Path) -> None:
     handler, mask = signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    hostile_items_cost_themselves_only(TWO, tmp_path)
+    require_failing_items_affect_no_others(TWO, tmp_path)
     assert (signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, [])) == (handler, mask)
 
 
-def test_worker_killed_once_costs_a_second_attempt(tmp_path: Path) -> None:
+def test_item_is_tried_again_after_its_worker_was_killed_once(tmp_path: Path) -> None:
     assert list(run_many(partial(dying_once, folder=tmp_path), range(5), TWO)) == list(range(5))
 
 
-def test_workers_killed_at_rest_cost_nothing() -> None:
+def test_idle_workers_that_are_killed_are_replaced() -> None:
     with closing(run_many(doubled, iter(range(40)), TWO)) as results:
         assert next(results) == 0
         time.sleep(0.5)
@@ -172,14 +172,14 @@ def killing_itself(_: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_item_that_kills_its_workers_ends_the_run_in_words() -> None:
+def test_item_that_kills_its_worker_twice_ends_the_run_with_a_reason() -> None:
     how = "was killed by SIGKILL|ended, or was killed"  # the latter where multiprocessing does not know
     with pytest.raises(FleetError, match=rf"a worker process ({how}), and another one again"):
         list(run_many(killing_itself, range(2), TWO))
 
 
 @pytest.mark.parametrize("workers", [ONE, TWO])
-def test_errors_are_raised_at_the_turn_of_their_item(workers: Workers) -> None:
+def test_error_of_an_item_is_raised_in_order(workers: Workers) -> None:
     with closing(run_many(refused, range(5), workers)) as results:
         assert [next(results) for _ in range(2)] == [0, 1]
         with pytest.raises(ValueError, match="number 2"):
@@ -193,7 +193,7 @@ print(list(try_many(abs, [-1, -2], Workers())))
 """
 
 
-def test_limit_of_the_shell_for_memory_is_kept() -> None:
+def test_memory_limit_of_the_shell_is_respected() -> None:
     command = ["bash", "-c", 'ulimit -d 3000000 && exec "$@"', "-", sys.executable, "-c", LIMITED]
     assert subprocess.run(command, capture_output=True, check=True, text=True).stdout == "[(-1, 1), (-2, 2)]\n"
 
@@ -210,7 +210,7 @@ print(list(try_many(partial(waiting, folder=Path(sys.argv[1])), range(9), Worker
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_nothing_is_left_of_a_parent_that_ends(tmp_path: Path, short_folder: Path, how: signal.Signals) -> None:
+def test_workers_end_when_their_parent_process_ends(tmp_path: Path, short_folder: Path, how: signal.Signals) -> None:
     script = tmp_path / "parent.py"
     script.write_text(PARENT)  # without a guard: workers must not run it once more
     path = os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])

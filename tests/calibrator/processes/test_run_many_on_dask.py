@@ -23,7 +23,7 @@ from calibrator.processes.run_many import Workers, run_many
 from calibrator.summaries.summary_store import existing_store
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.processes.dask_cluster import DaskCluster, gated, of_no_disk
-from tests.calibrator.processes.test_run_many import dying_once, hostile_items_cost_themselves_only
+from tests.calibrator.processes.test_run_many import dying_once, require_failing_items_affect_no_others
 
 pytest.importorskip("distributed")
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
@@ -38,11 +38,11 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
         assert all(worker.poll() is None for worker in cluster.workers)
 
 
-def test_hostile_items_cost_themselves_only(tmp_path: Path, where: Workers) -> None:
-    hostile_items_cost_themselves_only(where, tmp_path, knows_signals=False)  # the process of a worker may not
+def test_failing_or_crashing_items_do_not_affect_others_on_dask(tmp_path: Path, where: Workers) -> None:
+    require_failing_items_affect_no_others(where, tmp_path, knows_signals=False)  # the process of a worker may not
 
 
-def test_errors_of_items_are_no_lost_scheduler(where: Workers, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_an_item_is_not_taken_for_a_lost_scheduler(where: Workers, monkeypatch: pytest.MonkeyPatch) -> None:
     def items() -> Iterator[int]:
         yield from range(2, 60)
         raise OSError("no more")
@@ -58,7 +58,9 @@ def test_errors_of_items_are_no_lost_scheduler(where: Workers, monkeypatch: pyte
         list(run_many(abs, range(3), where))
 
 
-def test_late_scheduler_and_lost_worker_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_identical_if_scheduler_starts_late_and_a_worker_dies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As one that is started again after it was lost."""
     monkeypatch.setattr(module, "CONNECT_S", 60.0)
     with DaskCluster(tmp_path, at_once=False) as cluster:
@@ -93,7 +95,7 @@ def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("is_fetching", [False, True])
-def test_run_whose_workers_all_end_says_so(
+def test_loss_of_all_workers_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], is_fetching: bool
 ) -> None:
     """As workers do that lack this package; Dask alone waits for ever for results that ended with their worker."""
@@ -121,7 +123,9 @@ def test_run_whose_workers_all_end_says_so(
 
 
 @pytest.mark.parametrize(("greeting", "reason"), [(b"", "timed out"), (b"SSH-2.0-OpenSSH", "another kind of server")])
-def test_server_that_is_no_scheduler_is_named(greeting: bytes, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_server_that_is_not_a_dask_scheduler_is_reported(
+    greeting: bytes, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "CONNECT_S", 2.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(10.0)
@@ -199,14 +203,16 @@ def logs(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase, s3
     return out / "logs"
 
 
-def test_drives_in_object_storage_are_those_in_a_folder(logs: Path, tmp_path: Path) -> None:
+def test_drives_in_object_storage_equal_those_in_a_folder(logs: Path, tmp_path: Path) -> None:
     for source, out in ((logs, tmp_path / "here"), ("s3://fleet/logs", "s3://fleet/here")):
         command("import", source, "--layout", LAYOUT, "--out", out)
     assert drives("s3://fleet/here/drives") == drives(str(tmp_path / "here" / "drives"))
 
 
 @pytest.mark.long
-def test_cluster_reads_object_storage_as_this_machine_does(logs: Path, tmp_path: Path, s3: dict[str, str]) -> None:
+def test_cluster_and_object_storage_give_the_same_results_as_local_files(
+    logs: Path, tmp_path: Path, s3: dict[str, str]
+) -> None:
     layout = ("--layout", LAYOUT)
     for processes in (1, 2):
         command("summarise", logs, *layout, "--out", tmp_path / f"s{processes}", "--workers", processes)

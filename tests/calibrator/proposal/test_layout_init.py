@@ -57,7 +57,7 @@ WITH_HEATER = PACK_AND_MOTOR | {"heater": ("ClimaStatus.HeaterCurrent", -1)}
 # ---- from a database alone
 
 
-def test_own_power_train_is_found_whole(tmp_path: Path) -> None:
+def test_all_branches_and_inputs_of_the_own_power_train_are_found(tmp_path: Path) -> None:
     (tmp_path / "hv_powertrain.dbc").write_bytes((DBC / "hv_powertrain.dbc").read_bytes())
     guessed = found(tmp_path / "hv_powertrain.dbc")
     by_hand = read_layout(DBC / "hv_powertrain.toml")
@@ -83,7 +83,7 @@ BATTERIES = {
 
 
 @pytest.mark.parametrize("kind", BATTERIES)
-def test_battery_current_as_databases_call_it(kind: str, tmp_path: Path) -> None:
+def test_battery_current_is_found_under_usual_names(kind: str, tmp_path: Path) -> None:
     signal, sender = BATTERIES[kind]
     message = f'BO_ 1 Status1: 8 {sender}\n {signal} INV\n SG_ HV_Voltage : 40|16@1+ (0.1,0) [0|900] "Volts" INV\n'
     limits = 'BO_ 7 Limits: 8 BMS\n SG_ MaxPackCurrent : 0|16@1- (0.1,0) [-500|500] "A" INV\n'
@@ -118,7 +118,7 @@ LEFT_OUT = {
 
 
 @pytest.mark.parametrize("kind", LEFT_OUT)
-def test_no_pack_current_is_reported_with_the_reason(kind: str, tmp_path: Path) -> None:
+def test_missing_pack_current_is_reported_with_the_reason(kind: str, tmp_path: Path) -> None:
     message, why = LEFT_OUT[kind]
     path = database_file(tmp_path, message, INVERTER)
     run = calibrator("layout", "init", path, "--out", tmp_path / "car.toml")
@@ -138,7 +138,7 @@ def test_charger_is_a_branch_only_without_a_motor(tmp_path: Path) -> None:
     assert signed(found(database_file(tmp_path, PACK, charger, INVERTER))) == PACK_AND_MOTOR
 
 
-def test_motor_without_a_current_is_computed_of_torque_and_speed(tmp_path: Path) -> None:
+def test_motor_current_is_computed_from_torque_and_speed_if_not_measured(tmp_path: Path) -> None:
     motor = (
         'BO_ 2 x1DA: 8 INV\n SG_ MG_EffectiveTorque : 0|11@1- (0.5,0) [-274|274] "Nm" BMS\n'
         ' SG_ MG_OutputRevolution : 16|15@1- (1,0) [-16382|16382] "rpm" BMS\n'
@@ -150,13 +150,13 @@ def test_motor_without_a_current_is_computed_of_torque_and_speed(tmp_path: Path)
 @pytest.mark.parametrize(
     ("comment", "sign"), [("Discharge positive", 1), ("positive while charge flows", -1), ("Current", 1)]
 )
-def test_comments_tell_signs(comment: str, sign: int, tmp_path: Path) -> None:
+def test_sign_is_taken_from_the_comment_of_the_signal(comment: str, sign: int, tmp_path: Path) -> None:
     layout = found(database_file(tmp_path, PACK, INVERTER, f'CM_ SG_ 1 PackCurrent "{comment}";\n'))
     assert layout.find_branch("battery").sign == sign
 
 
 @pytest.mark.parametrize("kind", ["kcd", "sym"])
-def test_other_databases_do_as_well(kind: str, tmp_path: Path) -> None:
+def test_kcd_and_sym_databases_give_the_same_layout(kind: str, tmp_path: Path) -> None:
     database: Any = cantools.database.load_file(database_file(tmp_path, PACK, INVERTER))
     cantools.database.dump_file(database, tmp_path / f"car.{kind}")
     assert signed(found(tmp_path / f"car.{kind}")) == PACK_AND_MOTOR
@@ -217,7 +217,7 @@ def log_file(dbc: Path, series: Series, *, seconds: float = 60.0, lines: Sequenc
     return path
 
 
-def test_with_a_log_signs_are_found_against_convention(tmp_path: Path) -> None:
+def test_log_reveals_signs_contrary_to_convention(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     turned = {**DRIVING, "PackCurrent": lambda t: -battery_a(t), "HeaterCurrent": heater_a}
     layout = found(dbc, "--log", log_file(dbc, turned))
@@ -225,7 +225,7 @@ def test_with_a_log_signs_are_found_against_convention(tmp_path: Path) -> None:
     assert layout.full_scale_a == 250.0
 
 
-def test_motor_that_does_not_follow_the_battery_is_none(tmp_path: Path) -> None:
+def test_motor_that_does_not_follow_the_battery_is_not_a_branch(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER)
     log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 15.0 * np.sin(5.3 * t)})
     run = calibrator("layout", "init", dbc, "--log", log)
@@ -233,7 +233,7 @@ def test_motor_that_does_not_follow_the_battery_is_none(tmp_path: Path) -> None:
     assert "of the greatest of them: a branch is missing or wrong; --branches" in run.stderr, "15 kW are not mA"
 
 
-def test_wrong_range_is_judged_by_the_log(tmp_path: Path) -> None:
+def test_wrong_range_in_the_dbc_is_found_by_the_log(tmp_path: Path) -> None:
     pack = PACK.replace("16@1- (0.1,0) [-1000|1000]", "16@1+ (0.1,-819.2) [0|819]")
     dbc = database_file(tmp_path, pack, INVERTER)
     log = log_file(dbc, DRIVING)
@@ -243,7 +243,7 @@ def test_wrong_range_is_judged_by_the_log(tmp_path: Path) -> None:
     assert json.loads(run.stdout)["before"]["sum"]["rmse_a"] < 20.0  # negative currents count: else 60 A
 
 
-def test_unsigned_signal_that_is_signed_is_reported(tmp_path: Path) -> None:
+def test_signal_wrongly_declared_unsigned_is_reported(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK.replace("@1- (0.1,0) [-1000|1000]", "@1+ (0.1,0) [0|0]"), INVERTER)
     run = calibrator("layout", "init", dbc, "--log", log_file(dbc, DRIVING))
     assert run.returncode == 1
@@ -262,7 +262,7 @@ def test_multiplexed_battery_current_is_found(tmp_path: Path) -> None:
     assert layout.find_branch("battery").timeout_s == 0.5  # every 100 ms: every other frame
 
 
-def test_tesla_gives_the_layout_written_by_hand(shared_data: Path, tmp_path: Path) -> None:
+def test_guessed_tesla_layout_equals_the_layout_written_by_hand(shared_data: Path, tmp_path: Path) -> None:
     (tmp_path / "Model3CAN.dbc").symlink_to(shared_data / "tesla_model3" / "Model3CAN.dbc")
     guessed = found(tmp_path / "Model3CAN.dbc", "--log", shared_data / "tesla_model3" / "drive.log.gz")
     for one, other in zip(guessed.branch, read_layout(DBC / "tesla_model3.toml").branch, strict=True):
@@ -280,7 +280,9 @@ BO_ 690 Charger2B2: 8 OBC
 
 
 @pytest.mark.parametrize("recording", ["Circontrol_end", "Circontrol_midpoint", "eacaec_enda", "efacaec_mida"])
-def test_i3_at_its_chargers(recording: str, shared_data: Path, tmp_path: Path) -> None:
+def test_branches_and_signs_of_an_i3_at_its_chargers_are_found(
+    recording: str, shared_data: Path, tmp_path: Path
+) -> None:
     """Real ones, of 9 to 40 s; in two of them the current does not change, and only its mean tells the signs."""
     log = shared_data / "bmw_i3_charging" / f"2019_{recording}.csv.gz"
     layout = found(database_file(tmp_path, I3), "--log", log)
@@ -302,7 +304,7 @@ def table(tmp_path: Path) -> Path:
     return tmp_path / "drive.csv"
 
 
-def test_columns_of_a_table_are_proposed(table: Path) -> None:
+def test_branches_are_found_among_the_columns_of_a_table(table: Path) -> None:
     layout, columns = found(table), {"battery": "Batterie", "motor": "Motor", "heater": "Heizungs"}
     assert signed(layout) == {branch: (f"{name}strom [A]", -1) for branch, name in columns.items()}
     assert calibrator("kirchhoff", table, "--layout", layout.path).returncode == 0
@@ -317,13 +319,13 @@ def columns(path: Path, *names: str, delay_s: float = 0.0, scale: float = 1.0) -
     return path
 
 
-def test_current_that_closes_the_sum_is_a_branch_whatever_its_name(tmp_path: Path) -> None:
+def test_current_that_closes_the_sum_is_a_branch_under_any_name(tmp_path: Path) -> None:
     assert found(columns(tmp_path / "x.csv", "Ibat", "Imot", "I_x")).find_branch("auxiliary").source == "I_x"
     late = columns(tmp_path / "late.csv", "Ibat", "Imot", "I_x", delay_s=5.0)
     assert set(signed(found(late))) == {"battery", "motor"}
 
 
-def test_current_in_another_unit_than_its_header_says_is_named(tmp_path: Path) -> None:
+def test_column_in_another_unit_than_its_header_is_reported(tmp_path: Path) -> None:
     path = columns(tmp_path / "x.csv", "Ibat", "Imot", scale=1000.0)
     run = calibrator("layout", "init", path, "--out", tmp_path / "x.toml")
     assert run.returncode == 1
@@ -331,7 +333,7 @@ def test_current_in_another_unit_than_its_header_says_is_named(tmp_path: Path) -
     assert not (tmp_path / "x.toml").exists()
 
 
-def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
+def test_table_serves_as_log_of_a_database(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     kilowatts = 1e-3 * motor_a(TIME_S) * volts(TIME_S)
     names = "time", "PackStatus.PackCurrent [mA]", "PackVoltage", "DcPower", "ClimaStatus.HeaterCurrent"
@@ -343,7 +345,7 @@ def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
     assert calibrator("kirchhoff", tmp_path / "x.csv", "--layout", layout.path).returncode == 0
 
 
-def test_named_branches_are_written_without_a_guess(table: Path) -> None:
+def test_branches_given_by_the_user_are_written_unchanged(table: Path) -> None:
     layout = found(table, "--branches", "-battery=Batteriestrom,-motor=Motorstrom [A]")
     assert layout.path.read_text().count("# confirm:") == 2  # full scale, voltage
     assert signed(layout) == {"battery": ("Batteriestrom [A]", -1), "motor": ("Motorstrom [A]", -1)}
@@ -357,7 +359,9 @@ def test_named_branches_are_written_without_a_guess(table: Path) -> None:
     ("other.log --log car.dbc", "the database comes first"),
     ("car.dbc --out there.toml", "exists, and is not overwritten"),
 ])  # fmt: skip
-def test_database_mistake_is_one_line(line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistake_in_a_database_is_reported_in_one_line(
+    line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     database_file(tmp_path, PACK, INVERTER)
     database_file(tmp_path, PACK, PACK.replace("1 PackStatus", "9 Twin"), name="two.dbc")
     (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n")
@@ -371,7 +375,7 @@ def test_database_mistake_is_one_line(line: str, said: str, tmp_path: Path, monk
     assert (tmp_path / "there.toml").read_text() == "kept"
 
 
-def test_json_has_every_candidate(tmp_path: Path) -> None:
+def test_json_lists_every_candidate_signal(tmp_path: Path) -> None:
     run = calibrator("layout", "init", database_file(tmp_path, PACK, INVERTER), "--json")
     report = json.loads(run.stdout)
     assert report["branches"] == ["battery", "motor"]
@@ -393,11 +397,11 @@ def test_json_has_every_candidate(tmp_path: Path) -> None:
     ("HV_BatteryVoltage", "hv battery voltage"), ("PTC_leftCurrentHV", "ptc left current hv"),
     ("DcDc_LowVoltagePower", "dcdc lv power"), ("AirConPowerDemand", "aircon power demand"),
 ])  # fmt: skip
-def test_names_are_split_into_words(text: str, words: str) -> None:
+def test_signal_names_are_split_into_words(text: str, words: str) -> None:
     assert " ".join(words_of(text)) == words
 
 
-def test_places_are_known_by_the_words_of_several_houses() -> None:
+def test_branch_is_recognised_from_english_and_german_signal_names() -> None:
     assert places_of(words_of("BMS_PackCurrent")) == {"battery"}
     assert places_of(words_of("INV_DcPower")) == {"motor"}
     assert places_of(words_of("Odometer")) == set()
@@ -407,7 +411,7 @@ def test_places_are_known_by_the_words_of_several_houses() -> None:
     assert places_of(words_of("BAT_StromIst", "HV-Batteriestrom am Shunt")) == {"battery"}
 
 
-def test_a_battery_is_known_by_the_branch_or_else_by_its_signal() -> None:
+def test_battery_is_recognised_by_branch_name_or_signal_name() -> None:
     assert is_battery("battery", "X.Y")
     assert is_battery("source", "BMS_1.PackCurrent")
     assert not is_battery("motor", "BMS_1.InverterCurrent")

@@ -80,7 +80,7 @@ def evidence_of(x: Array) -> tuple[FleetEvidence, Faults]:
     return evidence, truth
 
 
-def test_variances_of_the_evidence_are_those_of_white_noise() -> None:
+def test_variances_of_slopes_and_intercepts_match_white_noise() -> None:
     faults = fleet(400)
     evidence = collect_evidence(simulated(faults, 5.0), ideal_currents(), np.zeros(len(faults)))
     a, b = slopes_and_intercepts(faults)
@@ -89,7 +89,7 @@ def test_variances_of_the_evidence_are_those_of_white_noise() -> None:
     assert intercept_score.std() == pytest.approx(1.0, abs=0.06)
 
 
-def test_criterion_is_the_squared_distance_of_the_projections() -> None:
+def test_criterion_equals_the_squared_distance_of_the_projections() -> None:
     """(7) equals (8) and (9): project the measured current on the plane of zero sum."""
     i_s, rng = ideal_currents(), np.random.default_rng(0)
     i_m = 1.1 * i_s + rng.normal(size=i_s.shape) + 0.5
@@ -106,7 +106,7 @@ def test_threshold_is_a_third_of_the_fleets_spread() -> None:
     assert found.sensor.all()
 
 
-def test_expected_features_follow_the_mean_of_a_fleet_that_is_not_symmetric() -> None:
+def test_expected_features_hold_for_an_asymmetric_fleet() -> None:
     faults = fleet(40, symmetric=False)
     expected = classify.expected_features(faults, ideal_currents(), np.zeros(3), reference_vehicles=40)
     np.testing.assert_allclose(evidence_of_noisy(faults, 0.0)[0].features, expected, rtol=1e-9, atol=1e-9)
@@ -124,7 +124,7 @@ def test_single_faults_are_recovered_exactly_without_noise(branches: int) -> Non
     np.testing.assert_allclose(found.faults.hardware_drift, truth.hardware_drift, atol=1e-6)
 
 
-def test_a_failed_optimisation_is_named_and_the_fleet_goes_on() -> None:
+def test_failed_optimisation_of_a_vehicle_does_not_stop_the_fleet() -> None:
     evidence, truth = evidence_of(np.tile([0.1, 0.0, 0.0, 0.0, 0.1, 0.0], (2, 1)))
     evidence.slopes[0, 0] = np.nan
     found = recover_fleet(evidence, classify.classify_by_truth(truth), full_scale_a=FULL_SCALE_A)
@@ -153,7 +153,7 @@ def test_symmetric_fleet_is_recovered_through_noise(perfect: bool, least: float)
     assert f2_score(classes.hardware, faults.has_hardware_fault) >= least
 
 
-def test_vehicle_held_out_of_the_reference_moves_nothing_and_its_drive_is_not_the_unity_drive() -> None:
+def test_held_out_vehicle_affects_neither_reference_nor_unity_drive() -> None:
     a, b = slopes_and_intercepts(fleet(4))
     vehicles = [exact_model(f"{j}", 400 + j, a[j], b[j]) for j in range(4)]
     evidence, reference, unity = evidence_of_models(vehicles, [True, True, True, False])
@@ -164,7 +164,7 @@ def test_vehicle_held_out_of_the_reference_moves_nothing_and_its_drive_is_not_th
     np.testing.assert_allclose(evidence.slopes, a / a[:3].mean(axis=0))
 
 
-def test_small_fleet_is_noticed_on_the_screen_and_in_the_record(two_vehicles: Path, tmp_path: Path) -> None:
+def test_notice_on_a_small_fleet_is_printed_and_recorded(two_vehicles: Path, tmp_path: Path) -> None:
     options = ("--method", "published", "--layout", LAYOUT, "--workers", 1)
     run = calibrator("calibrate", two_vehicles, *options, "--out", tmp_path / "result")
     record = json.loads((tmp_path / "result" / "run.json").read_text())

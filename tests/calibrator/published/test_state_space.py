@@ -57,7 +57,7 @@ def recording(order: int, snr_db: float, seed: int) -> tuple[Array, Array, Array
 
 
 @pytest.mark.parametrize("kind", A_OF_KIND)
-def test_simulation_follows_the_equations_and_starts_in_steady_state(kind: str) -> None:
+def test_simulation_follows_the_state_equations_from_steady_state(kind: str) -> None:
     model, expected = model_with(A_OF_KIND[kind], 2), []
     inputs, x = np.random.default_rng(1).normal(size=(50, 2)), model.x0
     for u in inputs:
@@ -80,7 +80,7 @@ def test_known_system_is_found_through_noise(order: int) -> None:
         assert np.abs(slopes - 1.0).max() < slope
 
 
-def test_order_is_chosen_as_the_system_has_it_and_the_snr_is_that_of_the_simulation() -> None:
+def test_chosen_order_is_that_of_the_system_and_snr_that_of_the_simulation() -> None:
     inputs, _, noisy = recording(6, 30, 2)
     assert choose_order(inputs, noisy) == 6
     model = identify_model(inputs, noisy, order=6)
@@ -88,7 +88,7 @@ def test_order_is_chosen_as_the_system_has_it_and_the_snr_is_that_of_the_simulat
     np.testing.assert_allclose(model.snr_db, simulation_snr_db(noisy, simulated), atol=1e-3)
 
 
-def test_constant_equal_and_hardly_moving_inputs_and_a_dead_current_do_no_harm() -> None:
+def test_identification_works_with_degenerate_inputs_and_a_zero_current() -> None:
     inputs, _, noisy = recording(4, 30, 7)
     blip = np.zeros(SAMPLES)
     blip[0] = 1.0  # as an air conditioning that was being switched off
@@ -109,7 +109,7 @@ def test_samples_outside_the_mask_are_not_used() -> None:
 
 
 @pytest.mark.parametrize("growth", [1.004, 1.0])
-def test_growth_and_pure_noise_give_stable_models(growth: float) -> None:
+def test_identified_models_of_growth_and_pure_noise_are_stable(growth: float) -> None:
     inputs, noise = smooth_inputs(9, 2000), np.random.default_rng(10).normal(size=(2000, 2))
     currents = noise if growth == 1.0 else growth ** np.arange(2000.0)[:, None] * [1.0, -1.0] + inputs[:, :2]
     for order in (1, 2, 4, 8):

@@ -105,20 +105,20 @@ messages = st.builds(
 
 
 @given(st.lists(messages, max_size=60), st.sampled_from([200, 1000, 1 << 17]), st.sampled_from([0, 6]))
-def test_any_log_is_read_as_by_python_can(log: list[can.Message], container_bytes: int, compression: int) -> None:
+def test_any_blf_log_is_read_as_by_python_can(log: list[can.Message], container_bytes: int, compression: int) -> None:
     assert_the_same(written(log, container_bytes=container_bytes, compression=compression))
 
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("flags", [1, 2])
-def test_both_headers_and_both_units_of_time_are_read(version: int, flags: int) -> None:
+def test_both_blf_header_versions_and_time_units_are_read(version: int, flags: int) -> None:
     body = classic(0x123, b"12345678")
     frames = assert_the_same(of_objects(an_object(CLASSIC, body, version=version, flags=flags, time=7)))
     assert frames.time_ns.tolist() == [70_000 if flags == 1 else 7]
 
 
 @pytest.mark.parametrize(("length", "code", "valid"), [(3, 3, 3), (64, 15, 64), (4, 9, 12), (12, 9, 0)])
-def test_the_newer_fd_object_is_read_with_what_it_leaves_out_as_zeros(length: int, code: int, valid: int) -> None:
+def test_omitted_bytes_of_the_newer_can_fd_object_are_read_as_zeros(length: int, code: int, valid: int) -> None:
     body = fd_64(bytes(range(1, length + 1)), code=code, valid=valid)
     frames = assert_the_same(of_objects(an_object(FD_64, body), an_object(CLASSIC, classic(0x7, b"ab"))))
     expected = bytes(range(1, min(length, valid) + 1)).ljust(valid, b"\0")
@@ -129,7 +129,7 @@ def test_the_newer_fd_object_is_read_with_what_it_leaves_out_as_zeros(length: in
     SOUND[:6] + struct.pack("<H", 7) + SOUND[8:],  # a header of unknown version
     an_object(CLASSIC, classic(0x11, b"x"), time=2**64 - 1),
 ])  # fmt: skip
-def test_an_object_that_cannot_be_a_frame_is_counted_as_damaged(spoilt: bytes) -> None:
+def test_blf_object_that_cannot_be_a_frame_is_counted_as_damaged(spoilt: bytes) -> None:
     frames = blf_frames(io.BytesIO(of_objects(spoilt, SOUND)), "x.blf")
     assert (frames.key.tolist(), frames.damaged) == ([0x10], 1)
 
@@ -142,20 +142,22 @@ def test_an_object_that_cannot_be_a_frame_is_counted_as_damaged(spoilt: bytes) -
     (of_objects(SOUND[:-4]), "the last object is cut"),
     (b"LOGG", "the header 'LOGG' of 144 bytes is expected"),
 ])  # fmt: skip
-def test_damage_is_refused_with_its_place(content: bytes, message: str) -> None:
+def test_damaged_blf_is_refused_with_the_byte_position(content: bytes, message: str) -> None:
     with pytest.raises(LogError, match=rf"x\.blf: truncated or damaged BLF: at byte \d+ .*{message}.* before it"):
         blf_frames(io.BytesIO(content), "x.blf")
 
 
 @pytest.mark.parametrize("batch_bytes", [1, 100, 1 << 21])
-def test_size_of_a_batch_of_containers_changes_nothing(batch_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_does_not_depend_on_the_batch_size_of_containers(
+    batch_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(blf, "BATCH_BYTES", batch_bytes)
     messages = [can.Message(timestamp=START + k, arbitration_id=k, data=bytes([k])) for k in range(100)]
     assert len(assert_the_same(written(messages, container_bytes=150))) == 100
 
 
 @pytest.mark.parametrize("wrong", [b"LOBJ" + bytes(60), b"no object" + bytes(40)])
-def test_a_damaged_container_among_others_is_named_with_the_frames_before_it(wrong: bytes) -> None:
+def test_damaged_container_is_reported_with_the_number_of_frames_before_it(wrong: bytes) -> None:
     sound = an_object(CLASSIC, classic(0x123, b"\1"))
     before = of_objects(sound, sound) + a_container(sound)
     with pytest.raises(LogError, match=f"at byte {len(before)} .*; 3 frames before it are readable"):

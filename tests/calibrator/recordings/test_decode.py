@@ -113,7 +113,7 @@ def multiplexed_messages(draw: st.DrawFn) -> Message:
 
 
 @given(multiplexed_messages(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=8))
-def test_every_page_within_pages_decodes_as_cantools_decodes_it(message: Message, rows: list[bytes]) -> None:
+def test_nested_multiplexed_signals_decode_as_in_cantools(message: Message, rows: list[bytes]) -> None:
     rows = [row[: message.length] for row in rows]
     expected = [by_cantools(message, row) for row in rows]
     for signal in message.signals:
@@ -137,7 +137,7 @@ def test_frames_of_any_length_decode_as_in_cantools(pair: tuple[Message, Signal]
 
 
 @pytest.mark.parametrize("code", [-32768, 0x8000])
-def test_the_code_for_not_available_is_not_good_however_the_dbc_writes_it(code: int) -> None:
+def test_code_for_not_available_is_not_good_in_signed_or_unsigned_notation(code: int) -> None:
     message, signal = one_signal(16, signed=True, scale=0.02, choices={code: "SNA", 1: "Standby"})
     decoded = decode_signal(message, signal, *payloads([b"\x00\x80", b"\x01\x00", b"\xff\xff"], 8))
     assert decoded.good.tolist() == [False, True, True]
@@ -150,7 +150,7 @@ VALUES = ["No error", "Initialised", "Open", "Closed", "Erroneous gear", "Snail 
 
 
 @pytest.mark.parametrize(("name", "expected"), [*((name, True) for name in NO_VALUE), *((n, False) for n in VALUES)])
-def test_names_of_the_dbc_tell_which_codes_are_no_value(name: str, expected: bool) -> None:
+def test_names_in_the_dbc_that_mean_not_available_are_recognised(name: str, expected: bool) -> None:
     assert means_not_available(name) == expected
 
 
@@ -158,20 +158,20 @@ def test_names_of_the_dbc_tell_which_codes_are_no_value(name: str, expected: boo
     ((-1.0, 1.0), [True, True, False]), ((0.0, 0.0), [True, True, True]), ((None, None), [True, True, True]),
     ((0.5, None), [False, True, True]), ((None, 0.5), [True, False, False]), ((0.0, 1.0), [True, True, False]),
 ])  # fmt: skip
-def test_a_value_outside_the_range_of_the_dbc_is_not_good(limits: tuple[float, float], good: list[bool]) -> None:
+def test_value_outside_the_range_of_the_dbc_is_not_good(limits: tuple[float, float], good: list[bool]) -> None:
     message, signal = one_signal(8, scale=0.1, limits=limits)
     decoded = decode_signal(message, signal, *payloads([b"\0", b"\x0a", b"\x0b"], 8))
     assert decoded.good.tolist() == good
 
 
-def test_a_number_of_more_than_64_bits_is_refused() -> None:
+def test_signal_of_more_than_64_bits_is_refused() -> None:
     message, signal = one_signal(65, size=64)
     with pytest.raises(DatabaseError, match="signal S is a number of 65 bits"):
         decode_signal(message, signal, *payloads([bytes(64)], 64))
 
 
 @given(st.binary(min_size=2, max_size=64), st.integers(0, 0xFFFF), st.integers(0, 10_000))
-def test_the_crc_of_profile_1_agrees_with_the_e2e_package(content: bytes, data_id: int, flip: int) -> None:
+def test_crc_of_profile_1_agrees_with_the_e2e_package(content: bytes, data_id: int, flip: int) -> None:
     right = bytearray(content)
     right[1] &= 0xF7
     e2e_p01_protect(right, data_id, length=len(right), increment_counter=False)
@@ -182,5 +182,5 @@ def test_the_crc_of_profile_1_agrees_with_the_e2e_package(content: bytes, data_i
     assert p01_is_sound(data, length, data_id).tolist() == expected == [True, False]
 
 
-def test_a_frame_without_room_for_crc_and_counter_is_wrong() -> None:
+def test_frame_too_short_for_crc_and_counter_fails_its_check() -> None:
     assert not p01_is_sound(*payloads([b"", b"\0"], 8), 0).any()

@@ -52,7 +52,7 @@ def expected_contents(messages: list[can.Message]) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".trc", ".mf4", ".csv"])
-def test_every_format_gives_the_frames_that_were_logged_packed_or_not(tmp_path: Path, suffix: str) -> None:
+def test_every_log_format_is_read_completely_compressed_or_not(tmp_path: Path, suffix: str) -> None:
     path = write_log(tmp_path / f"drive{suffix}", some_messages())
     packed = tmp_path / f"packed{suffix}.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
@@ -63,7 +63,7 @@ def test_every_format_gives_the_frames_that_were_logged_packed_or_not(tmp_path: 
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".csv"])
-def test_can_fd_frames_keep_all_their_bytes(tmp_path: Path, suffix: str) -> None:
+def test_can_fd_frames_are_read_with_all_their_bytes(tmp_path: Path, suffix: str) -> None:
     messages = [
         can.Message(timestamp=1.7e9 + k, arbitration_id=0x123, is_extended_id=False, is_fd=True, data=bytes(range(n)))
         for k, n in enumerate((3, 8, 12, 64))
@@ -89,7 +89,7 @@ candump_lines = st.builds(
 
 
 @given(st.lists(candump_lines, min_size=1, max_size=30), st.sampled_from(["\n", "\r\n", "\n\n"]))
-def test_the_candump_parser_agrees_with_python_can(lines: list[str], line_end: str) -> None:
+def test_candump_parser_agrees_with_python_can(lines: list[str], line_end: str) -> None:
     text = line_end.join(lines) + line_end
     found, kind = parse_candump(text.encode())
     messages = [m for m in can.CanutilsLogReader(io.StringIO(text)) if not m.is_remote_frame]
@@ -100,7 +100,7 @@ def test_the_candump_parser_agrees_with_python_can(lines: list[str], line_end: s
 
 
 @given(st.text(alphabet="()#0123456789AFGRTcan .\r-", max_size=80))
-def test_every_line_of_candump_is_counted_and_its_neighbours_are_read(line: str) -> None:
+def test_damaged_candump_line_is_counted_and_its_neighbours_are_read(line: str) -> None:
     good = "(1.000000) can0 123#01\n"
     found, kind = parse_candump(f"{good}{line}\n{good}".encode())
     kept = contents(found)
@@ -135,7 +135,7 @@ ERROR_FRAME = "(1.200000) can0 20000080#0000000000000000"
     (".asc", "0.05 1 123 Rx r", (0, 1, 0)),
     (".trc", "     21 ", (0, 0, 1)),
 ])  # fmt: skip
-def test_line_without_data_frame_is_left_out_and_counted(
+def test_line_without_a_data_frame_is_left_out_and_counted(
     tmp_path: Path, suffix: str, line: str, counts: tuple[int, int, int], capfd: Any, caplog: Any
 ) -> None:
     path = write_log(tmp_path / f"drive{suffix}", some_messages(20))
@@ -170,7 +170,7 @@ def test_unusable_log_is_refused_with_the_reason(tmp_path: Path, name: str, cont
         read_frames(tmp_path / name)
 
 
-def test_a_log_longer_than_one_block_keeps_order_and_line_numbers(tmp_path: Path) -> None:
+def test_order_and_line_numbers_hold_in_logs_longer_than_one_block(tmp_path: Path) -> None:
     line = "({:.6f}) can0 123#0102030405060708\n"
     count = BLOCK_BYTES // len(line.format(1.0)) + 1000
     path = tmp_path / "long.log"
@@ -182,7 +182,7 @@ def test_a_log_longer_than_one_block_keeps_order_and_line_numbers(tmp_path: Path
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
-def test_a_truncated_gzip_names_the_line_and_the_readable_frames(tmp_path: Path, share: float) -> None:
+def test_truncated_gzip_is_reported_with_line_and_readable_frames(tmp_path: Path, share: float) -> None:
     packed = gzip.compress(write_log(tmp_path / "drive.log", some_messages(20_000)).read_bytes())
     cut = tmp_path / "cut.log.gz"
     cut.write_bytes(packed[: int(share * len(packed))])
@@ -207,14 +207,16 @@ def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest
     ([5000.0, 5001.0, 100.0, 101.0], [0.0, 1.0, 1.0 + CLOCK_GAP_S, 2.0 + CLOCK_GAP_S], 0, 1),
     ([0.0, 600.0, 1201.0], [0.0, 600.0, 600.0 + CLOCK_GAP_S], 0, 1),
 ])  # fmt: skip
-def test_clock_is_repaired(logged_s: list[float], time_s: list[float], disordered: int, clock_steps: int) -> None:
+def test_disorder_steps_and_gaps_of_log_times_are_repaired(
+    logged_s: list[float], time_s: list[float], disordered: int, clock_steps: int
+) -> None:
     time = repaired_time(np.rint(1e9 * np.array(logged_s)).astype(np.int64))
     np.testing.assert_allclose(time.time_s, time_s)
     assert (time.disordered, time.clock_steps) == (disordered, clock_steps)
 
 
 @given(st.lists(st.integers(0, 8 * 10**18), min_size=1, max_size=50))
-def test_time_never_decreases_and_no_frame_is_lost(time_ns: list[int]) -> None:
+def test_repaired_time_never_decreases_and_no_frame_is_lost(time_ns: list[int]) -> None:
     time = repaired_time(np.array(time_ns, np.int64))
     assert sorted(time.order.tolist()) == list(range(len(time_ns)))
     assert time.time_s[0] == 0.0

@@ -162,7 +162,7 @@ def require_currents(found: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("program", LOGS)
-def test_log_of_other_programs_gives_currents(tmp_path: Path, layout: Path, program: str) -> None:
+def test_logs_written_by_other_programs_give_the_currents(tmp_path: Path, layout: Path, program: str) -> None:
     name, write = LOGS[program]
     write(tmp_path / name)
     require_currents(before(tmp_path / name, layout))
@@ -193,7 +193,7 @@ def test_logs_in_a_folder_are_one_recording_with_gaps(tmp_path: Path, layout: Pa
 
 @pytest.mark.filterwarnings("ignore:The inplace keyword")  # of asammdf
 @pytest.mark.parametrize("suffix", [".mf4", ".parquet"])
-def test_log_decoded_by_asammdf_is_a_table_of_its_signals(tmp_path: Path, layout: Path, suffix: str) -> None:
+def test_log_decoded_by_asammdf_is_read_as_a_table(tmp_path: Path, layout: Path, suffix: str) -> None:
     write_with_python_can(tmp_path / "raw.mf4")
     with asammdf.MDF(tmp_path / "raw.mf4") as raw, raw.extract_bus_logging({"CAN": [(tmp_path / "car.dbc", 0)]}) as mdf:
         if suffix == ".mf4":
@@ -214,7 +214,7 @@ def write_database(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("suffix", [".kcd", ".sym", ".arxml"])
-def test_databases_of_other_formats_are_read(tmp_path: Path, layout: Path, suffix: str) -> None:
+def test_database_formats_other_than_dbc_are_read(tmp_path: Path, layout: Path, suffix: str) -> None:
     layout.write_text(LAYOUT.replace("car.dbc", write_database(tmp_path / f"car{suffix}").name))
     write_with_python_can(tmp_path / "x.blf")
     require_currents(before(tmp_path / "x.blf", layout))
@@ -250,7 +250,7 @@ def on_buses(path: Path, *channels: tuple[str, int]) -> Path:
     (of_buses("pt", "aux").replace("Pack.", "pt:Pack.").replace("Motor.", "aux:Motor."),
      [("can0", 80), ("can1", 80), ("can2", 7)], ["7 frames of other buses ignored (can2)"]),
 ])  # fmt: skip
-def test_branches_come_from_the_buses_of_the_layout_and_frames_of_others_are_ignored(
+def test_branches_are_read_only_from_the_buses_in_the_layout(
     tmp_path: Path, layout: Path, layout_text: str, channels: list[tuple[str, int]], ignored: list[str]
 ) -> None:
     layout.write_text(layout_text)
@@ -259,14 +259,14 @@ def test_branches_come_from_the_buses_of_the_layout_and_frames_of_others_are_ign
     assert [notice for notice in found["notices"] if "buses" in notice] == ignored
 
 
-def test_two_buses_with_as_many_frames_are_refused_with_the_lines_to_write(tmp_path: Path, layout: Path) -> None:
+def test_ambiguous_bus_is_refused_with_the_layout_lines_to_add(tmp_path: Path, layout: Path) -> None:
     done = calibrator("kirchhoff", on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 40)), "--layout", layout)
     assert done.returncode == 1
     assert "Pack comes on several buses (frames: can0 40, can1 20)" in done.stderr
     assert '[[bus]] with name = "hv", channel = "can0", dbc = "car.dbc"' in done.stderr
 
 
-def test_prefix_of_the_bus_is_needed_only_where_two_buses_have_the_message(tmp_path: Path, layout: Path) -> None:
+def test_bus_prefix_is_needed_only_if_two_buses_have_the_message(tmp_path: Path, layout: Path) -> None:
     (tmp_path / "motor.dbc").write_text(DBC.replace("256 Pack", "257 Other"))
     text = of_buses("pt", "aux").replace('can1"\ndbc = "car', 'can1"\ndbc = "motor')
     log = on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 80))
@@ -278,7 +278,7 @@ def test_prefix_of_the_bus_is_needed_only_where_two_buses_have_the_message(tmp_p
 
 
 @pytest.mark.parametrize(("formula", "sum_a"), [("2 * m", 20.0 - 2 * 17.8), ("m - one", 3.2), ("p / u * 1000", 2.2)])
-def test_branch_computed_by_a_formula(tmp_path: Path, layout: Path, formula: str, sum_a: float) -> None:
+def test_branch_can_be_computed_by_a_formula(tmp_path: Path, layout: Path, formula: str, sum_a: float) -> None:
     (tmp_path / "car.dbc").write_text(
         DBC + ' SG_ One : 16|8@1+ (1,1) [0|0] "" Car\n SG_ Power : 0|16@1- (0.04,0) [-1000|1000] "kW" Car\n'
     )
@@ -312,7 +312,9 @@ def test_branch_computed_by_a_formula(tmp_path: Path, layout: Path, formula: str
         (('dbc = "car.dbc"', 'dbc = "x.kcd"'), "x.kcd: cannot read the DBC: No such file"),
     ],
 )  # fmt: skip
-def test_mistake_in_a_layout_is_one_line(tmp_path: Path, layout: Path, change: tuple[str, str], words: str) -> None:
+def test_mistake_in_a_layout_is_reported_in_one_line(
+    tmp_path: Path, layout: Path, change: tuple[str, str], words: str
+) -> None:
     assert change[0] in LAYOUT
     layout.write_text(LAYOUT.replace(*change))
     write_with_python_can(tmp_path / "x.log")
@@ -344,7 +346,9 @@ def nameless_archive(path: Path) -> None:
         ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
     ],
 )  # fmt: skip
-def test_mistake_in_a_log(tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str) -> None:
+def test_mistake_in_a_log_is_reported_in_one_line(
+    tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str
+) -> None:
     write(tmp_path / name)
     require_one_line(calibrator("kirchhoff", tmp_path / name, "--layout", layout), words)
 
@@ -397,7 +401,7 @@ def test_damaged_line_is_counted(tmp_path: Path, layout: Path, program: str, old
 
 @pytest.mark.parametrize("damage", ["empty", "cut at its end", "random"])
 @pytest.mark.parametrize("suffix", [".dbc", ".kcd", ".sym", ".arxml"])
-def test_damaged_database_is_one_line(tmp_path: Path, layout: Path, suffix: str, damage: str) -> None:
+def test_damaged_database_is_reported_in_one_line(tmp_path: Path, layout: Path, suffix: str, damage: str) -> None:
     path = write_database(tmp_path / f"car{suffix}")
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     layout.write_text(LAYOUT.replace("car.dbc", path.name))

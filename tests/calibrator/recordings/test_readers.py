@@ -59,14 +59,14 @@ def recorded(folder: Path, database: VehicleDatabase, *lines: tuple[float, str])
     return read_recording(folder / "x.log", database, vehicle="v", name="d").drive
 
 
-def test_current_has_sign_of_layout_and_is_in_ampere(tmp_path: Path, power_database: VehicleDatabase) -> None:
+def test_current_has_the_sign_of_the_layout_and_is_in_ampere(tmp_path: Path, power_database: VehicleDatabase) -> None:
     drive = recorded(tmp_path, power_database, (0.0, "00000003#9CFF"))
     np.testing.assert_allclose(drive.branches["battery"].value, [-10.0])
     with pytest.raises(LogError, match="no branch"):  # of 11 bits, not of 29
         recorded(tmp_path, power_database, (0.0, "003#9CFF"))
 
 
-def test_power_is_divided_by_latest_voltage_if_fresh(tmp_path: Path, power_database: VehicleDatabase) -> None:
+def test_power_is_divided_by_the_latest_voltage_unless_stale(tmp_path: Path, power_database: VehicleDatabase) -> None:
     lines = [(0.0, "001#1400"), (0.1, "002#A00F"), (0.1, "001#1400"), (0.2, "002#D007"), (0.25, "001#1400")]
     motor = recorded(tmp_path, power_database, *lines, (0.7, "001#1400"), (0.8, "001#1400")).branches["motor"]
     np.testing.assert_allclose(motor.time_s, [0.0, 0.1, 0.25, 0.7, 0.8], atol=1e-9)
@@ -74,7 +74,7 @@ def test_power_is_divided_by_latest_voltage_if_fresh(tmp_path: Path, power_datab
     np.testing.assert_allclose(motor.value[1:3], [-10_000 / 400.0, -10_000 / 200.0])
 
 
-def test_named_codes_and_those_of_the_layout_are_no_currents(tmp_path: Path, power_database: VehicleDatabase) -> None:
+def test_codes_for_no_value_in_dbc_or_layout_are_not_currents(tmp_path: Path, power_database: VehicleDatabase) -> None:
     names = 'VAL_ 1 Power -200 "Signal_ungueltig" ;\nVAL_ 2 Voltage 4000 "Ersatzwert" ;\n'
     (tmp_path / "power.dbc").write_text(POWER_DBC + names)
     (tmp_path / "power.toml").write_text(POWER_LAYOUT + "no_value = [-100, 21]\n")
@@ -87,7 +87,7 @@ def test_named_codes_and_those_of_the_layout_are_no_currents(tmp_path: Path, pow
     assert recorded(tmp_path, power_database, *lines).branches["motor"].good.all()
 
 
-def test_names_of_an_input_are_values_unless_they_mean_not_available(tmp_path: Path) -> None:
+def test_named_values_of_an_input_count_unless_they_mean_not_available(tmp_path: Path) -> None:
     gear = ' SG_ Gear : 16|8@1+ (1,0) [0|0] "" A\n'
     dbc = POWER_DBC.replace('[0|1000] "V" A\n', f'[0|1000] "V" A\n{gear}')
     (tmp_path / "power.dbc").write_text(dbc + 'VAL_ 2 Gear 1 "Drive" 2 "Ungueltig" 3 "SNA" ;\n')
@@ -98,12 +98,14 @@ def test_names_of_an_input_are_values_unless_they_mean_not_available(tmp_path: P
     assert drive.inputs["gear"].good.tolist() == [True, True, False]
 
 
-def test_log_without_a_branch_lists_what_is_expected(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_log_without_any_branch_is_refused_with_the_expected_messages(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
     with pytest.raises(LogError, match=r"x\.log: no branch .* 0x7FF, 0x18DAF110; expected HV_Battery \(0x110\)"):
         recorded(tmp_path, database, (0.0, "7FF#00"), (0.1, "18DAF110#00"))
 
 
-def test_an_input_that_is_never_available_is_left_out_and_reported(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_input_that_is_never_available_is_left_out_and_reported(tmp_path: Path, database: VehicleDatabase) -> None:
     battery = Channel(time_s=np.array([0.0, 0.1]), value=np.array([1.0, 2.0]), good=np.ones(2, bool))
     drive = Drive(vehicle="v", name="d", branches={"battery": battery}, inputs={})
     write_drive_log(tmp_path / "d.log", drive, database)
@@ -112,7 +114,7 @@ def test_an_input_that_is_never_available_is_left_out_and_reported(tmp_path: Pat
     assert "voltage: 2 of 2 frames not usable" in map(str, recording.report.notices())
 
 
-def test_a_frame_with_a_wrong_crc_is_labelled(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_sample_of_a_frame_with_wrong_crc_is_not_good(tmp_path: Path, database: VehicleDatabase) -> None:
     series = encode_message(database, "HV_Battery", np.array([0.0, 0.1]), {"BatteryCurrent": np.array([1.0, 2.0])})
     series.data[1, 0] ^= 1
     write_candump(tmp_path / "d.log", [series])
@@ -159,14 +161,16 @@ def test_frames_with_a_counter_of_several_bytes_are_written_and_read() -> None:
 
 
 @pytest.mark.parametrize(("value", "expected"), [(np.nan, "SNA"), (1e6, 650.0), (-1e6, -650.0)])
-def test_missing_values_become_sna_others_saturate(database: VehicleDatabase, value: float, expected: object) -> None:
+def test_missing_values_are_written_as_sna_and_large_ones_saturate(
+    database: VehicleDatabase, value: float, expected: object
+) -> None:
     series = encode_message(database, "HV_Motor", np.zeros(1), {"MotorCurrent": np.array([value])})
     decoded = database.message("HV_Motor").decode_simple(series.data[0].tobytes())
     assert decoded["MotorCurrent"] == (pytest.approx(expected) if isinstance(expected, float) else expected)
     assert decoded["MotorTorque"] == "SNA"
 
 
-def test_float_signal_is_not_written_as_whole_number() -> None:
+def test_writing_a_floating_point_signal_is_refused() -> None:
     database = big_endian_database(
         BIG_ENDIAN_DBC.replace("M: 8", "M: 16").replace("40|9@1-", "64|32@1-") + "SIG_VALTYPE_ 100 C : 1;\n"
     )
@@ -177,7 +181,7 @@ def test_float_signal_is_not_written_as_whole_number() -> None:
 
 @settings(max_examples=60)
 @given(st.integers(-32768, 32767), st.integers(0, 2047), st.integers(-256, 255), st.floats(-0.49, 0.49))
-def test_nearest_codes_are_written_in_both_byte_orders(a: int, b: int, c: int, e: float) -> None:
+def test_values_are_written_as_the_nearest_codes_in_both_byte_orders(a: int, b: int, c: int, e: float) -> None:
     database = big_endian_database()
     expected = database.message("M").encode({"A": a * 0.5 + 10, "B": b, "C": c * -0.25}, strict=False)
     values = {"A": np.array([(a + e) * 0.5 + 10]), "B": np.array([b + e]), "C": np.array([(c + e) * -0.25])}
@@ -192,7 +196,7 @@ def big_endian_database(dbc: str = BIG_ENDIAN_DBC, **keys: EndToEnd) -> VehicleD
 
 
 @pytest.mark.parametrize("suffix", [".log", ".log.gz"])
-def test_log_reads_back_in_order_of_time(database: VehicleDatabase, tmp_path: Path, suffix: str) -> None:
+def test_written_log_is_read_back_in_time_order(database: VehicleDatabase, tmp_path: Path, suffix: str) -> None:
     slow = encode_message(database, "HV_Dcdc", np.array([0.05, 0.15]), {"DcdcCurrent": np.ones(2)})
     fast = encode_message(database, "HV_Motor", np.array([0.0, 0.1, 0.2]), {"MotorCurrent": np.ones(3)})
     path = tmp_path / f"drive{suffix}"

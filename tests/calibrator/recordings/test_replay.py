@@ -44,7 +44,7 @@ SENT = [(frame.arbitration_id, frame.is_extended_id, bytes(frame.data)) for fram
 
 
 @pytest.mark.parametrize("speed", [1.0, 4.0])
-def test_frames_never_come_before_their_instant(speed: float) -> None:
+def test_frames_are_never_sent_before_their_time(speed: float) -> None:
     class Clocked(VirtualBus):
         times: list[float]
 
@@ -59,14 +59,14 @@ def test_frames_never_come_before_their_instant(speed: float) -> None:
             assert instant - begin >= (frame.timestamp - FRAMES[0].timestamp) / speed
 
 
-def test_log_that_goes_back_in_time_is_not_waited_for() -> None:
+def test_backward_time_step_in_a_log_causes_no_waiting() -> None:
     frames = [can.Message(timestamp=stamp, arbitration_id=1) for stamp in (1e6, 1.0, 2.0)]
     with VirtualBus("one") as bus, VirtualBus("one") as listener:
         assert list(play_frames(frames, bus)) == [0.0, 1.0 - 1e6, 2.0 - 1e6]
         assert len(heard(listener)) == 3
 
 
-def test_a_bus_that_takes_nothing_ends_the_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bus_that_accepts_no_frame_ends_the_replay(monkeypatch: pytest.MonkeyPatch) -> None:
     class Full(VirtualBus):
         def send(self, msg: can.Message, timeout: float | None = None) -> None:
             raise can.CanOperationError("Transmit buffer full")
@@ -81,7 +81,7 @@ def command(*arguments: object) -> int:
     return run_app(app, "calibrator", ["replay", *map(str, arguments)])
 
 
-def test_the_command_plays_a_log_and_counts(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_replay_command_sends_a_log_and_counts_frames(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with VirtualBus("command") as bus:
         assert command(log, "--interface", "virtual", "--channel", "command", "--speed", "0") == 0
         assert heard(bus) == SENT
@@ -92,7 +92,7 @@ def test_the_command_plays_a_log_and_counts(log: Path, capsys: pytest.CaptureFix
     ("missing.log", "virtual", "calibrator: .*no such file"),
     ("drive.log", "pigeon", "calibrator: pigeon c: cannot open"),
 ])  # fmt: skip
-def test_failure_ends_in_1(
+def test_failed_replay_exits_with_1(
     log: Path, capsys: pytest.CaptureFixture[str], name: str, interface: str, words: str
 ) -> None:
     assert command(log.parent / name, "--interface", interface, "--channel", "c") == 1
@@ -101,7 +101,9 @@ def test_failure_ends_in_1(
     assert re.match(words, captured.err)
 
 
-def test_ctrl_c_says_how_far(log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_reports_how_many_frames_were_sent(
+    log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def send(self: VirtualBus, msg: can.Message, timeout: float | None = None) -> None:
         if msg.arbitration_id == FRAMES[3].arbitration_id:
             raise KeyboardInterrupt

@@ -112,14 +112,14 @@ def require_sum(found: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("kind", TABLES)
-def test_table_gives_currents_without_a_layout(tmp_path: Path, kind: str) -> None:
+def test_tables_of_all_formats_give_currents_without_a_layout(tmp_path: Path, kind: str) -> None:
     name, write = TABLES[kind]
     write(tmp_path / name)
     assert is_table(tmp_path / name)
     require_sum(before(tmp_path / name, "--branches", BRANCHES))
 
 
-def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
+def test_unusable_rows_are_counted(tmp_path: Path) -> None:
     rows = frame().to_csv(index=False).splitlines()
     rows[20] += ",7"
     rows[30] = "," + rows[30].partition(",")[2]
@@ -128,7 +128,7 @@ def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
     assert "2 damaged lines or frames left out" in found["notices"]
 
 
-def test_row_numbers_that_a_filter_left_as_index_are_not_the_time(tmp_path: Path) -> None:
+def test_row_numbers_left_as_index_are_not_taken_for_the_time(tmp_path: Path) -> None:
     rows = frame().rename(columns={"time": "time [s]"})
     rows.drop(index=[3, 7, 8]).to_parquet(tmp_path / "x.parquet")
     table = read_table(tmp_path / "x.parquet")
@@ -141,14 +141,14 @@ def test_row_numbers_that_a_filter_left_as_index_are_not_the_time(tmp_path: Path
     [dates(), dates().set_names("time"), pd.MultiIndex.from_arrays([["V1"] * ROWS, TIME_S], names=["vehicle", "time"])],
     ids=["without a name", "with the name of a column", "of vehicle and time"],
 )
-def test_index_beside_a_column_of_times_is_read(tmp_path: Path, index: pd.Index) -> None:
+def test_column_of_times_takes_precedence_over_the_index(tmp_path: Path, index: pd.Index) -> None:
     frame().set_axis(index).to_parquet(tmp_path / "x.parquet")
     table = read_table(tmp_path / "x.parquet")
     assert table.time_s[-1] == pytest.approx(0.1 * (ROWS - 1))
     assert table.columns["Ibat [A]"] == pytest.approx(BATTERY_A)
 
 
-def test_headers_that_differ_in_blanks_only_get_numbers(tmp_path: Path) -> None:
+def test_headers_that_differ_only_in_blanks_are_numbered(tmp_path: Path) -> None:
     frame(**{"Ibat [A] ": BATTERY_A}).to_parquet(tmp_path / "x.parquet")
     assert list(read_table(tmp_path / "x.parquet").columns) == ["Ibat.1 [A]", "Imot (A)", "Iheat_A", "Ibat.2 [A]"]
 
@@ -160,7 +160,7 @@ def test_row_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     assert table.time_s[-1] == pytest.approx(0.1 * (ROWS - 2))
 
 
-def test_times_without_their_fractions_are_reported(tmp_path: Path) -> None:
+def test_times_without_fractions_of_a_second_are_reported(tmp_path: Path) -> None:
     csv(frame(time=TIME_S.astype(int)))(tmp_path / "x.csv")
     told = " ".join(before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"])
     assert "10 rows share each time: write its fractions of a second" in told
@@ -170,7 +170,7 @@ def test_times_without_their_fractions_are_reported(tmp_path: Path) -> None:
     assert "share" not in " ".join(before(tmp_path / "sparse.csv", "--branches", BRANCHES)["notices"])
 
 
-def test_column_of_texts_is_named_beside_the_others(tmp_path: Path) -> None:
+def test_column_of_texts_is_reported_by_all_commands(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text(LAYOUT)
     csv(powers().assign(**{"Ibat [A]": [f"{value:.1f} A" for value in BATTERY_A]}))(tmp_path / "x.csv")
     why = "column 'Ibat [A]': its cells are no numbers, such as '0.0 A' in line 2"
@@ -183,7 +183,7 @@ def test_column_of_texts_is_named_beside_the_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("step", "rows", "seconds"), [(1, 100, 99), (10, 100, 990), (10, 7000, 69.99), (500, 9, 4), (10**5, 9, 0.8)]
 )
-def test_whole_numbers_are_in_the_unit_that_fits(tmp_path: Path, step: int, rows: int, seconds: float) -> None:
+def test_time_unit_of_whole_numbers_is_inferred(tmp_path: Path, step: int, rows: int, seconds: float) -> None:
     csv(pd.DataFrame({"time": step * np.arange(rows), "a": np.arange(rows) % 7, "b": 1, "note": "ok"}))(
         tmp_path / "x.csv"
     )
@@ -225,7 +225,7 @@ def write_layout_with_dbc(folder: Path, battery: str, motor: str) -> Path:
 
 
 @pytest.mark.parametrize("names", ["{0}.{1}", "{1}", "CAN1.{0}.{1}"])
-def test_columns_of_a_decoded_log_belong_to_signals_of_its_dbc(tmp_path: Path, names: str) -> None:
+def test_columns_of_a_decoded_log_are_matched_to_signals_of_the_dbc(tmp_path: Path, names: str) -> None:
     layout = write_layout_with_dbc(tmp_path, "Pack", "Link")
     columns = {"time": TIME_S, names.format("Bms", "Pack"): BATTERY_A, names.format("Inv", "Link"): 980.0 * BATTERY_A}
     table = pd.DataFrame(columns).astype(object)
@@ -236,7 +236,7 @@ def test_columns_of_a_decoded_log_belong_to_signals_of_its_dbc(tmp_path: Path, n
     assert found["valid"] < ROWS - 20  # neither texts nor what the DBC's range forbids is a current
 
 
-def test_columns_that_could_be_of_two_messages_are_refused(tmp_path: Path) -> None:
+def test_column_that_fits_two_messages_is_refused(tmp_path: Path) -> None:
     csv(frame().rename(columns={"Ibat [A]": "Current", "Imot (A)": "Current_0"}))(tmp_path / "x.csv")
     done = calibrator(
         "kirchhoff", tmp_path / "x.csv", "--layout", write_layout_with_dbc(tmp_path, "Current", "Current")
@@ -245,7 +245,7 @@ def test_columns_that_could_be_of_two_messages_are_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("heater", ['power = "Pheat", voltage = "Ubat"', 'formula = "1e3 * Pheat / Ubat"'])
-def test_layout_names_columns_in_place_of_signals_and_a_branch_may_be_a_quotient(tmp_path: Path, heater: str) -> None:
+def test_layout_of_a_table_names_columns_and_quotients_of_columns(tmp_path: Path, heater: str) -> None:
     (tmp_path / "car.toml").write_text(LAYOUT.replace('power = "Pheat", voltage = "Ubat"', heater))
     csv(powers())(tmp_path / "x.csv")
     quotient = "battery=Ibat,-motor=Imot,-heater=Pheat*1000/Ubat"
@@ -272,7 +272,7 @@ def test_layout_names_columns_in_place_of_signals_and_a_branch_may_be_a_quotient
         ("time,I,J\n0,True,2\n1,False,3\n", "I,J", "branch I: I is in 'on/off'; expected A, mA, kA"),
     ],
 )  # fmt: skip
-def test_mistake_with_a_table_is_one_line(tmp_path: Path, text: str, branches: str, words: str) -> None:
+def test_mistake_with_a_table_is_reported_in_one_line(tmp_path: Path, text: str, branches: str, words: str) -> None:
     (tmp_path / "x.csv").write_text(text)
     done = calibrator("kirchhoff", tmp_path / "x.csv", "--branches", branches)
     assert done.returncode == 1
@@ -281,7 +281,7 @@ def test_mistake_with_a_table_is_one_line(tmp_path: Path, text: str, branches: s
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".feather", ".mf4", ".csv.gz"])
-def test_damaged_table_is_one_line(tmp_path: Path, suffix: str) -> None:
+def test_damaged_table_is_reported_in_one_line(tmp_path: Path, suffix: str) -> None:
     (tmp_path / f"x{suffix}").write_bytes(gzip.compress(frame().to_csv(index=False).encode())[:1500])
     done = calibrator("kirchhoff", tmp_path / f"x{suffix}", "--branches", "a,b")
     assert done.returncode == 1
@@ -289,7 +289,7 @@ def test_damaged_table_is_one_line(tmp_path: Path, suffix: str) -> None:
     assert len(done.stderr.splitlines()) == 1, done.stderr
 
 
-def test_log_of_frames_is_no_table_for_a_layout_without_dbc(tmp_path: Path) -> None:
+def test_log_of_frames_is_refused_with_a_layout_without_dbc(tmp_path: Path) -> None:
     (tmp_path / "x.log").write_text("(1.000000) can0 123#11\n(2.000000) can0 123#11\n")
     for layout in (LAYOUT, LAYOUT.replace('"Ibat"', '"Ibat", corrected = "A.B"')):
         (tmp_path / "car.toml").write_text(layout)

@@ -48,7 +48,9 @@ def test_overview_counts_vehicles_and_sensors_and_takes_medians(result: Path) ->
     assert found["duration_h"]["median"] == 0.5
 
 
-def test_workshop_list_has_hardware_sensors_then_what_many_share(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_workshop_list_is_ordered_hardware_then_sensors_then_shared_causes(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
     vehicles = six_vehicles(database)
     load = SensorFinding(branch="battery", cause="load", probability=0.99, text="5 A without a sensor.")
     inverted = SensorFinding(branch="motor", cause="inverted", probability=0.9, text="its sign is turned.")
@@ -64,7 +66,7 @@ def test_workshop_list_has_hardware_sensors_then_what_many_share(tmp_path: Path,
     assert "replace the sensor" in rows[1]["text"]
 
 
-def test_steps_say_what_to_do_and_to_whom(result: Path) -> None:
+def test_next_steps_name_action_and_vehicles(result: Path) -> None:
     install, window, hardware, check, left_out = steps(result)
     assert install.startswith("Install the parameters of V1, V10 on their nodes")
     assert window == "V4: a zero-current window (contactors open) would decide."
@@ -73,7 +75,7 @@ def test_steps_say_what_to_do_and_to_whom(result: Path) -> None:
     assert left_out == f"Find out why log of {EVIL} could not be used; most often: cannot be read: {EVIL}."
 
 
-def test_steps_join_vehicles_with_the_same_question(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_next_steps_combine_vehicles_with_the_same_question(tmp_path: Path, database: VehicleDatabase) -> None:
     held = sensor(0.0, 8.0, held_back="harm limit")
     window = "a zero-current window (contactors open) would decide: the motor sensor then shows +{} A or +0 A"
     needs = {"V1": window.format(7), "V2": window.format(3), "V3": window.format(7)}
@@ -86,7 +88,7 @@ def test_steps_join_vehicles_with_the_same_question(tmp_path: Path, database: Ve
     ]
 
 
-def test_parameters_of_a_table_are_for_tables(result: Path) -> None:
+def test_next_step_for_tables_is_correction_by_kirchhoff_not_a_node(result: Path) -> None:
     text = (result / "run.json").read_text()
     no_dbc = f'"dbc_sha256": "{hashlib.sha256(b"").hexdigest()}"'
     (result / "run.json").write_text(text.replace('"dbc_sha256": ""', no_dbc))
@@ -95,7 +97,7 @@ def test_parameters_of_a_table_are_for_tables(result: Path) -> None:
     assert "A node needs a layout with the signals of a DBC." in first
 
 
-def test_result_whose_rows_are_not_those_of_its_run_is_refused(result: Path) -> None:
+def test_result_whose_rows_do_not_match_its_run_file_is_refused(result: Path) -> None:
     run = (result / "run.json").read_text()
     (result / "run.json").write_text(run.replace('"motor"\n', '"dcdc"\n', 1))
     with pytest.raises(
@@ -133,7 +135,7 @@ def margin(tmp_path: Path, database: VehicleDatabase) -> Margin:
     return of
 
 
-def test_sensor_needs_its_error_at_the_limit_and_corrected_its_doubt_alone(margin: Margin) -> None:
+def test_margin_is_the_sensor_error_or_if_corrected_its_uncertainty(margin: Margin) -> None:
     found, _ = margin(sensor(0.1, -4.0, apply=True), sensor(0.02, 1.0, apply=True))
     assert found["common_before_a"] == pytest.approx(44.0 + DOUBT_A)
     assert found["common_after_a"] == pytest.approx(DOUBT_A)
@@ -144,14 +146,14 @@ def test_sensor_needs_its_error_at_the_limit_and_corrected_its_doubt_alone(margi
     assert half["common_gain_a"] == pytest.approx(24.0)
 
 
-def test_one_margin_for_all_falls_no_lower_than_the_worst_that_is_not_corrected(margin: Margin) -> None:
+def test_common_margin_is_set_by_the_worst_uncorrected_sensor(margin: Margin) -> None:
     found, text = margin(sensor(0.1, 4.0, apply=True), sensor(0.02, -1.0), sensor())
     assert found["common_after_a"] == pytest.approx(9.0 + DOUBT_A)
     assert [name for name, _ in found["largest"]] == ["V2"]
     assert f"Not corrected, these keep it large: V2 ({9.0 + DOUBT_A:.1f} A)." in text
 
 
-def test_sensor_that_is_not_known_is_not_counted_and_reported_so(margin: Margin) -> None:
+def test_unknown_sensor_is_excluded_from_the_margin_and_reported(margin: Margin) -> None:
     lost = sensor(0.3, 50.0, sd=0.2)
     found, text = margin(lost, sensor(0.1, 4.0), sensor())
     assert (found["vehicles"], found["not_known"]) == (2, 1)
@@ -162,7 +164,7 @@ def test_sensor_that_is_not_known_is_not_counted_and_reported_so(margin: Margin)
     assert "How wrong the battery sensor can be is not known, so no margin follows." in text
 
 
-def test_gains_are_given_in_kilowatts_where_the_voltage_is_known(margin: Margin) -> None:
+def test_margin_gain_is_given_in_kilowatts_if_the_voltage_is_known(margin: Margin) -> None:
     _, text = margin(sensor(0.1, 4.0, apply=True), sensor(), voltage_v=350.0)
     assert "44.0 A = 15.4 kW given back with one margin for all" in text
     _, text = margin(sensor(0.1, 4.0, apply=True), sensor())
@@ -171,7 +173,7 @@ def test_gains_are_given_in_kilowatts_where_the_voltage_is_known(margin: Margin)
     assert (none["common_gain_a"], none["own_gain_a"]) == (0.0, None)
 
 
-def test_of_a_large_fleet_one_in_a_thousand_may_need_more(margin: Margin) -> None:
+def test_margin_of_a_large_fleet_covers_all_but_one_in_a_thousand(margin: Margin) -> None:
     usual = [sensor(0.0, 5.0)] * 1000
     assert margin(*usual, sensor(0.0, 300.0))[0]["common_before_a"] == pytest.approx(5.0 + DOUBT_A)
     assert margin(*usual[:100], sensor(0.0, 300.0))[0]["common_before_a"] == pytest.approx(300.0 + DOUBT_A)

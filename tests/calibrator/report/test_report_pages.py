@@ -51,26 +51,26 @@ def visible(page: str) -> str:
     return " ".join(html.unescape(shown).split())
 
 
-def test_sums_before_and_after_are_counted_in_bins(result: Path) -> None:
+def test_histogram_counts_sums_before_and_after_correction(result: Path) -> None:
     bins = facts_of(report_page(result)[0])["junction"]
     assert (sum(bins["before"]), sum(bins["after"])) == (6, 6)
     assert len(bins["edges"]) == len(bins["before"]) + 1
     assert bins["load"] == 0.3
 
 
-def test_names_and_reasons_are_text_and_never_code(result: Path) -> None:
+def test_names_and_reasons_are_escaped_in_the_page(result: Path) -> None:
     page, _ = report_page(result)
     assert EVIL not in page
     assert page.count("&lt;script&gt;document.title") == 5  # the notice, what was left out, why, and both in the step
 
 
-def test_the_page_fetches_nothing(result: Path) -> None:
+def test_report_page_refers_to_no_external_resource(result: Path) -> None:
     page, _ = report_page(result)
     assert not re.search(r'(src|href)="(?!#|data:)', page)
     assert "default-src 'none'" in page
 
 
-def test_the_page_has_its_numbers_without_its_script(result: Path) -> None:
+def test_report_page_shows_its_numbers_without_javascript(result: Path) -> None:
     text = visible(report_page(result)[0])
     for part in ("7 vehicles looked at", "2 corrected (33 %)", "2 for the workshop", "10.50 A Kirchhoff sum"):
         assert part in text
@@ -78,7 +78,9 @@ def test_the_page_has_its_numbers_without_its_script(result: Path) -> None:
     assert "1 because it is beyond the limits of the layout" in text
 
 
-def test_of_a_very_large_fleet_those_with_a_fault_are_listed(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_of_a_very_large_fleet_lists_only_vehicles_with_a_fault(
+    result: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(page_module, "MOST_SENSORS", 11)
     page, report = report_page(result)
     assert len(columns_of(page)["vehicle"]) == 5
@@ -86,7 +88,7 @@ def test_of_a_very_large_fleet_those_with_a_fault_are_listed(result: Path, monke
     assert "5 of 6 vehicles are listed" in visible(page)
 
 
-def test_the_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None:
+def test_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None:
     page, about = report_page(result, "V4")
     text = visible(page)
     assert about["parameters"].vehicle == "V4"
@@ -105,7 +107,7 @@ def test_the_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None
     assert second == {**wanted, **NO_HARDWARE, "hardware_drift": 0.01}
 
 
-def test_findings_are_in_the_workshop_list_and_with_the_vehicle(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_findings_appear_in_the_workshop_list_and_with_the_vehicle(tmp_path: Path, database: VehicleDatabase) -> None:
     vehicles = six_vehicles(database)
     findings = [
         SensorFinding(branch="motor", cause="inverted", probability=0.993, text="motor: its sign is turned."),
@@ -126,7 +128,7 @@ def test_findings_are_in_the_workshop_list_and_with_the_vehicle(tmp_path: Path, 
     assert "Workshop list" not in visible(report_page(result, "V1")[0])
 
 
-def test_a_vehicle_that_was_left_out_is_reported_with_its_reason(result: Path) -> None:
+def test_vehicle_left_out_is_shown_with_its_reason(result: Path) -> None:
     with pytest.raises(FleetError, match="it was left out: cannot be read"):
         report_page(result, f"log of {EVIL}")
     with pytest.raises(FleetError, match="no vehicle 'V99' in it"):
@@ -137,11 +139,11 @@ def test_a_vehicle_that_was_left_out_is_reported_with_its_reason(result: Path) -
     ("part", "whole", "text"),
     [(0, 9, "0 %"), (1, 3000, "< 1 %"), (1, 3, "33 %"), (2999, 3000, "> 99 %"), (9, 9, "100 %")],
 )
-def test_share_of_few_vehicles_is_neither_none_nor_all(part: int, whole: int, text: str) -> None:
+def test_share_of_some_vehicles_is_never_rounded_to_0_or_100_percent(part: int, whole: int, text: str) -> None:
     assert share(part, whole) == text
 
 
-def test_page_and_numbers_of_the_fleet(result: Path, tmp_path: Path) -> None:
+def test_report_command_writes_the_page_and_prints_its_numbers(result: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "page.html"
     done = calibrator("report", result, "--out", out)
     assert (done.returncode, done.stdout) == (0, f"{out}: {out.stat().st_size / 1e6:.2f} MB; open it in a browser\n")
@@ -153,7 +155,7 @@ def test_page_and_numbers_of_the_fleet(result: Path, tmp_path: Path) -> None:
     assert found["workshop"][0]["cause"] == "hardware"
 
 
-def test_page_is_named_after_its_vehicle_and_stands_in_the_result(result: Path) -> None:
+def test_page_of_a_vehicle_is_written_into_the_result_under_its_name(result: Path) -> None:
     found = json.loads(calibrator("report", result, "--vehicle", "V3", "--json").stdout)
     assert found["page"] == str(result / "V3.html")
     assert found["parameters"]["hardware_fault"]["drift"] == -0.06

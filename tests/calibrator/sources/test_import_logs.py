@@ -35,7 +35,7 @@ def report(two_vehicles: Path, tmp_path_factory: pytest.TempPathFactory, databas
     return imported([two_vehicles / "logs"], tmp_path_factory.mktemp("store"), database)
 
 
-def test_stored_drives_are_the_logs(two_vehicles: Path, report: ImportReport, database: VehicleDatabase) -> None:
+def test_stored_drives_equal_the_logs(two_vehicles: Path, report: ImportReport, database: VehicleDatabase) -> None:
     logs, store = find_fleet(two_vehicles).vehicles, find_fleet(report.store).vehicles
     assert list(logs) == list(store) == ["V001", "V002"]
     for vehicle, (log,) in logs.items():
@@ -43,7 +43,7 @@ def test_stored_drives_are_the_logs(two_vehicles: Path, report: ImportReport, da
         assert recording_digest(load_drive(kept, database)) == recording_digest(load_drive(log, database))
 
 
-def test_equal_notices_are_reported_once_and_json_keeps_those_of_every_drive(report: ImportReport) -> None:
+def test_equal_notices_are_merged_in_text_and_kept_per_drive_in_json(report: ImportReport) -> None:
     told = [line for line in report.as_text().splitlines() if "junction_box_temperature" in line]
     kept = [notice for drive in json.loads(report.as_json())["drives"] for notice in drive["notices"]]
     frames = [int(re.findall(r"(\d+) of", notice)[0]) for notice in kept if "junction_box_temperature" in notice]
@@ -60,7 +60,9 @@ def test_damaged_drive_is_not_imported(two_vehicles: Path, tmp_path: Path, datab
     assert "remove it and import it again" in report.left_out["V001/drive"]
 
 
-def test_left_over_of_a_killed_import_goes(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+def test_leftover_file_of_a_killed_import_is_removed(
+    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
     folder = tmp_path / "drives" / "V001"
     folder.mkdir(parents=True)
     left, other = folder / ".drive.parquet.x1y2", folder / ".drive.parquet.new"
@@ -72,7 +74,9 @@ def test_left_over_of_a_killed_import_goes(two_vehicles: Path, tmp_path: Path, d
     assert {path.name for path in folder.iterdir()} == {"drive.parquet", other.name}
 
 
-def test_import_into_a_closed_bucket_reads_nothing(two_vehicles: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_import_into_an_unwritable_bucket_fails_before_reading_logs(
+    two_vehicles: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def denied(*_: object, **__: object) -> None:
         raise PermissionError("Access Denied")
 
@@ -88,7 +92,9 @@ def write_endless_log(path: Path) -> None:
     path.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
 
 
-def test_slow_log_costs_itself_only(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+def test_slow_log_is_left_out_and_others_are_imported(
+    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
     endless = tmp_path / "logs" / "V000" / "endless.log.gz"
     write_endless_log(endless)
     logs = [endless, two_vehicles / "logs"]
@@ -98,7 +104,7 @@ def test_slow_log_costs_itself_only(two_vehicles: Path, tmp_path: Path, database
     assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 10 s and was ended; ")
 
 
-def test_full_disk_ends_an_import(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+def test_full_disk_stops_an_import(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     """All further drives would be lost one by one, with exit code 0."""
     command = [sys.executable, "-m", "calibrator", "import", str(two_vehicles / "logs"), "--layout", str(LAYOUT)]
     limited = ["prlimit", "--fsize=1000", *command, "--out", str(tmp_path)]

@@ -41,7 +41,7 @@ def make(*paths: Path) -> None:
     (["V1/a.log", "empty/notes.md"], ["nothing", "empty", "V1"], ["V1/a"],
      ["nothing: no such file or folder", "empty: no logs in it; expected .log, .asc"]),
 ])  # fmt: skip
-def test_which_log_is_of_which_vehicle_and_what_is_left_out(
+def test_logs_are_assigned_to_vehicles_by_folder_and_problems_are_reported(
     tmp_path: Path, files: list[str], arguments: list[str], found: list[str], problems: list[str]
 ) -> None:
     make(*(tmp_path / name for name in files))
@@ -51,7 +51,7 @@ def test_which_log_is_of_which_vehicle_and_what_is_left_out(
         assert words.replace("{}", str(tmp_path)) in problem
 
 
-def test_log_at_a_url_is_of_its_folder_too() -> None:
+def test_log_at_a_url_is_assigned_to_the_vehicle_of_its_folder() -> None:
     for name in ("a.log.gz", "b.log.gz"):
         open_storage("memory://logs/V1").write(name, b"")
     assert drives(find_logs(["memory://logs/V1/a.log.gz"])) == ["V1/a"]
@@ -60,7 +60,7 @@ def test_log_at_a_url_is_of_its_folder_too() -> None:
     assert problem.startswith("memory://logs/V1/c.log.gz: nothing is there, or no logs in it")
 
 
-def test_archive_is_a_folder_of_its_name_and_what_is_damaged_beside_logs_is_a_problem_or_a_log(tmp_path: Path) -> None:
+def test_archive_counts_as_a_vehicle_folder_and_a_damaged_one_is_reported(tmp_path: Path) -> None:
     make(tmp_path / "V1" / "a.log", tmp_path / "V1" / "b.log")
     with zipfile.ZipFile(tmp_path / "V2.ZIP", "w") as archive:
         archive.writestr("a.log", "")
@@ -72,7 +72,7 @@ def test_archive_is_a_folder_of_its_name_and_what_is_damaged_beside_logs_is_a_pr
     assert problem.startswith(f"{tmp_path / 'old.zip'}: not a readable archive: ")
 
 
-def test_folder_of_a_vehicle_may_be_a_link(tmp_path: Path) -> None:
+def test_folder_of_a_vehicle_may_be_a_symbolic_link(tmp_path: Path) -> None:
     make(tmp_path / "disk" / "V1" / "a.log")
     (tmp_path / "fleet").mkdir()
     (tmp_path / "fleet" / "V1").symlink_to(tmp_path / "disk" / "V1")
@@ -105,7 +105,7 @@ def store(database: VehicleDatabase, tmp_path: Path) -> Path:
     (None, []),
     (["battery", "motor"], ["branches recorded but not asked for, missing from the junction sum: auxiliary"]),
 ])  # fmt: skip
-def test_branches_that_were_not_recorded_or_not_asked_for_are_named(
+def test_branches_not_recorded_or_not_requested_are_named(
     store: Path, database: VehicleDatabase, branches: list[str] | None, beside: list[str]
 ) -> None:
     notices = [n for n in probe_equipment(find_fleet(store), database, branches).notices if n.startswith("branches")]

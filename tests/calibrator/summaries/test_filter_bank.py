@@ -24,7 +24,7 @@ def inputs_of(seed: int, samples: int = SAMPLES) -> Array:
     return np.random.default_rng(seed).normal(3.0, 2.0, (samples, len(NAMES)))
 
 
-def test_columns_are_the_inputs_and_each_input_through_each_pole() -> None:
+def test_columns_are_the_inputs_and_each_input_filtered_by_each_pole() -> None:
     u = inputs_of(0)
     columns, used = bank_of().run(u, np.ones(SAMPLES, bool))
     poles = [complex(*pole) for pole in (*POLES[1:3], POLES[0], POLES[3])]
@@ -35,7 +35,7 @@ def test_columns_are_the_inputs_and_each_input_through_each_pole() -> None:
     np.testing.assert_array_equal(columns[~used], 0.0)
 
 
-def test_columns_are_the_states_of_the_system() -> None:
+def test_columns_equal_the_states_of_the_state_space_model() -> None:
     u, bank = inputs_of(1), bank_of()
     A, B = bank.system()
     n = bank.states
@@ -47,7 +47,7 @@ def test_columns_are_the_states_of_the_system() -> None:
     np.testing.assert_allclose(columns[used][:, len(NAMES) :], model.simulate(u)[used], atol=1e-11)
 
 
-def test_a_bank_without_poles_is_the_plain_inputs_from_the_first_sample_on() -> None:
+def test_bank_without_poles_returns_the_inputs_unchanged() -> None:
     u = inputs_of(2)
     bank = filter_bank.plain_bank(NAMES, period_s=PERIOD_S)
     columns, used = bank.run(u, np.ones(SAMPLES, bool))
@@ -55,7 +55,7 @@ def test_a_bank_without_poles_is_the_plain_inputs_from_the_first_sample_on() -> 
     np.testing.assert_array_equal(columns, u)
 
 
-def test_an_error_in_the_start_is_nearly_gone_when_samples_are_used() -> None:
+def test_error_of_the_initial_state_has_decayed_when_samples_are_used() -> None:
     u, bank = inputs_of(4, 2 * SAMPLES), bank_of(POLES[1:3])
     known, _ = bank.run(u, np.ones(2 * SAMPLES, bool))
     started, used = bank.run(u[SAMPLES:], np.ones(SAMPLES, bool))
@@ -68,7 +68,7 @@ def test_an_error_in_the_start_is_nearly_gone_when_samples_are_used() -> None:
 
 
 @pytest.mark.parametrize("is_long", [False, True])
-def test_short_gap_keeps_the_last_inputs_and_a_long_one_starts_filters_again(is_long: bool) -> None:
+def test_short_gap_holds_the_inputs_and_a_long_gap_restarts_the_filters(is_long: bool) -> None:
     u, valid = inputs_of(5), np.ones(SAMPLES, bool)
     gap = slice(300, 300 + HOLDING + is_long)
     held = u.copy()
@@ -82,7 +82,7 @@ def test_short_gap_keeps_the_last_inputs_and_a_long_one_starts_filters_again(is_
     assert used[gap.stop :].any()
 
 
-def test_a_bank_file_brings_the_same_bank_back(tmp_path: Path) -> None:
+def test_bank_is_read_back_unchanged_from_its_file(tmp_path: Path) -> None:
     (tmp_path / "bank.json").write_bytes(bank_of().to_json())
     assert filter_bank.read_bank(tmp_path / "bank.json") == bank_of()
 
@@ -96,7 +96,7 @@ def test_a_bank_file_brings_the_same_bank_back(tmp_path: Path) -> None:
     ('{"input_names": ["u"], "period_s": 0.0}', "period 0.0 s; expected a positive number"),
     ('{"input_names": ["u", "u"], "period_s": 0.1}', "expected distinct names"),
 ])  # fmt: skip
-def test_a_file_that_is_no_bank_is_refused_with_its_name(tmp_path: Path, text: str, message: str) -> None:
+def test_file_that_is_not_a_filter_bank_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "bank.json"
     if text:
         path.write_text(text)

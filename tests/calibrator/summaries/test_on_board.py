@@ -120,7 +120,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) 
     return folder
 
 
-def test_summary_made_on_board_is_that_of_the_log(folder: Path, tmp_path: Path) -> None:
+def test_summary_made_on_board_equals_that_of_the_log(folder: Path, tmp_path: Path) -> None:
     of_log = stored(folder / "of_log")
     size = sum(path.stat().st_size for path in (folder / "vehicle" / "V1").iterdir())
     assert size < 20_000 * MINUTES / 60.0 + 5000  # besides the levels, which are there once per file
@@ -148,7 +148,7 @@ def test_summary_made_on_board_is_that_of_the_log(folder: Path, tmp_path: Path) 
         np.testing.assert_allclose(getattr(on_board.zero_current, name), reading, rtol=1e-6)
 
 
-def test_unusable_record_is_left_out(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_on_board_record_is_left_out(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (path,) = (folder / "vehicle" / "V1").iterdir()
     content = path.read_bytes()
     for vehicle, damaged in {"V1": content, "V2": content[:300], "V3": content, "V4": b"summary"}.items():

@@ -74,7 +74,7 @@ def drives_in(store: SummaryStore) -> dict[str, list[tuple[str, ...]]]:
     return {name: [record.drives for record in records] for name, records in records_in(store).items()}
 
 
-def test_each_drive_is_read_once_and_again_when_it_was_changed(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_drive_is_read_once_and_again_only_if_it_was_changed(tmp_path: Path, database: VehicleDatabase) -> None:
     drives, out = tmp_path / "drives", tmp_path / "summaries"
     for vehicle in ("V1", "V2"):
         write(drives, vehicle, "a", database)
@@ -97,7 +97,7 @@ def test_each_drive_is_read_once_and_again_when_it_was_changed(tmp_path: Path, d
     assert after[1, 1] == pytest.approx(2.25 * before[1, 1], rel=1e-6)
 
 
-def test_a_bad_drive_costs_its_vehicle_and_is_tried_again(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_vehicle_with_a_bad_drive_is_left_out_and_tried_again(tmp_path: Path, database: VehicleDatabase) -> None:
     drives, out = tmp_path / "drives", tmp_path / "summaries"
     for vehicle in ("V1", "V2"):
         write(drives, vehicle, "a", database)
@@ -130,7 +130,7 @@ def copy(drives: Path, source: str, target: str) -> None:
     shutil.copy(drives / "drives" / f"{source}.parquet", path)
 
 
-def test_recording_of_two_vehicles_counts_for_neither(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_recording_found_in_two_vehicles_counts_for_neither(tmp_path: Path, database: VehicleDatabase) -> None:
     drives, out = tmp_path / "drives", tmp_path / "summaries"
     for vehicle in ("V1", "V2", "V3"):
         write(drives, vehicle, "a", database)
@@ -147,7 +147,7 @@ def test_recording_of_two_vehicles_counts_for_neither(tmp_path: Path, database: 
     assert (added.left_out, drives_in(store)) == ({}, {name: [("a",)] for name in ("V1", "V2", "V3")})
 
 
-def test_recording_that_a_vehicle_has_twice_counts_once(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_duplicate_recording_of_a_vehicle_counts_once(tmp_path: Path, database: VehicleDatabase) -> None:
     drives = tmp_path / "drives"
     write(drives, "V1", "a", database)
     copy(drives, "V1/a", "V1/b")
@@ -159,7 +159,7 @@ def test_recording_that_a_vehicle_has_twice_counts_once(tmp_path: Path, database
     assert total(store, "V1").duration_s < 301.0
 
 
-def test_short_drive_counts_where_its_vehicle_has_others(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_short_drive_counts_if_its_vehicle_has_others(tmp_path: Path, database: VehicleDatabase) -> None:
     drives, out = tmp_path / "drives", tmp_path / "summaries"
     write(drives, "V1", "a", database)
     add(drives, out, database)
@@ -181,13 +181,17 @@ def put(name: str, value: float) -> Change:
     (put("battery", -np.inf), "drive d: branch battery shows inf A"),
     (put("speed", np.nan), "drive d: input speed has values that are no numbers"),
 ])  # fmt: skip
-def test_impossible_values_are_named(tmp_path: Path, database: VehicleDatabase, change: Change, message: str) -> None:
+def test_impossible_values_of_a_drive_are_reported(
+    tmp_path: Path, database: VehicleDatabase, change: Change, message: str
+) -> None:
     write(tmp_path, "V1", "d", database, change=change)
     with pytest.raises(DriveError, match=re.escape(message)):
         read_vehicle_summary(find_fleet(tmp_path).vehicles["V1"], EQUIPMENT, database)
 
 
-def test_program_fault_ends_in_70(tmp_path: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_while_summarising_exits_with_70(
+    tmp_path: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write(tmp_path / "drives", "V1", "a", database)
     path = tmp_path / "sitecustomize.py"  # a bug in a process that reads
     path.write_text("import numpy\nnumpy.ascontiguousarray = lambda *_, **__: 1 // 0\n")

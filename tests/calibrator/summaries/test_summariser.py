@@ -43,7 +43,7 @@ def a_bank(*time_constants_s: float) -> FilterBank:
     return FilterBank(input_names=a_drive(0).input_names, period_s=PERIOD_S, poles=poles)
 
 
-def test_the_sum_of_summaries_is_the_summary_of_the_drives_together() -> None:
+def test_sum_of_summaries_equals_the_summary_of_all_drives() -> None:
     first, second = a_drive(2), a_drive(3, samples=170)
     warm_c = [20.0 + 0.01 * drive.time_s for drive in (first, second)]
     together = summarise_samples([first, second], period_s=PERIOD_S, bank=a_bank(3.0, 8.0), temperatures_c=warm_c)
@@ -61,7 +61,7 @@ def test_the_sum_of_summaries_is_the_summary_of_the_drives_together() -> None:
     assert both.bank == together.bank
 
 
-def test_what_was_summarised_differently_does_not_add_up() -> None:
+def test_summaries_of_different_banks_or_branches_do_not_add_up() -> None:
     drive = a_drive(2)
     plain, filtered = (summarise_samples([drive], period_s=PERIOD_S, bank=bank) for bank in (None, a_bank(3.0)))
     with pytest.raises(DriveError, match=r"made with 2 filter banks \(.*\); expected one"):
@@ -70,7 +70,7 @@ def test_what_was_summarised_differently_does_not_add_up() -> None:
         plain + plain.take_branches([0, 1])
 
 
-def test_a_bank_of_other_inputs_or_of_another_period_is_refused() -> None:
+def test_filter_bank_with_other_inputs_or_period_is_refused() -> None:
     drive, bank = a_drive(2), a_bank(3.0)
     with pytest.raises(DriveError, match="align the drive with the bank's inputs"):
         summarise_samples([drive.with_inputs(drive.input_names[1:])], period_s=PERIOD_S, bank=bank)
@@ -79,7 +79,7 @@ def test_a_bank_of_other_inputs_or_of_another_period_is_refused() -> None:
 
 
 @pytest.mark.parametrize("time_constants_s", [(), (2.0, 9.0)])
-def test_moments_are_those_of_the_samples(time_constants_s: tuple[float, ...]) -> None:
+def test_moments_equal_those_of_the_samples(time_constants_s: tuple[float, ...]) -> None:
     drive, bank = a_drive(8, samples=3000), a_bank(*time_constants_s)
     filtered, used = bank.run(drive.inputs, drive.valid)
     kept = used & (used.reshape(-1, 30).sum(axis=1) >= 6).repeat(30)
@@ -93,7 +93,7 @@ def test_moments_are_those_of_the_samples(time_constants_s: tuple[float, ...]) -
 
 
 @pytest.mark.parametrize("samples", [30, 300])
-def test_white_noise_is_measured_without_bias(samples: int) -> None:
+def test_white_noise_is_estimated_without_bias(samples: int) -> None:
     rng = np.random.default_rng(6)
     variance = [
         summarise_samples(
@@ -139,7 +139,7 @@ def test_spikes_are_labelled_by_branch_and_sign_and_left_out() -> None:
     np.testing.assert_allclose(summary.total, columns.T @ columns)
 
 
-def test_current_that_flows_and_delay_that_is_left_are_no_spikes() -> None:
+def test_real_current_pulses_and_residual_delays_are_not_spikes() -> None:
     drive, pulse = coloured_drive(), np.zeros((SAMPLES, 3))
     pulse[[200, 700, 1100]] = [100.0, -60.0, -40.0]
     steps = 80.0 * (np.arange(SAMPLES) // 100 % 2)
@@ -149,7 +149,7 @@ def test_current_that_flows_and_delay_that_is_left_are_no_spikes() -> None:
 
 
 @pytest.mark.parametrize("gain", [-1.0, 0.4, 1.8])
-def test_spikes_are_found_whatever_the_gains(gain: float) -> None:
+def test_spikes_are_found_for_any_gains_of_the_sensors(gain: float) -> None:
     bad = coloured_drive().currents_a * [1.0, gain, 1.0]
     bad[500, 0] += 60.0
     found = find_spikes(bad, np.ones(SAMPLES, bool))
@@ -188,7 +188,7 @@ def shifted(plain: Drive, by_a: Array | float) -> Drive:
     return replace(plain, branches=branches)
 
 
-def test_offsets_are_read_with_their_uncertainty() -> None:
+def test_offsets_are_read_in_zero_current_windows_with_uncertainty() -> None:
     found = zero_current_offsets([drive()], tuple(OFFSETS_A), DATABASE)
     error = found.offset_a - np.array(list(OFFSETS_A.values()))
     assert (np.abs(error) < 4.0 * found.sd_a).all()
@@ -200,18 +200,18 @@ def test_offsets_are_read_with_their_uncertainty() -> None:
     [drive(open_s=(0.0, 0.0)), drive(open_s=(10.0, 13.0)), drive(state=False)],
     ids=["never", "short", "no signal"],
 )
-def test_without_a_window_there_is_no_reading(without: Drive) -> None:
+def test_no_zero_current_window_gives_no_reading(without: Drive) -> None:
     assert np.isnan(zero_current_offsets([without], tuple(OFFSETS_A), DATABASE).offset_a).all()
 
 
-def test_windows_that_differ_are_believed_less() -> None:
+def test_disagreeing_zero_current_windows_increase_the_uncertainty() -> None:
     drives = [drive(), shifted(drive(), 1.0)]
     found = zero_current_offsets(drives, tuple(OFFSETS_A), DATABASE)
     np.testing.assert_allclose(found.offset_a, np.array(list(OFFSETS_A.values())) + 0.5, atol=0.05)
     assert (found.sd_a > 0.3).all()
 
 
-def test_what_wanders_within_a_window_does_not_average_out() -> None:
+def test_uncertainty_covers_wandering_offsets_within_a_window() -> None:
     z = []
     for seed in range(100):
         wander = np.cumsum(np.random.default_rng(seed).normal(0.0, 0.3 / np.sqrt(600.0), 1200))
@@ -220,7 +220,7 @@ def test_what_wanders_within_a_window_does_not_average_out() -> None:
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 
 
-def test_a_gap_in_the_contactor_messages_is_no_window() -> None:
+def test_gap_in_the_contactor_messages_is_not_a_window() -> None:
     gap = drive(open_s=(0.0, 60.0))
     state = gap.inputs["contactor_state"]
     known = (state.time_s < 8.0) | (state.time_s > 52.0)

@@ -38,7 +38,7 @@ def summary_of(samples: int, seed: int = 1) -> DriveSummary:
     return summaries_of(no_faults(1, 2), Conditions(samples=samples), seed=seed)[0]
 
 
-def test_what_is_read_is_what_was_written(store: SummaryStore) -> None:
+def test_summaries_are_read_back_as_written(store: SummaryStore) -> None:
     records = {record.vehicle: record for record in all_records(store)}
     assert sorted(records) == [f"V{j:03d}" for j in range(VEHICLES)]
     for name, summary in zip(
@@ -57,7 +57,7 @@ def test_what_is_read_is_what_was_written(store: SummaryStore) -> None:
         assert records[name].sources == ("1-2",)
 
 
-def test_any_tool_can_read_it(store: SummaryStore) -> None:
+def test_summary_files_are_readable_by_duckdb(store: SummaryStore) -> None:
     files = f"{store.url}/buckets/*.parquet"
     count, seconds = duckdb.execute(
         f"SELECT count(DISTINCT vehicle), sum(duration_s) FROM read_parquet('{files}')"
@@ -66,7 +66,7 @@ def test_any_tool_can_read_it(store: SummaryStore) -> None:
     assert seconds == pytest.approx(VEHICLES * 1800.0)
 
 
-def test_added_records_are_files_until_compacted(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_added_records_are_separate_files_until_compacted(tmp_path: Path, database: VehicleDatabase) -> None:
     store = small_store(tmp_path / "store", database, random_faults(4))
     bucket = store.bucket_of("V001")
     before = {path.name: path.read_bytes() for path in (tmp_path / "store" / "buckets").iterdir()}
@@ -97,7 +97,7 @@ def test_records_of_a_vehicle_add_up(store: SummaryStore) -> None:
     assert both.zero_current.sd_a[1] == pytest.approx(0.1 / np.sqrt(2.0))
 
 
-def test_a_long_drive_is_shortened_and_its_sums_stay(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_blocks_of_a_long_drive_are_merged_without_changing_its_sums(tmp_path: Path, database: VehicleDatabase) -> None:
     long = summary_of(30 * (MOST_BLOCKS + 40))
     store = SummaryStore(storage=open_storage(tmp_path), identity=identity_of(database, 1))
     bucket = store.bucket_of("V1")
@@ -110,7 +110,7 @@ def test_a_long_drive_is_shortened_and_its_sums_stay(tmp_path: Path, database: V
     assert kept.noise_a2.mean() == pytest.approx(long.noise_a2.mean(), rel=0.02)
 
 
-def test_a_record_without_data_says_why_and_does_not_spoil_the_others() -> None:
+def test_failed_drive_does_not_invalidate_other_records_of_its_vehicle() -> None:
     bad = Record(vehicle="V1", drives=("x",), sources=("",), found=None, problem="drive x: cut")
     with pytest.raises(DriveError, match="drive x: cut"):
         joined_records([bad])
@@ -118,7 +118,7 @@ def test_a_record_without_data_says_why_and_does_not_spoil_the_others() -> None:
 
 
 @pytest.mark.parametrize("damage", [b"", b"PAR1", b"x" * 5000])
-def test_a_damaged_bucket_is_named(tmp_path: Path, database: VehicleDatabase, damage: bytes) -> None:
+def test_damaged_bucket_is_named(tmp_path: Path, database: VehicleDatabase, damage: bytes) -> None:
     store = small_store(tmp_path, database, no_faults(2, 2))
     path = next((tmp_path / "buckets").iterdir())
     path.write_bytes(damage)
@@ -149,7 +149,7 @@ def own_store(store: SummaryStore, tmp_path: Path) -> SummaryStore:
 
 
 @pytest.mark.parametrize("changes", [{"moments": [1.0] * 29}, {"noise_a2": []}, {"delay_reference": "bogus"}])
-def test_rows_of_another_store_are_refused(own_store: SummaryStore, changes: dict[str, Any]) -> None:
+def test_rows_with_columns_of_another_store_are_refused(own_store: SummaryStore, changes: dict[str, Any]) -> None:
     bucket = fullest(own_store)
     spoil(own_store, bucket, changes)
     with pytest.raises(FleetError, match="damaged file of summaries: its columns are not those of this store"):
@@ -157,7 +157,7 @@ def test_rows_of_another_store_are_refused(own_store: SummaryStore, changes: dic
 
 
 @pytest.mark.parametrize("name", ["../../evil", "", "-V1", "Vä"])
-def test_a_vehicle_whose_name_cannot_be_used_is_refused(own_store: SummaryStore, name: str) -> None:
+def test_unusable_vehicle_name_is_refused(own_store: SummaryStore, name: str) -> None:
     bucket = fullest(own_store)
     spoil(own_store, bucket, {"vehicle": name})
     expected = rf"parquet: vehicle {re.escape(repr(name))} cannot be used; .* not starting with a dash, dot"
@@ -166,7 +166,7 @@ def test_a_vehicle_whose_name_cannot_be_used_is_refused(own_store: SummaryStore,
             read(bucket)
 
 
-def test_changed_byte_is_noticed(own_store: SummaryStore) -> None:
+def test_changed_byte_in_a_bucket_is_detected(own_store: SummaryStore) -> None:
     bucket = fullest(own_store)
     path = Path(own_store.url) / "buckets" / own_store.files(bucket)[0][0]
     content = bytearray(path.read_bytes())
@@ -177,7 +177,7 @@ def test_changed_byte_is_noticed(own_store: SummaryStore) -> None:
     assert list(look_at_store(own_store.url, whole=True).faults) == [f"bucket {bucket:05d}"]
 
 
-def test_a_bucket_that_is_the_copy_of_another_is_refused(own_store: SummaryStore) -> None:
+def test_bucket_copied_from_another_is_refused(own_store: SummaryStore) -> None:
     first, second = own_store.buckets()[:2]
     folder = Path(own_store.url) / "buckets"
     shutil.copy(folder / own_store.files(first)[0][0], folder / own_store.files(second)[0][0])
@@ -186,14 +186,14 @@ def test_a_bucket_that_is_the_copy_of_another_is_refused(own_store: SummaryStore
             read(second)
 
 
-def test_object_storage_holds_the_same(database: VehicleDatabase) -> None:
+def test_summary_store_works_in_object_storage(database: VehicleDatabase) -> None:
     store = small_store(Storage(url="memory://fleet/one"), database, random_faults(4))
     assert len(all_records(store)) == 4
     assert read_identity(open_storage("memory://fleet/one"), database) == store.identity
     assert set(store.versions()) == {store.files(bucket)[0][0] for bucket in store.buckets()}
 
 
-def test_a_store_of_another_layout_version_or_content_is_refused(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_store_of_another_layout_version_or_content_is_refused(tmp_path: Path, database: VehicleDatabase) -> None:
     storage, identity = open_storage(tmp_path), identity_of(database, 1)
     assert read_identity(storage, database) is None
     write_identity(storage, identity)

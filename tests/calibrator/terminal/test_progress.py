@@ -10,7 +10,9 @@ from calibrator.terminal.text import Notice, few_reasons, figure, left_out_text,
 from tests.calibrator.screen import Screen
 
 
-def test_a_log_gets_lines_with_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_in_a_log_is_lines_with_remaining_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     clock = iter([0.0, 5.0, 11.0, 12.0, 40.0, 41.0])
     monkeypatch.setattr("calibrator.terminal.progress.time.monotonic", lambda: next(clock))
     with progress_bar("read drives", 8, "vehicles") as done:
@@ -24,7 +26,9 @@ def test_a_log_gets_lines_with_time_left(monkeypatch: pytest.MonkeyPatch, capsys
     ]
 
 
-def test_passes_are_numbered(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_of_several_passes_is_numbered(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("calibrator.terminal.progress.WORTH_A_LINE_S", 0.0)
     with numbered_passes(2):
         with progress_bar("learn the fleet", None):
@@ -53,7 +57,7 @@ def in_terminal(*, interrupt: bool = False, columns: int = 80) -> str:
 
 
 @pytest.mark.parametrize("columns", [30, 50, 80, 120])
-def test_bar_has_colour_fits_every_terminal_and_has_the_count(columns: int) -> None:
+def test_progress_bar_is_coloured_and_fits_the_terminal_width(columns: int) -> None:
     raw = in_terminal(columns=columns)
     assert re.search(r"\x1b\[[0-9;]*3[0-9;]*m", raw)
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", raw)
@@ -64,7 +68,7 @@ def test_bar_has_colour_fits_every_terminal_and_has_the_count(columns: int) -> N
     assert ("vehicles" in lines[-1]) == (columns >= 70)
 
 
-def test_ctrl_c_leaves_the_cursor_and_a_new_line() -> None:
+def test_ctrl_c_restores_the_cursor_on_a_new_line() -> None:
     before, _, _ = in_terminal(interrupt=True).partition("Traceback")
     assert before.rindex("\x1b[?25h") > before.rindex("\x1b[?25l")
     assert before.rstrip("\x1b[?25h").endswith("\n")
@@ -77,11 +81,11 @@ def test_ctrl_c_leaves_the_cursor_and_a_new_line() -> None:
     (50.0, 1, "50"), (2.4, 3, "2.4"), (0.034567, 2, "0.035"), (4096.4, 2, "4,096"), (-123.456, 3, "-123"),
     (0.0, 3, "0"), (-1e-12, 3, "0"), (1e7, 3, "10,000,000"), (math.nan, 3, "-"),
 ])  # fmt: skip
-def test_figures_are_written_as_people_do(value: float, digits: int, text: str) -> None:
+def test_numbers_are_formatted_with_significant_digits_and_separators(value: float, digits: int, text: str) -> None:
     assert figure(value, digits) == text
 
 
-def test_of_many_reasons_five_are_reported_and_how_many_more_there_are() -> None:
+def test_five_reasons_are_reported_and_the_number_of_others() -> None:
     reasons = {f"V{j}": "cut" for j in range(7)}
     five = "; V0: cut; V1: cut; V2: cut; V3: cut; V4: cut"
     assert few_reasons({}) == ""
@@ -89,7 +93,7 @@ def test_of_many_reasons_five_are_reported_and_how_many_more_there_are() -> None
     assert few_reasons(reasons, count=1000) == f"{five}; and 995 more"
 
 
-def test_one_reason_of_many_vehicles_is_one_line() -> None:
+def test_same_reason_of_many_vehicles_is_one_line() -> None:
     reasons = dict.fromkeys((f"V{k:03}" for k in range(1, 45)), "too short")
     line = "V001, V002, V003, V004, V005, V006 and 38 more: too short"
     assert left_out_text(reasons) == f"left out:\n  {line}"
@@ -103,7 +107,7 @@ def test_one_reason_of_many_vehicles_is_one_line() -> None:
     (["V1/monday", "V1/tuesday", "V2/monday"], "in 3 drives of 2 vehicles: 3 of 6 frames"),
     (["V1/monday", "V2/monday"], "in 2 vehicles: 2 of 4 frames"),
 ])  # fmt: skip
-def test_equal_notices_are_reported_once_with_the_sum_of_their_counts(drives: list[str], text: str) -> None:
+def test_equal_notices_are_merged_and_their_counts_added(drives: list[str], text: str) -> None:
     notice = Notice(text="{} of {} frames", counts=(1, 2))
     notices = {(vehicle, name): [notice] for vehicle, _, name in (each.partition("/") for each in drives)}
     assert merged_notices(notices) == [text]

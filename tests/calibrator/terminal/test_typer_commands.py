@@ -45,7 +45,9 @@ def hello() -> None:
     (["fail", "user", "more\nlines"], 2, "prog fail: Got unexpected extra argument"),
     (["fly"], 2, "prog: No such command 'fly'; see 'prog --help'"),
 ])  # fmt: skip
-def test_error_is_one_line(arguments: list[str], code: int, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_of_a_command_is_one_line(
+    arguments: list[str], code: int, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_app(app, "prog", arguments) == code
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -56,14 +58,16 @@ def test_error_is_one_line(arguments: list[str], code: int, text: str, capsys: p
 @pytest.mark.parametrize(
     "arguments", [["--debug", "fail", "user"], ["fail", "--debug", "user"], ["fail", "user", "--debug"]]
 )
-def test_debug_shows_the_traceback_wherever_it_stands(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_debug_option_shows_the_traceback_at_any_position(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_app(app, "prog", arguments) == 1
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "Traceback (most recent call last):"
     assert lines[-1] == "prog: no fleet"
 
 
-def test_help_is_not_cut_and_tells_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_is_not_truncated_and_lists_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(app, "prog", ["--help"]) == 0
     words = " ".join(capsys.readouterr().out.split())
     assert "too long for one line of a list of commands." in words
@@ -78,7 +82,7 @@ COMMANDS += [[name] for names in ALL.values() for name in names if [name] not in
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_help_is_readable(
+def test_help_of_every_command_fits_80_columns_and_has_an_example(
     command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -97,7 +101,7 @@ def number_options(command: Any, *words: str) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("given", ["few", "nan", "inf"])
-def test_every_number_has_bounds_and_is_looked_at_first(given: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_number_option_has_bounds_that_are_checked_first(given: str, capsys: pytest.CaptureFixture[str]) -> None:
     options = [*number_options(get_command(calibrator_app))]
     assert len(options) > 20
     for words in options:
@@ -125,7 +129,7 @@ def work() -> None:
     list(run_many(int, ["1", "one"], Workers(processes=2)))
 
 
-def test_a_fault_in_a_worker_process_is_one_line_too(capfd: pytest.CaptureFixture[str]) -> None:
+def test_internal_error_in_a_worker_process_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
     assert run_app(app, "prog", ["work"]) == 70
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith("prog: internal error: ValueError: invalid literal for int() with base 10: 'one'")
