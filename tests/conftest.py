@@ -25,7 +25,7 @@ WHEN_ASKED = [ROOT / "tests" / name for name in ("package", "vcan")]
 """Folders whose tests run only where they are named: they need a built wheel, or a kernel with SocketCAN."""
 NOTHING_MAY_BE_SKIPPED = os.environ.get("HV_REQUIRE_ALL") == "1"
 
-settings.register_profile("patient", deadline=None)  # a busy machine, or a first call that compiles, proves nothing
+settings.register_profile("patient", deadline=None)  # a busy machine or a first compilation may be slow
 settings.load_profile("patient")
 
 _open_buses: WeakSet[can.BusABC] = WeakSet()
@@ -90,12 +90,12 @@ def no_bus_left_open() -> Iterator[None]:
 
 
 def pytest_configure() -> None:
-    """Heed Ctrl-C, and let programs started by tests heed it: a shell that starts jobs in the background ignores it."""
+    """Let Ctrl-C end the tests and programs that they start: a shell lets jobs in the background ignore it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave tests out that run only when asked for: they never skip."""
+    """Do not collect tests that run only on request, so that they need not skip."""
     if collection_path not in WHEN_ASKED:
         return None
     asked = [(config.invocation_params.dir / argument.partition("::")[0]).resolve() for argument in config.args]

@@ -36,7 +36,7 @@ def page(browser: webdriver.Chrome, result: Path, tmp_path: Path) -> webdriver.C
 
 
 def opened(browser: webdriver.Chrome, text: str, path: Path) -> webdriver.Chrome:
-    """Open a page; what the browser logged before is forgotten."""
+    """Open a page and discard earlier logs of the browser."""
     path.write_text(text)
     browser.get_log("browser")
     browser.get_log("performance")
@@ -58,7 +58,7 @@ def rows(browser: webdriver.Chrome) -> list[list[str]]:
 
 
 def vehicle_text(browser: webdriver.Chrome, name: str) -> str:
-    """What the page shows of a vehicle that is chosen."""
+    """Choose a vehicle; returns what the page shows of it."""
     browser.execute_script(f"location.hash = 'vehicle={name}'")
     until(browser, f"return document.getElementById('vehicle').dataset.vehicle === '{name}'")
     return browser.find_element(By.ID, "vehicle").text
@@ -238,7 +238,7 @@ def test_report_prints_on_a4_with_complete_figures(page: webdriver.Chrome) -> No
     boxes = [tuple(map(float, box.split())) for box in re.findall(rb"/MediaBox \[([0-9. ]+)\]", printed)]
     assert boxes
     assert all(box == pytest.approx((0, 0, 595, 842), abs=1.0) for box in boxes)
-    # While it is printed figures are as wide as the paper, and afterwards as the screen again.
+    # Figures are as wide as the paper while printing, and as the screen again afterwards.
     widths = page.execute_script(
         "const wide = () => [...document.querySelectorAll('.plot[data-drawn] .main-svg')].map((at) => at.clientWidth);"
         "window.dispatchEvent(new Event('beforeprint')); return wide();"

@@ -1,4 +1,4 @@
-"""The calibrator's command line in this process: starting Python takes longer than most commands that are tried."""
+"""The calibrator's command line in this process: starting Python takes longer than most of them."""
 
 import fcntl
 import os
@@ -16,7 +16,7 @@ __all__ = ["calibrator", "made_once", "once"]
 
 
 def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run a command; how it starts and ends as a process is for test_command_line.py."""
+    """Run a command; test_command_line.py tests how it starts and ends as a process."""
     output, errors = TextIOWrapper(BytesIO(), encoding="utf-8"), TextIOWrapper(BytesIO(), encoding="utf-8")
     line = [*map(str, arguments)]
     with redirect_stdout(output), redirect_stderr(errors):
@@ -25,13 +25,13 @@ def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def said(stream: TextIOWrapper) -> str:
-    """All that was written."""
+    """Everything written to a stream."""
     stream.seek(0)
     return stream.read()
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, *arguments: object) -> Path:
-    """Folder that a command writes, for all tests."""
+    """Folder that a command writes once for all tests."""
 
     def make(out: Path) -> None:
         done = calibrator(*arguments, "--layout", LAYOUT, "--out", out, "--workers", 1)

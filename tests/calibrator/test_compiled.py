@@ -1,4 +1,4 @@
-"""Compiled code is kept in a folder of this state of the source, and works where there is none."""
+"""Compiled code is cached in a folder for this version of the source, and works without one."""
 
 import ast
 import os

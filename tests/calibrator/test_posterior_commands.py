@@ -73,7 +73,7 @@ def test_unmeasured_load_is_estimated_from_the_fleet_and_reported(fleet: Path, r
 
 @pytest.fixture(scope="session")
 def strict(summaries: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Nothing may do harm, so nothing is corrected and faulty vehicles stay undecided."""
+    """Result with a harm limit of zero: nothing is corrected, and faulty vehicles stay undecided."""
     return made_once(tmp_path_factory, "strict_result", "calibrate", summaries, "--harm-limit", 0)
 
 

@@ -21,7 +21,7 @@ def sensor_faults(drift: list[list[float]] | Array, offset: list[list[float]] | 
     ((0.1, 0.2), (0.109, 0.2), True, True),
     ((0.1, 0.2), (0.111, 0.2), False, True),
     ((0.1, 0.2), (0.1, 0.221), False, True),
-    ((0.0, 0.0), (0.0049, 0.0), True, True),  # a vanishing truth counts as the smallest fault, 0.05
+    ((0.0, 0.0), (0.0049, 0.0), True, True),  # a truth of zero counts as the smallest fault, 0.05
     ((0.0, 0.0), (0.0051, 0.0), False, True),
     ((0.1, 0.0), (float("nan"), 0.0), False, False),
 ])  # fmt: skip

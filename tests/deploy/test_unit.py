@@ -1,4 +1,4 @@
-"""The systemd unit: what systemd itself says of it, and the properties that the documentation promises."""
+"""The systemd unit: systemd verifies it, and it has the properties that the documentation promises."""
 
 import os
 import re
@@ -43,7 +43,7 @@ def run(*command: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("additions", [[], [*DEPLOY.glob("*.conf")]], ids=["alone", "with its additions"])
+@pytest.mark.parametrize("additions", [[], [*DEPLOY.glob("*.conf")]], ids=["without drop-ins", "with drop-ins"])
 def test_systemd_finds_no_mistake_in_the_unit(analyze: str, unit: Path, additions: list[Path]) -> None:
     folder = unit.with_name(f"{unit.name}.d")
     folder.mkdir()
@@ -61,7 +61,7 @@ def test_unit_has_few_privileges_according_to_systemd(analyze: str, unit: Path) 
 
 
 def test_node_accepts_the_command_line_of_the_unit(capsys: pytest.CaptureFixture[str]) -> None:
-    """With the example environment: all that keeps it from running is the layout that is not there."""
+    """With the example environment only the missing layout keeps the node from running."""
     values = dict(re.findall(r"(?m)^(\w+)=(.*)$", (DEPLOY / "ecu-node.env").read_text()))
     (line,) = re.findall(r"(?m)^ExecStart=(.*)$", UNIT.read_text())
     command = line.replace("%i", "can0").split()[1:]

@@ -134,7 +134,7 @@ class Junction:
 
     @property
     def corrected_for_s(self) -> float:
-        """How long the node went on to correct after the sensors broke. [s]"""
+        """How long the node continued to correct after the sensors broke. [s]"""
         return float("inf") if self.fell_back_s is None else self.fell_back_s - BREAK_S
 
     def _send(self, name: str, shown_a: float, now_s: float) -> None:

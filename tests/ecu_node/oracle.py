@@ -1,7 +1,7 @@
-"""What must come of a frame in the node, by cantools (signals) and fractions (correction), in both modes.
+"""The expected output of the node for each frame, by cantools (signals) and fractions (correction), in both modes.
 
-The exact code is rounded, halves up; the node may come out as if the value were greater by less than 2^-10 of a code.
-Which frames are intact and in order is told by the node's receiver, which test_e2e.py compares with AUTOSAR's words.
+The exact code is rounded, halves up; that of the node may be of a value greater by less than 2^-10 of a code.
+Which frames are intact and in order is taken from the node's receiver, which test_e2e.py compares with AUTOSAR.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ _TOLERANCE = Fraction(1, 1024)
 
 
 class _Outcome(NamedTuple):
-    """Least and greatest code that may come of a branch, None for no value, and its quality."""
+    """Least and greatest code expected of a branch, None for no value, and its quality."""
 
     allowed: tuple[int, int] | None
     quality: Quality
@@ -57,7 +57,7 @@ def _codes(message: Message, data: bytes) -> dict[str, int]:
 
 
 class _Branch:
-    """One branch in one mode: what must come of its last frame."""
+    """One branch in one mode, with the output expected for its last frame."""
 
     def __init__(self, database: VehicleDatabase, branch: Branch, fault: BranchParameters, mode: Mode) -> None:
         self.sign, self.is_power = branch.sign, branch.power is not None
@@ -224,7 +224,7 @@ class Oracle:
 def require_right(
     database: VehicleDatabase, parameters: VehicleParameters, mode: Mode, frames: Iterable[tuple[int, bytes]]
 ) -> None:
-    """Send frames, a millisecond apart, through the node's core, and require of each what must come of it."""
+    """Send frames, a millisecond apart, through the node's core, and compare the output for each with the oracle."""
     oracle = Oracle(database, parameters, mode)
     corrector = wire(database, InForce(parameters=parameters), 0.0, mode=mode)
     sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}

@@ -80,7 +80,7 @@ class Codes:
         return self.span[0] <= code <= self.span[1] and code not in self.gaps
 
     def worth(self, code: int) -> Fraction:
-        """What a code says, in A, W or V."""
+        """Value of a code, in A, W or V."""
         return self._scale * code + self._offset
 
     def exact_code(self, value: Fraction) -> Fraction:
@@ -205,7 +205,7 @@ def _draw(rng: Random, kinds: Collection[str]) -> tuple[dict[str, Any], list[Mes
             drift = rng.choice((0.0, 0.02, round(rng.uniform(-0.4, 0.4), 4)))
             offset_a = rng.choice((0.0, 3.0, round(rng.uniform(-50.0, 50.0), 3)))
             faults[name] = BranchParameters(drift=drift, offset_a=offset_a, apply=rng.random() < 0.9)
-    for draft in sources:  # and signals that are nobody's business
+    for draft in sources:  # and signals that the layout does not use
         draft.place(rng, Signal("Other", 0, rng.choice((1, 4, 8))))
     keys = ("signal", "power", "voltage", "corrected")
     named = {branch[key].split(".")[0] for branch in branches for key in keys if key in branch}

@@ -46,7 +46,7 @@ BATTERY_A, CORRECTED_A = 111.0, 100.0
 
 @pytest.fixture(autouse=True)
 def _no_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the configuration of who runs the tests; HOME holds can.conf."""
+    """Ignore the configuration of the user who runs the tests; HOME holds can.conf."""
     for name in ("CAN_CONFIG", "CAN_BITRATE", "CAN_INTERFACE", "CAN_CHANNEL"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -204,7 +204,7 @@ def test_listen_only_reports_whether_the_adapter_acknowledges_frames(
 def running(
     *options: str, program: Sequence[str] = ("-m", "ecu_node"), until: str = "running on"
 ) -> Iterator[list[str]]:
-    """A node in a process of its own, from when it says so; the lines of its log, all of them after the block."""
+    """A node in a process of its own, once it reports that it runs; the lines of its log, complete after the block."""
     command = [sys.executable, *program, *options]
     environment = {**os.environ, "CAN_CONFIG": os.environ.get("CAN_CONFIG", '{"sleep_after_open": 0}')}
     log: list[str] = []

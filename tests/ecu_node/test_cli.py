@@ -1,4 +1,4 @@
-"""The command line: exit codes, one-line messages, and what a light process it is."""
+"""The command line: exit codes, one-line messages, and light imports."""
 
 import json
 import os

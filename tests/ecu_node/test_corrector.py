@@ -1,4 +1,4 @@
-"""The node's core, frame by frame: what is answered, what is counted, what the status says."""
+"""The node's core, frame by frame: answers, counters and status."""
 
 import math
 import re
@@ -168,12 +168,12 @@ BOTH, LATE = ("battery", "motor"), ("motor",)
         [(2.9, LATE, STARTING), (0.4, LATE, STALE)],
         [(10.0, BOTH, STARTING), (1.0, (), CORRECTING), (2.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
     ],
-    ids=["silent branch", "tried again after the bus has slept", "never appears", "sleep is no fault"],
+    ids=["silent branch", "tried again after the bus has slept", "branch never appears", "sleep is not a fault"],
 )
 def test_silent_branch_stops_the_correction_until_the_bus_has_slept(
     database: VehicleDatabase, phases: list[tuple[float, Collection[str], tuple[State, Reason]]]
 ) -> None:
-    """For how long [s] which branches are silent, and what the node says of itself at the end."""
+    """Each phase has its duration [s], the silent branches, and the state of the node at its end."""
     corrector, now_s = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0)), 0.0
     for seconds, silent, expected in phases:
         drive(database, corrector, now_s, now_s + seconds, silent=silent)
@@ -386,7 +386,7 @@ def test_junction_sum_is_not_interpolated_across_a_frame_without_value(database:
 
 
 def test_value_is_used_though_its_timestamp_precedes_that_of_a_missing_one(database: VehicleDatabase) -> None:
-    """As after the clock was set: the first frame counts as of when it was read, the next one as of when it came."""
+    """As after a clock step: the first frame has the time of its reading, the next one that of its arrival."""
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
     answers(corrector, battery(database, 0, -655.36), 0.02)
     answers(corrector, battery(database, 1, 80.0), 0.01)
@@ -430,7 +430,7 @@ def test_scale_in_unit_and_in_factor_is_applied_once(make_database: MakeDatabase
 
 
 def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_database: MakeDatabase) -> None:
-    """And is written again, as long as it is not stale, into each answer to the other branches of its message."""
+    """Until it is stale, it is repeated in each answer to the other branches of its message."""
     layout = SMALL_LAYOUT.replace('"Net.Voltage"', '"Net.Voltage", corrected = "PairOut.Heater"')
     signal = ' SG_ Heater : 40|16@1+ (1,0) [0|60000] "W" Node\n SG_ Quality'
     database = make_database(layout, SMALL_DBC.replace(" SG_ Quality", signal) + 'VAL_ 512 Heater 65535 "SNA";\n')
@@ -587,7 +587,7 @@ def test_branch_of_a_frozen_control_unit_becomes_stale(make_database: MakeDataba
 def test_answer_is_corrected_if_parameters_name_the_branch(
     database: VehicleDatabase, faulty: str, name: str, corrected_a: float, quality: Quality
 ) -> None:
-    """An offset counts into the junction, and the motor's signal is positive out of it."""
+    """Offsets are positive into the junction, the motor's signal is positive out of it."""
     corrector = corrector_for(database, **{faulty: (0.25, 5.0)})
     frame = battery(database, 3) if name == "battery" else motor(database, 3)
     assert published(database, corrector, frame, 0.0, name) == (corrected_a, quality)

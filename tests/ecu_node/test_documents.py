@@ -1,4 +1,4 @@
-"""What the documents name exists: tests of hazards and of the fault table, reasons and states of the status."""
+"""Everything named in the documents exists: tests of hazards and faults, reasons and states of the status."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Drives summed up by a node: frames in, records out. That they are those of the log: tests/calibrator/summaries."""
+"""Drives summed up by a node: frames in, records out. tests/calibrator/summaries compares them with the log."""
 
 import argparse
 import math

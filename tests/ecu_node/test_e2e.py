@@ -1,4 +1,4 @@
-"""End-to-end protection: what is accepted, what is counted out; the libraries find the frames sound."""
+"""End-to-end protection: accepted and rejected frames; independent libraries find the frames intact."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -147,7 +147,7 @@ def test_default_data_id_is_the_message_id(protect: Callable[..., Protection], p
     protection = protect(autosar(profile, "offset = 3"), room=long)
     assert protection.identity == identity
     (frame,) = stream(protection, 1)
-    assert (identity.to_bytes(4, "big") in frame) is (profile != "P05")  # which sends none
+    assert (identity.to_bytes(4, "big") in frame) is (profile != "P05")  # which does not send it
 
 
 def crc8(data: bytes, polynomial: int) -> int:
@@ -214,7 +214,7 @@ def test_every_byte_of_a_multi_byte_counter_is_compared(protection: Protection, 
         ),
         ("valid = { window = 5, min_ok = 1, max_error = 2 }", [0] * 6, (), "VVVVVX"),
     ],
-    ids=["errors", "lost frames are no errors, nor a few at first", "repeated frames are not intact"],
+    ids=["corrupt frames are errors", "lost frames are not errors", "repeated frames are not intact"],
 )
 def test_e2e_state_follows_the_windows_of_recent_frames(
     kind: str, protect: Callable[..., Protection], windows: str, sent: Sequence[int], spoilt: Sequence[int], states: str

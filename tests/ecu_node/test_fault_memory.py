@@ -1,4 +1,4 @@
-"""The fault memory: what was latched is kept, told, and cleared."""
+"""The fault memory: latched faults are stored, listed and cleared."""
 
 import json
 from contextlib import redirect_stdout
@@ -78,7 +78,7 @@ def test_fault_is_stored_with_its_currents(vehicle: Vehicle, capsys: pytest.Capt
 
 @pytest.mark.parametrize(("number", "latched"), [(44, Reason.SUM_IMPLAUSIBLE), (43, Reason.NONE)])
 def test_latched_fault_survives_a_restart_until_it_is_cleared(vehicle: Vehicle, number: int, latched: Reason) -> None:
-    """It was the same set of parameters; another one is tried."""
+    """With the same parameter set; another set is tried."""
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.file.write_text(vehicle.file.read_text().replace('"parameter_set": 44', f'"parameter_set": {number}'))
     vehicle.start()
@@ -90,7 +90,7 @@ def test_latched_fault_survives_a_restart_until_it_is_cleared(vehicle: Vehicle, 
 
 
 def test_bus_sleep_releases_a_stale_branch_and_a_short_gap_does_not(vehicle: Vehicle) -> None:
-    """Sleep does not release what the sums said."""
+    """Sleep does not release faults that the junction sum revealed."""
     for count in (1, 2):
         vehicle.latch(Reason.BRANCH_STALE, "motor")
         for seconds, latched in ((2.0, Reason.BRANCH_STALE), (7.0, Reason.NONE)):

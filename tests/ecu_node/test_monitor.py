@@ -1,4 +1,4 @@
-"""``ecu-node monitor``: what it makes of frames (by cantools and autosar-e2e), and how it shows it."""
+"""``ecu-node monitor``: frames by cantools and autosar-e2e, how they are evaluated and shown."""
 
 import json
 import os

@@ -43,7 +43,7 @@ def overlay_bus(database: VehicleDatabase, channel: str) -> can.BusABC:
 
 @contextmanager
 def at_work(node: Node, *, may_end: bool = False) -> Iterator[Future[None]]:
-    """Run a node in a thread; what ends it, ends the test, unless it may end."""
+    """Run a node in a thread; an error that ends it fails the test, unless it may end."""
     stop, ready = threading.Event(), threading.Event()
     with ThreadPoolExecutor(1) as pool:
         running = pool.submit(node.run, stop.is_set, ready.set)
@@ -297,7 +297,7 @@ def wait_until(done: Callable[[], bool]) -> None:
 
 
 def test_failed_bus_is_reported_as_open_only_when_it_works_again(peer: can.BusABC, channel: str) -> None:
-    """A bus off that is told as it opens again is counted."""
+    """A bus-off that is reported as the bus opens again is counted."""
     down = can.CanOperationError("Network is down", errno.ENETDOWN)
     opened = iter([*(FailingBus(f"{channel} down", receiving=down) for _ in range(3)), VirtualBus(channel)])
     peer.send(can.Message(arbitration_id=0x40, is_error_frame=True))
@@ -327,7 +327,7 @@ def test_frame_that_the_bus_rejects_does_not_block_later_frames(peer: can.BusABC
 
 
 def test_bus_whose_sending_fails_is_opened_again(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
-    """The kernel tells it once."""
+    """The kernel reports the error only once."""
     gone = can.CanOperationError("No such device or address", errno.ENXIO)
     buses = iter([FailingBus(channel, sending=gone), overlay_bus(database, channel)])
     with node_on(database, "", lambda: next(buses)) as corrector:

@@ -26,7 +26,7 @@ from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
         ),
         (lambda _: None, Reason.NO_PARAMETERS, "no such parameter file; name one that is there"),
     ],
-    ids=["empty", "one byte", "half written", "of another vehicle", "gone"],
+    ids=["empty", "one byte", "half written", "of another vehicle", "missing"],
 )
 def test_unfit_parameter_file_is_not_used(
     database: VehicleDatabase, tmp_path: Path, spoil: Callable[[bytes], bytes | None], reason: Reason, words: str
@@ -46,7 +46,7 @@ def test_unfit_parameter_file_is_not_used(
 
 @pytest.mark.parametrize("mode", [Mode.OVERLAY, Mode.GATEWAY])
 def test_changing_parameters_has_the_same_effect_as_starting_with_them(make_database: MakeDatabase, mode: Mode) -> None:
-    """Measured and corrected signal count differently here."""
+    """Measured and corrected signal have different scales here."""
     database = make_database(dbc=SMALL_DBC.replace("SG_ Battery : 0|16@1- (0.1,0)", "SG_ Battery : 0|16@1- (0.2,0)"))
     before, after = (
         InForce(parameters=parameters_for(database, **faults))

@@ -94,7 +94,7 @@ def test_sensor_that_stays_constant_while_the_others_move_is_stuck(junction: Jun
 
 @pytest.mark.parametrize("name", NAMES)
 def test_stuck_branch_is_named_even_if_the_sum_may_vary_widely(tmp_path: Path, name: str) -> None:
-    """Neither a jump nor a gain error or an offset shows; that one code never changes does, after a while."""
+    """No jump, gain error or offset is visible, but after a while one code that never changes is."""
 
     def swinging(time_s: float) -> dict[str, float]:
         motor_a, heater_a = 60.0 + 30.0 * math.sin(0.7 * time_s), 60.0 + 30.0 * math.sin(3.1 * time_s)
@@ -127,7 +127,7 @@ def test_quality_signal_of_two_bits_reports_implausible_as_invalid(tmp_path: Pat
 
 
 def test_load_steps_are_not_a_fault(junction: Junction) -> None:
-    """Frames come one after the other, and the motor's sensor is 20 ms late: a moment long one branch moves alone."""
+    """Frames come one after the other, and the motor's sensor is 20 ms late: for a moment one branch moves alone."""
 
     def steps(time_s: float) -> dict[str, float]:
         heater_a = 60.0 if time_s % 3.0 < 1.5 else 0.0
@@ -140,7 +140,7 @@ def test_load_steps_are_not_a_fault(junction: Junction) -> None:
 
 
 def test_gross_fault_is_detected_without_residual_standard_deviations(tmp_path: Path) -> None:
-    """The sum that the calibrator saw is none."""
+    """A sum as large as the calibrator stated is not a fault."""
     junction = Junction(three_branches(tmp_path), sd_a=None, sd_per_a=None, corrected_a=60.0)
     junction.wrong = {"heater": lambda shown_a: shown_a + 60.0}
     junction.run(20.0, driving)

@@ -1,6 +1,6 @@
-"""Random frames of random vehicles through the node's core, each compared with what must come of it.
+"""Random frames of random vehicles through the node's core, each compared with the oracle.
 
-``HV_FRAMES=10000000 pytest -n auto tests/ecu_node/test_random_vehicles.py`` tries so many.
+``HV_FRAMES=10000000 pytest -n auto tests/ecu_node/test_random_vehicles.py`` tries that many.
 """
 
 import os

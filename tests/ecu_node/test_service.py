@@ -1,4 +1,4 @@
-"""What the service manager is told, over a real socket; the log's rate limit; signals."""
+"""Messages to the service manager over a real socket, and the log's rate limit."""
 
 import os
 import socket
@@ -40,7 +40,7 @@ class Manager:
         self.socket.settimeout(0.0)
 
     def told(self) -> list[str]:
-        """Everything told so far."""
+        """All messages received so far."""
         texts = []
         while True:
             try:
@@ -51,7 +51,7 @@ class Manager:
 
 @pytest.fixture
 def managed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager]:
-    """A service manager that wants to hear from the node every 4 s."""
+    """A service manager whose watchdog expects a message every 4 s."""
     manager = Manager(tmp_path / "notify")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     monkeypatch.setenv("WATCHDOG_USEC", str(int(1e6 * WATCHDOG_S)))

@@ -20,7 +20,7 @@ Ends = tuple[SocketCanLink, socket.socket]
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    """A link, and the other end; datagrams between processes are to the system calls what frames are."""
+    """A link, and the other end; the system calls treat datagrams between processes like frames."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     far.settimeout(1.0)
     with near, far:
@@ -45,7 +45,7 @@ def random_frame(rng: random.Random) -> can.Message:
 
 
 def fields(message: can.Message) -> tuple[object, ...]:
-    """All that a frame is."""
+    """All fields of a frame."""
     return (
         *(message.arbitration_id, message.is_extended_id, message.is_remote_frame, message.is_error_frame),
         *(message.is_fd, message.bitrate_switch, message.error_state_indicator, message.dlc, bytes(message.data)),

@@ -1,6 +1,6 @@
 """Signals that come while the node starts: at the very moment when it opens its layout, or begins to import a library.
 
-Python's audit events tell the moment: the process signals itself there, and the rest is as it always is.
+At this moment, found by Python's audit events, the process sends the signal to itself; nothing else is changed.
 """
 
 import signal

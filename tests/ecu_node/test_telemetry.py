@@ -1,4 +1,4 @@
-"""Telemetry, latency, garbage and real time: nothing of it holds up the bus."""
+"""Telemetry, latency, garbage and real time: none of them delays the bus."""
 
 import json
 import os

@@ -130,7 +130,7 @@ def decoded(database: VehicleDatabase, message: str, data: bytes) -> dict[str, A
 
 
 class AtOnce(Executor):
-    """Does in the foreground what is to be done in the background."""
+    """Runs background work at once, in the foreground."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         done: Future[Any] = Future()

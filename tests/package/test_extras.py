@@ -53,7 +53,9 @@ def test_calibrator_extra_covers_all_steps_from_logs_to_exports(
     assert " frames in " in played
 
 
-def test_vehicle_takes_what_the_calibrator_publishes(installed: Installed, car: Path, tmp_path: Path) -> None:
+def test_update_extra_takes_parameters_published_by_the_calibrator(
+    installed: Installed, car: Path, tmp_path: Path
+) -> None:
     off_board, on_board = installed("calibrator"), installed("update")
     calibrator(off_board, tmp_path, "repository", "key", "anna", "--no-passphrase", "--out", ".")
     roles = [word for role in ("root", "targets", "snapshot", "timestamp") for word in (f"--{role}", "anna.pub")]
@@ -132,7 +134,7 @@ def test_docs_are_built_from_the_source_distribution(installed: Installed, unpac
     assert (unpacked / "build" / "docs" / "docs" / "index.html").is_file()
 
 
-# What a command says whose extra is missing, and doing what it says helps
+# A command without its extra names the extra, and installing it helps
 
 
 STEPS: dict[str, tuple[tuple[str, ...], str]] = {

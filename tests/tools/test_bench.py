@@ -1,4 +1,4 @@
-"""Benchmarks give a figure of every kind at small size, each of something that worked; how large it is, is for them."""
+"""Benchmarks give a figure of every kind at small size, of work that succeeded; its size is not tested."""
 
 import os
 import subprocess

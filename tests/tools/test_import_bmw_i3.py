@@ -123,7 +123,7 @@ def test_files_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
         imported(path)
 
 
-def test_one_bad_file_does_not_stop_the_others_and_the_exit_code_says_so(tmp_path: Path) -> None:
+def test_bad_file_does_not_stop_the_import_but_sets_the_exit_code(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     write_csv(tmp_path / "in" / "A.csv", columns())
     write_csv(tmp_path / "in" / "B.csv.gz", columns())
@@ -147,7 +147,7 @@ def test_a_layout_without_these_branches_is_refused(tmp_path: Path) -> None:
     assert "no branch or input named auxiliary" in str(done.exception)
 
 
-def test_values_beyond_the_range_of_the_dbc_are_labelled_with_what_is_computed_from_them(tmp_path: Path) -> None:
+def test_values_outside_the_dbc_range_and_those_computed_from_them_are_labelled(tmp_path: Path) -> None:
     values = columns()
     values["current"][100] = -2000.0
     values["voltage"][200] = 1500.0

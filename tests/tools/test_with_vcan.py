@@ -1,4 +1,4 @@
-"""How tools/with_vcan is used; what it does on its kernel is seen by the tests in tests/vcan."""
+"""Usage of tools/with_vcan; the tests in tests/vcan show what it does on its kernel."""
 
 import subprocess
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What may befall a file."""
+"""Kinds of damage to a file."""
 
 import os
 from collections.abc import Callable

@@ -59,7 +59,7 @@ def test_change_after_a_signature_invalidates_all_signatures(repo: Repo, other: 
 def test_staged_but_unsigned_roles_do_not_block_a_new_timestamp(
     repo: Repo, state: Path, other: VehicleParameters
 ) -> None:
-    """Else a signer who is away for 30 days would end the updates of the whole fleet."""
+    """Otherwise a signer who is away for 30 days would stop the updates of the whole fleet."""
     repo.updated(state)
     repo.add(other)
     repo.done("rotate", repo.path, "timestamp", "--public", repo.folder / "keys" / "new.pub")
@@ -82,7 +82,7 @@ def test_key_rotation_keeps_the_threshold_unless_another_is_given(repo: Repo) ->
     assert "1 of 1 (was 2)" in repo.done("rotate", repo.path, "targets", *public[:2], "--threshold", 1)
 
 
-def test_revoked_file_that_is_added_again_is_no_longer_revoked_and_add_says_so(repo: Repo, state: Path) -> None:
+def test_adding_a_revoked_file_again_ends_its_revocation_and_is_reported(repo: Repo, state: Path) -> None:
     repo.done("revoke", repo.path, "v1")
     repo.publish()
     repo.updated(state)
@@ -95,7 +95,7 @@ def test_revoked_file_that_is_added_again_is_no_longer_revoked_and_add_says_so(r
 def test_interrupted_publication_can_be_completed(
     repo: Repo, new: Path, other: VehicleParameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Up to the new timestamp vehicles see what was there before."""
+    """Until the new timestamp vehicles receive the previous files."""
     repo.updated(new)
     repo.add(other)
     with monkeypatch.context() as patch:

@@ -58,7 +58,7 @@ def test_metadata_of_foreign_keys_is_refused(role: str, repo: Repo, state: Path,
 
 
 def test_rollback_is_refused(repo: Repo, state: Path) -> None:
-    """Else a revocation could be held back by an old bundle."""
+    """Otherwise an old bundle could hide a revocation."""
     old = repo.bundle().read_bytes()
     repo.revoke()
     assert "nothing is in force now" in repo.updated(state, repo.bundle())
@@ -89,7 +89,7 @@ def test_freeze_is_detected_when_metadata_expires(role: str, repo: Repo, new: Pa
 
 
 def test_freeze_with_the_clock_set_back_is_detected(repo: Repo, state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time of an earlier update is kept, and no clock before it is believed."""
+    """The time of an earlier update is kept, and no earlier clock time is accepted."""
     later = replace(read_state(state), latest=datetime(2099, 1, 1, tzinfo=UTC))
     monkeypatch.setattr("ecu_node.update.client.read_state", lambda _: later)
     repo.refused(state, "expired at")
@@ -148,7 +148,7 @@ def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, n
     "keys", [("timestamp", "mallory"), ("snapshot", "mallory"), ("t1", "mallory"), ("r1",), ("snapshot", "timestamp")]
 )
 def test_one_stolen_key_cannot_deliver_parameters(keys: tuple[str, ...], repo: Repo, new: Path) -> None:
-    """Nor do all online keys: their thief signs all that they can sign."""
+    """Nor can all online keys: their thief signs all that they can sign."""
     repo.forge(repo.bin, evil_target(repo), *keys)
     repo.relist(repo.bin, *keys)
     repo.refused(new, "was signed by ")

@@ -1,4 +1,4 @@
-"""What a vehicle makes of an honest repository: our own checks, revocation, time, and damaged files."""
+"""Updates from an honest repository: our own checks, revocation, time, and damaged files."""
 
 import lzma
 import math
@@ -207,7 +207,7 @@ def test_latest_time_seen_is_kept_when_the_clock_is_set_back(
 
 
 def test_canonical_json_equals_that_of_securesystemslib(offered: Repo) -> None:
-    """What is signed is written quickly here; keys, numbers, escapes and odd letters come out the same."""
+    """The fast encoder used here writes keys, numbers, escapes and unusual characters in the same way."""
     documents = [Metadata.from_file(str(path)).signed.to_dict() for path in offered.metadata.glob("*.json")]
     odd = {"b": [], "a": {}, "é": "\x7f€\U0001f697/<&'", "": [True, False, 0, -1, 2**63], "A": [[{"z": "", "y": 1}]]}
     for document in (*documents, odd, {**odd, "n": None}, {**odd, "c": 'a "b"\\\n\x00'}):
@@ -277,7 +277,7 @@ def test_flipped_bit_in_the_state_is_detected(state: Path) -> None:
 
 
 def test_change_of_any_byte_of_a_bundle_is_detected(repo: Repo, new: Path) -> None:
-    """Of head and tail each is changed or the last, of those between every seventh."""
+    """Each byte of head and tail, and every seventh between, is changed, or is the last one of a cut bundle."""
     content, path = repo.bundle().read_bytes(), repo.folder / "changed"
     places = sorted({*range(64), *range(0, len(content), 7), *range(len(content) - 64, len(content))})
     weak = lzma.compress(lzma.decompress(content))  # whole, but checked by CRC-64 alone

@@ -71,7 +71,7 @@ def ended(
 def test_running_node_keeps_its_parameters_while_the_state_is_damaged(
     damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
 ) -> None:
-    """In a running node what was in force stays; one that starts with it passes through."""
+    """A running node keeps the set in force; a node that starts with a damaged state passes values through."""
     running, path = Running(correcting, database), correcting / "state.json"
     whole = path.read_bytes()
     damage(path)
@@ -136,7 +136,7 @@ def test_end_of_a_trial_in_a_damaged_state_does_not_end_the_node(correcting: Pat
 def test_changed_state_is_read_again_after_a_read_error(
     correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else a revocation would not be heeded before the next start."""
+    """Otherwise a revocation would take effect only at the next start."""
 
     def broken_disk(folder: Path) -> VehicleState:
         raise TrustError(Reason.NO_PARAMETERS, f"{folder}: Input/output error")
@@ -202,7 +202,7 @@ def test_trial_starts_only_once_the_set_is_valid(
 def test_running_node_loads_a_set_written_to_its_state(
     vehicle: Path, parameters: VehicleParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And says so to the service manager."""
+    """It also reports this to the service manager."""
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     bus = ["--interface", "virtual", "--channel", "state"]
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:

@@ -1,4 +1,4 @@
-"""A parameter set on trial in a node: what is right comes in force, what is wrong does not, and why."""
+"""A parameter set on trial in a node: a right one comes in force, a wrong one does not, with the reason."""
 
 import math
 import shutil
@@ -125,11 +125,11 @@ def test_right_set_comes_in_force_after_its_trial_and_not_before(vehicle: Path, 
 @pytest.mark.parametrize(
     ("drift", "offset_a"), [(-DRIFT, -OFFSET_A), (0.0, -OFFSET_A), (3.0 * DRIFT, OFFSET_A), (DRIFT, 10.0)]
 )
-@pytest.mark.parametrize("left_a", [0.5, 20.0], ids=["little", "much"])
+@pytest.mark.parametrize("left_a", [0.5, 20.0], ids=["small remaining sum", "large remaining sum"])
 def test_wrong_set_fails_its_trial(
     vehicle: Path, database: VehicleDatabase, drift: float, offset_a: float, left_a: float
 ) -> None:
-    """Also where the calibrator saw that much is left of the sum."""
+    """Also if the calibrator stated a large remaining sum."""
     drive = tried(vehicle, right(database, drift, offset_a, left_a=left_a), database)
     assert drive.told == (State.PASSING_THROUGH, Reason.NO_PARAMETERS)
     assert (read_state(vehicle).in_force, read_state(vehicle).on_trial) == (None, None)
@@ -180,14 +180,14 @@ def test_set_without_a_change_passes_its_trial(vehicle: Path, database: VehicleD
 
 
 def test_set_without_a_predicted_change_may_leave_a_residual(vehicle: Path, database: VehicleDatabase) -> None:
-    """As one that was written by hand: what is taken away is measured all the same."""
+    """As in a file written by hand: the reduction of the sum is measured all the same."""
     unknown = JunctionResidual(measured_a=4.0, corrected_a=0.5)
     parameters = replace(right(database), junction_residual=unknown)
     assert tried(vehicle, parameters, database, load_a=-0.5).has_said(PASSED)
 
 
 def test_trial_waits_in_invalid_states_and_while_no_current_flows(vehicle: Path, tmp_path: Path) -> None:
-    """As while the vehicle charges, where the layout says so."""
+    """As while the vehicle charges, if the layout excludes this state."""
     own = own_vehicle(tmp_path, '[watch]\ninput = "contactor_state"\nvalid = [2]\n')
     drive = tried(vehicle, right(own), own, contactor=1)
     drive.go_on(1.1 * TRIAL_S, contactor=2, moving=False)

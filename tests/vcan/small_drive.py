@@ -1,4 +1,4 @@
-"""A small drive with known sensor faults, and what must come of it: by fractions and cantools, without the node's code.
+"""A small drive with known sensor faults, and the output expected by fractions and cantools, without the node's code.
 
 Three branches, sinusoidal currents that sum to zero; the sensors show (1 + d) i + o, quantised by the DBC. At each
 instant every branch sends one frame.

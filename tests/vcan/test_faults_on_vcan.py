@@ -1,4 +1,4 @@
-"""What docs/fault_table.md says of faults that take a kernel, or a process of its own."""
+"""Faults of docs/fault_table.md that need a kernel, or a process of their own."""
 
 import signal
 import time
@@ -43,7 +43,7 @@ def qualities(frames: list[bytes]) -> set[int]:
 
 
 def state_of(frame: bytes) -> tuple[State, Reason]:
-    """What a status frame says."""
+    """State and reason in a status frame."""
     return State(frame[1] >> 4), Reason(frame[2])
 
 
@@ -62,7 +62,7 @@ def send_branches(database: VehicleDatabase, k: int) -> None:
 
 @pytest.fixture
 def bus_is_back() -> Iterator[None]:
-    """The next test finds vcan0 as this one did."""
+    """Restore vcan0 for the next test."""
     yield
     if not Path(f"/sys/class/net/{CHANNEL}").exists():
         ip_link("add", CHANNEL, "type", "vcan")
@@ -140,7 +140,7 @@ def test_second_gateway_refuses_to_start_and_the_first_continues(
         other_recording.wait_for(STATUS, 1)
         words = "vcan0 and vcan1: another gateway works between them on this computer; stop one"
         with pytest.raises(AssertionError, match=words), start_node(params, *GATEWAY):
-            pass  # it never says that it runs
+            pass  # it refuses to start
         other_recording.wait_for(STATUS, len(other_recording.data_of(STATUS)) + 3)
         assert first.stop() == 0
     counters = [data[1] & 15 for data in other_recording.data_of(STATUS)]

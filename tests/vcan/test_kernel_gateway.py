@@ -47,7 +47,7 @@ FOREIGN = "FFFFFFFFFFFFFFFF"
 
 @pytest.fixture(autouse=True)
 def no_rules() -> Iterator[None]:
-    """Begin and end without rules in the kernel, so that what one test leaves does no harm to others."""
+    """Begin and end without rules in the kernel, so that rules left by one test do not affect others."""
     subprocess.run(["cangw", "-F"], check=True)
     yield
     subprocess.run(["cangw", "-F"], check=True)
@@ -193,7 +193,7 @@ def test_gateway_refuses_to_start_if_rules_are_left_that_it_cannot_change(
         node.stop(signal.SIGKILL)
     words = "an earlier gateway left rules in the kernel, which only CAP_NET_ADMIN may change"
     with pytest.raises(AssertionError, match=words), start_node(params, *GATEWAY, by=WITHOUT_RIGHTS):
-        pass  # it never says that it runs
+        pass  # it refuses to start
     assert len(rules()) == RULES, "others are still carried"
 
 
@@ -275,7 +275,7 @@ def joined() -> Iterator[None]:
 
     def carry(source: socket.socket, target: socket.socket) -> None:
         while not ended.is_set():
-            with suppress(OSError):  # nothing came, or a full queue
+            with suppress(OSError):  # nothing was received, or the queue is full
                 target.send(source.recv(16))
 
     for end, channel in zip(ends, (CHANNEL, OTHER_CHANNEL), strict=True):
@@ -294,7 +294,7 @@ def joined() -> Iterator[None]:
             end.close()
 
 
-@pytest.mark.parametrize("killed", [False, True], ids=["at work", "killed before"])
+@pytest.mark.parametrize("killed", [False, True], ids=["gateway running", "gateway killed before"])
 def test_joined_buses_stop_the_gateway_and_no_frame_circulates(
     params: Path, drive: Path, tmp_path: Path, start_node: StartNode, other_recording: Recording, killed: bool
 ) -> None:

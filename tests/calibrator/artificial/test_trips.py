@@ -92,7 +92,7 @@ def test_no_recording_serves_both_calibration_and_judging() -> None:
     assert levels(single.trip(0, "calibration")).isdisjoint(levels(single.trip(0, "unseen")))
 
 
-def test_builtin_trip_obeys_the_junction_law_with_branches_and_inputs_of_the_layout(database: VehicleDatabase) -> None:
+def test_builtin_trip_obeys_the_junction_law_and_has_all_channels(database: VehicleDatabase) -> None:
     trip = builtin_trip(np.random.default_rng(7), duration_s=300.0, name="trip")
     np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
     assert set(trip.currents_a) == set(database.layout.branch_names)

@@ -55,7 +55,7 @@ def true_drive(*, delay_s: Mapping[str, float] | None = None, seed: int = 1) -> 
 
 
 def with_branch(drive: Drive, name: str, value: Array) -> Drive:
-    """The same with another course of one branch."""
+    """The same drive with other values of one branch."""
     changed = replace(drive.branches[name], value=value, good=np.isfinite(value))
     return replace(drive, branches={**drive.branches, name: changed})
 
@@ -94,7 +94,7 @@ class DoctorRun:
     report: dict[str, Any]
 
     def findings(self, *kinds: str) -> list[SimpleNamespace]:
-        """Those of some kinds, or all."""
+        """Findings with these codes, or all."""
         found = [SimpleNamespace(**item) for item in self.report["findings"]]
         return [item for item in found if item.code in kinds or not kinds]
 
@@ -105,7 +105,7 @@ class DoctorRun:
 
 
 def examined(layout: Path, *logs: Path) -> DoctorRun:
-    """Run the command; its exit code must fit to what it found."""
+    """Run the command; its exit code must match its findings."""
     done = calibrator("doctor", "--layout", layout, *(word for log in logs for word in ("--log", log)), "--json")
     assert done.stderr == ""
     doctor = DoctorRun(code=done.returncode, report=json.loads(done.stdout))

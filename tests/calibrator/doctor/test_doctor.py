@@ -253,7 +253,7 @@ def test_branch_without_plausible_values_is_found(
 def test_branch_with_mostly_unusable_frames_is_an_error(
     lost: float, severity: str, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
-    """As with the wrong byte order in the DBC: what is left of it is no current."""
+    """As with a wrong byte order in the DBC: the remaining values are no current either."""
     drive = true_drive()
     value = drive.branches["dcdc"].value.copy()
     value[np.random.default_rng(0).random(len(value)) < lost] = np.nan

@@ -70,7 +70,7 @@ def test_delays_of_two_similar_motors_and_a_slow_converter_are_found() -> None:
 
 
 def honest_sd_s(vehicles: list[MadeUp], branches: tuple[str, ...]) -> Array:
-    """Deviations of the last branch's delay, of which the errors are no more and no less, with a mean of zero."""
+    """Stated deviations of the last branch's delay; requires errors of this size with a mean of zero."""
     drives = [made_up_drive(seed, vehicle) for seed, vehicle in enumerate(vehicles)]
     found = [estimate_delays([drive], branches, max_sd_s=0.05) for drive in drives]
     delay_s, sd_s = np.array([(each.delay_s[-1], each.sd_s[-1]) for each in found]).T

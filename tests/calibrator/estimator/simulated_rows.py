@@ -1,7 +1,7 @@
 """Evidence rows of fleets whose faults are known, in fractions of full scale: fault offsets [A] at 1 A full scale.
 
-What the rows are, and what parameters leave of them, is written here once more from the equations, without the code
-that it is compared with: :func:`rows_of` and :func:`plain_residual`.
+Rows and residuals are computed here from the equations, independently of the code
+that they are compared with: :func:`rows_of` and :func:`plain_residual`.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What no gain error and no offset explains: found and named, and nothing else."""
+"""Misfits that no gain error and no offset explains are found and named, and nothing else is."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -44,7 +44,7 @@ CAUSES: dict[str, Bend] = {
 
 
 def a_drive(seed: int, faults: Faults, bend: Bend | None, branch: int = 0, load_a: Array | float = 0.0) -> Samples:
-    """One drive; one sensor is bent about the zero that its offset moved."""
+    """One drive; one sensor is nonlinear about its offset."""
     rng, K = np.random.default_rng(seed), len(faults.drift)
     u = coloured(rng, SAMPLES, INPUTS, 0.99) + np.array([0.5, 0.2, 0.0])
     error = 1.5 * coloured(rng, SAMPLES, K, 0.99)
@@ -80,7 +80,7 @@ def checked(summaries: Sequence[DriveSummary], K: int) -> list[tuple[SensorFindi
 def test_nonlinear_sensor_is_found_and_named(cause: str, branch: int, K: int) -> None:
     found = checked(a_fleet(K, CAUSES[cause], branch), K)
     if (cause, branch, K) == ("clipped", 1, 3):
-        cause, branch = "switching", -1  # the level beyond which it is clipped shows in no single other current
+        cause, branch = "switching", -1  # the clipping level is visible in no single other current
     probability = {each.cause: each.probability for each in found[BAD]}
     assert probability[cause] > 0.7
     assert {each.branch for each in found[BAD]} <= {None, *BRANCHES[branch : branch + 1]}

@@ -1,4 +1,4 @@
-"""What is said of a vehicle: confidence and harm are the probabilities that plain draws give."""
+"""Decisions on a vehicle: confidence and harm are the probabilities that plain draws give."""
 
 from dataclasses import replace
 from typing import Any
@@ -161,7 +161,7 @@ def test_estimated_offset_includes_the_group_constant_only_if_of_sensors(of_sens
     prior, shared = group_prior(), np.append(np.zeros(4), of_sensor)
     model = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
     of_group = model.weight.copy()
-    of_group[..., 0] = 0.0  # of those who belong to the group
+    of_group[..., 0] = 0.0  # only draws in which the vehicle belongs to the group
     found = posterior_points([model._replace(weight=of_group / of_group.sum())])[0]
     np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)
 
@@ -192,7 +192,7 @@ def test_groups_are_matched_across_fault_models_in_any_order() -> None:
     np.testing.assert_allclose(found.group_probability, [[1.0, 0.0], [0.0, 0.0]], atol=0.1)
 
 
-# From rows to estimates: right where they are sure, each vehicle by itself, harmless in odd worlds
+# From rows to estimates: correct where confident, and harmless
 
 
 VARIANCE = 0.04
@@ -205,7 +205,7 @@ def moments(rows: EvidenceRows) -> dict[str, Any]:
 
 
 def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[RowsEstimate, Faults]:
-    """Estimate, and what of it would be deployed."""
+    """Estimate, and the part of it that would be deployed."""
     rows = rows_of(faults, seed=seed, load=load)
     found = estimate_rows(rows, learn_fault_models(rows, feed=0), feed=0, **moments(rows))
     deployed = found.identifiable & (found.harm_probability < HARM_LIMIT)
@@ -262,7 +262,7 @@ def test_standard_deviations_match_the_actual_errors() -> None:
 
 
 def test_vehicle_without_information_has_no_confidence() -> None:
-    """As drives of a minute are: the prior alone is no evidence."""
+    """As with drives of a minute: the prior alone is no evidence."""
     rows = rows_of(no_faults(2, K), seed=1)
     covariance = rows.covariance.copy()
     covariance[1] = UNKNOWN_VARIANCE * np.eye(5 * K)

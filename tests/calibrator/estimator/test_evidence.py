@@ -50,7 +50,7 @@ def scaled(summary: DriveSummary, column: int, factor: float) -> DriveSummary:
 
 
 def largest_error(read_out: Array) -> float:
-    """Of the read-outs, relative to each branch's largest."""
+    """Largest error of the read-outs, relative to the largest read-out of each branch."""
     return float(np.max(np.abs(read_out[:-1] - W) / np.abs(W).max(axis=0)))
 
 
@@ -80,7 +80,7 @@ def test_fleet_model_is_invariant_to_vehicle_order_units_and_input_copies() -> N
 
 @pytest.mark.parametrize("varying", [0, 3])
 def test_effect_of_an_input_is_learnt_from_vehicles_where_it_varies(varying: int) -> None:
-    """Of the mass of a vehicle, say: where it stands still its variance is rounding, which must not be divided by."""
+    """Such as the vehicle's mass: where it is constant, its variance is rounding and must not be a divisor."""
     rng, summaries, told = np.random.default_rng(8), [], np.array([0.1, -0.1, 0.0])
     for j in range(12):
         drive = simulated_drives.drive_of(rng, simulated_drives.no_faults(1, K).take(0), simulated_drives.Conditions())
@@ -103,7 +103,7 @@ def test_vehicle_with_an_input_in_a_wrong_unit_does_not_bias_the_fleet_model() -
 
 
 def law_of(*currents_a: Array) -> evidence.VehicleRegressions:
-    """Of the currents (T, K) of some vehicles."""
+    """Junction law of vehicles with these currents (T, K)."""
     samples = [simulated_drives.samples_of(np.zeros((len(each), 0)), each) for each in currents_a]
     return evidence.junction_regression(
         evidence.stack_summaries([summarise_samples([each], period_s=simulated_drives.PERIOD_S) for each in samples])
@@ -132,7 +132,7 @@ def test_standardised_errors_of_the_junction_law_are_standard_normal() -> None:
 
 
 def test_noise_on_a_small_branch_does_not_bias_its_gain_to_zero() -> None:
-    """Least squares would by 7 % and more."""
+    """Least squares would be biased by 7 % and more."""
     currents, truths = zip(*(currents_of(seed, (80.0, 6.0), (0.5, 0.5, 2.0), 3600) for seed in range(60)), strict=True)
     ratio = law_of(*currents).estimate[:, 1] / np.array(truths)[:, 1]
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.006)
@@ -178,7 +178,7 @@ def test_standardised_errors_of_evidence_rows_are_standard_normal(
     z = np.linalg.solve(L, errors_of(rows, faults)[:, measured, None])[..., 0]
     rms = np.sqrt(np.mean(z**2, axis=0))
     assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25, rms
-    # The last, the junction constant, is the sum of the intercepts but for rounding: stated too wide, others are not.
+    # The last one, the junction constant, is the sum of the intercepts but for rounding: its deviation is overstated.
     assert ((rms[:-1] > 0.35) & (rms[:-1] < 1.45)).all(), rms
     assert 0.15 < rms[-1] < 1.45, rms
     assert (np.abs(z.mean(axis=0)) < 0.45).all(), z.mean(axis=0)

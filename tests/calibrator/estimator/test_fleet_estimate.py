@@ -127,7 +127,7 @@ def test_probability_integral_transform_of_the_truth_lies_in_0_to_1(
 
 @pytest.mark.parametrize("step_a", [0.0, 0.37])
 def test_branch_with_constant_values_leads_to_no_correction(step_a: float) -> None:
-    """Its gain is open, though its variance and that of its model are not zero but rounding."""
+    """Its gain is undetermined: its variance and that of its model are only rounding errors."""
     rng, summaries = np.random.default_rng(6), []
     for j in range(8):
         drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=360))
@@ -148,7 +148,7 @@ def test_branch_with_constant_values_leads_to_no_correction(step_a: float) -> No
 
 @cache
 def drives(fault: str, load_a: float = 0.0) -> Summaries:
-    """Of a fleet with one fault, in the sensors of a vehicle, in its hardware, or in a batch of sensors."""
+    """Drives of a fleet with one fault, in the sensors of a vehicle, in its hardware, or in a batch of sensors."""
     fleet = no_faults(16, K)
     if fault == "drift":
         fleet.drift[0, 1] = 0.06

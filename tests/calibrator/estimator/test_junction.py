@@ -1,4 +1,4 @@
-"""One junction by itself: gains from a sensor that is known, offsets from what tells them, and what stays open."""
+"""A single junction: gains from a trusted sensor, offsets from load or charge balance, and what stays undetermined."""
 
 import json
 import re
@@ -148,7 +148,7 @@ def test_car_at_rest_determines_an_offset_but_no_gain() -> None:
 
 
 def bent(frame: pd.DataFrame, rms_a: float) -> None:
-    """Bend the motor's sensor: what no straight line explains has this RMS."""
+    """Make the motor's sensor nonlinear: its deviation from a straight line has this RMS."""
     current_a = frame["motor"].to_numpy()
     curve = np.polynomial.Polynomial.fit(current_a, current_a**3, 1)
     bend = current_a**3 - curve(current_a)
@@ -218,14 +218,14 @@ def test_nonlinear_sensor_is_reported_and_not_corrected(change: Any, cause: str)
 
 
 def steady_heater(rng: np.random.Generator, frame: pd.DataFrame) -> None:
-    """While it stands still it has no noise either; taken for noisy, it once made a step of 10^10 A."""
+    """While constant it has no noise either; treating it as noisy once gave a step of 10^10 A."""
     steady = frame["heater"].where(frame.index > 150.0, -2.0)
     frame["battery"] -= steady - frame["heater"]
     frame["heater"] = steady
 
 
 def switched_heater(rng: np.random.Generator, frame: pd.DataFrame) -> None:
-    """Of two currents any curve is straight; noise taken out of one once made an error of 10^5 % at full scale."""
+    """Two levels of a current fit any straight line; subtracting noise once gave an error of 10^5 % at full scale."""
     heater_a = np.repeat(rng.choice([-1.0, -31.0], len(frame) // 75 + 1), 75)[: len(frame)]
     frame["battery"] = -frame["motor"] - heater_a + rng.normal(0.0, 0.2, len(frame))
     frame["heater"] = heater_a + rng.normal(0.0, 0.2, len(frame))
@@ -255,7 +255,7 @@ def test_noise_and_loads_are_not_taken_for_nonlinear_sensors(spoil: Any, causes:
 
 
 def test_gain_errors_lie_within_their_standard_deviations() -> None:
-    """Gains of twelve junctions are within their deviation about as often as normal errors, and never far."""
+    """Gains of twelve junctions are within their deviation about as often as normal errors, and never far outside."""
     errors = []
     for seed in range(12):
         gain = np.random.default_rng(seed).uniform(-0.2, 0.2, 2)

@@ -1,4 +1,4 @@
-"""Laws that explain a fleet: its faults, its centre and its spread, and what its vehicles share."""
+"""Fault models learnt from a fleet: prior, centre and spread, and errors that its vehicles share."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from tests.calibrator.estimator.simulated_rows import Errors, random_faults, row
 
 
 def moved(rows: EvidenceRows, by: Array) -> EvidenceRows:
-    """Rows (N, 5K) that differ by so much more, known ones only."""
+    """Rows shifted by these amounts (N, 5K), where they are known."""
     return replace(rows, values=rows.values + by * rows.known)
 
 
@@ -31,7 +31,7 @@ def learned(rows: EvidenceRows) -> FaultModel:
 
 
 def shared_by(models: list[FaultModel]) -> dict[tuple[int, ...], float]:
-    """Probabilities of what all vehicles share: places of offsets, gains and of a group's offset."""
+    """Probability of each set of shared errors: places of offsets, of gains and of a group's offset."""
     found: dict[tuple[int, ...], float] = {}
     for model in models:
         cause = tuple(np.flatnonzero(np.abs(model.spread.shared) > learning.LEAST_SHARED).tolist())
@@ -124,7 +124,7 @@ def test_offset_of_most_vehicles_is_not_a_group_beside_a_declared_load() -> None
 
 @pytest.mark.parametrize("seed", [8, 10])
 def test_intercepts_equal_by_chance_in_two_vehicles_set_no_reference(seed: int) -> None:
-    """Where most vehicles are faulty: a whole fleet's sensors were then off by 15 % of full scale, for certain."""
+    """With mostly faulty vehicles this once gave a whole fleet an offset of 15 % of full scale, with certainty."""
     faults = random_faults(seed, vehicles=24, branches=3, sparsity=50.0, balanced=False)
     spread, at = learned(rows_of(faults, seed=seed)).spread, RowPlaces(3)
     assert np.abs(spread.mean[[*np.arange(15)[at.intercepts], at.junction]]).max() < 0.003
@@ -170,7 +170,7 @@ def test_single_fault_does_not_determine_the_prior_of_fault_sizes() -> None:
 
 
 def test_single_vehicle_does_not_reinforce_its_own_number_of_faults() -> None:
-    """One vehicle is judged by the guess alone, whatever numbers it has made likely before."""
+    """It is judged by the initial guess, not by a prior that it has shaped itself."""
     errors = Errors(slope=0.1, ratio=0.03, intercept=0.05, junction=0.03)
     rows = rows_of(random_faults(3, vehicles=1, branches=2), seed=3, errors=errors)
     draws, guess = explain(rows, law_of(2), feed=0), first_prior(2)
@@ -284,7 +284,7 @@ def test_loads_that_differ_between_vehicles_are_not_sensor_offsets() -> None:
 
 
 def test_learning_works_without_any_known_slope() -> None:
-    """As drives of a minute are: it was an error of the program."""
+    """As with drives of a minute; this was once an internal error."""
     rows = rows_of(random_faults(1, vehicles=12, branches=2), seed=1)
     covariance = rows.covariance.copy()
     for row in np.arange(10)[RowPlaces(2).slopes]:

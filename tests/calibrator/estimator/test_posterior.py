@@ -1,4 +1,4 @@
-"""Posterior of a vehicle: residuals, fits and weights of its explanations are those of plain mathematics."""
+"""Posterior of a vehicle: residuals, fits and weights of its explanations equal a direct computation."""
 
 from dataclasses import replace
 from math import comb
@@ -229,7 +229,7 @@ def test_posterior_weights_equal_integration_on_a_grid() -> None:
 
 
 def test_explanation_of_four_faults_is_found_by_the_search() -> None:
-    """A hardware offset looks like one of two sensors; that alone, two of the four faults, would be too few."""
+    """A hardware offset resembles offsets of two sensors; the prior allows four faults, no fewer."""
     truth = no_faults(1, 3)
     truth.hardware_offset_a[0], truth.drift[0, 1], truth.offset_a[0] = [0.16, 0.0, -0.16], 0.24, [-0.12, 0.0, 0.24]
     prior = paper_prior(3, 4)
@@ -269,7 +269,7 @@ def test_offset_is_known_even_if_the_gain_of_its_branch_is_not() -> None:
         value = log_prior(prior, theta, on) - 0.5 * np.einsum("sa,ab,sb->s", e, precision, e) - theta[:, 2]
         log_evidence.append(logsumexp(value) + np.log(1e-3 if 2 in on else 1.0 / 701))
     odds = float(np.exp(log_evidence[1] - log_evidence[0]))
-    assert 0.05 < odds < 20.0  # the recording does not tell
+    assert 0.05 < odds < 20.0  # the recording leaves it open
     assert found[2, 5][0] / found[5,][0] == pytest.approx(odds, rel=0.15)
 
 
@@ -293,7 +293,7 @@ def test_posterior_of_a_load_equals_a_grid_and_is_never_negative() -> None:
     assert [of_supports(draws, weight, j)[6,][0] > 0.5 for j in range(3)] == [True, False, False]
 
 
-# Prior of the faults: densities, numbers of faults, and the law that they follow
+# Prior of the faults: densities and numbers of faults
 
 
 def counted(K: int, sparsity: float, vehicles: int = 4000) -> Array:

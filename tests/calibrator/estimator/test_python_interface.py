@@ -59,7 +59,7 @@ def fitted(example: Any) -> FleetCalibrator:
     return cast("FleetCalibrator", example.calibrator)
 
 
-# What it offers
+# Public interface
 
 
 def test_package_exports_its_interface_and_imports_nothing_heavy() -> None:
@@ -132,7 +132,7 @@ def test_results_of_frames_without_a_layout_have_no_files_for_the_node(fitted: F
         fitted.write(tmp_path / "result")
 
 
-# The way of the command
+# The same result as by the command
 
 
 def test_python_interface_writes_the_same_result_as_the_command(
@@ -203,7 +203,7 @@ def test_internal_error_in_one_vehicle_is_a_warning(monkeypatch: pytest.MonkeyPa
     assert sorted(found.vehicles_) == ["V1", "V3"]
 
 
-# What frames may be
+# Data frames that are accepted
 
 
 def test_index_of_timestamps_or_seconds_gives_the_same_result() -> None:

@@ -1,4 +1,4 @@
-"""Direct readings: every slip in a table is named, contradictions are named, and nothing is averaged over them."""
+"""Direct readings: mistakes in a table and contradictions are reported, and contradictions are not averaged."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Result folders: what is written is found again, and what is no result is named."""
+"""Result folders: written results are read back, and other folders are refused."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def vehicle(database: VehicleDatabase, name: str) -> VehicleParameters:
     return replace(parameters_for(database, battery=(0.1, 0.0), motor=(0.0, 1.0)), vehicle=name)
 
 
-@pytest.fixture(params=[2, results.MOST_FILES + 1], ids=["a file each", "in parts"])
+@pytest.fixture(params=[2, results.MOST_FILES + 1], ids=["one file per vehicle", "buckets of vehicles"])
 def result(request: pytest.FixtureRequest, tmp_path: Path, database: VehicleDatabase) -> Path:
     """A result of two vehicles, written as one of few or of many."""
     folder = tmp_path / "result"

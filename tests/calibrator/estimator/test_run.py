@@ -1,4 +1,4 @@
-"""Whole runs, as a user types them and bucket by bucket: every vehicle by itself, and none stops the others."""
+"""Whole runs, by command and by bucket: vehicles are independent, and none stops the others."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ ONE = Workers(processes=1)
 
 @pytest.fixture(scope="module", autouse=True)
 def environment() -> Iterator[None]:
-    """Results are made at the same time, and by one thread."""
+    """Results have the same time stamp, and are made by one thread."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
         patch.setenv("OMP_NUM_THREADS", "1")
@@ -231,7 +231,7 @@ def test_vehicle_without_usable_drives_is_left_out(store: SummaryStore, task: Fl
 
 
 def failing_for(bad: str, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From now on vehicles cannot be estimated if this one is among them."""
+    """Let the estimation of vehicles fail if this one is among them."""
     estimate = FleetTask.estimate
 
     def refusing(task: FleetTask, vehicles: Sequence[VehicleSummary]) -> Any:

@@ -1,4 +1,4 @@
-"""What is said of a vehicle: what would decide, what was found in words, the evidence in the units of its sensors."""
+"""Reports on a vehicle: evidence that would decide, findings in words, evidence in the units of its sensors."""
 
 from dataclasses import replace
 
@@ -79,7 +79,7 @@ CHECK = "a check of the {} sensor against a reference would decide: its gain is 
     ((of(0.6, drift=(0.1, 0)), of(0.4, drift=(0, -0.2))), ("", ""), CHECK.format("motor", 0, -20)),
     ((of(0.5, drift=(0.1, 0)), of(0.5, drift=(0.1, 0))), ("", ""),
      "the explanations differ in the vehicle, not in its sensors: inspect the hardware"),
-    # of a branch that is held back, the explanation in its way counts, not the second one
+    # of a branch that is held back, the explanation that prevents its correction counts, not the second one
     ((of(0.958, drift=(0.1, 0), offset_a=(0, 8)), of(0.04, drift=(0.2, 0), offset_a=(0, 8)),
       of(0.002, drift=(0.1, 0), offset_a=(8, 0))), ("", "harm limit"), WINDOW.format(0, 8)),
     ((of(0.99, drift=(0.1, 0)), of(0.01, drift=(0, 0.1))), ("harm limit", ""), CHECK.format("battery", 10, 0)),
@@ -94,7 +94,7 @@ def test_deciding_evidence_is_named_for_each_open_question(
     assert advice(estimate(*explanations, held_back=held_back)).startswith(text)
 
 
-def test_finding_says_why_its_branch_is_not_corrected() -> None:
+def test_finding_explains_why_its_branch_is_not_corrected() -> None:
     finding = SensorFinding(branch="motor", cause="clipped", probability=0.98, text="the motor sensor clips at 100 A")
     found = estimate(of(1.0, drift=(0, 0.1)), held_back=("", "does not fit"), findings=(finding,))
     assert advice(found) == "the motor sensor clips at 100 A"
@@ -161,7 +161,7 @@ def test_reported_evidence_without_noise_equals_that_of_the_true_faults() -> Non
     np.testing.assert_allclose(sd[names.index("offset read battery")], 0.001 * scale)
 
 
-def test_gain_error_of_a_whole_or_more_has_no_parameters() -> None:
+def test_gain_error_of_100_percent_or_more_is_impossible() -> None:
     assert impossible(estimate(of(1.0, drift=(0.9, 0))), 0, NAMES) == ""
     assert "its motor current does not follow its inputs" in impossible(estimate(of(1.0, drift=(0, 1.2))), 0, NAMES)
 

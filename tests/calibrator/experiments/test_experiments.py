@@ -214,7 +214,7 @@ Change = Callable[[Estimate], Any]
 
 @dataclass(frozen=True)
 class Own:
-    """Finds no faults, and says what it is told to say."""
+    """A method that finds no faults, and whose estimate can be changed."""
 
     name: str = "own"
     change: Change = lambda estimate: estimate

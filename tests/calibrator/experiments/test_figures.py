@@ -1,4 +1,4 @@
-"""Figures of merit against what they are by definition."""
+"""Figures of merit compared with their definitions."""
 
 from dataclasses import replace
 from typing import Any
@@ -24,7 +24,7 @@ def figures_of(*trials: Values) -> dict[str, Any]:
 
 
 def confident(confidence: Array, recovered: Array | Mask) -> Values:
-    """Values of a method that says its confidence, and recovers some vehicles."""
+    """Values of a method with these confidences, which recovers some vehicles."""
     within = recovered.astype(bool)
     zero = np.zeros((len(within), 2))
     estimate, trial = one_of(drift=np.where(within, 0.0, 1.0)[:, None] + zero, truth=zero)
@@ -82,7 +82,7 @@ def test_calibration_error_by_chance_equals_that_of_exact_confidences() -> None:
 @pytest.mark.parametrize(
     ("drift", "harm_second", "recovery_rate", "harmed"),
     [(0.1, 0.0, 1.0, 0.0), (0.1, 0.2, 0.5, 0.5), (0.1, -1.0, 0.5, 0.5)],
-    ids=["truth", "a sound branch is corrected", "a gain of zero cannot be corrected"],
+    ids=["true correction", "sound branch is corrected", "gain of zero"],
 )
 def test_vehicle_with_a_worsened_branch_is_harmed(
     drift: float, harm_second: float, recovery_rate: float, harmed: float

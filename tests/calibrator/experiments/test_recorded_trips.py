@@ -92,7 +92,7 @@ def test_delays_are_removed_unless_they_are_to_be_left_in(fleet: RecordedFleet) 
     np.testing.assert_array_equal(left_in.truth.drift, trial.truth.drift)
 
 
-# Worlds do what they say to the vehicles that have them, and nothing to the others
+# Worlds change the vehicles that they affect as they are defined, and no others
 
 
 SOUND = RecordedCase(sparsity=100.0)

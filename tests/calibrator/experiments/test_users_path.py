@@ -66,7 +66,7 @@ def test_experiment_gives_the_same_estimate_as_simulate_and_calibrate(store: Pat
         drift=column("drift"),
         offset_a=column("offset_a"),
     )
-    # noise, instants of frames and steps of signals are other ones: what is sure agrees, what is not nearly does
+    # noise, frame times and quantisation differ between the two: decisions are equal, values nearly so
     within = judge(estimate, trial)["recovery_rate"]
     by_commands = recovered(found, trial.truth, full_scale_a=fleet.full_scale_a, smallest_fault=case.magnitude[0])
     np.testing.assert_array_equal(by_commands, within)

@@ -1,4 +1,4 @@
-"""The C core beside the node: frames and codes in, and the first that they make something else of."""
+"""The C core compared with the node: frames and codes in, and the first that gives different results."""
 
 from array import array
 from collections.abc import Iterable, Iterator
@@ -18,7 +18,7 @@ SILENCE_S = 1e7
 
 
 def by_the_node(checked: Checked, given: Iterable[tuple[int, bytes | None]]) -> Iterator[bytes]:
-    """What the node makes of frames as a gateway, as records."""
+    """Output of the node as a gateway for these frames, as records."""
     corrector = wire(checked.database, InForce(parameters=checked.parameters), 0.0, mode=Mode.GATEWAY)
     sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}
     now_s = 0.0

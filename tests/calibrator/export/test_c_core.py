@@ -52,7 +52,7 @@ def test_c_core_matches_the_node_for_random_frames(part: int, tmp_path: Path) ->
 
 @needs("clang")
 @pytest.mark.parametrize("part", PARTS)
-def test_c_core_matches_the_node_for_random_vehicles_without_undefined_behaviour(part: int, tmp_path: Path) -> None:
+def test_c_core_matches_the_node_for_random_vehicles_under_sanitizers(part: int, tmp_path: Path) -> None:
     vehicles, rng, changed = drawn_vehicles(Random(part), tmp_path), Random(part), 0
     for _ in range(6):
         checked = next(vehicles)

@@ -1,6 +1,6 @@
-"""What is exported for calibration tools, read by readers that are not ours, and flashed into a compiled program.
+"""Exports for calibration tools, read by independent readers and flashed into a compiled program.
 
-Each format alone brings a program that was linked with another vehicle's calibration to the node's own bits.
+Each format alone lets a program linked with another vehicle's calibration give the same bits as the node.
 """
 
 import xml.etree.ElementTree as ET

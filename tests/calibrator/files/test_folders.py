@@ -59,14 +59,14 @@ def test_partial_folder_of_a_killed_process_is_removed(tmp_path: Path, name: str
 @pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
 @pytest.mark.parametrize("name", ["x", "x/y/z"])
 def test_folder_in_an_unwritable_file_system_is_refused(require: Callable[[Path], None], name: str) -> None:
-    # No right forbids it to root; only trying tells.
+    # Permissions do not stop root, so only an attempt shows it.
     with pytest.raises(FleetError, match=rf"^/proc/{name}: nothing can be made in /proc: .*; choose another folder$"):
         require(Path("/proc") / name)
 
 
 @pytest.mark.parametrize("require", [require_new_folder, require_possible_folder, require_possible_file])
 def test_url_is_refused_where_only_a_path_can_be_written(require: Callable[[Path], None]) -> None:
-    """Else a folder ``s3:`` is made here."""
+    """Otherwise a local folder ``s3:`` would be made."""
     with pytest.raises(FleetError, match=r"^s3:/bucket/result: is a URL; name a folder of this machine"):
         require(Path("s3://bucket/result"))
 
@@ -120,7 +120,7 @@ def test_several_files_are_written_together_or_not_at_all(tmp_path: Path, monkey
     assert (tmp_path / "old").read_bytes() == b"old"
 
 
-# Places that cannot be used are told in one line
+# Places that cannot be used are reported in one line
 
 
 @pytest.mark.parametrize("place", ["", " ", "file://", "s3://"])
@@ -148,7 +148,7 @@ def test_file_that_vanishes_while_listing_does_not_hide_others(tmp_path: Path, m
     (tmp_path / "there").touch()
 
     class Vanishing:
-        """What os.scandir yields, of a file that another process removes."""
+        """Entry of os.scandir for a file that another process removes."""
 
         name = "gone"
         is_dir, is_file = staticmethod(lambda: False), staticmethod(lambda: True)

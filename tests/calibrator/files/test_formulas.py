@@ -1,4 +1,4 @@
-"""Formulas of a layout: arithmetic is understood, everything else refused with file and place."""
+"""Formulas of a layout: arithmetic is evaluated, everything else is refused with file and place."""
 
 from pathlib import Path
 

@@ -32,7 +32,7 @@ def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
 
 
 def figures(*arguments: object) -> Any:
-    """What --json gives."""
+    """Figures that --json prints."""
     done = run(*arguments, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     return json.loads(done.stdout)
@@ -159,7 +159,7 @@ def test_advice_on_a_wrong_sign_or_unit_removes_the_error(
     def errors(column: str, sign: str, motor_a: Array) -> list[str]:
         path, *_ = table(tmp_path, 6, battery=MOTOR_A + heater, heater=-heater, **{column: motor_a})
         lines = run(path, "--branches", f"battery=battery,heater=heater,{sign}motor={column}").stdout.splitlines()
-        return [line for line in lines if line.startswith("error")]  # nothing tells full scale
+        return [line for line in lines if line.startswith("error")]  # not the hint that full scale is unknown
 
     (line,) = errors("motor [A]", "", -factor * MOTOR_A)
     assert line.startswith(f"error    motor: {text}: ")
@@ -170,7 +170,7 @@ def test_advice_on_a_wrong_sign_or_unit_removes_the_error(
 
 def test_layout_init_is_suggested_only_where_it_works(tmp_path: Path) -> None:
     path, *_ = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
-    for column, is_told in (("motor", True), ("motor*1", False)):  # a layout is not made of formulas
+    for column, is_told in (("motor", True), ("motor*1", False)):  # no layout is made from formulas
         done = run(path, "--branches", f"battery=battery,motor={column}")
         assert ("next: calibrator layout init" in done.stderr) is is_told
 

@@ -20,7 +20,7 @@ LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 
 
 START = "import os, signal, sys; from calibrator.__main__ import calibrator_program as run; sys.argv[1:] = ['{}']; "
-# The import of the command line sends SIGINT to itself and swallows what comes of it, as libraries do.
+# The import of the command line sends SIGINT to itself and swallows the exception, as libraries do.
 SWALLOWED = """
 class Finder:
     def find_spec(self, name, path=None, target=None):

@@ -1,4 +1,4 @@
-"""Commands that read logs, as users type them: hostile logs, kills, lost workers, a scheduler that is restarted."""
+"""Commands that read logs, as users type them: harmful logs, kills, lost workers, a restarted scheduler."""
 
 import gzip
 import json
@@ -41,7 +41,7 @@ def started(
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Files but the hidden ones: what a killed worker was just writing goes with the next import."""
+    """Contents of files except hidden ones, which a killed worker may leave until the next import."""
     files = [path for path in folder.rglob("[!.]*") if path.is_file()]
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 

@@ -84,7 +84,7 @@ def children() -> list[multiprocessing.process.BaseProcess]:
 
 
 def is_running(pid: int) -> bool:
-    """Whether there is such a process that has not ended; one that has may wait to be asked how."""
+    """Whether this process still runs; one that has ended but was not waited for does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
@@ -212,7 +212,7 @@ print(list(try_many(partial(waiting, folder=Path(sys.argv[1])), range(9), Worker
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_workers_end_when_their_parent_process_ends(tmp_path: Path, short_folder: Path, how: signal.Signals) -> None:
     script = tmp_path / "parent.py"
-    script.write_text(PARENT)  # without a guard: workers must not run it once more
+    script.write_text(PARENT)  # it has no __main__ guard: workers must not run it again
     path = os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, str(script), str(tmp_path), str(short_folder)]
     environment = {**os.environ, "PYTHONPATH": path}

@@ -1,4 +1,4 @@
-"""The same on a Dask cluster with two workers: results, lost workers, a scheduler that is restarted, object storage."""
+"""run_many on a Dask cluster with two workers: results, lost workers, a scheduler that is restarted, object storage."""
 
 import json
 import signal
@@ -39,7 +39,9 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
 
 
 def test_failing_or_crashing_items_do_not_affect_others_on_dask(tmp_path: Path, where: Workers) -> None:
-    require_failing_items_affect_no_others(where, tmp_path, knows_signals=False)  # the process of a worker may not
+    require_failing_items_affect_no_others(
+        where, tmp_path, knows_signals=False
+    )  # a worker of Dask may not know the signal
 
 
 def test_error_of_an_item_is_not_taken_for_a_lost_scheduler(where: Workers, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,7 +63,7 @@ def test_error_of_an_item_is_not_taken_for_a_lost_scheduler(where: Workers, monk
 def test_results_are_identical_if_scheduler_starts_late_and_a_worker_dies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As one that is started again after it was lost."""
+    """A late scheduler is like one that is restarted after its loss."""
     monkeypatch.setattr(module, "CONNECT_S", 60.0)
     with DaskCluster(tmp_path, at_once=False) as cluster:
         start = Timer(1.0, cluster.start)
@@ -98,7 +100,7 @@ def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypat
 def test_loss_of_all_workers_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], is_fetching: bool
 ) -> None:
-    """As workers do that lack this package; Dask alone waits for ever for results that ended with their worker."""
+    """Such as workers without this package; Dask itself waits forever for results that were lost with their worker."""
     monkeypatch.setattr(module, "CONNECT_S", 2.0)
     monkeypatch.setattr(module, "RETURN_S", 2.0)
     with DaskCluster(tmp_path) as cluster:
@@ -174,7 +176,7 @@ def command(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def summaries(place: str) -> dict[str, list[object]]:
-    """What a store holds, without the versions of files, which storages count in their own ways."""
+    """Contents of a store without the versions of its files, which differ between storages."""
     store = existing_store(place)
     return {
         name: [(r.drives, r.digests, r.found and r.found.summary.moments.tobytes(), r.problem) for r in records]

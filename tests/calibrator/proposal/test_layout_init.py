@@ -197,7 +197,7 @@ DRIVING: Series = {
 
 
 def log_file(dbc: Path, series: Series, *, seconds: float = 60.0, lines: Sequence[str] = ()) -> Path:
-    """Frames every 50 ms; signals without a series are 0; ranges of the database are not looked at."""
+    """Frames every 50 ms; signals without a series are 0; ranges of the database are not enforced."""
     database: Any = cantools.database.load_file(dbc, strict=False)
     written = list(lines)
     for step in range(int(20 * seconds)):
@@ -283,7 +283,7 @@ BO_ 690 Charger2B2: 8 OBC
 def test_branches_and_signs_of_an_i3_at_its_chargers_are_found(
     recording: str, shared_data: Path, tmp_path: Path
 ) -> None:
-    """Real ones, of 9 to 40 s; in two of them the current does not change, and only its mean tells the signs."""
+    """Real ones, of 9 to 40 s; in two of them the current does not change, and only its mean reveals the signs."""
     log = shared_data / "bmw_i3_charging" / f"2019_{recording}.csv.gz"
     layout = found(database_file(tmp_path, I3), "--log", log)
     assert signed(layout) == {"battery": ("Battery112.Battery_Current", -1), "charger": ("Charger2B2.CHG_Amps", 1)}

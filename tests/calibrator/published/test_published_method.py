@@ -1,4 +1,4 @@
-"""The published method: evidence, classifiers, recovery, and what it says of a small fleet."""
+"""The published method: evidence, classifiers, recovery, and the notice on a small fleet."""
 
 import json
 from pathlib import Path
@@ -47,7 +47,7 @@ def evidence_of_noisy(faults: Faults, noise_a: float) -> tuple[FleetEvidence, Ar
 
 
 def exact_model(name: str, samples: int, slope: Array, intercept_a: Array) -> VehicleModel:
-    """A model that shows the measured currents where its inputs are the ideal ones."""
+    """A model that gives the measured currents if its inputs are the ideal currents."""
     i_s, zero = ideal_currents(samples), np.zeros(3)
     n: dict[str, Any] = {"A": np.zeros((0, 0)), "B": np.zeros((0, 3)), "C": np.zeros((3, 0)), "x0": np.zeros(0)}
     return VehicleModel(
@@ -134,7 +134,9 @@ def test_failed_optimisation_of_a_vehicle_does_not_stop_the_fleet() -> None:
     np.testing.assert_allclose(found.faults.offset_a[1], truth.offset_a[1], atol=1e-4)
 
 
-@pytest.mark.parametrize(("perfect", "least"), [(True, 0.9), (False, 0.8)], ids=["perfect", "trees"])
+@pytest.mark.parametrize(
+    ("perfect", "least"), [(True, 0.9), (False, 0.8)], ids=["perfect classifier", "decision trees"]
+)
 def test_symmetric_fleet_is_recovered_through_noise(perfect: bool, least: float) -> None:
     faults = fleet(120)
     evidence, reference = evidence_of_noisy(faults, 0.05)

@@ -1,4 +1,4 @@
-"""Logs of every format as frames: what is read, what of a damaged one, and the time of a log repaired."""
+"""Logs of every format read as frames: complete ones, damaged ones, and ones with wrong times."""
 
 import gzip
 import importlib.util

@@ -139,7 +139,7 @@ def test_row_numbers_left_as_index_are_not_taken_for_the_time(tmp_path: Path) ->
 @pytest.mark.parametrize(
     "index",
     [dates(), dates().set_names("time"), pd.MultiIndex.from_arrays([["V1"] * ROWS, TIME_S], names=["vehicle", "time"])],
-    ids=["without a name", "with the name of a column", "of vehicle and time"],
+    ids=["index without a name", "index named like a column", "index of vehicle and time"],
 )
 def test_column_of_times_takes_precedence_over_the_index(tmp_path: Path, index: pd.Index) -> None:
     frame().set_axis(index).to_parquet(tmp_path / "x.parquet")

@@ -1,4 +1,4 @@
-"""What stands in the pages, apart from what a browser makes of them."""
+"""Contents of the report pages, without a browser."""
 
 import base64
 import gzip
@@ -31,7 +31,7 @@ def facts_of(page: str) -> dict[str, Any]:
 
 
 def packed(page: str, name: str) -> bytes:
-    """What a browser unpacks."""
+    """Data of the page that a browser unpacks."""
     found = re.search(f'id="{name}-data">(.*?)</script>', page, re.DOTALL)
     assert found is not None
     return gzip.decompress(base64.b64decode(found[1]))

@@ -68,7 +68,7 @@ def test_leftover_file_of_a_killed_import_is_removed(
     left, other = folder / ".drive.parquet.x1y2", folder / ".drive.parquet.new"
     left.write_bytes(b"half")
     os.utime(left, (0, 0))
-    other.write_bytes(b"half")  # of an import that goes on beside this one
+    other.write_bytes(b"half")  # of an import that runs at the same time
     os.utime(other, (2e9, 2e9))
     imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     assert {path.name for path in folder.iterdir()} == {"drive.parquet", other.name}
@@ -105,7 +105,7 @@ def test_slow_log_is_left_out_and_others_are_imported(
 
 
 def test_full_disk_stops_an_import(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
-    """All further drives would be lost one by one, with exit code 0."""
+    """Otherwise all further drives would be left out one by one, with exit code 0."""
     command = [sys.executable, "-m", "calibrator", "import", str(two_vehicles / "logs"), "--layout", str(LAYOUT)]
     limited = ["prlimit", "--fsize=1000", *command, "--out", str(tmp_path)]
     unmeasured = {name: value for name, value in os.environ.items() if not name.startswith("COV")}

@@ -100,7 +100,7 @@ def node_on(folder: Path, database: VehicleDatabase, delays: dict[str, float]) -
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) -> Path:
-    """Folder of a log, its summary (of_log), and what a node that heard it wrote (vehicle)."""
+    """Folder of a log, its summary (of_log), and the summary of a node that received it (vehicle)."""
     folder = tmp_path_factory.mktemp("on_board")
     log = folder / "logs" / "V1" / "drive.log.gz"
     write_drive_log(log, recorded_drive(), database)

@@ -136,7 +136,7 @@ def test_recording_found_in_two_vehicles_counts_for_neither(tmp_path: Path, data
         write(drives, vehicle, "a", database)
     _, store = add(drives, out, database)
     copy(drives, "V1/a", "V2/b")
-    for _ in range(2):  # the second run finds nothing else
+    for _ in range(2):  # the second run gives the same
         added, store = add(drives, out, database)
         reasons = {name: text.partition(";")[0] for name, text in added.left_out.items()}
         assert reasons == {"V1": "same recording as V2", "V2": "same recording as V1"}

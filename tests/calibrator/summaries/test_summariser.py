@@ -1,4 +1,4 @@
-"""Samples into summaries: sums are those of the samples, spikes and what is not valid take no part."""
+"""Samples into summaries: sums equal those of the samples; spikes and invalid samples are left out."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -198,7 +198,7 @@ def test_offsets_are_read_in_zero_current_windows_with_uncertainty() -> None:
 @pytest.mark.parametrize(
     "without",
     [drive(open_s=(0.0, 0.0)), drive(open_s=(10.0, 13.0)), drive(state=False)],
-    ids=["never", "short", "no signal"],
+    ids=["contactors never open", "window too short", "no contactor signal"],
 )
 def test_no_zero_current_window_gives_no_reading(without: Drive) -> None:
     assert np.isnan(zero_current_offsets([without], tuple(OFFSETS_A), DATABASE).offset_a).all()

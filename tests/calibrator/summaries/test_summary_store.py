@@ -1,4 +1,4 @@
-"""Summaries on disk: nothing is lost, records add up, and nothing that does not fit gets in."""
+"""Summaries on disk: nothing is lost, records add up, and data that do not fit are refused."""
 
 import re
 import shutil
@@ -129,7 +129,7 @@ def test_damaged_bucket_is_named(tmp_path: Path, database: VehicleDatabase, dama
 
 
 def spoil(store: SummaryStore, bucket: int, changes: Mapping[str, Any]) -> str:
-    """Change columns of the first vehicle of a bucket, as another tool would; its name."""
+    """Change columns of the first vehicle of a bucket, as another tool would; returns its name."""
     path = Path(store.url) / "buckets" / store.files(bucket)[0][0]
     rows = pq.read_table(path).to_pylist()
     name = str(rows[0]["vehicle"])

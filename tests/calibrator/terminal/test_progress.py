@@ -1,4 +1,4 @@
-"""What a bar shows, at any width, and what goes to a log instead."""
+"""The progress bar at any width, and the lines that a log gets instead."""
 
 import math
 import re
