@@ -98,8 +98,8 @@ LEAST_SHARED_GAIN = (0.3, 0.004)
 """Share of the vehicles that agree, and size of a gain error from which on their sensors may share it. [1]"""
 SURELY_SHARED = 2.0
 """Size from which on sensors may share a gain error, over the standard deviation of one vehicle's gain ratio. Errors of
-the noise that is taken out of the junction regression are alike in all vehicles: they bias ratios by up to half of it,
-and averaging over vehicles does not remove that. [1]"""
+the noise that is taken out of the junction regression are alike in all vehicles: they bias all ratios
+in the same way, and averaging over vehicles does not remove that. [1]"""
 LEAST_EXPECTED = 1e-6
 """Least probability of a vehicle without and of one with a sensor fault, whatever share is expected: no evidence could
 overcome a probability of zero. [1]"""

@@ -72,14 +72,14 @@ def test_forged_frame_before_each_real_one_stops_the_correction(junction: Juncti
     assert junction.corrected_after == 0
 
 
-def test_broken_battery_sensor_is_named_before_a_steady_load(junction: Junction) -> None:
+def test_broken_battery_sensor_alone_is_named_beside_a_steady_load(junction: Junction) -> None:
     def steady_heater(time_s: float) -> dict[str, float]:
         return driving(time_s) | {"battery": driving(time_s)["motor"] + 10.0, "heater": 10.0}
 
     junction.noise_a = 0.0
     junction.break_sensors(20.0, steady_heater, battery=lambda shown_a: 1.5 * shown_a)
     assert junction.corrector.latched is Reason.SUM_IMPLAUSIBLE
-    assert junction.corrector.latched_branches[0] == "battery"
+    assert junction.corrector.latched_branches == ("battery",)
 
 
 def test_sensor_that_stays_constant_while_the_others_move_is_stuck(junction: Junction) -> None:
