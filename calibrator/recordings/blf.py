@@ -1,11 +1,11 @@
-"""BLF files (Vector's binary logging format) into frame arrays, their objects by compiled code.
+"""Read BLF files (Vector's binary logging format) into frame arrays; compiled code parses their objects.
 
-A BLF file is a header ``LOGG`` and objects ``LOBJ``, each with its own size; most are containers, whose content, often
-compressed, is again objects, which may go over from one container into the next. There is no public specification; the
-layout of the objects is that of python-can's reader, which is the oracle of the tests.
+A BLF file is a header ``LOGG`` and objects ``LOBJ``, each with its own size. Most objects are containers, whose
+content, often compressed, is again a sequence of objects; one of these may continue in the next container. There is no
+public specification; the layout of the objects is that of python-can's reader, against which the tests compare.
 
-A size of zero makes a naive reader go round for ever, and a file cut inside a container reads as a shorter one without
-any error: the structure is checked throughout, and damage is refused with its place.
+An object of size zero makes a naive reader loop for ever, and a file cut inside a container reads as a shorter file
+without any error. So the structure is checked throughout, and damage is refused with its place.
 """
 
 import struct
@@ -39,9 +39,9 @@ from calibrator.recordings.log_files import UNREADABLE, open_log
 __all__ = ["blf_frames", "read_blf"]
 
 BATCH_BYTES = 1 << 21
-"""Content of containers that is taken apart at a time. [byte]"""
+"""Content of containers that is parsed at a time. [byte]"""
 LARGEST_OBJECT = 1 << 28
-"""Containers have some 128 KiB; a larger size is damage. [byte]"""
+"""Objects of a larger size count as damage: containers have some 128 KiB. [byte]"""
 _FILE_HEADER = struct.Struct("<4sL8xQ16x8H")
 """Signature, size of the header, size of the file, date and time of the start (year, month, day of the week, ..)."""
 _FILE_HEADER_BYTES = 144
@@ -53,19 +53,19 @@ _CONTAINER = 10
 _CONTAINER_HEADER_BYTES = 16
 _STORED, _DEFLATE = 0, 2
 _LONGEST_PADDING = 4
-"""Between objects; at the end of a file it may lack. [byte]"""
+"""Up to this much padding stands between objects; at the end of a file it may be missing. [byte]"""
 _CLASSIC, _CLASSIC_2, _FD, _FD_64 = 1, 86, 100, 101
-"""Types of objects that are data or remote frames."""
+"""Types of objects that hold data or remote frames."""
 _ERROR, _ERROR_EXT, _ERROR_FD = 2, 73, 104
 _TEN_MICROSECONDS = 1
-"""Flag of the unit of time; nanoseconds otherwise."""
+"""Value of an object's flags if its time counts in units of 10 us; otherwise it counts in nanoseconds."""
 _TEN_MICROSECONDS_NS = 10_000
 _SOUND, _IMPOSSIBLE, _NO_OBJECT, _WIDE = range(4)
-"""How taking a batch apart ended; the last one: it has payloads of CAN FD, and the columns are for classic ones."""
+"""How parsing a batch ended. ``_WIDE``: it has payloads of CAN FD, but the columns are for classic ones."""
 
 
 class _DamageError(Exception):
-    """What is wrong, and at which byte of the file."""
+    """A damage of the file: what is wrong, and at which byte."""
 
     def __init__(self, byte: int, text: str) -> None:
         super().__init__(f"at byte {byte} {text}")
@@ -90,13 +90,13 @@ def blf_frames(file: BinaryIO, name: str) -> Frames:
     Returns
     -------
     Frames
-        In the order of the file.
+        The frames in the order of the file.
 
     Raises
     ------
     LogError
-        If the file is no BLF file, is cut, or has an object of impossible size; the message gives the byte, what was
-        expected there, and how many frames come before.
+        If the file is no BLF file, is cut, or has an object of impossible size; the message gives the byte, what is
+        wrong there, and how many frames come before it.
     """
     parts: list[Frames] = []
     try:
@@ -131,7 +131,7 @@ def blf_frames(file: BinaryIO, name: str) -> Frames:
 
 
 def _batches(file: BinaryIO) -> Iterator[list[tuple[bytes, int]]]:
-    """Some containers at a time; those before a damage come before its error."""
+    """Yield containers in batches of :data:`BATCH_BYTES`; those before a damage are yielded before its error."""
     batch: list[tuple[bytes, int]] = []
     try:
         for container in _containers(file):
@@ -148,7 +148,7 @@ def _batches(file: BinaryIO) -> Iterator[list[tuple[bytes, int]]]:
 
 
 def _file_header(file: BinaryIO) -> tuple[int, int]:
-    """Go behind the header; the size of the file that it states, 0 if unknown, and the start in ns since 1970."""
+    """Read the header; return the file size that it states, and the start in ns since 1970; each 0 if unknown."""
     head = file.read(_FILE_HEADER_BYTES)
     if len(head) < _FILE_HEADER_BYTES or head[:4] != b"LOGG":
         raise _DamageError(0, f"the header 'LOGG' of {_FILE_HEADER_BYTES} bytes is expected, found {head[:4]!r}")
@@ -158,14 +158,14 @@ def _file_header(file: BinaryIO) -> tuple[int, int]:
     file.read(length - _FILE_HEADER_BYTES)
     try:
         start_s = int(datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp())
-    except ValueError:  # there is no date
+    except ValueError:  # the header has no valid date
         return size, 0
     start_ns = max(start_s, 0) * 10**9 + milliseconds * 10**6
     return size, start_ns if start_ns <= LATEST_TIME_STAMP_NS else 0
 
 
 def _containers(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
-    """Content of each container, and the byte at which it starts."""
+    """Yield the content of each container, and the byte at which the container starts."""
     position = file.tell()
     while head := file.read(_OBJECT_HEADER_BYTES):
         if len(head) < _OBJECT_HEADER_BYTES:
@@ -201,7 +201,7 @@ def _container_content(content: bytes, position: int) -> bytes:
 
 
 class _Numbers(NamedTuple):
-    """The same bytes as little-endian numbers of 1, 2, 4 and 8 bytes that start at any of them."""
+    """Views of some bytes: element k is the little-endian number of 1, 2, 4 or 8 bytes that starts at byte k."""
 
     u8: NDArray[np.uint8]
     u16: NDArray[np.uint16]
@@ -210,7 +210,7 @@ class _Numbers(NamedTuple):
 
     @classmethod
     def of(cls, content: bytes) -> "_Numbers":
-        """View; zeros stand after the end."""
+        """View a copy of the bytes, followed by zeros so that the last numbers can be read."""
         padded, n = content + bytes(8), len(content)
         return cls(*(np.ndarray((n,), kind, padded, strides=(1,)) for kind in ("<u1", "<u2", "<u4", "<u8")))
 
@@ -219,10 +219,11 @@ class _Numbers(NamedTuple):
 def _take_apart(  # noqa: PLR0912, PLR0915 (see below)
     data: _Numbers, start_ns: int, columns: FrameColumns
 ) -> tuple[int, int, int, int]:
-    """Fill a row per frame: how it ended, rows, where what is left over begins, and the size that is impossible.
+    """Fill one row of `columns` per frame.
 
-    It is one function, with a name for each array: those that go into another one, or come out of a tuple, are counted
-    in each round of the loop, which takes seven times as long as all else.
+    Returns how parsing ended, the number of rows, where the unparsed rest begins, and the impossible size, if any. All
+    is one function with a name for each array: arrays passed to another function, or taken out of a tuple, would be
+    reference-counted in each round of the loop, which takes seven times as long as all else.
     """
     u8, u16, u32, u64 = data
     kinds, time_ns, keys, channels, lengths, payloads = columns
@@ -285,5 +286,5 @@ def _take_apart(  # noqa: PLR0912, PLR0915 (see below)
 
 @inner
 def _integer(number: np.unsignedinteger) -> int:
-    """Signed, as compiled code makes floating point of unsigned and signed numbers together."""
+    """Make a number signed: numba would turn a mix of unsigned and signed integers into floating point."""
     return int(np.int64(number))

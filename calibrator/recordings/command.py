@@ -1,4 +1,4 @@
-"""``calibrator replay``: a CAN log onto a bus."""
+"""``calibrator replay``: play a CAN log onto a bus."""
 
 import logging
 import time

@@ -1,12 +1,12 @@
-"""Signals of a DBC decoded, and end-to-end protection checked, over whole columns of payloads.
+"""Decode signals of a DBC, and check end-to-end protection, over whole columns of payloads.
 
 A signal is a run of bits: little-endian (Intel) from its lowest bit upwards, big-endian (Motorola) from its highest bit
 downwards. The bytes it touches are joined to one integer, shifted and masked; physical = raw * scale + offset.
 
 A value is *present* where the frame carries the signal (multiplexing), and *good* where it may be used: the frame is
-long enough, the raw value does not stand for "no value", and the physical value lies within the DBC's range (a range of
-0 to 0 is none). Which codes stand for that, names tell that mean "not available"; of what branches are measured with,
-as on the node, any name and the layout's ``no_value``.
+long enough, the raw value does not stand for "no value", and the physical value lies within the DBC's range (0 to 0
+means no range). The codes for "no value" are those whose name in the DBC means "not available"; for the signals that
+measure a branch, as on the node, they are all codes with a name and those of the layout's ``no_value``.
 """
 
 import math
@@ -44,7 +44,7 @@ _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 
 @dataclass(frozen=True, kw_only=True)
 class Decoded:
-    """One signal of some frames.
+    """One decoded signal of some frames.
 
     Attributes
     ----------
@@ -53,8 +53,8 @@ class Decoded:
     present : ndarray of bool of shape (n,)
         Whether the frame carries the signal; False only for multiplexed signals.
     bad : mapping of str to ndarray of bool, shape (n,)
-        Why values may not be used, by reason: ``too short``, ``not available`` (a code that is no value),
-        ``out of range`` (of the DBC, or no number).
+        Which values may not be used, by reason: ``too short``, ``not available`` (the code stands for no value),
+        ``out of range`` (outside the DBC's range, or not a number).
     """
 
     value: Array
@@ -63,7 +63,7 @@ class Decoded:
 
     @property
     def good(self) -> Mask:
-        """Whether each value is there and may be used, shape (n,)."""
+        """Whether each value is present and may be used, shape (n,)."""
         return np.asarray(self.present & ~np.logical_or.reduce(list(self.bad.values())))
 
 
@@ -79,7 +79,7 @@ def decode_signal(
     Parameters
     ----------
     message : Message
-        The message that the frames are.
+        The message that the frames carry.
     signal : Signal
         One of its signals.
     data : ndarray of uint8, shape (n, W)
@@ -87,12 +87,13 @@ def decode_signal(
     length : ndarray of uint8, shape (n,)
         Payload bytes of each frame.
     no_value : frozenset of int, optional
-        :func:`codes_of_no_value` where there is a layout; without it, names of the DBC that mean "not available".
+        Codes that stand for no value, from :func:`codes_of_no_value` if there is a layout; by default those whose name
+        in the DBC means "not available".
 
     Returns
     -------
     Decoded
-        Values and labels, one per frame.
+        Values, and which of them are present and good, one per frame.
 
     Raises
     ------
@@ -116,7 +117,7 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
     Parameters
     ----------
     signal : Signal
-        The signal; its multiplexing is not looked at.
+        The signal; its multiplexing is ignored.
     data, length : ndarray
         As in :func:`decode_signal`.
 
@@ -125,7 +126,7 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
     raw : ndarray of int64, uint64 or float64, shape (n,)
         Raw values; int64 for signed and uint64 for unsigned signals.
     complete : ndarray of bool, shape (n,)
-        Whether the frame is long enough; the raw value is of no meaning where not.
+        Whether the frame is long enough; otherwise the raw value has no meaning.
 
     Raises
     ------
@@ -147,7 +148,7 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
     if bits < _WORD_BITS:
         word &= np.uint64((1 << bits) - 1)
     if signal.is_float:
-        with np.errstate(invalid="ignore"):  # signalling NaN
+        with np.errstate(invalid="ignore"):  # a signalling NaN warns when it is converted
             return word.astype(f"u{bits // 8}").view(_FLOATS[bits]).astype(np.float64), complete
     if signal.is_signed:
         sign = np.uint64(1 << (bits - 1))
@@ -157,19 +158,19 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
 
 @dataclass(frozen=True, kw_only=True)
 class SignalRange:
-    """Least and greatest value of a signal, and what rounding may add to them."""
+    """Least and greatest value of a signal, and the tolerance for rounding."""
 
     low: float
     high: float
     slack: float
 
     def holds(self, value: Array) -> Mask:
-        """Which values lie inside; NaN does not."""
+        """Return which values lie inside the range; NaN does not."""
         return np.asarray((value >= self.low - self.slack) & (value <= self.high + self.slack))
 
 
 def bit_range(signal: Signal, factor: float = 1.0) -> tuple[float, float]:
-    """Least and greatest value that the bits of an integer signal can say, multiplied by a factor."""
+    """Return the least and greatest value that the bits of an integer signal can express, multiplied by a factor."""
     first = -(1 << signal.length - 1) if signal.is_signed else 0
     codes = (first, first + (1 << signal.length) - 1)
     low, high = sorted(factor * (code * float(signal.scale) + float(signal.offset)) for code in codes)
@@ -177,20 +178,20 @@ def bit_range(signal: Signal, factor: float = 1.0) -> tuple[float, float]:
 
 
 def signal_range(signal: Signal, factor: float = 1.0) -> SignalRange:
-    """Range of one signal.
+    """Return the valid range of one signal.
 
     Parameters
     ----------
     signal : Signal
         A signal of the DBC.
     factor : float
-        What its physical values are multiplied by.
+        Factor by which the physical values are multiplied, such as that of a unit.
 
     Returns
     -------
     SignalRange
-        Infinite on a side that the DBC does not limit. 0 to 0 limits neither: DBC files give it to signals without a
-        range.
+        The range, infinite on a side that the DBC does not limit. 0 to 0 limits neither side: DBC files state it for
+        signals without a range.
     """
     low = -math.inf if signal.minimum is None else float(signal.minimum)
     high = math.inf if signal.maximum is None else float(signal.maximum)
@@ -201,7 +202,7 @@ def signal_range(signal: Signal, factor: float = 1.0) -> SignalRange:
 
 
 def _bit_run(signal: Signal) -> tuple[list[int], int]:
-    """Bytes from the least to the most significant, and how many bits the lowest one has below the signal."""
+    """Return the bytes of a signal, least significant first, and how many bits of the first lie below the signal."""
     if signal.byte_order == "little_endian":
         first, shift = divmod(signal.start, 8)
         return list(range(first, (signal.start + signal.length - 1) // 8 + 1)), shift
@@ -211,7 +212,7 @@ def _bit_run(signal: Signal) -> tuple[list[int], int]:
 
 
 def _joined(data: NDArray[np.uint8], columns: list[int], shift: int) -> NDArray[np.uint64]:
-    """Bytes joined to one integer, its lowest `shift` bits cut off. 64 bits may lie across nine bytes."""
+    """Join bytes to one integer, and cut off its lowest `shift` bits. A signal of 64 bits may touch nine bytes."""
     word = np.zeros(len(data), np.uint64)
     for place, column in enumerate(columns):
         byte, move = data[:, column].astype(np.uint64), 8 * place - shift
@@ -222,9 +223,9 @@ def _joined(data: NDArray[np.uint8], columns: list[int], shift: int) -> NDArray[
 def _presence(
     message: Message, signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]
 ) -> tuple[Mask, Mask]:
-    """Whether the frames carry a signal, and whether they are long enough to know; unknown counts as present.
+    """Return which frames carry a signal, and which are long enough to tell; if not, the signal counts as present.
 
-    No frame carries a signal whose multiplexer the message does not have.
+    No frame carries a signal whose multiplexer is missing from the message.
     """
     everywhere = np.ones(len(data), np.bool_)
     if signal.multiplexer_ids is None or signal.multiplexer_signal is None:
@@ -257,14 +258,14 @@ def _is_one_of(signal: Signal, raw: Raw, codes: frozenset[int]) -> Mask:
 
 _NO_COUNTER = 15
 _CRC = np.array([crc8.gsm_a(bytes([byte])) for byte in range(256)], np.uint8)
-"""CRC of each byte, of polynomial 0x1D, start and final value 0."""
+"""CRC of each byte value, with polynomial 0x1D and start and final value 0."""
 
 
 def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: int) -> Mask:
-    """Check CRC and range of the counter of frames of one message, protected by AUTOSAR E2E profile 1A.
+    """Check the CRC and the counter's range in frames of one message that AUTOSAR E2E profile 1A protects.
 
-    There byte 0 is CRC-8 SAE J1850 (polynomial 0x1D, start and final value 0x00 in this profile) over the low and the
-    high byte of the data identifier and the bytes after the CRC. AUTOSAR, "E2E Protocol Specification", profile 1, both
+    In this profile, byte 0 is CRC-8 SAE J1850 (polynomial 0x1D, start and final value 0x00) over the low and the high
+    byte of the data identifier and the bytes after the CRC. AUTOSAR, "E2E Protocol Specification", profile 1, with both
     bytes of the data identifier included.
 
     Parameters
@@ -291,7 +292,7 @@ def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: in
 def _crc_of_rows(
     data: NDArray[np.uint8], length: NDArray[np.uint8], table: NDArray[np.uint8], start: int, crc: NDArray[np.uint8]
 ) -> None:
-    """CRC over the bytes after the first of each row."""
+    """Compute for each row the CRC over its bytes after the first."""
     for row in range(len(data)):
         value = start
         for column in range(1, length[row]):
@@ -302,21 +303,22 @@ def _crc_of_rows(
 def message_is_sound(
     database: VehicleDatabase, message: Message, data: NDArray[np.uint8], length: NDArray[np.uint8]
 ) -> Mask:
-    """Check frames of one message as the layout says that it is protected.
+    """Check frames of one message against the end-to-end protection that the layout states for it.
 
     Parameters
     ----------
     database : VehicleDatabase
         DBC and layout.
     message : Message
-        That the frames are.
-    data, length :
-        As for :func:`p01_is_sound`.
+        The message that the frames carry.
+    data, length : ndarray
+        Payloads, and bytes of each frame, as in :func:`p01_is_sound`.
 
     Returns
     -------
     ndarray of bool, shape (n,)
-        True where the frame is long enough and CRC and counter are possible; everywhere if it is not protected.
+        True where the frame is long enough and its CRC and counter are valid; True everywhere if the message is not
+        protected.
     """
     protection = protection_of(database, message)
     if protection is None:

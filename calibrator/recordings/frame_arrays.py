@@ -1,4 +1,4 @@
-"""Frames of a log as arrays, so that everything after reading works on whole columns; and the time of a log, repaired.
+"""Frames of a log as arrays, so that all later steps work on whole columns; and the repair of a log's time stamps.
 
 A frame is kept as it was logged: time stamp, identifier, channel, length and payload. Error and remote frames carry no
 payload; they and damaged lines are counted.
@@ -22,13 +22,13 @@ LARGEST_IDENTIFIER = (1 << 29) - 1
 CLASSIC_BYTES = 8
 FD_BYTES = 64
 LATEST_TIME_STAMP_NS = 9 * 10**18
-"""Larger time stamps do not fit into 64 bits, and no log has them. [ns]"""
+"""Latest possible time stamp: larger ones do not fit into 64 bits, and no log has them. [ns]"""
 NOTHING, DATA, ERROR, REMOTE, DAMAGED = range(5)
-"""What a line or an object of a log is, in :class:`FrameColumns`."""
+"""Kinds of lines or objects of a log, in :class:`FrameColumns`."""
 
 
 def frame_key(frame_id: int, *, extended: bool) -> int:
-    """Identifier and its kind in one number: the identifier, with :data:`EXTENDED_BIT` where it has 29 bits."""
+    """Return the identifier as a key: with :data:`EXTENDED_BIT` set if it has 29 bits, unchanged if it has 11."""
     return frame_id | EXTENDED_BIT if extended else frame_id
 
 
@@ -51,9 +51,9 @@ class Frames:
     channels : tuple of str
         Names of the buses that the frames came from.
     error_frames, remote_frames, damaged : int
-        What the log has besides: error frames, remote frames, and lines or frames that could not be read.
+        Counts of what else the log has: error frames, remote frames, and lines or frames that could not be read.
     first_damaged : int
-        Line of a text that is the first damaged one, from 1; 0 if there is none or the log has no lines.
+        Number of the first damaged line of a text log, from 1; 0 if there is none or the log has no lines.
     """
 
     time_ns: NDArray[np.int64]
@@ -81,7 +81,7 @@ class Frames:
         return replace(self, **columns)
 
     def messages(self) -> Iterator[can.Message]:
-        """Yield the frames as messages to be sent, each with its time stamp [s]; CAN FD where longer than 8 bytes."""
+        """Yield the frames as messages to be sent, with time stamps [s]; those longer than 8 bytes are CAN FD."""
         for time_ns, key, length, data in zip(self.time_ns, self.key, self.length, self.data, strict=True):
             yield can.Message(
                 timestamp=int(time_ns) * 1e-9,
@@ -119,9 +119,9 @@ def concatenate_frames(parts: Sequence[Frames]) -> Frames:
 
 
 class FrameColumns(NamedTuple):
-    """What compiled readers fill in, a row per line or object of a log: what it is, and the columns of :class:`Frames`.
+    """Arrays that compiled readers fill, one row per line or object: its kind, and the columns of :class:`Frames`.
 
-    Channels are numbers of the reader's own.
+    The reader numbers the channels as it likes; :meth:`frames` names them.
     """
 
     kind: NDArray[np.uint8]
@@ -133,7 +133,7 @@ class FrameColumns(NamedTuple):
 
     @classmethod
     def of(cls, rows: int, *, fd: bool) -> "FrameColumns":
-        """Columns of so many rows, for payloads of 8 bytes, or of 64 for CAN FD."""
+        """Make columns of this many rows, for payloads of 8 bytes, or of 64 for CAN FD."""
         return cls(
             kind=np.zeros(rows, np.uint8),
             time_ns=np.zeros(rows, np.int64),
@@ -144,10 +144,10 @@ class FrameColumns(NamedTuple):
         )
 
     def frames(self, channels: Sequence[str] | None = None, *, rows: int | None = None) -> Frames:
-        """Data frames, and the counts of the others, of the first so many rows or of all.
+        """Return the data frames, and the counts of other kinds, of the first `rows` rows or of all.
 
-        `channels` are the names by the reader's numbers; without them these count from 1, and names from 0, as those of
-        python-can do.
+        `channels` are the names of the reader's channel numbers. Without names, each channel is named after its number
+        minus one, as logs count channels from 1 and python-can from 0.
         """
         kind = self.kind[:rows]
         counts = np.bincount(kind, minlength=DAMAGED + 1).tolist()
@@ -171,7 +171,7 @@ class FrameColumns(NamedTuple):
 
 
 def frames_of(messages: Sequence[can.Message]) -> Frames:
-    """Messages of python-can as frames; those of an impossible length, identifier or time stamp are damaged."""
+    """Convert messages of python-can; those with an impossible length, identifier or time stamp count as damaged."""
     columns = FrameColumns.of(len(messages), fd=any(len(message.data) > CLASSIC_BYTES for message in messages))
     channels: dict[str, int] = {}
     for row, message in enumerate(messages):
@@ -196,25 +196,25 @@ def frames_of(messages: Sequence[can.Message]) -> Frames:
 # ---- time
 
 LARGEST_DISORDER_S = 1.0
-"""Buffers of loggers are emptied more often than this. [s]"""
+"""Larger steps back are the clock's: loggers empty their buffers more often than this. [s]"""
 LONGEST_PAUSE_S = 600.0
-"""A bus that is silent for longer has been asleep; what follows counts as after a gap. [s]"""
+"""A bus that is silent for longer has been asleep; the pause is replaced by :data:`CLOCK_GAP_S`. [s]"""
 CLOCK_GAP_S = 60.0
 """Length of the gap that replaces a clock step; longer than all time-outs of usual layouts. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogTime:
-    """Time of the frames of one log: increasing, and without the jumps of a clock that was set while recording.
+    """Time of the frames of one log, sorted, and without the jumps of a clock that was set while recording.
 
     Attributes
     ----------
     order : ndarray of int64, shape (n,)
-        Order in which the frames are to be taken.
+        Indices that sort the frames by time.
     time_s : ndarray of shape (n,)
         Time since the first frame, in that order, not decreasing. [s]
     disordered : int
-        Frames that were logged before an earlier one.
+        Frames that were logged after a later one.
     clock_steps : int
         Steps of the clock that were replaced by a gap of :data:`CLOCK_GAP_S`.
     """
@@ -226,11 +226,11 @@ class LogTime:
 
 
 def repaired_time(time_ns: NDArray[np.int64]) -> LogTime:
-    """Put time stamps into order.
+    """Sort time stamps, and replace jumps of the clock by gaps.
 
     Frames of several buses may be logged slightly out of order: they are sorted. A larger step back, or a step forward
-    longer than any pause within a drive, is the clock's: the recording goes on after a gap of fixed length, so that
-    nothing is interpolated across it and a wrong date cannot make a drive of years.
+    longer than any pause within a drive, is a step of the clock. The recording then continues after a gap of fixed
+    length, so that nothing is interpolated across it and a wrong date cannot make a drive of years.
 
     Parameters
     ----------

@@ -10,26 +10,26 @@ from ecu_node.errors import BusError
 __all__ = ["play_frames"]
 
 _SEND_LIMIT_S = 1.0
-"""A bus that takes nothing for this long has nobody listening, or is off. [s]"""
+"""A bus that takes no frame for this long has no listener, or is off. [s]"""
 _SEND_PAUSE_S = 0.0005
 
 
 def play_frames(messages: Iterable[can.Message], bus: can.BusABC, *, speed: float = 1.0) -> Iterator[float]:
-    """Send messages in their order, at their instants.
+    """Send messages in their order, each at its instant relative to the first one.
 
     Parameters
     ----------
     messages : iterable of can.Message
         Frames with timestamps [s].
     bus : can.BusABC
-        Where to.
+        The bus to send them to.
     speed : float
         1 keeps the timing, 2 halves the time, 0 goes as fast as the bus takes frames. [1]
 
     Yields
     ------
     float
-        Of each frame, when it is sent: its time since the first one in the log. [s]
+        After each frame is sent: its time in the log since the first frame. [s]
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Files of recordings: alone, in folders, in ``.zip`` archives, gzipped; and what kind of recording one is.
+"""Find and open files of recordings, alone, in folders, in ``.zip`` archives or gzipped, and tell their kind.
 
 A file inside an archive has the path ``fleet.zip/V0001/monday.log``, as if the archive were a folder.
 """
@@ -46,7 +46,7 @@ UNREADABLE = (OSError, EOFError, zlib.error, isal_zlib.error)
 _NO_ARCHIVE = (*UNREADABLE, zipfile.BadZipFile, UnicodeError, RuntimeError, KeyError)
 """What opening and unpacking an archive may raise; RuntimeError where it is encrypted."""
 _BINARY = (".mf4", ".parquet", ".feather", ".arrow")
-"""Formats whose readers need a file that is not packed."""
+"""Suffixes of formats whose readers cannot read gzip and need an unpacked file."""
 PRINTED_CANDUMP = re.compile(
     rb"^[ \t]*(?:\((?P<time>[-\d:. ]+)\)[ \t]+)?(?P<channel>[\w.-]+)[ \t]+(?:[RT]X [-B] [-E][ \t]+)?"
     rb"(?P<id>[\dA-F]{8}|[\dA-F]{3})[ \t]+\[(?P<length>\d+)\](?:[ \t]+(?P<remote>remote request)|[ \t]+(?P<data>"
@@ -59,26 +59,29 @@ TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf
 FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
 """Headers of identifiers, lower case: a text file that has one of them beside a time is a log of CAN frames."""
 _FRAME_CHANNEL = bytes(8) + b"CAN_DataFrame\0"
-"""A block of text begins with its count of links, which is 0, then comes the text."""
+"""End of the header of an MDF text block, which is its number of links, 0, and then the text."""
 _HEAD_BYTES = 1 << 16
 _READ_BYTES = 1 << 13
-"""Asked for at a time: room for all of it is made for each piece that comes, and a damage takes it along. [byte]"""
+"""Size of one read: each read allocates this much, and a damage inside it loses all of it. [byte]"""
 BLOCK_BYTES = 1 << 23
-"""Text parsed at a time: bounds the memory, large enough for calls not to count. [byte]"""
+"""Text parsed at a time: it bounds the memory, and is large enough to make the cost of calls negligible. [byte]"""
 
 
 def suffix_of(path: Path) -> str:
-    """Suffix of a file, lower case, that of the packed one for ``.gz``."""
+    """Return the suffix of a file in lower case; for ``.gz``, that of the file inside."""
     return Path(path.name.lower().removesuffix(".gz")).suffix
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Open a file that is in no archive, gzipped or not."""
+    """Open a file outside archives for reading, and unpack it if it is gzipped."""
     return cast("BinaryIO", igzip.open(path, "rb") if path.name.lower().endswith(".gz") else path.open("rb"))
 
 
 def read_undamaged(file: BinaryIO, size: int) -> tuple[bytes, Exception | None]:
-    """As much of so many bytes as can be read, and what kept the rest; a single large read would lose it all."""
+    """Read up to `size` bytes; return those before any damage, and the exception, if any, that stopped the reading.
+
+    It reads in small pieces, as a single large read would lose everything.
+    """
     parts: list[bytes] = []
     read1 = cast("io.BufferedIOBase", file).read1
     try:
@@ -91,7 +94,10 @@ def read_undamaged(file: BinaryIO, size: int) -> tuple[bytes, Exception | None]:
 
 
 def text_blocks(file: BinaryIO) -> Iterator[bytes]:
-    """Pieces of a text of :data:`BLOCK_BYTES` that end at a line end; those before a damage come before its error."""
+    """Yield a text in pieces of about :data:`BLOCK_BYTES` that end at a line end.
+
+    If the file is damaged, the lines before the damage are yielded first, and then its exception is raised.
+    """
     rest, damage, ended = b"", None, False
     while damage is None and not ended:
         part, damage = read_undamaged(file, BLOCK_BYTES)
@@ -106,7 +112,7 @@ def text_blocks(file: BinaryIO) -> Iterator[bytes]:
 
 
 def text_head(path: Path) -> tuple[str, str]:
-    """Beginning of a text file that is in no archive, whole lines, and its encoding; of a damaged one what there is."""
+    """Return the first lines of a text file outside archives, or those before a damage, and its encoding."""
     with open_log(path) as file:
         head, damage = read_undamaged(file, _HEAD_BYTES)
     if damage is not None and not head:
@@ -121,7 +127,7 @@ def text_head(path: Path) -> tuple[str, str]:
 
 
 def read_rows(file: BinaryIO | TextIO, **options: Any) -> tuple[pd.DataFrame, int]:
-    """Rows of a CSV, with options of :func:`pandas.read_csv`, and how many had too many cells and are left out."""
+    """Read a CSV with options of :func:`pandas.read_csv`; return its rows, and how many were left out as too long."""
     with warnings.catch_warnings(record=True) as complaints:
         warnings.simplefilter("always")
         rows = pd.read_csv(file, index_col=False, skipinitialspace=True, on_bad_lines="warn", **options)
@@ -129,7 +135,7 @@ def read_rows(file: BinaryIO | TextIO, **options: Any) -> tuple[pd.DataFrame, in
 
 
 def reason_of(error: BaseException) -> str:
-    """One line that says what an error of a reader means."""
+    """Return one line that says what an exception of a reader means."""
     if isinstance(error, EOFError):
         return "the compressed file is cut off"
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
@@ -137,14 +143,14 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_candump(head: str, *, printed: bool = False) -> bool:
-    """Whether a text begins with lines of candump; with `printed`, as it prints them without ``-L``."""
+    """Check whether a text begins with lines of candump, of any form or, if `printed`, of the form without ``-L``."""
     lines = [line for line in head.splitlines() if line.strip()][:50]
     forms = (PRINTED_CANDUMP,) if printed else (PRINTED_CANDUMP, _LOGGED)
     return 2 * sum(any(form.match(line.encode()) for form in forms) for line in lines) > len(lines)
 
 
 def is_bus_log(path: Path) -> bool:
-    """Whether an MDF 4 file holds frames: ASAM's name of their channel is a text in it, which is never compressed."""
+    """Check whether an MDF 4 file holds frames: it then contains ASAM's name of their channel, never compressed."""
     if not path.stat().st_size:
         return True
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -152,7 +158,7 @@ def is_bus_log(path: Path) -> bool:
 
 
 def is_table(path: Path) -> bool:
-    """Whether a file is a table: by its suffix, and where logs of frames have the same one, by what is in it."""
+    """Check whether a file is a table: by its suffix and, if logs of frames share that suffix, by its content."""
     suffix = suffix_of(path)
     if suffix == ".zip" or path.is_dir():
         return any(is_table(file) for file in files_in(path)[:1])
@@ -176,15 +182,15 @@ def _is_frame_header(line: str) -> bool:
 
 
 def exists(path: Path) -> bool:
-    """Whether there is such a file, alone or in an archive."""
+    """Check whether a file exists, alone or in an archive."""
     archive = _archive(path)
     return path.is_file() if archive is None else path in files_in(archive)
 
 
 def files_in(path: Path) -> list[Path]:
-    """All files in a folder, at any depth, or in an archive, but hidden ones and those in hidden folders.
+    """List all files in a folder, at any depth, or in an archive, except hidden ones and those in hidden folders.
 
-    None for another file.
+    The list is empty if the path is neither a folder nor an archive.
 
     Raises
     ------
@@ -204,15 +210,15 @@ def files_in(path: Path) -> list[Path]:
 
 
 def _is_hidden(name: PurePath) -> bool:
-    """Whether a file or a folder on the way to it is hidden; ``..`` counts as such."""
+    """Check whether a file, or a folder on the way to it, is hidden; ``..`` counts as hidden."""
     return any(part.startswith(".") for part in name.parts)
 
 
 @contextmanager
 def readable(path: Path) -> Iterator[Path]:
-    """A file that can be read by its path: the file itself, or a copy out of an archive.
+    """Yield a path that readers can open: the file itself, or an unpacked copy for the time of the block.
 
-    Errors of the user that name the copy come out with the path that the user knows.
+    A UserError that names the copy is raised with the path that the user knows.
     """
     archive, packed = _archive(path), path.name.lower().endswith(".gz") and suffix_of(path) in _BINARY
     if archive is None and not packed:

@@ -1,10 +1,10 @@
-"""Log files into frame arrays: candump (.log, .txt), ASC, BLF, TRC, MF4 and CSV, each also gzipped, in folders or .zip.
+"""Read log files into frame arrays: candump (.log, .txt), ASC, BLF, TRC, MF4, CSV, also gzipped, in folders or .zip.
 
-A format is one function, and one line of :data:`READERS`.
+Each format is one function and one line of :data:`READERS`.
 
-A damaged file is refused with the place of the damage and the number of frames before it; the readable part is not
-used, because nobody can tell what else is missing. Logs often have single broken lines, or frames with an impossible
-length or time: these are left out and counted, up to :data:`MAX_DAMAGED_SHARE`.
+A damaged file is refused; the message gives the place of the damage and the number of frames before it. Its readable
+part is not used, because nobody can tell what else is missing. Many logs have single broken lines, or frames with an
+impossible length or time: these are left out and counted, up to :data:`MAX_DAMAGED_SHARE`.
 """
 
 from collections.abc import Callable
@@ -39,16 +39,16 @@ READERS: dict[str, Callable[[Path], Frames]] = {
     ".csv": read_csv,
     ".txt": read_csv,
 }
-"""What reads a file that is not packed or only gzipped, by its suffix."""
+"""Reader of a file by its suffix; each but that of MF4 also unpacks gzip."""
 LOG_SUFFIXES = tuple(READERS)
 MAX_DAMAGED_SHARE = 0.05
-"""Of the lines or frames of a log. Recordings of a real car through a serial adapter had up to 3 % broken lines and
-decoded well. [1]"""
+"""Largest share of damaged lines or frames in a log. Recordings of a real car through a serial adapter had up to 3 %
+broken lines and decoded well. [1]"""
 _IS_TABLE = "a table of values, not a log of frames, which is needed here"
 
 
 def is_log(path: Path) -> bool:
-    """Whether a file is a log or a table: by its suffix, and a ``.txt`` by what is in it; a damaged one counts."""
+    """Check whether a file is a log or a table: by its suffix, or a ``.txt`` by its content. A damaged one counts."""
     suffix = suffix_of(path)
     if suffix == ".txt":
         try:
@@ -65,8 +65,8 @@ def read_frames(path: Path) -> Frames:
     Parameters
     ----------
     path : Path
-        The file; its suffix says the format, see :data:`LOG_SUFFIXES`. Of a folder or an archive all logs one after the
-        other.
+        The file; its suffix says the format, see :data:`LOG_SUFFIXES`. For a folder or an archive, all logs in it are
+        read one after the other.
 
     Returns
     -------

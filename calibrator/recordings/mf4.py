@@ -1,7 +1,7 @@
 """MDF 4 files through asammdf: frames of a bus, or decoded channels. Needs the extra ``mf4``.
 
-The format is a graph of binary blocks that point at each other; a damaged one can keep its reader busy for ever, or
-take all memory: where files of strangers are read, the limits of :func:`.try_many` end that.
+The format is a graph of binary blocks that point at each other. A damaged file can keep its reader busy for ever or
+exhaust the memory; files that cannot be trusted are therefore read within the limits of :func:`.try_many`.
 """
 
 import gc
@@ -58,7 +58,7 @@ def read_mf4(path: Path) -> Frames:
 
 
 def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Read the decoded channels of an MDF 4 file; raises as :func:`read_mf4`.
+    """Read the decoded channels of an MDF 4 file; raise LogError as :func:`read_mf4` does.
 
     Parameters
     ----------
@@ -68,9 +68,10 @@ def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
     Returns
     -------
     frame : DataFrame
-        A row per instant [s] of any channel, in the index; NaN where a channel has none then.
+        One row per instant at which any channel has a value; the index is the time [s]. NaN where a channel has no
+        value at that instant.
     units : dict of str to str
-        By channel.
+        Unit of each channel that has one.
     """
     with _opened(path) as mdf:
         frame: pd.DataFrame = mdf.to_dataframe(use_display_names=True, time_as_date=False, reduce_memory_usage=False)
@@ -86,7 +87,7 @@ def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a file; whatever asammdf raises until the block ends is a LogError, and what it prints is not shown."""
+    """Open a file; inside the block every exception becomes a LogError, and asammdf prints and warns nothing."""
     if importlib.util.find_spec("asammdf") is None:
         raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'hv-current-correction[mf4]'")
     reason, hook = "", sys.unraisablehook
@@ -95,7 +96,7 @@ def _opened(path: Path) -> Iterator[Any]:
         from asammdf import MDF  # noqa: PLC0415 (an extra, slow to import)
 
         getLogger("asammdf").setLevel(CRITICAL)
-        sys.unraisablehook = lambda _: None  # asammdf cannot close what is left of a damaged file
+        sys.unraisablehook = lambda _: None  # asammdf fails when it closes a damaged file
         try:
             with MDF(path) as mdf:
                 yield mdf
@@ -112,7 +113,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _frames(mdf: Any) -> Frames:
-    """Frames of all groups of a bus log, as the standard of ASAM names their channels."""
+    """Return the frames of all groups of a bus log; their channels have the names that the ASAM standard sets."""
     parts, counts = [], dict.fromkeys(("CAN_ErrorFrame", "CAN_RemoteFrame"), 0)
     for number, group in enumerate(mdf.groups):
         names = {channel.name for channel in group.channels}
@@ -128,7 +129,7 @@ def _frames(mdf: Any) -> Frames:
 
 
 def _frames_of_group(signal: Any, start: Any) -> Frames:
-    """Data frames of one group; those of impossible length or time are damaged."""
+    """Return the data frames of one group; frames with an impossible length or time are marked as damaged."""
     known = {name.removeprefix("CAN_DataFrame.") for name in signal.samples.dtype.names}
 
     def field(name: str, default: int) -> Any:

@@ -1,8 +1,9 @@
-"""One log or table and the layout's signals make one drive.
+"""Read one log or table, with the signals that the layout names, as one drive.
 
-Branch k is signal * sign, or sign * power / voltage with the voltage of the latest good frame at or before the power's,
-not older than the branch's time-out, or sign * formula at the instants of what comes most often in it, the others
-interpolated. Every branch keeps the instants of its own frames or rows. Currents are positive into the junction.
+The current of a branch is one of three: sign * signal; sign * power / voltage, where the voltage is that of the latest
+good frame at or before the power's frame and not older than the branch's time-out; or sign * formula, evaluated at the
+instants of its most frequent channel, to which the others are interpolated. Every branch keeps the instants of its own
+frames or rows. Currents are positive into the junction.
 """
 
 from abc import ABC, abstractmethod
@@ -42,28 +43,28 @@ _NOTHING = Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bo
 _MOST_LISTED = 12
 """Identifiers listed in a message: enough to recognise the bus, short enough for one line."""
 MOST_STRAY = 0.05
-"""Share of a message's frames on other buses that is ignored: what gateways and loggers spill. [1]"""
+"""Largest share of a message's frames on other buses that is ignored: gateways and loggers leak a few frames. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingReport:
-    """What a log holds, and what of it could not be used.
+    """Contents of a log or table, and the parts of it that could not be used.
 
     Attributes
     ----------
     channels : collection of (str, Channel)
         All branches and inputs of the layout by name, in its order.
     frames, error_frames, damaged : int
-        Counts over the whole log; rows of a table are its frames.
+        Counts over the whole log; in a table, each row counts as a frame.
     disordered, clock_steps : int
-        Frames logged before an earlier one; steps of the clock that became gaps.
+        Frames whose time is before that of a frame logged earlier; steps of the clock that became gaps.
     ignored : mapping of str to int
-        Frames that come from other buses than those that the layout means, by channel.
+        Number of frames from buses that the layout does not mean, by channel.
     found : str
         How a table was read; empty for logs.
     unfit : tuple of str
-        What of the layout the recording cannot serve, and what to do: channels of a ``[[bus]]`` that the log does not
-        have, columns of branches whose cells are no numbers; empty for nothing.
+        What the layout asks for and the recording lacks, and what to do about it: channels of a ``[[bus]]`` that the
+        log does not have, columns of branches whose cells are not numbers. Empty if nothing is lacking.
     """
 
     channels: Collection[tuple[str, Channel]]
@@ -91,7 +92,7 @@ class RecordingReport:
         ]
 
     def log_notices(self) -> list[Notice]:
-        """Return those of the notices that concern the log as a whole, not single channels."""
+        """Return the notices that concern the log as a whole, not single channels."""
         found, unfit = (text.replace("{", "{{").replace("}", "}}") for text in (self.found, "; ".join(self.unfit)))
         texts = {
             f"{{}} rows, {found}": self.frames if found else 0,
@@ -107,14 +108,14 @@ class RecordingReport:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A drive, what was published as corrected beside it, and the account of the log.
+    """A drive, the corrected currents found beside it in the log, and the report on the log.
 
     Attributes
     ----------
     drive : Drive
         Measured currents and inputs.
     corrected : mapping of str to Channel
-        Corrected currents found in the log by branch name, positive into the junction. [A]
+        Corrected currents that a node published into the log, by branch name, positive into the junction. [A]
     report : RecordingReport
         What was found and what was left out.
     """
@@ -125,7 +126,7 @@ class Recording:
 
 
 def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name: str) -> Recording:
-    """Read a log or a table as a drive with its account.
+    """Read a log or a table as a drive, with a report on what was read.
 
     Parameters
     ----------
@@ -139,12 +140,12 @@ def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name:
     Returns
     -------
     Recording
-        The drive; branches without frames and inputs without a good one are absent from it and named in the report.
+        The drive. Branches without frames and inputs without a good frame are absent from it and named in the report.
 
     Raises
     ------
     LogError
-        If the file cannot be read, holds none of the branches, or one signal on two buses.
+        If the file cannot be read, holds none of the branches, or has one message on several buses.
     DatabaseError
         If a signal of the layout cannot be decoded.
     """
@@ -152,7 +153,7 @@ def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name:
 
 
 def open_recording(path: Path, database: VehicleDatabase) -> "SignalSource":
-    """Read a log or a table; LogError as :func:`read_recording`."""
+    """Read a log or a table, without making a drive of it yet; raise LogError as :func:`read_recording` does."""
     if is_table(path):
         return TableSource(read_table(path), database)
     return FrameSource(read_frames(path), database, str(path))
@@ -178,25 +179,25 @@ class SignalSource(ABC):
 
     @abstractmethod
     def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:
-        """One signal in the unit of the DBC, at the frames or rows that carry it, and why samples may not be used.
+        """Return one signal in the unit of the DBC, at the frames or rows that carry it, and which samples are bad.
 
-        What has no reason is good.
+        The second result maps each reason to the samples that it makes unusable; all other samples are good.
         """
 
     @abstractmethod
     def unit(self, signal_name: str) -> str:
-        """Unit of a signal; empty where nobody says it."""
+        """Return the unit of a signal; empty if neither DBC nor recording states one."""
 
     @abstractmethod
     def found_and_expected(self) -> str:
-        """What the recording has and what the branches need, for a message."""
+        """Return what the recording has and what the branches need, as part of an error message."""
 
     @abstractmethod
     def report(self, channels: Collection[tuple[str, Channel]]) -> RecordingReport:
-        """The account of the recording."""
+        """Return the report on the recording, given its channels by name."""
 
     def recording(self, vehicle: str, name: str) -> Recording:
-        """The drive of this vehicle and name, with its account; LogError if none of the branches is in it."""
+        """Make the drive, with its report; raise LogError if the recording holds none of the branches."""
         layout = self.database.layout
         branches = {branch.name: self.branch(branch, branch.source) for branch in layout.branch}
         if not any(channel.time_s.size for channel in branches.values()):
@@ -214,9 +215,10 @@ class SignalSource(ABC):
         return Recording(drive=drive, corrected=corrected, report=self.report(tuple((branches | inputs).items())))
 
     def branch(self, branch: Branch, signal_name: str) -> Channel:
-        """One branch, measured or corrected, as a current positive into the junction.
+        """Return one branch, measured or corrected, as a current that is positive into the junction. [A]
 
-        The signal is a current, or a power if the branch is one; of a computed branch it is the formula.
+        `signal_name` names a current, or a power if the branch is given by power and voltage. A branch with a formula
+        is computed, and `signal_name` is not used.
         """
         if branch.formula is not None:
             return self._computed(branch, branch.formula)
@@ -231,14 +233,14 @@ class SignalSource(ABC):
         return Channel(time_s=power.time_s, value=value, good=good & np.isfinite(value))
 
     def _scaled(self, signal_name: str, units: Mapping[str, float], branch: Branch) -> Channel:
-        """One signal in A, V or W."""
+        """Return one signal converted to A, V or W, whichever `units` is for."""
         channel = self.samples(signal_name)[0]
         where = f"{self.database.layout.path}: branch {branch.name}"
         factor = factor_of(self.unit(signal_name), units, f"{where}: {signal_name}")
         return Channel(time_s=channel.time_s, value=channel.value * factor, good=channel.good)
 
     def _computed(self, branch: Branch, formula: str) -> Channel:
-        """A branch by its formula, at the instants of what comes most often in it."""
+        """Compute a branch from its formula, at the instants of the most frequent channel in the formula."""
         layout, names = self.database.layout, formula_names(parse_formula(formula))
         signals = {item.name: item.signal for item in layout.input}
         channels = {name: self.samples(signals.get(name, name))[0] for name in layout.base_inputs(names)}
@@ -257,16 +259,16 @@ class SignalSource(ABC):
 
 
 class FrameSource(SignalSource):
-    """Frames of a log.
+    """A CAN log as a source of signals.
 
     Attributes
     ----------
     frames : Frames
-        In the order of time.
+        The frames in the order of time.
     time : LogTime
-        Their times, and what was repaired.
+        Their times, and what was repaired in them.
     ignored : dict of str to int
-        Frames looked at and left out as they come from another bus, by channel.
+        Number of frames left out so far because they come from another bus, by channel.
     """
 
     def __init__(self, frames: Frames, database: VehicleDatabase, where: str) -> None:
@@ -324,7 +326,7 @@ class FrameSource(SignalSource):
         )
 
     def _of_message(self, signal_name: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array, Mask]:
-        """Of the message of a signal: payloads, lengths and times, and whether end-to-end protection is right."""
+        """Return payloads, lengths and times of a signal's message, and which frames pass the end-to-end check."""
         name = split_signal(signal_name)[0]
         if name not in self._messages:
             message = self.database.message(name)
@@ -336,7 +338,7 @@ class FrameSource(SignalSource):
         return self._messages[name]
 
     def _is_of_bus(self, name: str, channel: NDArray[np.uint32]) -> Mask:
-        """Which frames of a message come from the bus that the layout names, or from the one that has nearly all."""
+        """Return which frames of a message come from its bus: the layout's, else the bus that carries nearly all."""
         channels, wanted = self.frames.channels, self.database.channel_of(name)
         if wanted is not None:
             return np.asarray(channel == (channels.index(wanted) if wanted in channels else len(channels)))
@@ -353,13 +355,13 @@ class FrameSource(SignalSource):
         return np.asarray(channel == main)
 
     def _ignore(self, channel: NDArray[np.uint32], known: Sequence[str]) -> None:
-        """Count frames that come from other channels."""
+        """Count the frames on channels that are not among the known ones."""
         counts = zip(self.frames.channels, np.bincount(channel, minlength=len(self.frames.channels)), strict=True)
         self.ignored.update({bus: int(count) for bus, count in counts if count and bus not in known})
 
 
 class TableSource(SignalSource):
-    """Columns of a table; with a DBC they may be called ``Message.Signal`` or ``Signal``."""
+    """A table as a source of signals; with a DBC its columns may be called ``Message.Signal`` or ``Signal``."""
 
     def __init__(self, table: Table, database: VehicleDatabase) -> None:
         super().__init__(database, str(table.path), table.time_s)
@@ -396,7 +398,7 @@ class TableSource(SignalSource):
         )
 
     def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:
-        """A column, in the unit of the DBC where both units are known; see the class above."""
+        """Return a column as :meth:`SignalSource.samples` does, converted to the DBC's unit if both are known."""
         header = self.table.header(signal_name)
         if header is None:
             return _NOTHING, {}
@@ -410,7 +412,7 @@ class TableSource(SignalSource):
 
 
 def _ratio(unit: str, wanted: str) -> float:
-    """Factor from one unit to another of the same quantity; 1 where that is not known."""
+    """Return the factor from one unit to another of the same quantity; 1 if either unit is unknown."""
     for known in (AMPERE, VOLT, WATT):
         if unit in known and usual_unit(wanted) in known:
             return known[unit] / known[usual_unit(wanted)]
@@ -418,7 +420,7 @@ def _ratio(unit: str, wanted: str) -> float:
 
 
 def _held(channel: Channel, time_s: Array, max_age_s: float) -> tuple[Array, Mask]:
-    """Latest good value at or before each instant, and whether there is one that is not too old."""
+    """Return the latest good value at or before each instant, and whether it exists and is not too old."""
     known_s, known = channel.time_s[channel.good], channel.value[channel.good]
     latest = np.searchsorted(known_s, time_s, side="right") - 1
     if not known_s.size:

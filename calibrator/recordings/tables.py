@@ -1,7 +1,7 @@
 """Tables of measured values: CSV and other text, Parquet, Feather, decoded MF4. One column is the time.
 
-Nothing has to be said about a file: delimiter, decimal sign, encoding, header, units and the time column are found, and
-:attr:`Table.found` tells what was found. Rows need not have a value in every column.
+The user need not describe a file: delimiter, decimal sign, encoding, header, units and the time column are detected,
+and :attr:`Table.found` says what was detected. Rows need not have a value in every column.
 """
 
 import csv
@@ -46,9 +46,9 @@ from ecu_node.layout import layout_of
 __all__ = ["Table", "bare_name", "is_table", "layout_from_branches", "likely_full_scale_a", "peak_of", "read_table"]
 
 MOST_SHARING = 1.5
-"""Rows with the same time, on average, from which on the time is too coarse: loggers repeat a few instants. [1]"""
+"""The time is too coarse if more rows than this, on average, share one instant: loggers repeat a few instants. [1]"""
 _DELIMITERS = ("\t", ";", "|", ",", " ")
-"""In the order in which they are tried: a comma may be the decimal sign, a blank stand in a date."""
+"""In the order in which they are tried: a comma may be the decimal sign, and a blank may be part of a date."""
 _EMPTY = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "null", "none"))
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
@@ -68,17 +68,18 @@ _TIME_UNITS = {
     **dict.fromkeys(("h", "hours"), 3600.0),
 }
 _SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""Least count since 1970 in each unit, which no recording reaches in the next larger one."""
+"""Numbers from which on a time since 1970 is taken to be in this unit; in the next larger unit it would be absurd."""
 _LONG_STEPS = ((5000.0, "us"), (5.0, "ms"))
-"""Whole numbers without a unit with this median step or more: tables have up to 200 rows a second, or one in seconds.
+"""Times that are whole numbers without a unit are taken to be in this unit if their median step is this or more.
 
-Steps below 100 are milliseconds only where the table is then not shorter than :data:`_SHORTEST_S`.
+The bounds rest on tables with up to 200 rows a second, or one every few seconds. Steps below 100 count as milliseconds
+only if the table is then not shorter than :data:`_SHORTEST_S`.
 """
 _SHORTEST_S = 60.0
 ON_OFF = "on/off"
-"""Unit of a column of true and false, so that none is taken for a current."""
+"""Unit given to a column of true and false, so that it is not taken for a current."""
 HEADROOM = 2.0
-"""A recorded drive hardly ever has the nominal maximum in it. [1]"""
+"""Full scale over the recorded peak: a drive hardly ever reaches the nominal maximum current. [1]"""
 ROUND = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 
@@ -93,18 +94,18 @@ class Table:
     time_s : ndarray of shape (n,)
         Time since the first row, not decreasing. [s]
     columns : dict of str to ndarray of shape (n,)
-        Numbers by header as written; NaN where there is none.
+        Numbers by header, as the header is written in the file; NaN where a row has no number.
     units : dict of str to str
         Unit by header, where it has one: ``A`` for ``Ibat [A]``, ``Ibat (Amps)`` or ``Ibat_A``.
     bad : dict of str to ndarray of bool, shape (n,)
         Where a column has a text or an infinite number instead of a number; columns without such cells are absent.
     texts : dict of str to str
-        Of columns whose cells are no numbers, by header: the first such cell and where it stands, for messages.
+        For columns without any number, by header: the first cell that is no number and where it stands, for messages.
     found : str
-        What was found out about the file, for people.
+        What was detected about the file, in words.
     disordered, clock_steps, without_time : int
-        Rows after a later one, now sorted; steps of the clock, now gaps; rows left out as they have no time
-        or more cells than the header.
+        Rows that came after a later one and were sorted; steps of the clock that became gaps; rows left out because
+        they have no time or more cells than the header.
     """
 
     path: Path
@@ -119,7 +120,7 @@ class Table:
     without_time: int = 0
 
     def header(self, name: str) -> str | None:
-        """Header of a column by its name: as written, without unit, or the signal's name alone; None without one."""
+        """Return the header of a column named as written, without unit, or by its signal alone; None if none fits."""
         return self._same(name, self.columns)
 
     def _same(self, name: str, headers: Iterable[str]) -> str | None:
@@ -140,7 +141,7 @@ class Table:
         return None
 
     def column(self, name: str) -> str:
-        """As :meth:`header`; :class:`LogError` with the columns that are there if there is none."""
+        """Return the header as :meth:`header` does; raise :class:`LogError` with the known columns if none fits."""
         header = self.header(name)
         if header is None:
             why = "; ".join(self.no_numbers(name) or (f"there is no column {name!r}", self.known(name)))
@@ -148,14 +149,14 @@ class Table:
         return header
 
     def no_numbers(self, name: str) -> tuple[str, ...]:
-        """What to say of a column that is there, without numbers, and what to do; empty for others."""
+        """Return the complaint about a column that holds no numbers, and what to do; empty for all other columns."""
         header = None if self.header(name) is not None else self._same(name, self.texts)
         if header is None:
             return ()
         return f"column {header!r}: {self.texts[header]}", "write numbers, and the unit in the header"
 
     def known(self, name: str = "") -> str:
-        """The columns, those that look like a name first, as part of a message."""
+        """List the columns as part of a message, those similar to `name` first."""
         like = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
         names = list(dict.fromkeys([*like, *self.columns]))
         more = f" and {len(names) - 12} more" if len(names) > 12 else ""
@@ -163,7 +164,7 @@ class Table:
 
 
 def bare_name(header: str) -> str:
-    """Header of a column without its unit."""
+    """Return the header of a column without its unit."""
     return _name_and_unit(header)[0]
 
 
@@ -187,7 +188,7 @@ def read_table(path: Path) -> Table:
     Returns
     -------
     Table
-        All columns with numbers but the time.
+        The time, and all other columns that hold numbers.
 
     Raises
     ------
@@ -230,10 +231,10 @@ def read_table(path: Path) -> Table:
 
 
 def _index_as_columns(frame: pd.DataFrame) -> pd.DataFrame:
-    """A frame with a plain index and different headers.
+    """Turn the index of a data frame into columns, and make its headers distinct.
 
-    An index without a name may be the time, or the numbers of the rows that a filter has left: it comes last, so that
-    any column that is called time comes first.
+    An index without a name may be the time, or only row numbers that a filter has left. It becomes the last column, so
+    that any column that is called time is tried before it.
     """
     index, frame = frame.index, frame.reset_index(drop=True)
     if any(name is not None for name in index.names):
@@ -244,20 +245,20 @@ def _index_as_columns(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def layout_from_branches(text: str, *, table: Table | None = None) -> VehicleDatabase:
-    """Make a layout for a table out of an option.
+    """Make a layout for a table from the text of the option ``--branches``.
 
     Parameters
     ----------
     text : str
-        Branches between commas, as ``battery=Ibat,-motor=Imot``: name and column, or the column alone. A minus stands
-        before a current that is positive out of the junction. Quotients such as ``-motor=Pmot/Ubat`` are formulas [A].
+        Branches separated by commas, as ``battery=Ibat,-motor=Imot``: name and column, or the column alone. A minus
+        marks a current that is positive out of the junction. Quotients such as ``-motor=Pmot/Ubat`` are formulas [A].
     table : Table, optional
-        Tells full scale, period and time-outs, and checks the columns.
+        The table, from which full scale and time-outs are taken, and in which the columns must exist.
 
     Returns
     -------
     VehicleDatabase
-        With a layout that stands in no file.
+        The layout, which is in no file, without a DBC.
 
     Raises
     ------
@@ -299,12 +300,12 @@ def _period_s(time_s: Array) -> float:
 
 
 def peak_of(value: Array) -> float:
-    """Greatest magnitude but for wild samples; 0 without any."""
+    """Return the 99.9 % quantile of the magnitude, which ignores wild samples; 0 for no values."""
     return float(np.quantile(np.abs(value), 0.999)) if len(value) else 0.0
 
 
 def likely_full_scale_a(peak_a: float) -> float:
-    """Full scale of a junction of which a recording reaches so much, rounded up. [A]"""
+    """Guess the full scale of a junction from the recorded peak current, rounded up to a round number. [A]"""
     least_a = HEADROOM * peak_a
     decade = 10.0 ** np.floor(np.log10(least_a))
     return float(next(step * decade for step in ROUND if step * decade >= least_a * (1.0 - 1e-9)))
@@ -349,7 +350,7 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
 
 
 def _coarse(time_s: Array, columns: Mapping[str, Array]) -> str:
-    """What to say where rows have more values of one column than different times; else nothing."""
+    """Return a remark if too many rows of a column share each time; empty otherwise."""
     kept = [time_s[np.isfinite(value)] for value in columns.values()]
     share = max(len(times) / max(len(np.unique(times)), 1) for times in kept)
     what = f"; {share:.3g} rows share each time: write its fractions of a second"
@@ -357,7 +358,7 @@ def _coarse(time_s: Array, columns: Mapping[str, Array]) -> str:
 
 
 def _spread(time_s: Array) -> Array:
-    """Times of rows that share each with others, as if these came evenly until the next; the first ones end with it."""
+    """Spread rows that share one time evenly until the next time; those of the first time end just before the next."""
     stamps, first, count = np.unique(time_s, return_index=True, return_counts=True)
     if len(stamps) < 2:
         return time_s
@@ -369,7 +370,7 @@ def _spread(time_s: Array) -> Array:
 
 
 def _numbers(column: "pd.Series[float]") -> tuple[Array, Mask]:
-    """Numbers of a column, NaN where there is none, and where something else than a number stands."""
+    """Return the numbers of a column, NaN where a cell has none, and which cells hold something else than a number."""
     if pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
         value = column.to_numpy(np.float64, na_value=np.nan)
         bad = np.isinf(value)
@@ -385,7 +386,7 @@ def _numbers(column: "pd.Series[float]") -> tuple[Array, Mask]:
 
 
 def _time(path: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> tuple[list[str], Array, str]:
-    """Headers of the time, the time [s] and what it was taken for."""
+    """Find the time: return the headers of its column or columns, the time [s], and what it was taken for."""
     named = [name for name in frame if _TIME_WORD.search(bare_name(name).lower())]
     for first, second in itertools.pairwise(named):  # a date and the time of day beside it
         if "dat" in first.lower() and not pd.api.types.is_numeric_dtype(frame[second]):
@@ -411,13 +412,13 @@ def _is_row_number(name: str) -> bool:
 
 
 def _increases(time_s: Array) -> bool:
-    """Whether these can be instants: there, different, and hardly ever going back."""
+    """Check whether numbers can be instants: most are present, they differ, and they hardly ever decrease."""
     step = np.diff(time_s[np.isfinite(time_s)])
     return len(step) + 1 > 0.5 * len(time_s) and bool((step > 0.0).any()) and float(np.mean(step < 0.0)) < 0.02
 
 
 def _seconds(column: "pd.Series[float]", name: str, unit: str) -> tuple[Array, str]:
-    """A column as seconds, and the unit or form it was taken for; NaN where it is no time."""
+    """Convert a column to seconds, NaN where a cell is no time; return also the unit or form it was taken for."""
     if pd.api.types.is_timedelta64_dtype(column):
         return np.asarray(column.dt.total_seconds()), "duration"
     if pd.api.types.is_datetime64_any_dtype(column):
@@ -448,7 +449,7 @@ def _likely_unit(value: Array) -> str:
 
 
 def _dates(column: "pd.Series[str]") -> Array:
-    """Seconds since the first instant; days come before months where points part them."""
+    """Convert dates to seconds since the earliest one; dates with points, as 31.12.2025, have the day first."""
     if not pd.api.types.is_datetime64_any_dtype(column):
         text = column.astype("string").str.strip().str.replace(r"(:\d\d),(\d)", r"\1.\2", regex=True)
         if not bool(text.str.match(r"\d+[-./]\d").mean() > 0.5):
@@ -495,7 +496,7 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
     frame.attrs["line"] = first + 1
     for name in frame.select_dtypes(exclude="number"):
         frame[name] = _without_thousands(frame[name], decimal)
-    if decimal == ",":  # columns that hold a text somewhere
+    if decimal == ",":  # pandas leaves the comma in columns that hold a text somewhere
         texts = frame.select_dtypes(exclude="number")
         frame[texts.columns] = texts.apply(lambda c: c.astype("string").str.replace(r"^([-+\d]*),", r"\1.", regex=True))
     shown = {"\t": "tabs", " ": "blanks"}.get(delimiter, f"'{delimiter}'")
@@ -504,7 +505,7 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
 
 
 def _without_thousands(column: "pd.Series[str]", decimal: str) -> "pd.Series[str]":
-    """A column without the separators of its thousands: where a cell has both signs, as 1,234.5 or 1.234,5."""
+    """Remove the thousands separators of a column if any cell has both signs, as 1,234.5 or 1.234,5."""
     comma, point = (",", r"\.") if decimal == "." else (r"\.", ",")
     text = column.astype("string").str.strip()
     if not text.str.fullmatch(rf"[-+]?\d{{1,3}}({comma}\d{{3}})+{point}\d*").any():
@@ -514,7 +515,7 @@ def _without_thousands(column: "pd.Series[str]", decimal: str) -> "pd.Series[str
 
 
 def _cells(path: Path, head: str) -> tuple[str, list[list[str]]]:
-    """Delimiter, and the cells of the first lines."""
+    """Return the delimiter, and the cells of the first lines; raise LogError if these form no table."""
     lines = head.splitlines()
     for delimiter in _DELIMITERS:
         reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
@@ -532,12 +533,12 @@ def _cells(path: Path, head: str) -> tuple[str, list[list[str]]]:
 
 
 def _usual_width(rows: Sequence[Sequence[str]]) -> int:
-    """Number of cells that most of the lower half of the rows have."""
+    """Return the most common number of cells in the lower half of the rows, which has no header."""
     return Counter(len(row) for row in rows[len(rows) // 2 :] if row).most_common(1)[0][0] if rows else 0
 
 
 def _has_values(cells: Sequence[str]) -> bool:
-    """Whether most cells that are not empty begin as numbers and dates do."""
+    """Check whether most cells that are not empty begin like a number or a date."""
     filled = [cell for cell in cells if cell.lower() not in _EMPTY]
     return 2 * sum(re.match(r"[-+.,]?\d", cell) is not None for cell in filled) > len(filled)
 
@@ -549,7 +550,7 @@ def _are_units(cells: Sequence[str]) -> bool:
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Names of which none is empty and no two are alike: of some that are, each has its number before its unit."""
+    """Make names non-empty and distinct: equal names get numbers, put before the unit (``I.1 [A]``, ``I.2 [A]``)."""
     filled = [text.strip() or f"column {place}" for place, text in enumerate(names, start=1)]
     total, seen = Counter(filled), Counter[str]()
     result = []

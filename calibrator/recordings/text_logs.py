@@ -7,8 +7,8 @@
        0.011478 1  1F334455x       Rx   d 8 50 04 0C A9 D4 03 88 01  Length = 0 BitCount = 0          ASC
 
 Lines of these two forms are read by compiled code, ASC some thirty times as fast as by python-can. What candump prints
-without ``-L``, and the rows of SavvyCAN, are turned into lines of ``candump -L`` first. python-can reads what is left:
-TRC, its own CSV, and ASC with CAN FD or decimal numbers.
+without ``-L``, and the rows of SavvyCAN, are turned into lines of ``candump -L`` first. python-can reads the rest: TRC,
+its own CSV, and ASC with CAN FD or decimal numbers.
 """
 
 import io
@@ -63,40 +63,41 @@ __all__ = ["parse_candump", "read_asc", "read_candump", "read_csv", "read_trc"]
 _DECIMAL = re.compile(r"^base\s+dec", re.MULTILINE | re.IGNORECASE)
 _RELATIVE = re.compile(r"^base\s+\w+\s+timestamps\s+relative", re.MULTILINE | re.IGNORECASE)
 _MOST_DISORDER = 0.1
-"""Share of lines whose time is not after the one before: in a log nearly none, of distances about half. [1]"""
+"""Share of lines with a time not after that of the line before: nearly none for absolute times, about half for times
+since the line before. More than this share means the latter. [1]"""
 _SINCE_1970_S = 1e8
-"""Later than any time since a start. [s]"""
+"""Times above this are dates: no recording lasts so long since its start. [s]"""
 _NO_TEXT = frozenset(range(32)) - frozenset(b"\t\n\v\f\r\x1a")
-"""Control characters; the last one kept ends text files of old systems."""
+"""Control characters that no text has. 0x1A is not among them, as it ends text files of old systems."""
 _LOOKED_AT = 4096
-"""Bytes: of random ones, a tenth are control characters."""
+"""Bytes searched for control characters, which are a tenth of random bytes. [byte]"""
 _AT_A_TIME = 10_000
-"""Messages of python-can that are kept at a time: they take more memory than arrays."""
+"""Messages of python-can that are collected before they become arrays, which take less memory. [1]"""
 _ERROR_BIT = 1 << 29
 _MOST_CHANNELS = 256
-"""Different names in one block of text; no machine has more buses."""
+"""Largest number of channel names in one block of text; no machine has more buses. [1]"""
 _NANOSECOND_DIGITS = 9
 _NOT_HEX = 255
 HEX = np.array([int(c, 16) if c in "0123456789ABCDEFabcdef" else _NOT_HEX for c in map(chr, range(256))], np.uint8)
 """Value of each character as a hexadecimal digit."""
 _Text = NDArray[np.uint8]
 _Parse = Callable[[bytes], tuple[Frames, NDArray[np.uint8]]]
-"""Of some lines their frames, and what each line is."""
+"""Parser of some lines: returns their frames, and what each line is (``DATA``, ``DAMAGED`` ...)."""
 
 
 class _CanFdError(Exception):
-    """An ASC file has frames of CAN FD."""
+    """An ASC file has frames of CAN FD, which the compiled parser does not know."""
 
 
 def read_candump(path: Path) -> Frames:
-    """Read what ``candump -L`` wrote, or candump printed."""
+    """Read a log that ``candump -L`` wrote, or the text that candump prints without ``-L``."""
     if is_candump(text_head(path)[0], printed=True):
         return _read_lines(path, lambda text: parse_candump(_as_logged(text, path)), at_once=True)
     return _read_lines(path, parse_candump)
 
 
 def read_csv(path: Path) -> Frames:
-    """Read a CSV of SavvyCAN and other programs of GVRET, or of python-can; or a text of candump."""
+    """Read a CSV in the GVRET form (SavvyCAN and others) or of python-can; or a text of candump."""
     head = text_head(path)[0]
     if is_candump(head):
         return read_candump(path)
@@ -128,7 +129,7 @@ def read_trc(path: Path) -> Frames:
 
 
 def _read_lines(path: Path, parse: _Parse, *, at_once: bool = False) -> Frames:
-    """Frames of a text, gzipped or not, some lines at a time or all at once; LogError if the file is cut."""
+    """Read the frames of a text, gzipped or not, in blocks of lines or all at once; LogError if the file is cut."""
     parts, first_damaged, above = list[Frames](), 0, 0
     try:
         with open_log(path) as file:
@@ -150,10 +151,10 @@ def _read_lines(path: Path, parse: _Parse, *, at_once: bool = False) -> Frames:
 
 
 def _as_logged(text: bytes, path: Path) -> bytes:
-    """Turn what candump prints into as many lines of ``candump -L``; other lines stay as they are.
+    """Turn the lines that candump prints into lines of ``candump -L``, one for one; other lines stay as they are.
 
-    Times are absolute (``-ta``, ``-tA``), since the start (``-tz``) or since the line before (``-td``), which hardly
-    ever increase.
+    Times are absolute (``-ta``, ``-tA``), since the start (``-tz``) or since the line before (``-td``). The last kind
+    is recognised because such times do not increase steadily.
     """
     times = [match["time"] for match in PRINTED_CANDUMP.finditer(text)]
     if None in times:
@@ -175,7 +176,7 @@ def _as_logged(text: bytes, path: Path) -> bytes:
 
 
 def _seconds(time: str) -> float:
-    """Seconds since 1970 or any other instant; NaN for what is no time."""
+    """Parse a date or a number as seconds since 1970 or another instant; NaN if the text is no time."""
     try:
         return datetime.fromisoformat(time).timestamp() if "-" in time else float(time)
     except ValueError:
@@ -183,7 +184,7 @@ def _seconds(time: str) -> float:
 
 
 def _gvret_as_logged(text: bytes, columns: Sequence[str]) -> bytes:
-    """Turn rows of GVRET into as many lines of ``candump -L``: microseconds, and hexadecimal identifier and bytes."""
+    """Turn rows of GVRET (time in us, identifier and bytes hexadecimal) into lines of ``candump -L``, one for one."""
     lines = list[str]()
     for line in text.splitlines():
         row = [cell.strip() for cell in line.decode("latin-1").split(",")]
@@ -208,16 +209,16 @@ def _gvret_as_logged(text: bytes, columns: Sequence[str]) -> bytes:
 
 
 def _csv_messages(text: TextIO) -> Iterator[can.Message]:
-    """Messages of a file that does not say which are CAN FD."""
+    """Yield the messages of a CSV of python-can; those longer than 8 bytes are marked as CAN FD, as it does not say."""
     for message in can.CSVReader(text):
         message.is_fd = message.dlc > CLASSIC_BYTES
         yield message
 
 
 def _read_by_python_can(path: Path, reader: Callable[[TextIO], Iterable[can.Message]]) -> Frames:
-    """Take every message of a text; what python-can raises on damage becomes a LogError with the place.
+    """Read every message of a text; any exception of python-can becomes a LogError with the line.
 
-    Binary data under the name of a text are refused, as python-can skips whatever it does not know.
+    A binary file with the suffix of a text is refused first, as python-can would silently skip what it does not know.
     """
     with open_log(path) as file:
         if _NO_TEXT.intersection(read_undamaged(file, _LOOKED_AT)[0]):
@@ -244,7 +245,7 @@ def _read_by_python_can(path: Path, reader: Callable[[TextIO], Iterable[can.Mess
 
 
 class _CountedLines(io.TextIOWrapper):
-    """A text file that knows how many of its lines were read."""
+    """A text file that counts the lines read so far."""
 
     count = 0
 
@@ -275,7 +276,7 @@ def _quiet() -> Iterator[list[LogRecord]]:
 
 
 def parse_candump(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
-    """Parse lines of ``candump -L`` that end in LF or CRLF: frames in their order, and what each line is."""
+    """Parse lines of ``candump -L``, ended by LF or CRLF; return frames in the order of lines, and each line's kind."""
     text = text if text.endswith(b"\n") else text + b"\n"
     lines, found, fd = text.count(b"\n"), -1, False
     while found < 0:
@@ -285,7 +286,7 @@ def parse_candump(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
 
 
 def _parse_plain_asc(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
-    """Parse lines of an ASC file with hexadecimal numbers: frames in their order, and what each line is."""
+    """Parse lines of an ASC file with hexadecimal numbers; return frames in their order, and each line's kind."""
     if b"CANFD" in text:
         raise _CanFdError
     columns = FrameColumns.of(text.count(b"\n") + (not text.endswith(b"\n")), fd=False)
@@ -297,10 +298,11 @@ def _parse_plain_asc(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
 def _parse_candump(  # noqa: PLR0912, PLR0915 (a line is judged from left to right)
     text: _Text, digits: _Text, names: NDArray[np.int64], columns: FrameColumns
 ) -> int:
-    """Parse line by line; the number of different channels, whose first and last places in the text are `names`.
+    """Parse line by line into `columns`, and return the number of different channels.
 
-    The text ends with a line end. -1: a payload has no room in the columns. One loop without calls is three times as
-    fast as a function per line; nothing goes beyond a line end, so what follows a fault in a line does no harm.
+    `names` receives the start and end of each channel's name in the text, which must end with a line end. The result
+    is -1 if a payload does not fit into the columns. One loop without calls is three times as fast as a function per
+    line. No step passes a line end, so parsing goes on safely after a fault in a line.
     """
     kind, time_ns, key, channel, length, data = columns
     row, at, channels = 0, 0, 0
@@ -377,7 +379,7 @@ def _parse_candump(  # noqa: PLR0912, PLR0915 (a line is judged from left to rig
 
 @compiled
 def _parse_asc(text: _Text, digits: _Text, columns: FrameColumns) -> None:
-    """Parse line by line."""
+    """Parse line by line into `columns`."""
     row, start = 0, 0
     while start < len(text):
         end = start
@@ -389,7 +391,7 @@ def _parse_asc(text: _Text, digits: _Text, columns: FrameColumns) -> None:
 
 @inner
 def _is_same(text: _Text, first: int, last: int, first_too: int, last_too: int) -> bool:
-    """Whether two parts of the text are the same."""
+    """Check whether two parts of the text are the same; `last` is one past the end."""
     if last - first != last_too - first_too:
         return False
     for k in range(last - first):  # noqa: SIM110 (compiled)
@@ -402,7 +404,7 @@ def _is_same(text: _Text, first: int, last: int, first_too: int, last_too: int) 
 def _asc_line(  # noqa: PLR0911 (as above)
     text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns
 ) -> int:
-    """Parse what starts here and ends with the text into a row; what it is."""
+    """Parse the line from `at` to the end of the text into a row of `columns`; return what kind of line it is."""
     at, end = _word(text, at)
     time_ns, fraction, at = _time(text, at)
     if fraction < 0 or at != end:
@@ -445,7 +447,7 @@ def _asc_line(  # noqa: PLR0911 (as above)
 
 @inner
 def _word(text: _Text, at: int) -> tuple[int, int]:
-    """First and last place of the next word; both the end if there is none."""
+    """Return where the next word starts, and one past its end; the end of the text for both if there is none."""
     while at < len(text) and text[at] <= ord(" "):
         at += 1
     end = at
@@ -456,7 +458,10 @@ def _word(text: _Text, at: int) -> tuple[int, int]:
 
 @inner
 def _time(text: _Text, at: int) -> tuple[int, int, int]:
-    """Seconds with a fraction in ns, -1 if they are too many digits; digits of the fraction, -1 for none; its end."""
+    """Parse seconds with a fraction; return the time [ns], the number of fraction digits, and where the number ends.
+
+    The time is -1 if it has no fraction, too many digits or too many seconds; the digits are -1 if there is no point.
+    """
     time_ns, seconds, point = 0, 0, -1
     start = at
     while at < len(text) and (ord("0") <= text[at] <= ord("9") or (text[at] == ord(".") and point < 0)):
@@ -475,7 +480,7 @@ def _time(text: _Text, at: int) -> tuple[int, int, int]:
 
 @inner
 def _hexadecimal(text: _Text, at: int, end: int, digits: _Text) -> int:
-    """Number of up to 8 hexadecimal digits, -1 for anything else."""
+    """Parse a number of up to 8 hexadecimal digits; return -1 for anything else."""
     value = 0 if 0 < end - at <= 8 else -1
     for k in range(at, end):
         value = -1 if value < 0 or digits[text[k]] == _NOT_HEX else 16 * value + digits[text[k]]

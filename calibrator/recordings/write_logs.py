@@ -1,4 +1,4 @@
-"""Signals to CAN frames to a candump log, through the DBC and the layout's end-to-end protection."""
+"""Encode signals as CAN frames, with the DBC and the layout's end-to-end protection, and write them as candump log."""
 
 import gzip
 from collections.abc import Iterable, Mapping
@@ -28,7 +28,7 @@ class FrameSeries:
     arbitration_id, extended : int, bool
         Identifier, and whether it has 29 bits.
     time_s : ndarray of shape (n,)
-        Instants. [s]
+        Instants of the frames. [s]
     data : ndarray of uint8 of shape (n, length)
         Payloads.
     """
@@ -47,7 +47,7 @@ def encode_message(
     Parameters
     ----------
     database : VehicleDatabase
-        DBC and layout; messages that the layout protects get counter and CRC.
+        DBC and layout; a message that the layout protects gets counter and CRC.
     message_name : str
         Message of the DBC.
     time_s : ndarray of shape (n,)
@@ -77,7 +77,7 @@ def encode_message(
 
 
 def sent_values(signal: Signal, values: Array) -> Array:
-    """Values of a signal as a reader of its frames sees them.
+    """Return the values of a signal as a reader of its frames decodes them.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def sent_values(signal: Signal, values: Array) -> Array:
     Returns
     -------
     ndarray of shape (n,)
-        The same in steps of the signal and within its range.
+        The values rounded to steps of the signal and limited to its range.
     """
     return np.asarray(_raw_codes(signal, values) * float(signal.scale) + float(signal.offset))
 
@@ -130,7 +130,7 @@ def write_candump(path: Path, series: Iterable[FrameSeries]) -> int:
 
 
 def _raw_codes(signal: Signal, physical: Array) -> NDArray[np.int64]:
-    """Nearest raw code of each value, inside the valid range; SNA or 0 for NaN."""
+    """Return the nearest raw code of each value, inside the valid range; for NaN the code SNA, or 0 without one."""
     named = {str(name): int(code) for code, name in (signal.choices or {}).items()}
     missing = named.get("SNA", 0)
     lowest, highest = _valid_codes(signal)
@@ -142,7 +142,7 @@ def _raw_codes(signal: Signal, physical: Array) -> NDArray[np.int64]:
 
 
 def _valid_codes(signal: Signal) -> tuple[int, int]:
-    """Least and greatest raw code inside the width of a signal and the range of its DBC."""
+    """Return the least and greatest raw code within the width of a signal and its range in the DBC."""
     half = 1 << (signal.length - 1)
     lowest, highest = (-half, half - 1) if signal.is_signed else (0, 2 * half - 1)
     if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
@@ -152,7 +152,7 @@ def _valid_codes(signal: Signal) -> tuple[int, int]:
 
 
 def _bit_positions(signal: Signal) -> list[int]:
-    """Position (byte * 8 + bit) of each bit of a signal, least significant first."""
+    """Return the position (byte * 8 + bit) of each bit of a signal, least significant first."""
     if signal.byte_order == "little_endian":
         return list(range(signal.start, signal.start + signal.length))
     positions = [signal.start]
