@@ -1,1 +1,1 @@
-"""Drives: their store, their common time base, and their delays."""
+"""Store drives, align their channels on one time base, and find the delays between branches."""

@@ -1,8 +1,8 @@
 """Channels of a drive on one time base.
 
-The rule. The instants are whole multiples of the layout's period, over the span that every needed channel covers with
+The rule: The instants are whole multiples of the layout's period, over the span that every needed channel covers with
 good samples. At each instant a channel's value is interpolated linearly between its last good sample at or before and
-its next good sample at or after the instant; nothing is extrapolated. The value is valid if those two samples lie not
+its next good sample at or after the instant; nothing is extrapolated. The value is valid if those two samples are not
 farther apart than the channel's limit (time-out of a branch, ``max_age_s`` of an input), or if one lies at the instant
 itself. An instant is valid if all its values are, and if every derived input has a finite value there. Instants that
 are not valid stay in place with NaN in all columns.
@@ -33,15 +33,15 @@ __all__ = [
 ]
 
 MAX_SAMPLES = 20_000_000
-"""23 days at 0.1 s; a drive that claims more has a wrong time."""
+"""Most samples of a drive, which is 23 days at 0.1 s; a longer drive has a wrong time. [1]"""
 
 SLOWER = 1.5
-"""Frames that are farther apart than so many periods tell nothing at each of them. [1]"""
+"""If the frames are more than this many periods apart, the period is made as long as their distance. [1]"""
 _STALE, _NOT_GOOD = "stale", "not good"
 
 
 def at_pace(layout: Layout, drives: Sequence[Drive]) -> Layout:
-    """The layout with the distance of the frames as its period, where even the fastest branch is slower than that."""
+    """Return the layout; if its period is too short even for the fastest branch, with that branch's frame distance."""
     channels = [channel for drive in drives for channel in drive.branches.values() if channel.good.sum() > 1]
     fastest_s = min((float(np.median(np.diff(each.time_s[each.good]))) for each in channels), default=0.0)
     if fastest_s < SLOWER * layout.period_s:
@@ -66,7 +66,7 @@ def choose_inputs(
     Returns
     -------
     kept, left_out : tuple of str
-        Those whose recorded inputs are all available, and the others.
+        Names of the inputs whose recorded inputs are all available, and of the others.
     """
     wanted = layout.model_inputs if names is None else names
     kept = tuple(name for name in wanted if layout.base_inputs([name]) <= set(available))
@@ -89,9 +89,9 @@ def evaluate_formula(formula: str, values: Mapping[str, Array]) -> Array:
     Parameters
     ----------
     formula : str
-        As ``ecu_node.formulas.parse_formula`` takes it.
+        A formula that ``ecu_node.formulas.parse_formula`` accepts.
     values : mapping of str to ndarray of shape (T,)
-        Inputs by name; all that the formula names.
+        Values by name, at least for all names in the formula.
     """
     shape = np.broadcast_shapes(*(value.shape for value in values.values()))
     arrays = {name: np.asarray(value, np.float64) for name, value in values.items()}
@@ -109,7 +109,7 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
     drive : Drive
         The drive.
     layout : Layout
-        Says period, limits and formulas.
+        The layout, with period, limits and formulas.
     branches : sequence of str
         Names of the K branches wanted.
     inputs : sequence of str, optional
@@ -118,7 +118,7 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
     Returns
     -------
     Samples
-        Aligned samples.
+        The aligned samples.
 
     Raises
     ------
@@ -167,7 +167,7 @@ def align_channels(
     channels : mapping of str to Channel
         The channels, at least one.
     limits_s : mapping of str to float
-        Longest distance of neighbouring good samples, per channel. [s]
+        Longest distance of neighbouring good samples to interpolate between, by channel. [s]
     period_s : float
         Distance of the instants. [s]
     where : str
@@ -180,7 +180,8 @@ def align_channels(
     values : dict of str to ndarray of shape (T,)
         Interpolated values by channel.
     reasons : dict of str to ndarray of bool, shape (T,)
-        Where any channel is ``stale``, and where any is ``not good``.
+        Why instants are not valid: where good samples of any channel are too far apart, with bad samples between them
+        (``not good``) or without (``stale``).
 
     Raises
     ------
@@ -200,12 +201,12 @@ def align_channels(
 
 
 def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, Mask]:
-    """Interpolate a channel, and say where it can be.
+    """Interpolate a channel, and say where the interpolation is valid.
 
     Parameters
     ----------
     channel : Channel
-        With at least one good sample.
+        A channel with at least one good sample.
     time_s : ndarray of shape (T,)
         Instants. [s]
     limit_s : float
@@ -224,7 +225,7 @@ def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array,
 
 
 def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:
-    """Instants that the good samples of all channels cover."""
+    """Return the instants that the good samples of all channels cover."""
     start, stop = max(float(time_s[0]) for time_s in good_s), min(float(time_s[-1]) for time_s in good_s)
     slack = INSTANT_SLACK * period_s
     first, last = int(np.ceil((start - slack) / period_s)), int(np.floor((stop + slack) / period_s))
@@ -239,7 +240,7 @@ def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:
 
 
 def _interpolated(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, NDArray[np.uint8]]:
-    """Values at the instants, and labels of those whose neighbours are too far apart."""
+    """Return the values at the instants, and labels of the instants whose neighbours are too far apart."""
     value, label = np.empty(len(time_s)), np.zeros(len(time_s), np.uint8)
     samples = (np.ascontiguousarray(channel.time_s), np.ascontiguousarray(channel.value), channel.good)
     _interpolate(samples, time_s, limit_s + TIME_RESOLUTION_S, value, label)
@@ -253,10 +254,10 @@ _FAR, _SPOILT = 1, 2
 def _interpolate(
     samples: tuple[Array, Array, Mask], time_s: Array, limit_s: float, value: Array, label: NDArray[np.uint8]
 ) -> None:
-    """Values between the last good sample at or before and the next at or after each of some increasing instants.
+    """Interpolate at increasing instants between the good samples before (or at) and after (or at) each of them.
 
-    Of several samples at one instant the last counts. Beyond the first and the last sample their values are held. Where
-    the two are farther apart than the limit, the label says whether samples that are not good lie between them.
+    Of several samples at one instant the last counts. Before the first and after the last sample, that sample's value
+    is held. If the two samples are farther apart than the limit, the label says whether bad samples lie between them.
     """
     known_s, known, good = samples
     before, after = -1, _next_good(known_s, good, -1)
@@ -284,7 +285,10 @@ def _interpolate(
 
 @inner
 def _next_good(known_s: Array, good: Mask, at: int) -> int:
-    """Index of the next good sample after one, the last of those at its instant; the number of samples for none."""
+    """Return the index of the next good sample after `at`; the number of samples if there is none.
+
+    Of several good samples at one instant it is the last.
+    """
     at += 1
     while at < len(good) and not good[at]:
         at += 1

@@ -1,12 +1,12 @@
-"""Means of a branch current over short windows, at any instant, from its raw frames.
+"""Average a branch current over short windows, at any instant, from its raw frames.
 
-Between good samples the current i is taken as linear. Its charge Q (integral of i) and the integral P of that are then
-exact, and so are the mean of i with triangular weight over +-w, and the slope of this mean:
+Between good samples the current i is taken as linear. Then its charge Q (the integral of i) and the integral P of Q are
+exact, and so are the mean of i with triangular weight over +-w and the slope of this mean:
 
     m_w(t) = (P(t + w) - 2 P(t) + P(t - w)) / w^2          dm_w/dt = (Q(t + w) - 2 Q(t) + Q(t - w)) / w^2
 
-The band (w, W) of the current is m_w - m_W: free of offsets and of what changes slowly, and smooth enough to be
-compared between branches whose frames come at different instants. It is linear and the same for all branches, so the
+The band (w, W) of the current is m_w - m_W. It is free of offsets and of slow changes, and smooth enough to be compared
+between branches whose frames come at different instants. The band is a linear filter, the same for all branches, so the
 junction law holds for it too.
 """
 
@@ -21,7 +21,8 @@ from calibrator.drive import Array, Channel, Mask
 __all__ = ["Band", "ChargeCurve", "charge_curve", "covered"]
 
 GAP_PERIODS = 3.5
-"""Good samples farther apart than this many median distances leave a gap: two lost frames in a row are bridged. [1]"""
+"""Good samples that are more than this many median distances apart leave a gap; two lost frames in a row leave none.
+[1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +62,7 @@ class ChargeCurve:
     period_s: float
 
     def band(self, time_s: Array, band: Band) -> tuple[Array, Array]:
-        """Band of the current and its slope.
+        """Compute the band of the current and its slope.
 
         Parameters
         ----------
@@ -81,7 +82,7 @@ class ChargeCurve:
         return _band(time_s, self.time_s, self.pieces, shift_s, weight)
 
     def covers(self, time_s: Array, margin_s: float) -> Mask:
-        """Whether this much time on both sides of each instant lies within the samples and touches no gap."""
+        """Check at which instants this much time on both sides lies within the samples and touches no gap."""
         first, last = time_s - margin_s, time_s + margin_s
         inside = (first >= self.time_s[0]) & (last <= self.time_s[-1])
         gap_s = np.interp(last, self.time_s, self.gap_s) - np.interp(first, self.time_s, self.gap_s)
@@ -89,15 +90,15 @@ class ChargeCurve:
 
 
 def covered(curves: Sequence[ChargeCurve], time_s: Array, margin_s: float) -> Mask:
-    """Whether all curves cover this much time on both sides of each instant."""
+    """Check at which instants all curves cover this much time on both sides, without a gap."""
     return np.asarray(np.all([curve.covers(time_s, margin_s) for curve in curves], axis=0))
 
 
 @compiled
 def _band(time_s: Array, known_s: Array, pieces: Array, shift_s: Array, weight: Array) -> tuple[Array, Array]:
-    """Band and its slope, shape (T,) each: sums of P and Q at shifted instants with weights.
+    """Compute a band and its slope, shape (T,) each, as weighted sums of P and Q at shifted instants.
 
-    Of increasing instants each finds its lines beside those of the last.
+    The instants must increase, so that the search for the lines of each one starts at those of the one before.
     """
     x, slope = np.zeros(len(time_s)), np.zeros(len(time_s))
     for place in range(len(shift_s)):
@@ -126,7 +127,8 @@ def charge_curve(channel: Channel) -> ChargeCurve | None:
     Returns
     -------
     ChargeCurve or None
-        None with fewer than two good samples at different instants. Of several at one instant the last counts.
+        The curve; None for fewer than two good samples at different instants. Of several at one instant the last
+        counts.
     """
     time_s, pieces = np.empty(len(channel.time_s)), np.zeros((4, len(channel.time_s)))
     samples = (np.ascontiguousarray(channel.time_s), np.ascontiguousarray(channel.value), channel.good)
@@ -142,7 +144,10 @@ def charge_curve(channel: Channel) -> ChargeCurve | None:
 
 @compiled
 def _integrate(samples: tuple[Array, Array, Mask], time_s: Array, pieces: Array) -> int:
-    """Good samples at different instants, and the line after each, see :class:`ChargeCurve`; how many samples."""
+    """Fill in the good samples at different instants and the line after each, see :class:`ChargeCurve`.
+
+    Returns the number of these samples.
+    """
     known_s, value, good = samples
     integral, charge, current = pieces[0], pieces[1], pieces[2]
     count = 0

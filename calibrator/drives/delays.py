@@ -1,20 +1,20 @@
-"""How much later than the first branch each branch current of one vehicle is seen, from raw frames.
+"""Estimate from raw frames how much later than the first branch each branch current of a vehicle is seen.
 
-Sensors, filters and gateways delay the branch currents differently. Only the differences can be seen in the junction
-law. With x_k(t) the band (:mod:`calibrator.drives.charge`) of the measured current of branch k, seen tau_k later than
-that of the first, and g_k its gain ratio (1 + d_1) / (1 + d_k),
+Sensors, filters and gateways delay the branch currents differently. The junction law shows only the differences. Let
+x_k(t) be the band (:mod:`calibrator.drives.charge`) of the measured current of branch k, seen tau_k later than that of
+the first branch, and g_k its gain ratio (1 + d_1) / (1 + d_k). Then, for each k > 1,
 
     e(t) = x_1(t) + sum over k > 1 of g_k x_k(t + tau_k),       sum over t of e x_k = 0,   sum over t of e f(x_k') = 0.
 
-The last equation is that of the slopes x_k'. f weakens slopes that are no greater than the branch's noise: a small
-branch tells its delay by its few steps. Noise in x_k' would make the sums of f(x_k') g_k x_k', and so the confidence,
-too great; the slope g_k x_k' - e', which the other branches predict, stands in its place. The windows of x_k hold
-several samples of every branch: noise of a sensor then has nearly the same power in e whatever the phase of its
-frames, and pulls tau nowhere. Huber's weights defend against wild samples.
+The last equation uses the slopes x_k'. The function f weakens slopes that are no larger than the branch's noise, as a
+small branch shows its delay only in its few steps. Noise in x_k' would make the sums of f(x_k') g_k x_k', and so the
+confidence, too large; they are therefore formed with g_k x_k' - e', the slope that the other branches predict. The
+windows of x_k hold several samples of every branch: then the noise of a sensor has nearly the same power in e whatever
+the phase of its frames, and does not bias tau. Huber's weights limit the effect of wild samples.
 
-A delay is a property of the vehicle. It is searched on a grid of lags, so that no local minimum traps, and found by
-Newton steps, in the few minutes in which the branches move most; a step or two on all drives make it exact and tell,
-by the spread between blocks of time, how sure it is. A branch that changes too little to tell its delay is flagged.
+A delay is a property of the vehicle. To avoid local minima it is first searched on a grid of lags, and then refined by
+Newton steps, both in the few minutes in which the branches move most. One or two steps on all drives make it exact, and
+the spread between blocks of time gives its uncertainty. A branch that changes too little to show its delay is flagged.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,53 +33,56 @@ from ecu_node.summary import MAD_TO_SD
 __all__ = ["BranchDelays", "estimate_delays", "without_delays"]
 
 MAX_DELAY_S = 0.5
-"""Filters and gateways of real cars delay by tens to hundreds of milliseconds. [s]"""
+"""Largest delay searched for: filters and gateways of real cars delay by tens to hundreds of milliseconds. [s]"""
 MAX_SD_S = 0.005
-"""Of a delay that counts as known: half the period of a 100 Hz frame. [s]"""
+"""Largest standard deviation of a delay that counts as known: half the period of a 100 Hz frame. [s]"""
 SHORT_S = 0.2
-"""Least half width of the averages: sensor noise of some tenths of an ampere hides few of a small branch's steps.
-[s]"""
+"""Least half width w of the short windows: with it, sensor noise of some tenths of an ampere hides few steps of a small
+branch. [s]"""
 SHORT_PERIODS = 2.0
-"""Each window holds at least four samples of the slowest branch. [1]"""
+"""Least half width of the short windows in periods of the slowest branch, so that each holds at least four of its
+samples. [1]"""
 LONG_S = 5.0
-"""Loads that change more slowly count as constant; auxiliaries still change within it. [s]"""
+"""Half width W of the long windows: slower changes of loads count as constant; auxiliaries still change within it.
+[s]"""
 INSTANTS_PER_WINDOW = 4.0
-"""Instants looked at in each SHORT_S; more tell nothing new. [1]"""
+"""Instants evaluated per half width of the short windows; more add no information. [1]"""
 BLOCK_S = 10.0
-"""As long as the long windows reach: blocks count as independent. [s]"""
+"""Length of a block. It is the whole width of a long window, so that blocks count as independent. [s]"""
 FEWEST_BLOCKS = 6
-"""Fewer do not give a standard deviation worth the name."""
+"""Fewer blocks do not give a useful standard deviation. [1]"""
 SEARCHED_BLOCKS = 60
 """Blocks in which delays are searched: ten minutes in which the branches move most. [1]"""
 HOPELESS = 3.0
-"""Of a branch whose standard deviation, in these minutes, is more than so many times the largest allowed, no delay is
-looked for: it would wander, and take those of the others along. [1]"""
+"""If the standard deviation of a branch, in these minutes, exceeds the largest allowed this many times, its delay is
+no longer estimated: it would wander and distort those of the other branches. [1]"""
 GAIN_RANGE = (1.0 / 3.0, 3.0)
-"""Ratios of two sensors' gains, each within 0.6 to 1.4, and some loss to noise; outside, it is not the branch's own
-current that was found. [1]"""
+"""Plausible gain ratios of two sensors, with gains of 0.6 to 1.4 and some loss to noise. A ratio outside means that
+another current than the branch's own was found. [1]"""
 
 LAG_STEP_S = 0.05
-"""Grid of the search, a quarter of the shortest window: the true delay lies in the neighbourhood of the best lag.
-[s]"""
+"""Step of the grid of lags, a quarter of the least half width: the true delay is close to the best lag. [s]"""
 SEARCHED_INSTANTS = 1200
-"""Instants at which the search, and what is usual, looks at most. [1]"""
+"""Most instants used in the search for lags, and in the medians that set the scales of residuals and slopes. [1]"""
 SWEEPS = 2
-"""How many times each pair of branches takes its best lags: the first time those of the rest are still guesses."""
+"""Rounds in which each pair of branches takes its best lags; in the first, the other lags are still guesses. [1]"""
 SINGULAR = 1e-10
-"""Directions with less curvature or power than this share of the greatest are left alone. [1]"""
+"""Directions with less curvature or power than this share of the largest are left unchanged. [1]"""
 
 MOST_STEPS, MOST_STEPS_ON_ALL = 10, 2
-"""Five are usual; the delay of a branch that tells nothing wanders for ever. On all drives one is."""
+"""Most Newton steps in the searched minutes, where five are usual, and on all drives, where one is. The delay of a
+branch without information would wander for ever. [1]"""
 CONVERGED_S = 1e-3
-"""After a shorter step no other is made: Newton's error is the square of it over the windows, 5 us. [s]"""
+"""Newton's method ends after a step shorter than this: its error is the step squared over the windows, 5 us. [s]"""
 LONGEST_STEP_S = 0.02
-"""A longer step would leave the neighbourhood that the search found. [s]"""
+"""Steps are limited to this; a longer one would leave the neighbourhood of the lag that the search found. [s]"""
 SLOPE_NOISES = 3.0
-"""Slopes of this many standard deviations of a branch's usual slope count by half. [1]"""
+"""Slopes of this many standard deviations of a branch's usual slope have weight one half in f. [1]"""
 HUBER = 3.0
-"""Residuals of more than this many standard deviations weigh less: wild samples only. [1]"""
+"""Residuals of more than this many standard deviations weigh less, which concerns wild samples only. [1]"""
 LEAST_SCALE = 0.1
-"""Of the residual's root mean square: at rest most residuals are nearly zero, and their median says nothing. [1]"""
+"""Least scale of the residuals, as a share of their root mean square: at rest most residuals are nearly zero, and their
+median says nothing. [1]"""
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -96,7 +99,7 @@ class BranchDelays:
     sd_s : ndarray of shape (K,)
         Standard deviation of the delay; 0 for the reference, infinite where not known. [s]
     known : ndarray of bool, shape (K,)
-        False where the branch is too small or too quiet, or the drives too short, to tell.
+        False if the delay cannot be estimated: the branch is too small or too quiet, or the drives are too short.
     """
 
     branches: tuple[str, ...]
@@ -111,7 +114,7 @@ class BranchDelays:
 
 @dataclass(frozen=True, kw_only=True)
 class _Stretch:
-    """One drive: currents of its K branches, instants around which all are known, and the block of each instant."""
+    """One drive: curves of its K branches, instants around which all are known, and the block of each instant."""
 
     curves: tuple[ChargeCurve, ...]
     time_s: Array
@@ -120,7 +123,10 @@ class _Stretch:
 
 @dataclass(frozen=True, kw_only=True)
 class _Fit:
-    """Of the branches after the first, shape (K-1,) each: gains, delays and their deviations, and which are free."""
+    """Gain ratios and delays of the branches after the first, shape (K-1,) each.
+
+    `sd_s` are the standard deviations of the delays; a delay that is not `free` is no longer estimated.
+    """
 
     gain: Array
     delay_s: Array
@@ -129,7 +135,7 @@ class _Fit:
 
     @property
     def plausible(self) -> Mask:
-        """Whether it is the branch's own current that was found."""
+        """Whether gain ratio and delay are within their bounds, so that the branch's own current was found."""
         gain = self.gain
         return np.asarray((gain > GAIN_RANGE[0]) & (gain < GAIN_RANGE[1]) & (np.abs(self.delay_s) < MAX_DELAY_S))
 
@@ -213,7 +219,8 @@ def without_delays(drive: Drive, delays: Mapping[str, float]) -> Drive:
     Returns
     -------
     Drive
-        The same samples, those of each named branch at the instants at which they were true. Inputs stay as they are.
+        The drive with the samples of each named branch moved to the instants at which they were true. Inputs stay as
+        they are.
 
     Raises
     ------
@@ -240,7 +247,7 @@ def _require_branches(drive: Drive, branches: Sequence[str]) -> None:
 
 
 def _stretches(complete: Sequence[tuple[ChargeCurve, ...]], band: Band) -> tuple[list[_Stretch], int]:
-    """Drives with the instants to look at, and the number of blocks of all of them."""
+    """Return the drives with the instants to evaluate, and the number of blocks of all of them together."""
     stretches: list[_Stretch] = []
     blocks = 0
     for curves in complete:
@@ -256,7 +263,7 @@ def _stretches(complete: Sequence[tuple[ChargeCurve, ...]], band: Band) -> tuple
 
 
 def _most_telling(stretches: Sequence[_Stretch], band: Band, blocks: int) -> Sequence[_Stretch]:
-    """The blocks in which the branches, each for itself, move most; small branches seldom do."""
+    """Return the blocks in which the branches move most, each relative to its own total, as small ones seldom move."""
     if blocks <= SEARCHED_BLOCKS:
         return stretches
     K = len(stretches[0].curves)
@@ -278,12 +285,12 @@ def _most_telling(stretches: Sequence[_Stretch], band: Band, blocks: int) -> Seq
 
 
 def _search_lags(parts: Sequence[_Stretch], band: Band) -> Array:
-    """How much later than the first branch the others are seen, in whole steps of a grid, shape (K-1,). [s]
+    """Search on a grid how much later than the first branch the others are seen, shape (K-1,). [s]
 
-    With these lags the junction sum is smallest, gains free. The second moments of the bands of all branches at all
-    lags are gathered once; every combination of lags is then a small least-squares problem made of some of them. Two
-    branches at a time take their best lags with those of the others held: branches that do much the same, as two
-    motors, pull each other's lag off when searched one by one.
+    These lags make the junction sum smallest, with free gains. The second moments of the bands of all branches at all
+    lags are computed once; each combination of lags is then a small least-squares problem with some of these moments.
+    Two branches at a time take their best lags, while those of the others are held: branches with similar currents,
+    such as two motors, would distort each other's lag if they were searched one by one.
     """
     reach = int(MAX_DELAY_S / LAG_STEP_S)
     width, K = 2 * reach + 1, len(parts[0].curves)
@@ -301,7 +308,7 @@ def _search_lags(parts: Sequence[_Stretch], band: Band) -> Array:
 
 
 def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int], width: int) -> NDArray[np.intp]:
-    """Columns (lags) of some branches with which all together explain most of the first one."""
+    """Return the columns (lags) of the branches in `group` with which all branches best explain the first one."""
     choices = np.stack(np.meshgrid(*(width * k + np.arange(width) for k in group)), axis=-1).reshape(-1, len(group))
     tried = np.repeat(column[None, 1:], len(choices), axis=0)
     tried[:, np.array(group) - 1] = choices
@@ -316,11 +323,11 @@ def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int]
 
 
 def _newton(stretches: Sequence[_Stretch], band: Band, start: _Fit, steps: int) -> _Fit:
-    """Gains, and those of the delays that are free, from a first guess nearby."""
+    """Refine gains and free delays by at most `steps` Newton steps, from a first guess nearby."""
     others, gain, delay_s = len(start.gain), start.gain, start.delay_s
     block = np.concatenate([stretch.block for stretch in stretches])
     first = _bands(stretches, [0], band, np.zeros(1))
-    some = slice(None, None, -(-len(block) // SEARCHED_INSTANTS))  # of which medians are exact enough
+    some = slice(None, None, -(-len(block) // SEARCHED_INSTANTS))  # enough for exact medians
     for _ in range(steps):
         x, slope = _bands(stretches, range(1, others + 1), band, delay_s)
         e = first[0][:, 0] + x @ gain
@@ -342,7 +349,7 @@ def _newton(stretches: Sequence[_Stretch], band: Band, start: _Fit, steps: int) 
 
 
 def _bands(stretches: Sequence[_Stretch], which: Sequence[int], band: Band, delay_s: Array) -> tuple[Array, Array]:
-    """Bands and slopes of some branches, their delays taken out, shape (T, n) each."""
+    """Return bands and slopes of some branches, their delays taken out, shape (T, n) each."""
     parts = [
         [stretch.curves[k].band(stretch.time_s + lag_s, band) for k, lag_s in zip(which, delay_s, strict=True)]
         for stretch in stretches
@@ -361,9 +368,10 @@ def _add_products(  # noqa: PLR0917 (compiled: no keywords)
     block: NDArray[np.int64],
     sums: Array,
 ) -> None:
-    """Add the equations of every instant to those of its block, (B, 2K-2, 2K-1).
+    """Add the equations of each instant to those of its block in `sums`, shape (B, 2K-2, 2K-1).
 
-    Rows are the products with instruments, (x, f(x')); columns the derivatives by (g, tau), and last the values.
+    The rows are products with the instruments (x, f(x')), the columns the derivatives by (g, tau); the last column
+    holds the values.
     """
     (x, slope), (e, e_slope), others = branches, residual, len(gain)
     column = np.empty(2 * others + 1)
@@ -382,7 +390,7 @@ def _add_products(  # noqa: PLR0917 (compiled: no keywords)
 
 
 def _solve(moments: Array) -> Array:
-    """Solutions of n sets of equations (n, p, p+1), shape (n, p); nothing moves where nothing is known."""
+    """Solve n sets of equations (n, p, p+1); return shape (n, p), zero in directions without information."""
     matrix, value = moments[:, :, :-1], moments[:, :, -1]
     size = np.sqrt(np.abs(np.einsum("nii->ni", matrix)))
     size = np.where(size > 0.0, size, 1.0)
@@ -391,7 +399,7 @@ def _solve(moments: Array) -> Array:
 
 
 def _jackknife_sd(blocks: Array) -> Array:
-    """Standard deviation of the solution from leaving out one block at a time, one step each."""
+    """Estimate the standard deviation of the solution by a jackknife: one Newton step without each block."""
     total, count = blocks.sum(axis=0), len(blocks)
     left_out = _solve(total - blocks)
     sd = np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0))

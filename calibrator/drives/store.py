@@ -54,16 +54,16 @@ _SCHEMA = pa.schema(
     ]
 )
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+@ -]{0,63}")
-"""Also a file name on every system, and short enough for the parameter file."""
+"""Names that are also file names on every system, and short enough for the parameter file."""
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether a vehicle or drive may have this name, see :func:`require_plain_name`."""
+    """Check whether a vehicle or drive may have this name, see :func:`require_plain_name`."""
     return _PLAIN_NAME.fullmatch(name) is not None and not name.endswith((" ", "."))
 
 
 def name_problem(name: str, what: str) -> str:
-    """Why a vehicle or drive cannot have a name; empty if it can; as :func:`require_plain_name`."""
+    """Say why a vehicle or drive cannot have a name, see :func:`require_plain_name`; empty if it can."""
     expected = (
         "expected 1 to 64 letters A to Z, digits, blanks or _ . + @ -, not starting with a dash, dot, +, @ or blank, "
         "not ending with a dot or blank; rename it"
@@ -78,8 +78,8 @@ def require_plain_name(name: str, what: str) -> None:
     ------
     DriveError
         If the name is empty, longer than 64 characters, has other characters than A to Z, a to z, 0 to 9, ``_ . + @ -``
-        and blanks, does not start with a letter, a digit or ``_``, or ends with a dot or a blank. `what` is named so,
-        and is the start of the message.
+        and blanks, does not start with a letter, a digit or ``_``, or ends with a dot or a blank. The message begins
+        with `what`, which says whose name it is.
     """
     if problem := name_problem(name, what):
         raise DriveError(problem)
@@ -131,7 +131,7 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
 
 
 def remove_leftovers(store: str | Path, vehicles: Iterable[str], *, before_s: float) -> None:
-    """Remove what a killed process was just writing of these vehicles, before a time since 1970. [s]"""
+    """Remove incomplete files of these vehicles that a killed process left before a time since 1970. [s]"""
     for folder in (_folder(store, vehicle) for vehicle in vehicles):
         if folder.is_local:
             for left in Path(folder.url).glob(".*.parquet.*"):
@@ -140,7 +140,7 @@ def remove_leftovers(store: str | Path, vehicles: Iterable[str], *, before_s: fl
 
 
 def has_drive(store: str | Path, vehicle: str, name: str, layout: Layout) -> bool:
-    """Whether a store has a drive already; DriveError if it is damaged or was made with another layout or DBC."""
+    """Check whether a store has a drive; DriveError if it is damaged or was made with another layout or DBC."""
     folder = _folder(store, vehicle)
     place = f"{folder.url}/{name}.parquet"
     with _reading(place), folder.opened(f"{name}.parquet") as file:
@@ -151,7 +151,7 @@ def has_drive(store: str | Path, vehicle: str, name: str, layout: Layout) -> boo
 
 
 def list_drives(store: Path) -> list[DriveFile]:
-    """List the drives of a store of this machine, by vehicle and name; DriveError if the folder is none."""
+    """List the drives of a store on this machine, sorted by vehicle and name; DriveError if it is no store."""
     folder = store / DRIVES_FOLDER
     if not folder.is_dir():
         raise DriveError(
@@ -162,25 +162,25 @@ def list_drives(store: Path) -> list[DriveFile]:
 
 
 def iterate_drives(store: Path, layout: Layout) -> Iterator[Drive]:
-    """Read the drives of a store of this machine, made with this layout, in the order of :func:`list_drives`."""
+    """Read the drives of a store on this machine, made with this layout, in the order of :func:`list_drives`."""
     for entry in list_drives(store):
         yield read_drive_file(Path(entry.place), layout)
 
 
 def is_drive_file(path: Path) -> bool:
-    """Whether a file is one of a store: Parquet, but no table of somebody else's. A damaged one counts."""
+    """Check whether a file is a drive of a store, and not any other Parquet table. A damaged file counts as a drive."""
     if path.suffix != ".parquet":
         return False
     try:
         return _METADATA in (pq.read_schema(path).metadata or {})
-    except NotADirectoryError:  # in an archive, where no store is
+    except NotADirectoryError:  # the file is in an archive, which never holds a store
         return False
     except (OSError, pa.ArrowException):
         return True
 
 
 def read_drive_file(path: Path, layout: Layout) -> Drive:
-    """Read one drive of a store; DriveError if it is cut, no drive, or was made with another layout or DBC."""
+    """Read one drive of a store; DriveError if it is cut, is no drive, or was made with another layout or DBC."""
     with _reading(str(path)):
         table = pq.ParquetFile(pa.BufferReader(path.read_bytes())).read(use_threads=False)
         about = _about(table.schema)
@@ -197,7 +197,7 @@ def read_drive_file(path: Path, layout: Layout) -> Drive:
 
 
 def recording_digest(drive: Drive) -> str:
-    """Digest of what a drive holds, whatever it is called: no two recordings have the same, as noise differs."""
+    """Return a digest of a drive's channels, whatever drive and vehicle are called; two recordings differ by noise."""
     digest = hashlib.blake2b(digest_size=16)
     for channels in (drive.branches, drive.inputs):
         for name, channel in channels.items():
@@ -213,7 +213,7 @@ def _folder(store: str | Path, vehicle: str) -> Storage:
 
 @contextmanager
 def _reading(place: str) -> Iterator[None]:
-    """What a damaged file makes pyarrow raise becomes a DriveError."""
+    """Turn what pyarrow raises for a damaged file into a DriveError."""
     try:
         yield
     except OSError as error:
@@ -246,7 +246,7 @@ def _check_identity(about: Mapping[str, object], place: str, layout: Layout) -> 
 
 
 def read_onboard_record(path: Path, database: VehicleDatabase) -> SummaryFile:
-    """Read the record of a node; DriveError if it is damaged, or was made with another layout or DBC."""
+    """Read a summary that a node made on board; DriveError if it is damaged or made with another layout or DBC."""
     try:
         record = decode_summary(path.read_bytes())
     except OSError as error:

@@ -1,1 +1,1 @@
-"""A parameter file taken to other tools (A2L, DCM, CDFX) and to control units without Python (C, HEX)."""
+"""Export a parameter file to calibration tools (A2L, DCM, CDFX) and to control units without Python (C, HEX)."""

@@ -1,4 +1,4 @@
-"""``calibrator export``: from a parameter file to a file of another format, written whole or not at all."""
+"""``calibrator export``: write a parameter file in another format, whole or not at all."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -27,7 +27,7 @@ __all__ = ["export"]
 
 
 class ExportFormat(StrEnum):
-    """Formats that parameters are taken to."""
+    """Formats to which parameters can be exported."""
 
     C = "c"
     HEX = "hex"

@@ -1,8 +1,8 @@
-"""Data of the C core (``ecu_node/c/hv_correction.h``): the layout that is compiled, the calibration that is flashed.
+"""Data of the C core (``ecu_node/c/hv_correction.h``): the layout to be compiled and the calibration to be flashed.
 
-The calibration holds the node's own integer plans, each multiplied so that all have 58 bits below one code: the same
-results, bit by bit, and one conversion for all gains. It is written as a C struct, or as its image at the address of
-``hv_calibration`` in a compiled program, in Intel HEX.
+The calibration holds the node's own integer plans, each scaled so that all have 58 fractional bits below one code. So
+the results are the same, bit by bit, and one conversion serves all gains. The calibration is written as a C struct, or
+as the memory image of that struct, at the address of ``hv_calibration`` in a compiled program, in Intel HEX.
 """
 
 import json
@@ -53,7 +53,7 @@ __all__ = [
 ]
 
 FRACTION_BITS = 58
-"""SHIFT of the core."""
+"""Fractional bits of the core's fixed-point numbers, its ``SHIFT``."""
 _BRANCHES, _DATA_IDS = 16, 16
 _SYMBOL = "hv_calibration"
 _LEAST, _GREATEST = -(1 << 63), (1 << 63) - 1
@@ -63,18 +63,18 @@ _RECORD_BYTES = 32
 
 @dataclass(frozen=True, kw_only=True)
 class Checked:
-    """Parameters that fit, and what they fit.
+    """Parameters that were checked, and the layout and DBC that they fit.
 
     Attributes
     ----------
     name : str
         Name of the parameter file.
     digest : str
-        SHA-256 of the file as it was read, line ends counted as LF.
+        SHA-256 of the file as it was read, with line ends as LF.
     parameters : VehicleParameters
-        What it says.
+        Content of the file.
     database : VehicleDatabase
-        Layout and DBC that it was made for.
+        Layout and DBC for which it was made.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Checked:
 
     @property
     def provenance(self) -> dict[str, str]:
-        """Where it comes from, by short names that are the same in all formats."""
+        """Where the parameters come from, under short names that are the same in all formats."""
         parameters = self.parameters
         return {
             "vehicle": parameters.vehicle,
@@ -115,7 +115,7 @@ def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> 
     Returns
     -------
     Checked
-        Parameters that fit.
+        The parameters, which fit layout and DBC.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> 
 
 
 class BranchValues(NamedTuple):
-    """What is flashed of one branch, in the order of ``hv_values_t``; see there."""
+    """Numbers flashed for one branch, in the order of the C struct ``hv_values_t``, which explains them."""
 
     gain: int
     voltage_gain: int
@@ -142,13 +142,13 @@ class BranchValues(NamedTuple):
 
 
 _PASSED = BranchValues(1 << FRACTION_BITS, 0, 0, 1 << (FRACTION_BITS - 1), 0)
-"""Of a branch that is passed through."""
+"""Values of a branch that is passed through."""
 _VALUES = "qqqQQ"
 _BYTES = struct.calcsize(f"<QQ{_BRANCHES * _VALUES}")
 
 
 def branch_values(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> BranchValues:
-    """What the core needs to correct a branch as the node does as a gateway.
+    """Return the numbers with which the core corrects a branch as the node does in gateway mode.
 
     Parameters
     ----------
@@ -157,17 +157,17 @@ def branch_values(database: VehicleDatabase, branch: Branch, fault: SensorFault)
     branch : Branch
         A branch of the layout.
     fault : SensorFault
-        What is corrected.
+        Gain error and offset to be corrected.
 
     Returns
     -------
     BranchValues
-        The node's integer plan, of the same results for every code.
+        The node's integer plan, scaled; it gives the same result for every code.
 
     Raises
     ------
     ExportError
-        If the core's integers are too small for them.
+        If the numbers do not fit into the core's integers.
     """
     found, signals = scaled_plan(database, branch, fault), branch_signals(database, branch, Mode.GATEWAY)
     largest, numbers = (abs(found.bias) + 1) << FRACTION_BITS, [*found[:3]]
@@ -181,7 +181,7 @@ def branch_values(database: VehicleDatabase, branch: Branch, fault: SensorFault)
 
 
 def scaled_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> BranchValues:
-    """The same, though the numbers may be larger than the core's integers."""
+    """Return the numbers of :func:`branch_values` without the check that they fit into the core's integers."""
     if not fault.applied:
         return _PASSED
     signals = branch_signals(database, branch, Mode.GATEWAY)
@@ -202,7 +202,7 @@ def _too_large(branch: Branch, codes: Codes) -> ExportError:
 
 
 def image_bytes(checked: Checked, order: Literal["little", "big"]) -> bytes:
-    """The calibration as it stands in the memory of a control unit.
+    """Return the calibration as it is stored in the memory of a control unit.
 
     Parameters
     ----------
@@ -214,9 +214,9 @@ def image_bytes(checked: Checked, order: Literal["little", "big"]) -> bytes:
     Raises
     ------
     LayoutError, DatabaseError
-        If the node refuses layout or DBC as a gateway.
+        If the node refuses layout or DBC in gateway mode.
     ExportError
-        As :func:`branch_values`.
+        If a number does not fit into the core's integers, as in :func:`branch_values`.
     """
     values = [number for item in _all_values(checked) for number in item]
     head = (_layout_digest(checked.database), checked.parameters.number)
@@ -226,20 +226,20 @@ def image_bytes(checked: Checked, order: Literal["little", "big"]) -> bytes:
 
 
 def _all_values(checked: Checked) -> list[BranchValues]:
-    """Of the branches of the layout, in its order."""
+    """Return the numbers of all branches, in the order of the layout."""
     database = checked.database
     wire(database, InForce(parameters=checked.parameters), start_s=0.0, mode=Mode.GATEWAY)
     return [branch_values(database, branch, checked.parameters.fault(branch.name)) for branch in database.layout.branch]
 
 
 def _layout_digest(database: VehicleDatabase) -> int:
-    """What ties a calibration to its layout; 1 is the version of the core's structs."""
+    """Return a number that ties a calibration to its layout and DBC; the text's 1 is the version of the C structs."""
     text = f"1 {database.layout.digest} {database.digest}"
     return int.from_bytes(sha256(text.encode()).digest()[:8])
 
 
 class Image(NamedTuple):
-    """Where the calibration stands in a compiled program."""
+    """Place of the calibration in a compiled program."""
 
     address: int
     order: Literal["little", "big"]
@@ -258,12 +258,12 @@ def find_image(elf: Path, database: VehicleDatabase) -> Image:
     Returns
     -------
     Image
-        Address and byte order.
+        Address and byte order of the calibration.
 
     Raises
     ------
     ExportError
-        If it cannot be read, is not linked, or has no calibration of this core and layout.
+        If the file cannot be read, is not linked, or has no calibration of this core and layout.
     """
     try:
         with elf.open("rb") as file:
@@ -297,7 +297,7 @@ def find_image(elf: Path, database: VehicleDatabase) -> Image:
 
 
 def intel_hex(address: int, data: bytes) -> str:
-    """Data at an address as Intel HEX, in records of 32 bytes that do not cross a boundary of 32."""
+    """Return data at an address as Intel HEX, in records of at most 32 bytes that cross no multiple of 32."""
     if address + len(data) > 1 << 32:
         raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; HEX reaches to 0xFFFFFFFF, link it below")
 
@@ -317,13 +317,13 @@ def intel_hex(address: int, data: bytes) -> str:
 
 
 def foreign_protection(database: VehicleDatabase) -> list[str]:
-    """Names of the messages whose protection the core does not know."""
+    """Return the names of the messages whose end-to-end protection the core does not support."""
     entries = {message.name: database.layout.protection(message.name) for message in received(database).values()}
     return [name for name, entry in entries.items() if not isinstance(entry, ProfileP01 | ProfileP02 | None)]
 
 
 def c_text(checked: Checked) -> str:
-    """Layout and calibration as C, to be compiled with the core.
+    """Return layout and calibration as C source, to be compiled with the core.
 
     Parameters
     ----------
@@ -338,7 +338,7 @@ def c_text(checked: Checked) -> str:
     Raises
     ------
     LayoutError, DatabaseError, ExportError
-        As :func:`image_bytes`.
+        In the cases of :func:`image_bytes`.
     """
     database, values = checked.database, _all_values(checked)
     messages, carriers = received(database), rewritten(database)
@@ -369,7 +369,7 @@ def c_text(checked: Checked) -> str:
 
 
 def _message(database: VehicleDatabase, message: Message, has_branches: bool) -> tuple[object, ...]:
-    """A message and the numbers of its ``hv_message_t``."""
+    """Return a message and the numbers of its C struct ``hv_message_t``."""
     entry, key = database.layout.protection(message.name), key_of(message)
     profile, offset, step, data_id = "HV_UNPROTECTED", 0, 0, [0]
     if isinstance(entry, ProfileP01):
@@ -382,7 +382,7 @@ def _message(database: VehicleDatabase, message: Message, has_branches: bool) ->
 
 
 def rendered(template: str, **values: object) -> str:
-    """One of ``templates/`` with values put in where it says ``[[ name ]]``, as braces are C's own."""
+    """Render one of ``templates/``; values go where it says ``[[ name ]]``, because braces are part of C."""
     braces = {"variable_start_string": "[[", "variable_end_string": "]]"}
     environment = templates_of("calibrator.export", autoescape=template.endswith(".cdfx"), **braces)
     environment.filters |= {"comment": _comment, "int64": _int64, "printable": printable}
@@ -394,5 +394,5 @@ def _int64(number: int) -> str:
 
 
 def _comment(text: str) -> str:
-    """A text that ends or begins no comment."""
+    """Change a text so that it neither ends nor begins a C comment."""
     return json.dumps(text)[1:-1].replace("*/", "*_/").replace("/*", "/_*")

@@ -1,8 +1,8 @@
-"""What calibration tools read: named numbers with unit and range, as DCM 2.0, ASAM CDF 2.0 (``.cdfx``) and A2L.
+"""Files for calibration tools: named numbers with unit and range, as DCM 2.0, ASAM CDF 2.0 (``.cdfx``) and A2L.
 
-``HV.BRANCH.gain`` and its like are what is flashed, as the A2L places it; ``HV.BRANCH.drift`` and ``.offset`` say the
-same in physical units, for people, and ``HV.BRANCH.found...`` what was found, corrected or not. Currents are positive
-into the junction.
+``HV.BRANCH.gain`` and the like are the flashed numbers, whose addresses the A2L gives. ``HV.BRANCH.drift`` and
+``.offset`` say the same in physical units, for people, and ``HV.BRANCH.found...`` is the fault that was found, whether
+corrected or not. Currents are positive into the junction.
 """
 
 import itertools
@@ -21,16 +21,16 @@ __all__ = ["Characteristic", "a2l_text", "cdfx_text", "characteristics", "dcm_te
 
 _FUNCTION = "HV_current_correction"
 _FORBIDDEN = '"\\'
-"""DCM has no agreed way to write these in a text."""
+"""Characters that DCM has no agreed way to write in a text."""
 
 
 class _Field(NamedTuple):
-    """One of :class:`BranchValues`."""
+    """How one number of :class:`BranchValues` is described to tools."""
 
     text: str
     unit: str
     bits: int
-    """Below one."""
+    """Fractional bits."""
     record_layout: str
     compu_method: str
 
@@ -45,12 +45,12 @@ _FIELDS = {
 
 
 def _fields(branch: Branch) -> list[str]:
-    """Those that matter for a branch: a current has no voltage."""
+    """Return the names of the numbers that a branch has: one measured as a current has no voltage gain."""
     return [name for name in _FIELDS if name != "voltage_gain" or branch.voltage is not None]
 
 
 class Characteristic(NamedTuple):
-    """One number or truth value.
+    """One number or truth value, as calibration tools show it.
 
     Attributes
     ----------
@@ -59,11 +59,11 @@ class Characteristic(NamedTuple):
     text : str
         What it is, in one line of ASCII.
     branch : str
-        Whose it is; empty for the vehicle.
+        Name of its branch; empty if it belongs to the whole vehicle.
     unit : str
-        "-" for a pure number.
+        Unit; "-" for a pure number.
     value : float, int or bool
-        In that unit.
+        Value in that unit.
     """
 
     name: str
@@ -74,12 +74,12 @@ class Characteristic(NamedTuple):
 
     @property
     def full_text(self) -> str:
-        """With whose it is."""
+        """The text, preceded by the name of the branch or "vehicle"."""
         return f"{self.branch or 'vehicle'}: {self.text}"
 
 
 def characteristics(checked: Checked) -> list[Characteristic]:
-    """All characteristics of a parameter file, branch by branch.
+    """Return all characteristics of a parameter file, branch by branch.
 
     Parameters
     ----------
@@ -89,12 +89,12 @@ def characteristics(checked: Checked) -> list[Characteristic]:
     Returns
     -------
     list of Characteristic
-        First the vehicle's, then by branch, in the order of the layout.
+        Those of the vehicle, then those of each branch, in the order of the layout.
 
     Raises
     ------
     ExportError
-        If a number of the C core is not exact in floating point, in which tools hold it.
+        If a number of the C core is not exact in floating point, which tools use.
     """
     found = [Characteristic("HV.parameter_set", "number of the parameter set", "", "-", checked.parameters.number)]
     for branch in checked.database.layout.branch:
@@ -137,7 +137,7 @@ def _for_people(checked: Checked, branch: str) -> Iterator[Characteristic]:
 
 
 def _notes(checked: Checked) -> dict[str, str]:
-    """Texts about the whole file, such as the vehicle."""
+    """Return texts about the whole file by name, such as the vehicle."""
     texts = {key: value for key, value in checked.provenance.items() if key != "parameter_set"}
     for key, value in texts.items():
         if not value.isprintable() or any(letter in value for letter in _FORBIDDEN):
@@ -197,7 +197,7 @@ def cdfx_text(checked: Checked) -> str:
     Raises
     ------
     ExportError
-        As :func:`dcm_text`.
+        If a number of the C core is not exact in floating point, as for :func:`characteristics`.
     """
     rows = [(f"HV.{key}", key, "ASCII", "general", "", value) for key, value in _notes(checked).items()]
     for item in characteristics(checked):
@@ -244,7 +244,7 @@ def a2l_text(database: VehicleDatabase, image: Image) -> str:
         for name in _fields(branch):
             field, values, limits = _FIELDS[name], [getattr(item, name) for item in extremes], (0.0, 1.0)
             if name not in {"fraction", "applied"}:
-                slack = 1 << max(0, field.bits - 30)  # plans between the corners are rounded otherwise
+                slack = 1 << max(0, field.bits - 30)  # plans between the corners may be rounded differently
                 ends = max(min(values) - slack, -(1 << 63)), min(max(values) + slack, (1 << 63) - 1)
                 limits = (ends[0] / (1 << field.bits), ends[1] / (1 << field.bits))
             address = image.address + 8 * (2 + len(_FIELDS) * k + list(_FIELDS).index(name))
@@ -253,7 +253,7 @@ def a2l_text(database: VehicleDatabase, image: Image) -> str:
 
 
 def _extremes(database: VehicleDatabase, branch: Branch) -> list[BranchValues]:
-    """Values at the corners of what the layout allows, between which all others lie, and those that correct nothing."""
+    """Return the numbers for no correction and for the corners of the layout's limits, between which all others lie."""
     limits = database.layout.limits.drift, database.layout.offset_limit_a
     corners = itertools.product(*((-limit, limit) for limit in limits))
     faults = [NO_FAULT, *(SensorFault(drift=drift, offset_a=offset) for drift, offset in corners)]

@@ -1,1 +1,1 @@
-"""Files that are read and written: whole or not at all, here or at a URL."""
+"""Read and write files and folders, whole or not at all, on this machine or at a URL."""

@@ -1,4 +1,4 @@
-"""Files and folders that appear only when they are complete, and what is left of none that could not be written."""
+"""Write files and folders so that they appear only when they are complete, and leave nothing behind on failure."""
 
 import errno
 import os
@@ -19,9 +19,9 @@ _MODE = 0o644
 
 
 def require_possible_folder(out: Path) -> None:
-    """Raise FleetError, before any work is done, if a folder neither exists nor can be made, or nothing can be in it.
+    """Raise FleetError, before any work is done, if a folder cannot be made, or exists and cannot be written to.
 
-    Rights alone do not tell (a read-only disk, /proc), so a folder is made for a moment.
+    Access rights alone do not tell (a read-only disk, /proc), so a folder is made for a moment.
     """
     _require_possible(out.absolute(), out)
 
@@ -29,7 +29,7 @@ def require_possible_folder(out: Path) -> None:
 def require_possible_file(out: Path) -> None:
     """Raise FleetError, before any work is done, if a file cannot be written or replaced.
 
-    What is no regular file would be replaced, and not what a link leads to.
+    Links and devices are refused: writing would replace the link, not the file that it points to, or the device.
     """
     if out.is_symlink():
         raise FleetError(f"{out}: is a link, so it cannot be replaced; name the file itself or another one")
@@ -41,7 +41,7 @@ def require_possible_file(out: Path) -> None:
 
 
 def require_new_folder(out: Path) -> None:
-    """Raise FleetError if a folder to be written exists and holds something, or cannot be made or replaced."""
+    """Raise FleetError if a folder to be written is not empty, or cannot be made or replaced."""
     if out.is_symlink():
         raise FleetError(f"{out}: is a link, so it cannot be replaced; name the folder itself or choose another --out")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -52,13 +52,13 @@ def require_new_folder(out: Path) -> None:
 
 
 def _partial(out: Path) -> Path:
-    """Where a folder is filled: beside it, hidden."""
+    """Return the hidden folder, beside the one wanted, that is filled before it is renamed."""
     out = out.absolute()
     return out.with_name(f".{out.name}.partial-{os.getpid()}")
 
 
 def _require_possible(folder: Path, out: Path) -> None:
-    """Make a folder in a hidden one, and remove both; `out` is what the user calls it."""
+    """Check by a trial inside a hidden folder that `folder` can be made; `out` is its name in messages."""
     if out.parts and out.parts[0].endswith(":"):
         raise FleetError(f"{out}: is a URL; name a folder of this machine, as nothing else can be written to")
     nearest = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
@@ -73,7 +73,7 @@ def _require_possible(folder: Path, out: Path) -> None:
 
 @contextmanager
 def whole_folder(out: Path) -> Iterator[Path]:
-    """Fill a hidden folder beside the one wanted, and rename it when the block ends well.
+    """Yield a hidden folder beside the one wanted, to be filled, and rename it when the block ends without error.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         for left in out.parent.glob(f".{escape(out.name)}.partial-*"):
-            if not Path("/proc", left.name.rpartition("-")[2]).exists():  # its process is gone
+            if not Path("/proc", left.name.rpartition("-")[2]).exists():  # the process that made it is gone
                 shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()
     except OSError as error:
@@ -118,7 +118,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
-    """Write files that belong together: all of them beside their places first, hidden, and then into their places.
+    """Write files that belong together: first hidden beside their places, then, when all are written, rename them.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
     Raises
     ------
     UserError
-        If one cannot be written; it is named, and none of them has changed.
+        If one cannot be written; the message names it, and no file has changed.
     """
     partial: dict[Path, Path] = {}
     made: set[Path] = set()

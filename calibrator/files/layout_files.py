@@ -1,4 +1,4 @@
-"""Layout and DBC of one vehicle, as the command line names them."""
+"""Read the layout and DBC that the command line names, and check the layout's formulas."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ __all__ = ["check_formulas", "checked_layout", "vehicle_database"]
 
 
 def checked_layout(path: Path) -> Layout:
-    """Read a layout, and check its formulas, too; LayoutError if it cannot be used."""
+    """Read a layout, and check its formulas as well; raise LayoutError if it cannot be used."""
     layout = read_layout(path)
     check_formulas(layout)
     return layout
@@ -23,8 +23,8 @@ def check_formulas(layout: Layout) -> None:
     Raises
     ------
     LayoutError
-        If one is not arithmetic, or names what is neither an input nor a derived input above it; of a layout without
-        a DBC a branch may name columns, too.
+        If a formula is not arithmetic, or uses a name that is neither an input nor a derived input above it. In a
+        layout without a DBC, the formula of a branch may also name columns.
     """
     known = {item.name for item in layout.input}
     formulas = [(f"derived input {item.name}", item.formula, item.name) for item in layout.derived]

@@ -1,4 +1,4 @@
-"""Files of a local folder or of object storage (a URL that fsspec knows), each written whole or not at all."""
+"""Read and write files in a local folder or in object storage (a URL that fsspec knows), each whole or not at all."""
 
 import errno
 import fcntl
@@ -41,11 +41,11 @@ class Entry:
     Attributes
     ----------
     name : str
-        Without its folder.
+        Name without the folder.
     size : int
-        [byte]
+        Size of the file. [byte]
     version : str
-        Changes when the file changes: size, and time of the last change or what the storage has instead.
+        Text that changes when the file changes: its size, and the time of its last change or the storage's equivalent.
     """
 
     name: str
@@ -72,23 +72,23 @@ class Storage:
 
     @property
     def lasts(self) -> bool:
-        """Whether what is written stays when this process ends."""
+        """Whether written files stay when this process ends; those of ``memory://`` do not."""
         return not self.url.startswith("memory://")
 
     def folder(self, name: str) -> "Storage":
-        """Return a folder in this one; it is made when something is written."""
+        """Return a folder in this one; it is created when a file is first written into it."""
         return Storage(url=f"{self.url.rstrip('/')}/{name}")
 
     def contents(self, prefix: str = "") -> tuple[list[str], list[Entry]]:
-        """Return the names of its folders, and its files, both sorted; none if there is no such folder.
+        """Return the names of the inner folders, and the files, both sorted; none if this folder does not exist.
 
-        Hidden ones do not count, nor do names that begin otherwise than with ``prefix``.
+        Hidden ones are left out, and so are names that do not begin with `prefix`.
         """
         if self.is_local:
             return self._list_local(prefix)
         filesystem, root = self._filesystem()
         try:
-            if prefix and self.url.startswith(("s3", "gs", "gcs")):  # one request, however many others there are
+            if prefix and self.url.startswith(("s3", "gs", "gcs")):  # these list by prefix in one request
                 found = list(filesystem.find(root, prefix=prefix, maxdepth=1, detail=True).values())
             else:
                 found = filesystem.ls(root, detail=True)
@@ -119,7 +119,7 @@ class Storage:
                     if item.is_dir():
                         folders.append(item.name)
                     elif item.is_file():
-                        with suppress(FileNotFoundError):  # another process has removed it just now
+                        with suppress(FileNotFoundError):  # another process may have just removed it
                             status = item.stat()
                             version = f"{status.st_size}-{status.st_mtime_ns}"
                             files.append(Entry(item.name, status.st_size, version))
@@ -130,7 +130,7 @@ class Storage:
         return sorted(folders), sorted(files, key=lambda entry: entry.name)
 
     def names(self, prefix: str = "") -> list[str]:
-        """Return the names of its files and folders that begin so, sorted."""
+        """Return the names of files and folders that begin with `prefix`, sorted."""
         folders, files = self.contents(prefix)
         return sorted([*folders, *(entry.name for entry in files)])
 
@@ -154,7 +154,7 @@ class Storage:
 
     @contextmanager
     def opened(self, name: str) -> Iterator[BinaryIO | None]:
-        """Open a file of which only parts are read; None if there is none, StorageError if it cannot be opened."""
+        """Open a file to read parts of it; None if there is none, StorageError if it cannot be opened."""
         filesystem, root = self._filesystem()
         try:
             file = filesystem.open(f"{root}/{name}", "rb")
@@ -174,7 +174,7 @@ class Storage:
                 write_atomically(Path(self.url) / name, content)
                 return
             filesystem, root = self._filesystem()
-            if self.url.partition("://")[0] in OBJECT_STORAGE:  # a folder made there might be a new bucket, of a slip
+            if self.url.partition("://")[0] in OBJECT_STORAGE:  # making a folder there could create a bucket by mistake
                 filesystem.pipe_file(f"{root}/{name}", content)
             else:
                 filesystem.makedirs(root, exist_ok=True)
@@ -184,9 +184,9 @@ class Storage:
             raise self._failed(name, "write", error) from None
 
     def require_writable(self) -> None:
-        """Raise StorageError, before any work is done, if no file can be written: one is, and removed."""
+        """Raise StorageError, before any work is done, if a trial file cannot be written; it is removed again."""
         self.write(".trial", b"")
-        with suppress(StorageError):  # some may write and not remove
+        with suppress(StorageError):  # some users may write but not remove
             self.remove(".trial")
 
     def remove(self, name: str) -> None:
@@ -201,7 +201,7 @@ class Storage:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """While no other process of this machine does the same; only folders have locks, and not on every disk."""
+        """Hold a lock against other processes of this machine; without effect in object storage and on some disks."""
         if not self.is_local:
             yield
             return
@@ -214,7 +214,7 @@ class Storage:
             os.close(handle)
 
     def _filesystem(self) -> tuple[Any, str]:
-        """What fsspec reads and writes the storage with, and the folder's name there."""
+        """Return the file system of fsspec for this storage, and the folder's name in it."""
         from fsspec.core import url_to_fs  # noqa: PLC0415 (takes time, and not every command needs it)
 
         try:
@@ -237,17 +237,19 @@ class Storage:
 
 
 def is_url(place: str) -> bool:
-    """Whether a place is in object storage or on another machine."""
+    """Check whether a place is a URL, in object storage or on another machine."""
     return "://" in place
 
 
 def open_storage(place: str | Path) -> Storage:
-    """Storage at a path or URL; a ``file://`` URL is a path, and paths become absolute: others may work elsewhere.
+    """Return the storage at a path or URL; a ``file://`` URL counts as a path.
+
+    Paths become absolute, because worker processes may run in another folder.
 
     Raises
     ------
     StorageError
-        If nothing is named, which would be the folder that one happens to be in.
+        If the text is empty, which would otherwise mean the current folder.
     """
     text = str(place).removeprefix("file://")
     if not text.strip() or text.endswith("://"):
@@ -260,10 +262,10 @@ def open_storage(place: str | Path) -> Storage:
 def walk(
     storage: Storage, problems: list[str], *, above: frozenset[str] = frozenset()
 ) -> Iterator[tuple[Storage, list[Entry]]]:
-    """Folders that hold files, at any depth, each listed at its turn: the files of no two are in memory at once.
+    """Yield each folder that holds files, at any depth, with its files. Each is listed only when it is its turn.
 
-    An inner folder that cannot be read is added to the problems, and the others go on. Links are followed, but for
-    those that lead back to a folder above.
+    An inner folder that cannot be read is added to `problems`, and the others go on. Links are followed, except those
+    that lead back to a folder above.
     """
     place = os.path.realpath(storage.url) if storage.is_local else storage.url
     if place in above:
@@ -280,7 +282,7 @@ def walk(
 
 @contextmanager
 def local_copy(url: str) -> Iterator[Path]:
-    """A file as one of this machine: itself, or a copy that is gone after the block."""
+    """Yield a file on this machine: the file itself, or a temporary copy of a remote one for the time of the block."""
     if not is_url(url):
         yield Path(url)
         return

@@ -1,4 +1,4 @@
-"""Texts made of the templates of a package, by jinja2."""
+"""Render texts from the templates of a package with jinja2."""
 
 from typing import Any
 
@@ -8,14 +8,14 @@ __all__ = ["templates_of"]
 
 
 def templates_of(package: str, folder: str = "templates", **settings: Any) -> Environment:
-    """Templates in a folder of a package, such as ``calibrator.report``; a name without a value is an error.
+    """Return the environment of the templates in a package, such as ``calibrator.report``; a missing value raises.
 
     Parameters
     ----------
     package, folder : str
         Package, and its folder with the templates.
     **settings
-        Of jinja2's environment, beside those that all packages share: blocks leave no lines and blanks behind.
+        Settings of jinja2's environment, beside those that all packages share (blocks leave no blank lines behind).
     """
     loader = PackageLoader(package, folder)
     blocks: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}

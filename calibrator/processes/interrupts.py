@@ -1,7 +1,7 @@
-"""Ctrl-C while libraries are imported, when KeyboardInterrupt does not do, and SIGTERM.
+"""Handle SIGTERM, and Ctrl-C while libraries are imported.
 
-Libraries swallow exceptions of their own imports, or turn them into others. SIGTERM ends the program at once, as a kill
-does, with a line.
+During imports KeyboardInterrupt does not suffice: libraries swallow exceptions of their own imports, or turn them into
+others. SIGTERM ends the program at once, as a kill does, but with a line that says so.
 """
 
 import os
@@ -20,20 +20,20 @@ TERMINATED = 143
 """Exit code that shells give to a program ended by SIGTERM."""
 ENDED = "ended by SIGTERM"
 SHOW_CURSOR = "\x1b[?25h"
-"""A bar hides the cursor of a terminal."""
+"""Escape sequence that shows the cursor again, which a progress bar hides."""
 GO_ON = ("import", "summarise")
-"""Commands that go on where they were."""
+"""Commands that continue where they were interrupted when they are run again."""
 
 
 def interrupted_message(arguments: Sequence[str], how: str = "interrupted") -> str:
-    """What is said of Ctrl-C, or of another way to end a command, which is the first of the arguments."""
+    """Return the message for a command ended by Ctrl-C or as `how` says; `arguments` are the command line's."""
     command = next((argument for argument in arguments if not argument.startswith("-")), "")
     kept = "; it goes on with what it had read" if command in GO_ON else ""
     return f"calibrator: {how}; run the same command again{kept}"
 
 
 def ending_at_sigterm() -> None:
-    """From now on SIGTERM ends the program with one line and :data:`TERMINATED`, unless that is handled already."""
+    """Let SIGTERM end the program with one line and exit code :data:`TERMINATED`, unless it is handled already."""
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
@@ -48,7 +48,7 @@ def ending_at_sigterm() -> None:
 
 
 def _descendants(process: str = "self") -> list[int]:
-    """Processes that a process has started, and those that these have, as far as the system tells."""
+    """Return all descendants of a process (children, their children ...) that ``/proc`` lists."""
     found: list[int] = []
     for task in Path(f"/proc/{process}/task").glob("*/children"):
         with suppress(OSError):
@@ -58,5 +58,5 @@ def _descendants(process: str = "self") -> list[int]:
 
 
 def importing() -> AbstractContextManager[None]:
-    """While the block imports what a command needs, Ctrl-C ends the program at once; nothing is open yet."""
+    """Let Ctrl-C end the program at once while the block imports libraries; no file is open yet."""
     return ending_at_interrupt(interrupted_message(sys.argv[1:]))

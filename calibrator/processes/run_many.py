@@ -1,11 +1,11 @@
-"""One function over many items: in this process, in processes of this machine, or on a Dask cluster.
+"""Apply one function to many items: in this process, in processes of this machine, or on a Dask cluster.
 
-Results come in the order of the items and do not depend on where they were computed; a few items per worker are in
-flight, so memory does not grow with their number. A worker that dies costs its item a second attempt; an item that
-kills its process twice, or takes longer than it may, is lost and the others go on.
+Results come in the order of the items and do not depend on where they were computed. A few items per worker are in
+flight, so memory does not grow with the number of items. An item whose worker dies gets a second attempt. An item that
+kills its process twice, or exceeds its time limit, is lost, and the others go on.
 
-Every worker process has a pool of one of its own (pebble): processes that share pipes and locks, as those of one pool
-do, can take each other along when one is killed.
+Every worker process is a pebble pool of one process: processes of one pool share pipes and locks, so killing one can
+break the others.
 """
 
 import gc
@@ -49,15 +49,15 @@ from ecu_node.program import load_python_can, say_error
 __all__ = ["Failed", "Workers", "run_many", "try_many", "try_many_shown"]
 
 AHEAD_PER_WORKER = 4
-"""Items in flight: others go on while one takes long, and few results wait in memory. [1]"""
+"""Items in flight per worker: enough to go on while one takes long, few enough results to keep in memory. [1]"""
 CONNECT_S, RETURN_S = 10.0, 60.0
-"""Within which a scheduler must answer at first; within which it and a worker must be there after it was lost. [s]"""
+"""Time for the scheduler's first answer; time for it and a worker to come back after they were lost. [s]"""
 SENT_AT_ONCE = 100
-"""Items in a message to the scheduler, which wants less than 10 MB. [1]"""
+"""Items per message to the scheduler; a message should stay below 10 MB. [1]"""
 COUNT_EVERY_S = 1.0
-"""How often it is asked how many workers there are, as some come and go. [s]"""
+"""Time between two requests for the number of workers, which may come and go. [s]"""
 MEMORY_SHARE, LEAST_MEMORY_BYTES = 0.8, 1 << 30
-"""Of the machine's memory for all processes that read; each may use this much at least. [1], [byte]"""
+"""Share of the machine's memory for all reading processes together; least memory limit of each. [1], [byte]"""
 PRELOADED = [
     "numba",
     "numpy",
@@ -68,10 +68,11 @@ PRELOADED = [
     "threadpoolctl",
     "typer",
 ]
-"""Slow to import, so imported once, for all processes. Not this package: the fork server may find another copy.
-Not cantools: with it, python-can would import asammdf, see :func:`.load_python_can`."""
+"""Modules that are slow to import, so the fork server imports them once for all processes. This package is not among
+them, as the fork server may find another copy of it; nor is cantools, as its import would make python-can import
+asammdf, see :func:`.load_python_can`."""
 LARGEST_GREETING = 1 << 20
-"""With which a scheduler begins, at most. [byte]"""
+"""Largest first message of a Dask scheduler. [byte]"""
 MEGABYTE = 1_000_000
 AGAIN = ", and run the same command again"
 REMEDY = "remove the file if it is damaged, cut it if it is long"
@@ -82,14 +83,19 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, kw_only=True)
 class Workers:
-    """Where a run computes.
+    """Where the work is done: on processes of this machine, or on a Dask cluster.
 
     Attributes
     ----------
     processes : int
         Number of processes on this machine.
     scheduler : str or None
-        Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead. FleetError if Dask is missing.
+        Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead.
+
+    Raises
+    ------
+    FleetError
+        If a scheduler is named and Dask is missing.
     """
 
     processes: int = 1
@@ -107,7 +113,8 @@ class Failed:
     Attributes
     ----------
     reason : str
-        What happened, and what to do, one line; a fault of the program begins with :data:`.INTERNAL_ERROR`.
+        One line that says what happened and what to do; for a fault of the program it begins with
+        :data:`.INTERNAL_ERROR`.
     """
 
     reason: str
@@ -116,21 +123,21 @@ class Failed:
 def run_many(
     function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers
 ) -> Generator[_Result, None, None]:
-    """Apply a function to each item; whatever it raises is raised here, at the turn of its item.
+    """Apply a function to each item; its exceptions are raised here, when the result of the item is due.
 
     Parameters
     ----------
     function : callable
-        Of module level, or a partial of such a function, as it goes to other processes.
+        A function at module level, or a partial of one, because it is sent to other processes.
     items : iterable
-        Taken as they are needed.
+        The arguments, taken as they are needed.
     workers : Workers
-        Where; one process on this machine is this one.
+        Where to compute; a single process on this machine means the current process.
 
     Yields
     ------
     object
-        What the function returns, in the order of the items.
+        Result of the function for each item, in the order of the items.
 
     Raises
     ------
@@ -138,7 +145,7 @@ def run_many(
         If an item killed its process twice, or the cluster cannot be reached.
     """
     if workers.scheduler is None and workers.processes == 1:
-        with threadpool_limits(1):  # as everywhere: sums depend on the number of threads
+        with threadpool_limits(1):  # as in worker processes, because sums depend on the number of threads
             yield from map(function, items)
         return
     with closing(_outcomes(function, items, workers, limit_s=None)) as outcomes:
@@ -151,22 +158,22 @@ def run_many(
 def try_many(
     function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers, *, limit_s: float = TIME_LIMIT_S
 ) -> "Generator[tuple[_Item, _Result | Failed], None, None]":
-    """Apply a function to each item, never in this process, as items are files of strangers.
+    """Apply a function to each item, always in other processes, because the items are files that cannot be trusted.
 
     Parameters
     ----------
-    function, items, workers
-        As for :func:`run_many`.
+    function, items, workers : callable, iterable, Workers
+        What to apply to what, and where, as for :func:`run_many`.
     limit_s : float
         Longest time for one item. [s]
 
     Yields
     ------
     item : object
-        In their order.
+        The items in their order.
     outcome : object or Failed
-        What the function returns of it, or why it does not: an error of the data, time or memory above the limits, or
-        a fault of the program. The others go on.
+        Result of the function, or why there is none: an error of the data, time or memory above the limits, or a fault
+        of the program. The other items go on.
     """
     yield from _outcomes(partial(_attempt, function), items, workers, limit_s=limit_s)
 
@@ -181,7 +188,7 @@ def try_many_shown(
     size: int,
     size_of: Callable[[_Item], int],
 ) -> "Generator[tuple[_Item, _Result | Failed], None, None]":
-    """As :func:`try_many`, with a bar of the progress; `size` is that of all items. [byte]"""
+    """Apply a function to each item as :func:`try_many`, with a progress bar; `size` is that of all items. [byte]"""
     done, total = 0, size // MEGABYTE + 1
     with (
         progress_bar(label, total, "MB") as progress,
@@ -230,7 +237,7 @@ def _outcomes(
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """A pickled function, and the longest time for one item; None: any time, and data that can be trusted. [s]"""
+    """A pickled function, and the longest time for one item [s]; None: no limit, as the data can be trusted."""
 
     function: bytes
     limit_s: float | None
@@ -238,15 +245,15 @@ class _Job:
 
 
 class _Processes:
-    """Processes that run one item each, as many as are asked for at a time; they may use so much memory each."""
+    """A growing set of processes, each running one item at a time within a memory limit of its own."""
 
     def __init__(self, memory_bytes: int) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="calibrator-", ignore_cleanup_errors=True)
         self._memory_bytes = max(memory_bytes, LEAST_MEMORY_BYTES)
         self._idle: LifoQueue[_Process] = LifoQueue()
         self._all: list[_Process] = []
-        resource_tracker.ensure_running()  # its start, else within the next one, would let SIGINT through
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which all that it forks inherit
+        resource_tracker.ensure_running()  # else the fork server starts it, and that would unblock SIGINT
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # all forked processes inherit the mask
         try:
             forkserver.set_forkserver_preload(PRELOADED)
             forkserver.ensure_running()
@@ -254,7 +261,7 @@ class _Processes:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
     def run(self, job: _Job, item: Any) -> Any:
-        """What the function returns of an item, or why it was lost."""
+        """Run the function on one item, in an idle or a new process; return its result, or why the item was lost."""
         try:
             process = self._idle.get_nowait()
         except Empty:
@@ -266,7 +273,7 @@ class _Processes:
             self._idle.put(process)
 
     def end(self) -> None:
-        """Kill them all, and remove what they left."""
+        """Kill all processes, and remove their temporary files."""
         for process in self._all:
             process.stop()
         for process in self._all:
@@ -294,16 +301,16 @@ class _Process:
                     self._future.cancel()
                 return self._future.result()
             except CancelledError:
-                self.join()  # its pool may have begun only after stop
+                self.join()  # the pool may have been started only after stop() was called
                 raise
             except TimeoutError:
-                if job.limit_s is None:  # one that the function raised
+                if job.limit_s is None:  # without a limit, the function itself raised it
                     raise
                 self.join()
                 why = f"reading took more than {job.limit_s:g} s and was ended; {REMEDY}, or allow more with"
                 return Failed(reason=f"{why} --time-limit")
             except (ProcessExpired, BrokenProcessPool) as error:
-                code = getattr(error, "exitcode", 0)  # not always known
+                code = getattr(error, "exitcode", 0)  # the exit code is not always known
                 how = f"was killed by {signal.Signals(-code).name}" if code < 0 else "ended, or was killed"
             self.join()
         if job.limit_s is None:
@@ -322,7 +329,7 @@ class _Process:
         return self._pool
 
     def stop(self) -> None:
-        """Let no more items be run; who waits for one gets CancelledError."""
+        """Run no more items; a thread that waits for a result gets CancelledError."""
         self._stopped = True
         if self._future is not None:
             self._future.cancel()
@@ -330,7 +337,7 @@ class _Process:
             self._pool.stop()
 
     def join(self) -> None:
-        """Kill the process."""
+        """Kill the process, and wait until it has ended."""
         pool, self._pool = self._pool, None
         if pool is not None:
             pool.stop()
@@ -338,7 +345,7 @@ class _Process:
 
 
 class _ForkedProcess(ForkServerProcess):
-    """Starts without running the user's script once more."""
+    """A process that starts without running the user's script once more."""
 
     starting = threading.Lock()
 
@@ -360,19 +367,19 @@ _pickled_function = b""
 
 
 def _begin(environment: dict[str, str], folder: str, memory_bytes: int | None, function: bytes) -> None:
-    """What a process does first; an exception here would be a process that is replaced for ever."""
+    """Set up a worker process. It must not raise: the process would be replaced again and again."""
     global _pickled_function  # noqa: PLW0603 (the process runs this function alone)
     _pickled_function = function
     os.environ.clear()
     os.environ.update(environment)
     tempfile.tempdir = folder
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    load_python_can()  # before the modules of readers are imported, with which they would take seconds
+    load_python_can()  # first, as the readers' own import of python-can would take seconds
     _one_thread()
-    with suppress(Exception):  # what it imports is not to count as time of an item; errors come with the first one
+    with suppress(Exception):  # its imports shall not count as an item's time; an error comes again with the first item
         _loaded(function)
     if memory_bytes is not None:
-        most = resource.getrlimit(resource.RLIMIT_DATA)[1]  # as of the user's shell
+        most = resource.getrlimit(resource.RLIMIT_DATA)[1]  # the limit of the user's shell
         resource.setrlimit(
             resource.RLIMIT_DATA, (memory_bytes if most == resource.RLIM_INFINITY else min(memory_bytes, most), most)
         )
@@ -390,7 +397,7 @@ def _loaded(function: bytes) -> Callable[[Any], Any]:
 
 @lru_cache
 def _one_thread() -> threadpool_limits:
-    """Limit this process for good: processes share the cores, and sums depend on the number of threads."""
+    """Limit this process to one thread for good: processes share the cores, and sums depend on the thread count."""
     return threadpool_limits(1)
 
 
@@ -404,7 +411,7 @@ def _end_with_parent() -> None:
 def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
     from distributed import KilledWorker  # noqa: PLC0415 (an extra)
 
-    waiting, flight, futures = iter(items), deque[Any](), deque[Any]()  # futures: of the first of the flight
+    waiting, flight, futures = iter(items), deque[Any](), deque[Any]()  # futures: of the first items in flight
     workers, counted_s = 1, -math.inf
     with _silenced():
         client = _connect(address, CONNECT_S)
@@ -416,21 +423,21 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
                 try:
                     if time.monotonic() - counted_s > COUNT_EVERY_S:
                         workers, counted_s = max(len(client.nthreads()), 1), time.monotonic()
-                        continue  # with as many items
+                        continue  # take as many items as the workers need
                     while unsent := list(islice(flight, len(futures), len(futures) + SENT_AT_ONCE)):
                         futures.extend(client.map(partial(_on_worker, job), unsent, pure=False))
                     try:
                         error = futures[0].exception(timeout=CONNECT_S)  # waits for it
                         # many at a time, as each request to the scheduler costs milliseconds; others keep workers busy
                         done = list(takewhile(lambda future: future.status == "finished", islice(futures, workers)))
-                        # those whose worker ends meanwhile would be waited for until there is another one
+                        # with a time-out, as gather waits for a new worker if one ends before it hands its result over
                         fetch = partial(client.gather, done, asynchronous=True)
                         outcomes = client.sync(fetch, callback_timeout=RETURN_S)
                     except TimeoutError:
                         _wait_for_worker(client, address)
                         continue
                     if error is None and not done:
-                        raise CancelledError  # it was lost
+                        raise CancelledError  # the future was lost with its worker or scheduler
                 except (CancelledError, OSError):
                     client.close(timeout=1)
                     client = _connect(address, RETURN_S, lost=True)
@@ -440,7 +447,7 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
                     why = "out of memory, or without this package"
                     outcomes = [Failed(reason=f"{address}: its workers ended one after the other, {why}")]
                 elif error is not None:
-                    futures[0].result()  # raises it
+                    futures[0].result()  # raises the error
                 for outcome in outcomes:
                     futures.popleft()
                     yield flight.popleft(), outcome
@@ -468,7 +475,7 @@ def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
 
 
 def _require_scheduler(address: str, patience_s: float) -> None:
-    """Raise OSError where another kind of server listens: for what it says, Client waits for ever."""
+    """Raise OSError if another kind of server listens at the address, as Client would wait for ever for its answer."""
     from distributed.comm.addressing import get_address_host_port  # noqa: PLC0415 (an extra)
 
     if not address.startswith("tcp://"):
@@ -476,9 +483,9 @@ def _require_scheduler(address: str, patience_s: float) -> None:
     try:
         server = socket.create_connection(get_address_host_port(address), patience_s)
     except OSError:
-        return  # Client waits for a scheduler to come, and says why none did
+        return  # Client waits for a scheduler to start, and says why none did
     with server:
-        first = server.recv(8)  # a scheduler speaks first, and begins with a length
+        first = server.recv(8)  # a scheduler sends the first message, which begins with its length
     if not 0 < int.from_bytes(first, "little") < LARGEST_GREETING:
         raise OSError("another kind of server listens there")
 
@@ -494,7 +501,7 @@ def _wait_for_worker(client: Any, address: str) -> None:
 
 
 def _on_worker(job: _Job, item: Any) -> Any:
-    """What a worker of a cluster does; files of strangers are read by a process of its own, which it can kill."""
+    """Run one item on a worker of a cluster; untrusted files are read in a process of its own, which it can kill."""
     if job.version != __version__:
         advice = f"install version {job.version} there"
         raise FleetError(f"a worker of the cluster has version {__version__} of hv-current-correction; {advice}")
@@ -508,7 +515,7 @@ def _on_worker(job: _Job, item: Any) -> Any:
 def _own_processes() -> _Processes:
     from distributed import get_worker  # noqa: PLC0415
 
-    multiprocessing.current_process().daemon = False  # or it could not start processes
+    multiprocessing.current_process().daemon = False  # a daemon could not start processes
     return _Processes(get_worker().memory_manager.memory_limit or _memory_bytes())
 
 
@@ -518,7 +525,7 @@ def _memory_bytes() -> int:
 
 @contextmanager
 def _silenced() -> Iterator[None]:
-    """Loggers that print tracebacks of what is told in one line here say nothing within the block."""
+    """Silence the loggers of Dask and asyncio in the block; they print tracebacks of errors reported here in a line."""
     names = ("distributed", "distributed.client", "tornado.application", "asyncio")
     levels = {logger: logger.level for logger in map(logging.getLogger, names)}
     for logger in levels:
@@ -526,6 +533,6 @@ def _silenced() -> Iterator[None]:
     try:
         yield
     finally:
-        gc.collect()  # of what is unfinished, asyncio tells only now
+        gc.collect()  # asyncio logs unfinished tasks when they are collected, so collect them while it is silent
         for logger, level in levels.items():
             logger.setLevel(level)

@@ -50,7 +50,7 @@ def _open(folder: Path) -> "Repository":
 
 
 def _alone(command: Callable[..., None]) -> Callable[..., None]:
-    """A command that writes: it waits until no other one does, as each reads what it changes."""
+    """Make a command that writes wait until no other one is writing, because each reads what it changes."""
 
     @wraps(command)
     def waiting(folder: Path, **options: object) -> None:

@@ -47,7 +47,8 @@ __all__ = ["BIN_BITS", "ROLES", "NewKeys", "Repository", "missing_text"]
 
 ROLES = ("root", "targets", "snapshot", "timestamp")
 BIN_BITS = 11
-"""2048 bins: of 10^6 vehicles a bundle has about 20 kB, and the snapshot is still read in milliseconds."""
+"""Bits of a bin's number, for 2048 bins: with 10^6 vehicles a bundle has about 20 kB, and the snapshot is still read in
+milliseconds."""
 _BINS = SuccinctRoles([], 1, BIN_BITS, "bins")
 _DAYS = {"root": 730, "targets": 730, "bins": 400, "snapshot": 60, "timestamp": 30}
 """How long metadata is valid. [d]"""
@@ -55,10 +56,10 @@ _RENEW_DAYS = 60
 """Targets and bins that expire within this time are staged anew, to be signed again. [d]"""
 
 _SHOWN = 3
-"""Roles that a message names."""
+"""Most roles that a message names. [1]"""
 
 _KINDS: Mapping[str, type[Signed]] = {"root": Root, "snapshot": Snapshot, "timestamp": Timestamp}
-"""Metadata of each role; of all others it is :class:`Targets`."""
+"""Class of the metadata of each role; for all other roles it is :class:`Targets`."""
 
 
 class NewKeys(NamedTuple):
@@ -74,12 +75,12 @@ def _expiry(role: str) -> datetime:
 
 
 class Repository:
-    """One repository.
+    """The repository in a folder.
 
     Parameters
     ----------
     folder : Path
-        Made by :meth:`create`.
+        The folder, made by :meth:`create`.
 
     Raises
     ------
@@ -95,7 +96,7 @@ class Repository:
             raise RepositoryStateError(f"{folder}: no repository; make one with 'calibrator repository init'")
         self._root_version = max(roots, default=0)
         self.waiting: dict[str, str] = {}
-        """Roles that :meth:`sign` left without enough signatures, and which are missing."""
+        """Roles that lack signatures after :meth:`sign`, with a text that says which are missing."""
         self._staged_versions: dict[str, int] = {}
         self._versions: dict[str, int] = {}
         self._snapshot_version = self._timestamp_version = 0
@@ -112,9 +113,9 @@ class Repository:
         Parameters
         ----------
         folder : Path
-            New or empty.
+            New or empty folder.
         roles : mapping of str to NewKeys
-            For each of :data:`ROLES`.
+            Keys for each of :data:`ROLES`.
         """
         if folder.exists() and any(folder.iterdir()):
             raise RepositoryStateError(f"{folder}: exists and is not empty; choose another folder")
@@ -134,7 +135,7 @@ class Repository:
         return cls(folder)
 
     def _read(self, path: Path) -> Metadata[Any]:
-        """Metadata of the role that the file is named after."""
+        """Read the metadata of the role after which the file is named."""
         with _readable(path):
             found: Metadata[Any] = Metadata.from_file(str(path))
             if not isinstance(found.signed, _KINDS.get(path.stem.rpartition(".")[2], Targets)):
@@ -142,17 +143,17 @@ class Repository:
         return found
 
     def _live(self, role: str) -> Any:
-        """What vehicles see of a role; None before it was published."""
+        """Return the published metadata of a role, which vehicles see; None before the first publication."""
         version = self._root_version if role == "root" else self._versions.get(role, 0)
         return self._read(self._metadata / f"{version}.{role}.json").signed if version else None
 
     def _latest(self, role: str) -> Any:
-        """What is staged for a role, else what is live; None if it is neither, which root and targets always are."""
+        """Return the staged metadata of a role, else the published; None without either, never for root or targets."""
         path = self._staged / f"{role}.json"
         return self._read(path).signed if path.exists() else self._live(role)
 
     def _stage(self, role: str, signed: Signed) -> None:
-        """Keep the next version of a role; what was staged before has lost its signatures."""
+        """Stage the next version of a role; signatures of a version staged before are lost."""
         live = self._root_version if role == "root" else self._versions.get(role, 0)
         signed.version, signed.expires = live + 1, _expiry(role)
         _write(self._staged / f"{role}.json", _encoded(Metadata[Any](signed)))
@@ -160,7 +161,7 @@ class Repository:
     def add(
         self, files: Iterable[Path], *, days: int, allow_large_step: bool, database: VehicleDatabase | None = None
     ) -> tuple[int, list[str]]:
-        """Stage parameter files, each in the place of what its vehicle had before.
+        """Stage parameter files, each in place of the one that its vehicle had before.
 
         Parameters
         ----------
@@ -169,21 +170,21 @@ class Repository:
         days : int
             How long they may be used. [d]
         allow_large_step : bool
-            They may differ a lot from what is in force, as after a repair.
+            Whether they may differ a lot from the parameters in force, as after a repair.
         database : VehicleDatabase or None
-            Layout and DBC that they must fit; None: each vehicle looks by itself.
+            Layout and DBC that they must fit; None: only the vehicles check that.
 
         Returns
         -------
         bins : int
             Number of bins that are staged now.
         lifted : list of str
-            Vehicles whose file was revoked, and is so no more.
+            Vehicles whose file had been revoked and is now allowed again.
 
         Raises
         ------
         ParameterError, RepositoryStateError
-            If one is no parameter file, does not fit, or is a second one of its vehicle; nothing is staged then.
+            If one is no parameter file, does not fit, or is a second one for its vehicle; then nothing is staged.
         """
         expires = (datetime.now(UTC) + timedelta(days=days)).replace(microsecond=0)
         bins: dict[str, dict[str, tuple[int, str, TargetFacts]]] = defaultdict(dict)
@@ -222,7 +223,7 @@ class Repository:
         return len(bins), lifted
 
     def revoke(self, vehicles: Sequence[str], digest: str | None) -> None:
-        """Stage that a file of these vehicles must not be used any more: the present one, or another by its SHA-256."""
+        """Stage the revocation of a file of these vehicles: the present one, or that with the given SHA-256."""
         bins: dict[str, Targets] = {}
         for vehicle in vehicles:
             path = target_path(vehicle)
@@ -243,11 +244,11 @@ class Repository:
             self._stage(role, targets)
 
     def threshold(self, role: str) -> int:
-        """How many keys of a role must sign."""
+        """Return how many keys of a role must sign."""
         return int(self._latest("root").roles[role].threshold)
 
     def rotate(self, role: str, new: NewKeys) -> None:
-        """Stage a root in which a role has other keys, and, for targets, all that the new keys must sign."""
+        """Stage a root in which a role has new keys and, if the role is targets, all metadata that these must sign."""
         root: Root = self._latest("root")
         for keyid in list(root.roles[role].keyids):
             root.revoke_key(keyid, role)
@@ -262,7 +263,7 @@ class Repository:
                     self._stage(name, self._latest(name))
 
     def renew(self) -> None:
-        """Stage root, targets and bins that expire soon; bins were signed when they were changed."""
+        """Stage root, targets and bins that expire soon; the expiry of a bin counts from its last change."""
         soon = datetime.now(UTC) + timedelta(days=_RENEW_DAYS)
         live = {"root": self._root_version, **self._versions}
         for role, version in live.items():
@@ -270,7 +271,7 @@ class Repository:
                 self._stage(role, self._live(role))
 
     def unstage(self) -> list[str]:
-        """Drop what is staged and was never published; raises RepositoryStateError before the first publication."""
+        """Drop all staged metadata, and return its roles; raise RepositoryStateError before the first publication."""
         if not self._timestamp_version:
             raise RepositoryStateError(f"{self._folder}: nothing was published yet; remove the folder to begin anew")
         paths = sorted(self._staged.glob("*.json"))
@@ -280,10 +281,10 @@ class Repository:
 
     @property
     def valid_until(self) -> datetime | None:
-        """When vehicles stop taking what is published, unless it is published anew; None before the first time.
+        """When vehicles stop accepting the published metadata, unless it is renewed; None before the first publication.
 
-        Timestamp and snapshot are new at each publication; root and targets may lack signatures for longer than they
-        are valid.
+        It is the earliest expiry of timestamp, root and targets. Each publication renews timestamp and snapshot; root
+        and targets may expire while their next version still lacks signatures.
         """
         if not self._timestamp_version:
             return None
@@ -296,12 +297,12 @@ class Repository:
             return expiry_of(path.read_bytes())
 
     def sign(self, signers: Sequence[Signer]) -> Iterator[str]:
-        """Sign what is staged; what lacks signatures after that stands in :attr:`waiting`.
+        """Sign all staged metadata; roles that still lack signatures are put into :attr:`waiting`.
 
         Parameters
         ----------
         signers : sequence of Signer
-            Keys of any roles; each signs what is its own.
+            Keys of any roles; each signs only the metadata of its roles.
 
         Yields
         ------
@@ -338,17 +339,17 @@ class Repository:
             yield role
 
     def publish(self, signers: Sequence[Signer]) -> None:
-        """Let vehicles see what :meth:`sign` has signed; while signatures are missing, only a new timestamp.
+        """Publish what :meth:`sign` has signed; while signatures are missing, publish only a new timestamp.
 
         Parameters
         ----------
         signers : sequence of Signer
-            Of snapshot and timestamp.
+            Keys of snapshot and timestamp.
 
         Raises
         ------
         RepositoryStateError
-            If their keys are missing; vehicles see what they saw before.
+            If these keys are missing; then vehicles see what they saw before.
         """
         root = self._live("root") if self.waiting else self._latest("root")
         missing = dict(self.waiting)
@@ -365,7 +366,7 @@ class Repository:
         self._put_in_place(root, {} if self.waiting else self._staged_versions, signers)
 
     def _put_in_place(self, root: Root, staged: Mapping[str, int], signers: Sequence[Signer]) -> None:
-        """Let what is staged be seen; a cut before the timestamp is replaced changes nothing, and a rerun goes on."""
+        """Publish what is staged, timestamp last; an interruption before it changes nothing, and a rerun continues."""
         for role, version in staged.items():
             content = (self._staged / f"{role}.json").read_bytes()
             _write(self._metadata / f"{version}.{role}.json", content)
@@ -387,11 +388,11 @@ class Repository:
         write_files({self._metadata / "timestamp.json": _signed_by(root, "timestamp", timestamp, signers)})
         for role, version in {**staged, "snapshot": snapshot.version}.items():
             (self._staged / f"{role}.json").unlink(missing_ok=True)
-            if role != "root":  # the version before stays, as vehicles may be reading it
+            if role != "root":  # keep the version before, as vehicles may be reading it
                 (self._metadata / f"{version - 2}.{role}.json").unlink(missing_ok=True)
 
     def bundle(self, vehicle: str) -> bytes:
-        """All that one vehicle needs to update from any earlier version, in one file."""
+        """Return the content of one file with all that a vehicle needs to update from any earlier version."""
         path, until = target_path(vehicle), self.valid_until
         if until is not None and until <= datetime.now(UTC):
             raise RepositoryStateError(
@@ -427,7 +428,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def missing_text(missing: Mapping[str, str]) -> str:
-    """Which signatures are missing, in words; of many roles the first three."""
+    """Say in words which signatures are missing; of many roles only the first three are named."""
     words = [f"{role} has {what}" for role, what in [*missing.items()][:_SHOWN]]
     return "; ".join(words) + (f"; and {len(missing) - _SHOWN} roles more" if len(missing) > _SHOWN else "")
 
@@ -437,7 +438,7 @@ def _lacking(signed: int, threshold: int, others: Iterable[str]) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Replace a file in one step; it is on the disk after the sync before the timestamp is replaced."""
+    """Replace a file in one step; the sync before the timestamp is replaced makes sure that it is on the disk."""
     new = path.with_suffix(".new")
     try:
         new.write_bytes(content)
@@ -453,7 +454,7 @@ def _set_keys(root: Root, role: str, new: NewKeys) -> None:
 
 
 def _delegate(targets: Targets, new: NewKeys) -> None:
-    """Let the keys of targets sign the bins, too."""
+    """Delegate the bins to the keys of targets, which then sign both."""
     keys: dict[str, Key] = {key.keyid: key for key in new.keys}
     targets.delegations = Delegations(keys, succinct_roles=SuccinctRoles(list(keys), new.threshold, BIN_BITS, "bins"))
 

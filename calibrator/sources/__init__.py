@@ -1,1 +1,1 @@
-"""The drives of a fleet, wherever they are: which log belongs to which vehicle, what was recorded twice."""
+"""Find the drives of a fleet, wherever they are, and which log belongs to which vehicle; import logs as drives."""

@@ -2,8 +2,8 @@
 
 The rule: a log belongs to the vehicle that its folder is named after, and the drive has the name of the file without
 its suffixes: ``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders and ``.zip`` archives
-are searched at any depth; an archive stands for a folder of its name. Logs that lie beside the folders of vehicles,
-vehicles whose name stands for two folders, and drives that two files claim, are left out and named.
+are searched at any depth; an archive stands for a folder of its name. Three things are left out and reported: logs that
+lie beside the folders of vehicles, vehicles that have two folders of one name, and drives that two files claim.
 """
 
 from collections import Counter
@@ -50,15 +50,15 @@ __all__ = [
 _Vehicle = TypeVar("_Vehicle")
 LOGS_FOLDER = "logs"
 PROBED_VEHICLES = 7
-"""How many vehicles are looked at to learn which branches and inputs the fleet has."""
+"""Number of vehicles whose drives are read to learn which branches and inputs the fleet has. [1]"""
 
 
 _Place = Storage | list[DriveFile]
-"""Where the drives of a vehicle are: a folder, which is listed again when it is its turn, or single files."""
+"""Where the drives of a vehicle are: a folder, which is listed each time it is needed, or single files."""
 
 
 class _Vehicles(Mapping[str, tuple[DriveFile, ...]]):
-    """Drives by vehicle; a large fleet is the names of its folders in memory."""
+    """Drives by vehicle. Only the places are kept in memory, so a large fleet takes little of it."""
 
     def __init__(self, places: Mapping[str, _Place]) -> None:
         self._places = dict(sorted(places.items()))
@@ -123,7 +123,7 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     Returns
     -------
     FleetSource
-        The drives, none perhaps, and what is left out; nothing is opened.
+        The drives, perhaps none, and what is left out and why. No log is opened.
     """
     places: dict[str, dict[str, _Place]] = {}
     usable, sizes = dict[str, bool](), Counter[str]()
@@ -191,9 +191,10 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
 
 
 def _logs_in(storage: Storage, shown: str, problems: list[str]) -> Iterator[tuple[str, list[Entry], Storage | None]]:
-    """Folders with logs, of a folder, an archive or a single log: path or URL, logs, and the folder if it is one.
+    """Search a folder, an archive or a single log, and yield each folder with logs in it.
 
-    A folder or archive inside that cannot be read is added to the problems.
+    Yields the folder's path or URL, its logs, and its storage, which is None in an archive or if only a single log was
+    named. A folder or archive inside that cannot be read is added to `problems`.
     """
     path = Path(storage.url)
     if storage.is_local and not path.exists():
@@ -227,7 +228,7 @@ def _entry(path: Path) -> Entry:
 
 
 def _is_log(folder: Storage, name: str) -> bool:
-    """Whether a file is a log: by its suffix; a text file of this machine also by what is in it."""
+    """Check whether a file is a log: by its suffix, and a text file on this machine also by its content."""
     if folder.is_local:
         return name.endswith(SUFFIX) or is_log(Path(folder.url) / name)
     return name.endswith(SUFFIX) or (not name.endswith(".txt") and is_log(Path(name)))
@@ -242,12 +243,12 @@ def _drive_name(file: str) -> str:
 
 
 def _without_suffix(name: str, suffix: str) -> str:
-    """A name without a suffix in small letters or capitals."""
+    """Remove a suffix, given in lower case, from a name that has it in any case."""
     return name[: -len(suffix)] if name.lower().endswith(suffix) else name
 
 
 def _drives(vehicle: str, folder: str, logs: Iterable[Entry]) -> list[DriveFile]:
-    """Drives of a vehicle of these logs in a folder."""
+    """Return a vehicle's drives for the logs of a folder; logs whose name no drive can have are skipped."""
     return [
         DriveFile(
             vehicle=vehicle,
@@ -262,7 +263,7 @@ def _drives(vehicle: str, folder: str, logs: Iterable[Entry]) -> list[DriveFile]
 
 
 def _by_name(drives: Iterable[DriveFile]) -> dict[str, list[DriveFile]]:
-    """Drives by their names, which several files may claim."""
+    """Group drives by name; a name with several files is claimed by all of them."""
     found: dict[str, list[DriveFile]] = {}
     for drive in sorted(drives, key=lambda item: item.place):
         found.setdefault(drive.name, []).append(drive)
@@ -270,12 +271,12 @@ def _by_name(drives: Iterable[DriveFile]) -> dict[str, list[DriveFile]]:
 
 
 def is_onboard(entry: DriveFile) -> bool:
-    """Whether a file is the record of a node's own summary, which has no samples."""
+    """Check whether a file is a summary that a node made on board, which has no samples."""
     return entry.place.endswith(SUFFIX)
 
 
 def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
-    """Load one drive from its store file or its log; UserError if the file cannot be used, which it names."""
+    """Load one drive from its store file or its log; raise a UserError that names the file if it cannot be used."""
     if is_onboard(entry):
         raise DriveError(f"{entry.place}: a summary that was made on board, without samples; give the log")
     with local_copy(entry.place) as path:
@@ -295,30 +296,30 @@ def read_vehicles(
     names: Sequence[str] | None = None,
     label: str = "read drives",
 ) -> tuple[list[_Vehicle], dict[str, str]]:
-    """Read vehicles; one that is bad never stops the others.
+    """Read the drives of vehicles; a vehicle that cannot be read never stops the others.
 
     Parameters
     ----------
     read : callable
-        Makes what a method needs of a vehicle from its DriveFiles, `equipment` and `database`; of module level, as it
-        goes to other processes.
+        Function that reads one vehicle from its DriveFiles, `equipment` and `database`, and returns what the caller
+        needs of it. It must be at module level, because it is sent to other processes.
     fleet, equipment, database : FleetSource, Equipment, VehicleDatabase
         The fleet, its branches and inputs, DBC and layout.
     workers : Workers
-        Where.
+        Where the vehicles are read.
     limit_s : float
         Longest time for one vehicle; one that takes longer is left out. [s]
     names : sequence of str or None
-        Which vehicles; None: all.
+        Names of the vehicles to read; None: all.
     label : str
-        What stands beside the bar of the progress.
+        Text beside the progress bar.
 
     Returns
     -------
     vehicles : list
-        Those that can be used, in the order of the fleet.
+        What `read` returned for the vehicles that can be used, in the order of the fleet.
     left_out : dict of str to str
-        Why the others cannot, by name.
+        Why the others cannot be used, by name.
 
     Raises
     ------
@@ -369,23 +370,23 @@ def probe_equipment(
     database : VehicleDatabase
         DBC and layout.
     branches : sequence of str, optional
-        Different branches to use instead of those found.
+        Branches to use instead of those found, each named once.
     limit_s : float
         Longest time for one drive. [s]
     modelled : bool
         Whether the branches are modelled from inputs, as those of a fleet are.
     drives : sequence of Drive
-        One of each vehicle to look at, if they were read already.
+        One drive of each vehicle to look at, if they were read already.
 
     Returns
     -------
     Equipment
-        At least two branches, and one input if they are modelled.
+        At least two branches and, if they are modelled, at least one input.
 
     Raises
     ------
     FleetError
-        If no vehicle can be read, too little is there, or a branch is asked for twice.
+        If no vehicle can be read, there are too few branches or inputs, or a branch is asked for twice.
     LayoutError
         If a branch is asked for that the layout does not have.
     """
@@ -440,7 +441,7 @@ def probe_equipment(
 
 
 def _names(entry: DriveFile, database: VehicleDatabase) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Branches and inputs that a drive has."""
+    """Return the names of the branches and inputs that a drive has."""
     if not is_onboard(entry):
         return _names_in(load_drive(entry, database))
     with local_copy(entry.place) as path:

@@ -1,4 +1,4 @@
-"""Logs of one or many vehicles become drives of a store. One bad log never stops the others."""
+"""Import logs of one or many vehicles as drives of a store. One bad log never stops the others."""
 
 import time
 from collections.abc import Sequence
@@ -33,12 +33,12 @@ class ImportedDrive:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportReport:
-    """What an import did."""
+    """Result of an import: drives written, already there and left out."""
 
     store: str
     drives: tuple[ImportedDrive, ...]
     already_there: tuple[str, ...]
-    """Drives, VEHICLE/NAME, that an earlier import has written; they were not read again."""
+    """Drives (VEHICLE/NAME) that an earlier import wrote; they were not read again."""
     left_out: dict[str, str]
 
     def as_json(self) -> str:
@@ -47,7 +47,7 @@ class ImportReport:
         return dumps({**vars(self), "drives": drives})
 
     def as_text(self) -> str:
-        """The report for people; a notice that several drives share is told once."""
+        """The report as text for people; a notice that several drives share is shown once."""
         rows = [(d.vehicle, d.name, f"{d.duration_s:.1f}", ", ".join(d.branches)) for d in self.drives]
         notices = [f"  {line}" for line in merged_notices({(d.vehicle, d.name): d.notices for d in self.drives})]
         parts = [

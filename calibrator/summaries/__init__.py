@@ -1,1 +1,1 @@
-"""Summaries of a fleet's drives on disk or in object storage: all that the estimator needs of them."""
+"""Summaries of a fleet's drives, which hold all that the estimator needs, on disk or in object storage."""

@@ -1,4 +1,4 @@
-"""``calibrator summarise``: drives become summaries; ``calibrator store``: what a store of them holds."""
+"""``calibrator summarise`` makes summaries of drives; ``calibrator store`` shows what a store of them holds."""
 
 from typing import Annotated
 

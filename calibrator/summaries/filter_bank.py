@@ -1,13 +1,13 @@
 """Filter bank: fixed A and B of the state space (2) of [1]_, shared by identical vehicles; each has its own read-out.
 
-Columns of the bank are the inputs u themselves and, per pole p, each input through x(t+1) = p x(t) + (1 - p) u(t): a
-low-pass for a real pole, a resonance for a complex one, of which real and imaginary part are two columns. All of them
+The columns of the bank are the inputs u themselves and, per pole p, each input through x(t+1) = p x(t) + (1 - p) u(t):
+a low-pass for a real pole, a resonance for a complex one, whose real and imaginary parts are two columns. All columns
 depend on inputs alone, so noise of the sensors leaves no bias in a read-out (output error).
 
-How samples run through it is compiled. The causal rule for invalid samples: an input keeps its last valid value for a
+The loop over samples is compiled. Its causal rule for invalid samples: an input keeps its last valid value for a
 limited time. After a longer gap, and at the start of a drive, the filters start in the steady state of the first valid
-input, and what they show is not used until they have settled: until all but a small share of an error in that start is
-gone. A bank without poles has nothing to settle: its columns are the plain inputs.
+input. Their output is not used until they have settled, that is, until all but a small share of an error in that
+starting state has decayed. A bank without poles has nothing to settle: its columns are the plain inputs.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -26,11 +26,12 @@ from calibrator.errors import DriveError
 __all__ = ["FilterBank", "low_passes", "plain_bank", "read_bank"]
 
 LONGEST_HOLD_S = 1.0
-"""Time that an input may keep its last valid value: currents of a drive seldom change more within. [s]"""
+"""Time that an input may keep its last valid value: currents of a drive seldom change much within it. [s]"""
 UNSETTLED = 0.05
-"""Share of the error of a start that may remain: after three time constants of the slowest pole. [1]"""
+"""Share of an error in the starting state that may remain: it is reached after three time constants of the slowest
+pole. [1]"""
 LARGEST_RADIUS = 1.0 - 1e-9
-"""Of a pole that settles at all. [1]"""
+"""Largest magnitude of a pole; beyond it the filter never settles. [1]"""
 
 Poles = tuple[tuple[float, float], ...]
 
@@ -45,13 +46,13 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     period_s : float
         Distance of the samples. [s]
     poles : tuple of (float, float)
-        Real and imaginary part of each pole of the z-plane, all inside the unit circle; of a complex pair the one with
-        positive imaginary part. Empty: the plain inputs.
+        Real and imaginary part of each pole in the z-plane, all inside the unit circle; a complex pair is given by its
+        pole with positive imaginary part. Empty: the plain inputs.
 
     Raises
     ------
     DriveError
-        If a pole is not stable or not of the upper half plane, the period not positive, or two inputs have one name.
+        If a pole is unstable or not in the upper half plane, the period is not positive, or two inputs share a name.
     """
 
     input_names: tuple[str, ...]
@@ -59,7 +60,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     poles: Poles = ()
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be run."""
+        """Raise DriveError if the bank cannot be run."""
         if not (np.isfinite(self.period_s) and self.period_s > 0.0):
             raise DriveError(f"filter bank: period {self.period_s} s; expected a positive number")
         if len(set(self.input_names)) < len(self.input_names):
@@ -73,7 +74,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def identity(self) -> str:
-        """Digest of input names, period and poles: summaries of different banks do not belong together."""
+        """Digest of input names, period and poles; only summaries with the same digest may be added up."""
         return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
 
     @property
@@ -98,7 +99,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return int(np.ceil(np.log(UNSETTLED) / np.log(slowest))) if slowest > 0.0 else 0
 
     def system(self) -> tuple[Array, Array]:
-        """Return A (n, n) and B (n, M); the states in the order of the columns that follow the inputs."""
+        """Return A (n, n) and B (n, M); the states are in the order of the columns that follow the inputs."""
         M = len(self.input_names)
         real, pairs = _by_kind(self.complex_poles)
         own = np.concatenate([real, pairs.real, pairs.real])
@@ -119,15 +120,15 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         valid : ndarray of bool of shape (T,)
             Samples that may be used.
         settling : int
-            Samples after a start that are not used, if they are more than :attr:`settling`: that of another bank, to be
-            compared with.
+            Samples to leave out after a start, if more than :attr:`settling`, so that this bank uses the same samples
+            as a slower one with which it is compared.
 
         Returns
         -------
         columns : ndarray of shape (T, W)
             Inputs and states; zero where not used.
         used : ndarray of bool of shape (T,)
-            Valid samples of settled filters.
+            Which samples are valid and come from settled filters.
         """
         columns, used = np.zeros((len(inputs), self.width)), np.zeros(len(inputs), np.bool_)
         real, pairs = _by_kind(self.complex_poles)
@@ -137,22 +138,22 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return columns, used
 
     def to_json(self) -> bytes:
-        """Text of a bank file."""
+        """Return the content of a bank file."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
     def described(self) -> str:
-        """Poles in words: the time constant of each low-pass, frequency and time constant of each resonance."""
+        """Describe the poles: the time constant of each low-pass, frequency and time constant of each resonance."""
         words = [_described(pole, self.period_s) for pole in self.complex_poles]
         return ", ".join(words) or "the plain inputs"
 
 
 def plain_bank(input_names: tuple[str, ...], *, period_s: float) -> FilterBank:
-    """Bank of the inputs as they are."""
+    """Return a bank without poles, whose columns are the inputs as they are."""
     return FilterBank(input_names=input_names, period_s=period_s)
 
 
 def low_passes(time_constants_s: Array, *, period_s: float) -> Poles:
-    """Poles of first-order low-passes.
+    """Return the poles of first-order low-passes.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ def low_passes(time_constants_s: Array, *, period_s: float) -> Poles:
     Returns
     -------
     tuple of (float, float)
-        As :class:`FilterBank` has them.
+        Real and imaginary part (0) of each pole, as in :class:`FilterBank`.
     """
     return tuple((float(pole), 0.0) for pole in np.exp(-period_s / np.asarray(time_constants_s)))
 
@@ -175,7 +176,7 @@ def read_bank(path: Path) -> FilterBank:
     Parameters
     ----------
     path : Path
-        What ``calibrator identify --out`` wrote.
+        File that ``calibrator identify --out`` wrote.
 
     Returns
     -------
@@ -198,7 +199,7 @@ def read_bank(path: Path) -> FilterBank:
 
 
 def _by_kind(poles: Complex) -> tuple[Array, Complex]:
-    """Real poles, and one of each complex pair."""
+    """Split poles into the real ones, and one of each complex pair."""
     return poles.real[poles.imag == 0.0], poles[poles.imag > 0.0]
 
 
@@ -213,12 +214,12 @@ def _described(pole: complex, period_s: float) -> str:
 def _filter(
     samples: tuple[Array, Mask], poles: Complex, real: int, limits: NDArray[np.int64], out: tuple[Array, Mask]
 ) -> None:
-    """Run the bank, sample by sample; after so many real poles come those of which a pair has two columns."""
+    """Run the bank, sample by sample; the first `real` poles are real, the others are complex and have two columns."""
     inputs, valid = samples
     columns, used = out
     M, m = inputs.shape[1], len(poles)
     states, held = np.zeros((m, M), np.complex128), np.zeros(M)
-    age, unsettled = limits[0] + 1, 0  # samples since the last valid input, and until the filters have settled
+    age, unsettled = limits[0] + 1, 0  # samples since the last valid input; samples until the filters have settled
     for t in range(len(inputs)):
         if valid[t]:
             held[:] = inputs[t]

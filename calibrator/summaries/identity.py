@@ -1,4 +1,4 @@
-"""What a store of summaries is of: summaries add up only if branches, inputs, filters and time base are the same."""
+"""Identity of a store of summaries: they add up only if branches, inputs, filters and time base are the same."""
 
 import hashlib
 from typing import Annotated
@@ -25,10 +25,11 @@ __all__ = [
 SCHEMA_VERSION = 4
 FILE = "summaries.json"
 FEWEST_BUCKETS, MOST_BUCKETS = 16, 32_768
-"""Of a store: few vehicles are lost with one that is not finished, and a folder can still be listed."""
+"""Bounds for the buckets of a store: enough that an interrupted bucket loses few vehicles, and few enough that their
+folder can be listed. [1]"""
 _HASH_BYTES = 8
 VEHICLES_PER_BUCKET = 256
-"""Aimed at: a few megabytes, read in a fraction of a second."""
+"""Number aimed at: such a bucket has a few megabytes and is read in a fraction of a second. [1]"""
 
 
 class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -37,13 +38,13 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     Attributes
     ----------
     schema_version : int
-        Of the store.
+        Version of the store's format.
     layout, layout_sha256, dbc_sha256 : str
-        Names and digests of what the signals mean.
+        Name of the layout, and digests of layout and DBC, which define what the signals mean.
     branches, inputs, fleet_inputs : tuple of str
         Branches and model inputs of the fleet, see :class:`~calibrator.drive.Equipment`.
     notices : tuple of str
-        What the layout has and the fleet lacks.
+        Notices of what the layout has and the fleet lacks.
     bank : FilterBank
         Filters of the fleet inputs.
     block_s : float
@@ -75,7 +76,7 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         )
 
     def difference(self, other: "StoreIdentity") -> str:
-        """What makes summaries of another store unfit for this one, in words; empty if they fit."""
+        """Say in words why summaries of another store do not fit into this one; empty if they fit."""
         for name in ("layout_sha256", "dbc_sha256", "branches", "fleet_inputs", "bank", "block_s"):
             mine, its = getattr(self, name), getattr(other, name)
             if mine != its:
@@ -90,7 +91,7 @@ def _short(value: object) -> str:
 
 
 def bucket_of(vehicle: str, buckets: int) -> int:
-    """Bucket of a vehicle, from 0 to ``buckets - 1``: the same on every machine, whatever other vehicles there are."""
+    """Return the bucket of a vehicle, from 0 to ``buckets - 1``; it depends on nothing but the name and `buckets`."""
     digest = hashlib.blake2b(vehicle.encode(), digest_size=_HASH_BYTES).digest()
     return int.from_bytes(digest, "big") % buckets
 
@@ -103,7 +104,7 @@ def store_identity(
     fleet: str,
     bank: FilterBank | None = None,
 ) -> StoreIdentity:
-    """Identity of a new store.
+    """Make the identity of a new store.
 
     Parameters
     ----------
@@ -121,7 +122,7 @@ def store_identity(
     Returns
     -------
     StoreIdentity
-        Of the present schema.
+        The identity, with the present schema version.
     """
     wanted = 1 << max(vehicles // VEHICLES_PER_BUCKET, 1).bit_length()
     return StoreIdentity(
@@ -152,17 +153,17 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
     storage : Storage
         Folder of the store.
     database : VehicleDatabase or None
-        DBC and layout it must have been made with; None: any.
+        DBC and layout that the store must have been made with; None: any.
 
     Returns
     -------
     StoreIdentity or None
-        None if there is no store.
+        The identity; None if there is no store.
 
     Raises
     ------
     FleetError
-        If the store is of another version, layout or DBC, or has numbers or names that none can have.
+        If the store has another version, layout or DBC, or contains impossible numbers or names.
     """
     content, where = storage.read_if_there(FILE), f"{storage.url}/{FILE}"
     if content is None:

@@ -1,9 +1,9 @@
-"""DriveSummary: all that the estimator needs of recorded drives, of a size that does not grow with their sampling rate.
+"""DriveSummary: all that the estimator needs of recorded drives, in a size that does not grow with the sampling rate.
 
-Per block of :data:`BLOCK_S` the second moments of (columns of a filter bank, measured currents, 1). Summaries of drives
-add up, and the spread between blocks tells how sure everything is that is computed from them. Second moments cannot
-tell a bent sensor from a gain error; the :class:`FitSums` beside them can, and :mod:`calibrator.estimator.checks` reads
-them.
+For each block of :data:`BLOCK_S` it holds the second moments of (columns of a filter bank, measured currents, 1).
+Summaries of drives add up, and the spread between blocks gives the uncertainty of everything computed from them. Second
+moments cannot distinguish a nonlinear sensor from a gain error; the :class:`FitSums` beside them can, and
+:mod:`calibrator.estimator.checks` reads them.
 """
 
 from collections.abc import Sequence
@@ -28,16 +28,16 @@ class FitSums:
     Attributes
     ----------
     levels : ndarray of shape (K, L, M + K + 2)
-        By level of branch k, see :data:`LEVEL_EDGES_A`: sums of (inputs, measured currents [A], 1) and of the square of
-        the measured current k [A^2].
+        For each level of the current of branch k, see :data:`LEVEL_EDGES_A`: sums of (inputs, measured currents [A], 1)
+        and of the square of the measured current k [A^2].
     fast_a2 : ndarray of shape (B, K, K)
         Sums of products of the second differences of the measured currents. [A^2]
     spikes : ndarray of shape (B, K, 2)
-        Samples left out of all sums as upward and downward spikes of one branch.
+        Number of samples left out of all sums because one branch has an upward or a downward spike there.
     temperature_c : ndarray of shape (B,)
         Mean temperature of the sensors; NaN where it is not known. [degC]
     starts : ndarray of bool of shape (B,)
-        Whether a drive starts with the block.
+        Whether a drive starts in the block.
     """
 
     levels: Array
@@ -49,15 +49,16 @@ class FitSums:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSummary:
-    """Moments of the drives of one vehicle in B blocks.
+    """Second moments of the drives of one vehicle, in B blocks.
 
     Attributes
     ----------
     moments : ndarray of shape (B, M + K + 1, M + K + 1)
-        Sums over the samples of a block of the products of (inputs, measured currents [A], 1); the inputs are the M
-        columns of the filter bank: those of the drive, and what the bank makes of them.
+        Sums over the samples of a block of the products of (inputs, measured currents [A], 1). Inputs here are the M
+        columns of the filter bank: the inputs of the drive and their filtered forms.
     noise_a2 : ndarray of shape (B, K)
-        White noise of each measured current in a block; an upper bound where the current itself changes fast. [A^2]
+        Variance of the white noise of each measured current in a block; an upper bound where the current itself
+        changes fast. [A^2]
     branches : int
         Number of branches K.
     period_s : float
@@ -65,7 +66,7 @@ class DriveSummary:
     bank : str
         Identity of the filter bank, see :class:`~calibrator.summaries.filter_bank.FilterBank`.
     fit : FitSums or None
-        What the check of fit needs; None: moments that were not made of samples, nothing is checked.
+        Sums for the check of fit; None if the moments were not made from samples, and then nothing is checked.
     """
 
     moments: Array
@@ -104,11 +105,11 @@ class DriveSummary:
 
     @property
     def variance_a2(self) -> Array:
-        """Variance of the measured currents, which no offset changes, shape (K,). [A^2]"""
+        """Variance of the measured currents, which offsets do not change, shape (K,). [A^2]"""
         return np.asarray(np.diag(self.mean_product_a2) - self.mean_a**2)
 
     def __add__(self, other: "DriveSummary") -> "DriveSummary":
-        """Return the summary of the drives of both: blocks one after the other.
+        """Return the summary of the drives of both, the blocks of `other` after those of this one.
 
         Raises
         ------
@@ -138,7 +139,7 @@ class DriveSummary:
         )
 
     def take_branches(self, order: Sequence[int], inputs: Sequence[int] | None = None) -> "DriveSummary":
-        """Return the same summary for some branches, in another order, and some of the inputs, or all."""
+        """Return the summary of the branches at these indices, in that order, and of some or all of the inputs."""
         chosen, M = list(order), self.inputs
         columns = [*(range(M) if inputs is None else inputs), *(M + k for k in chosen), M + self.branches]
         return replace(
@@ -156,7 +157,7 @@ class DriveSummary:
         )
 
     def shortened(self, most: int) -> "DriveSummary":
-        """Return the same with neighbouring blocks added until there are few enough; means are by samples."""
+        """Return the summary in at most `most` blocks, with neighbours added up; means are weighted by samples."""
         count, samples, fit = len(self.moments), self.moments[:, -1, -1], self.fit
         if count <= most:
             return self
@@ -178,7 +179,7 @@ class DriveSummary:
 
 
 def common_bank(summaries: Sequence[DriveSummary]) -> str:
-    """Identity of the filter bank that all summaries, at least one, were made with.
+    """Return the identity of the filter bank with which all summaries, at least one, were made.
 
     Raises
     ------

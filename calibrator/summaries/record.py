@@ -1,8 +1,8 @@
-"""Records of a store: what one reading of a vehicle's drives gave, as Parquet, one row each.
+"""Records of a store: the result of one reading of a vehicle's drives, one row each in a Parquet file.
 
-Moments are symmetric, so their upper triangles are stored, row by row, one block after the other. A record has at most
-:data:`MOST_BLOCKS` blocks: of longer drives neighbouring blocks are added, so a vehicle's size on disk and in memory
-does not grow with the hours that it is driven between two summaries. Records of a vehicle add up.
+Moments are symmetric, so only their upper triangles are stored, row by row, one block after the other. A record has at
+most :data:`MOST_BLOCKS` blocks: for longer drives neighbouring blocks are added, so the size of a record, on disk and
+in memory, does not grow with the hours driven between two summaries. Records of a vehicle add up.
 """
 
 import hashlib
@@ -29,13 +29,13 @@ from calibrator.terminal.text import counted
 __all__ = ["SCHEMA", "Outline", "Record", "decode_records", "drives_digest", "encode_records", "joined_records"]
 
 IMPOSSIBLE = "its summary holds impossible numbers; look at its recordings, and summarise them again"
-"""Why a vehicle is left out."""
+"""Reason why a vehicle with such a summary is left out."""
 FEWEST_BLOCKS = 4
-"""Fewer do not tell how sure anything is; a node's own are of several minutes. [1]"""
+"""Fewer blocks give no uncertainty. A vehicle may have so few because a node's own blocks last several minutes. [1]"""
 MOST_BLOCKS = 256
-"""Of a record: two hours and more; their spread is known to a tenth. [1]"""
+"""Most blocks of a record: they cover two hours and more, and their spread is known to a tenth. [1]"""
 MOST_MOMENT, MOST_VARIANCE_A2 = 1e30, 1e10
-"""Far beyond what any vehicle's recordings give: sums of products in any unit, variance of a current [A^2]."""
+"""Larger sums of products (in any unit) or variances of a current [A^2] are impossible: no recording comes near."""
 
 _FLOATS, _NAMES = pa.list_(pa.float64()), pa.list_(pa.string())
 SCHEMA = pa.schema(
@@ -61,7 +61,7 @@ SCHEMA = pa.schema(
     ]
 )
 _ABOUT = ["vehicle", "drives", "sources", "digests", "problem", "duration_s"]
-"""Columns without numbers of drives."""
+"""Columns that say which drives a record holds, without the numbers of their summary."""
 _NUMBERS = [field.name for field in SCHEMA if field.type in {_FLOATS, pa.list_(pa.bool_())}]
 
 
@@ -72,17 +72,17 @@ class Record:
     Attributes
     ----------
     vehicle : str
-        Name.
+        Name of the vehicle.
     drives : tuple of str
         Names of the drives.
     sources : tuple of str
         Which version of each drive's file was read, see :class:`.DriveFile`.
     digests : tuple of str
-        What each drive holds, see :func:`.recording_digest`; none of drives that could not be read.
+        Digest of each drive's content, see :func:`.recording_digest`; drives that could not be read have none.
     found : VehicleSummary or None
-        What they tell; None if they cannot be used, or were not asked for.
+        Summary of the drives; None if they cannot be used, or if only their names were read from the store.
     problem : str
-        Why they cannot be used; empty if they can.
+        Why the drives cannot be used; empty if they can.
     """
 
     vehicle: str
@@ -92,11 +92,11 @@ class Record:
     problem: str = ""
     digests: tuple[str, ...] = ()
     duration_s: float = 0.0
-    """Usable data in them, as stored. [s]"""
+    """Duration of the usable data in the drives, as stored. [s]"""
 
 
 class Outline(NamedTuple):
-    """What there is of one vehicle: names of the drives that can be used, and why it cannot be calibrated, if so."""
+    """Outline of one vehicle: names of its usable drives, and why it cannot be calibrated (empty if it can)."""
 
     vehicle: str
     drives: tuple[str, ...]
@@ -104,7 +104,7 @@ class Outline(NamedTuple):
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> "Outline":
-        """Outline of a vehicle from its records, which need not hold what their drives tell."""
+        """Make the outline of a vehicle from its records, which need not hold summaries."""
         usable = [record for record in records if not record.problem]
         drives = tuple(name for record in usable for name in record.drives)
         duration_s = sum(record.duration_s for record in usable)
@@ -112,7 +112,7 @@ class Outline(NamedTuple):
 
 
 def drives_digest(records: Sequence[Record]) -> str:
-    """Digest of the drives of a vehicle that can be used, as they are: another one if any was added or changed."""
+    """Return a digest of the usable drives of a vehicle; it changes when a drive is added or changed."""
     known = sorted(
         pair for record in records if record.found for pair in zip(record.drives, record.sources, strict=True)
     )
@@ -120,12 +120,12 @@ def drives_digest(records: Sequence[Record]) -> str:
 
 
 def joined_records(records: Sequence[Record]) -> VehicleSummary:
-    """All that the records of one vehicle, at least one, tell; see :func:`.added_summaries`.
+    """Join the records of one vehicle, at least one, to one summary; see :func:`.added_summaries`.
 
     Raises
     ------
     DriveError
-        If none can be used, they are too short together, or hold impossible numbers.
+        If no record can be used, all together are too short, or they hold impossible numbers.
     """
     usable = [record.found for record in records if record.found is not None]
     if not usable:
@@ -146,7 +146,7 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
 
 
 def encode_records(records: Sequence[Record], identity: StoreIdentity) -> bytes:
-    """Write records, which have the inputs and branches of the store, as a Parquet file."""
+    """Return records, which must have the inputs and branches of the store, as the content of a Parquet file."""
     buffer = io.BytesIO()
     table = pa.Table.from_pylist([_row(record, identity) for record in records], schema=SCHEMA)
     pq.write_table(
@@ -192,23 +192,23 @@ def decode_records(
     Parameters
     ----------
     contents : sequence of bytes
-        The files.
+        Contents of the files.
     identity : StoreIdentity
-        Of their store.
+        Identity of their store.
     where : str
-        Of the files, for messages.
+        Where the files are, for messages.
     whole : bool
-        Whether to read what the drives tell, too, and not only which they are.
+        Whether to read the summaries as well, and not only the names of the drives.
 
     Returns
     -------
     list of Record
-        In the order of the files.
+        The records in the order of the files.
 
     Raises
     ------
     FleetError
-        If a file is damaged, cut or no such file.
+        If a file is damaged, cut or not a file of records.
     DriveError
         If a vehicle has a name that is no file name.
     """
@@ -223,7 +223,7 @@ def decode_records(
                 continue
         except (pa.ArrowException, OSError):
             reason = "it is cut or changed, or no Parquet file"
-        except ValueError:  # lists of other lengths
+        except ValueError:  # lists have other lengths than those of this store
             pass
         raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again")
     return found
@@ -251,7 +251,7 @@ def _records(table: pa.Table, identity: StoreIdentity, where: str, *, whole: boo
 
 
 def _values(table: pa.Table, name: str) -> list[Array]:
-    """Numbers in each row of a column of lists: NaN for what is none, nothing where there is no list."""
+    """Return the numbers in each row of a column of lists: NaN for a null, an empty array if there is no list."""
     lists = table.column(name).combine_chunks()
     values = np.asarray(lists.values.to_numpy(zero_copy_only=False), np.float64)
     return [values[start:stop] for start, stop in pairwise(lists.offsets.to_numpy().tolist())]
@@ -260,7 +260,7 @@ def _values(table: pa.Table, name: str) -> list[Array]:
 def _vehicle(
     row: Mapping[str, Any], numbers: Mapping[str, Array], identity: StoreIdentity, bank: str
 ) -> VehicleSummary:
-    """What a row tells; ValueError if its numbers are too few or too many."""
+    """Make the summary of one row; raise ValueError if it has too few or too many numbers."""
     K, L = len(identity.branches), len(LEVEL_EDGES_A) + 1
     p = identity.bank.width + K + 1
     noise_a2 = numbers["noise_a2"].reshape(-1, K)

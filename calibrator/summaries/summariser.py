@@ -1,4 +1,4 @@
-"""Samples of drives into their summary: filtered, without spikes, summed by blocks; with sums for the check of fit."""
+"""Summarise samples of drives: filter the inputs, leave out spikes, add up by blocks, also for the check of fit."""
 
 from collections.abc import Sequence
 
@@ -31,7 +31,7 @@ from ecu_node.summary import (
 __all__ = ["find_spikes", "second_differences", "summarise_samples"]
 
 LEVEL_OF_AMPERE: NDArray[np.int64] = np.searchsorted(LEVELS_A, np.arange(LEVELS_A[-1] + 1), side="right")
-"""Distance of the level of so many whole amperes from the middle one."""
+"""For each number of whole amperes: how many levels its level is away from the middle one."""
 
 
 def summarise_samples(
@@ -56,19 +56,19 @@ def summarise_samples(
     temperatures_c : sequence of ndarray of shape (T,), or None
         Temperature of the sensors in each drive, NaN where it is not known. [degC]
     settling : int
-        Samples after the start of a drive that are not used, if they are more than the bank needs.
+        Samples to leave out after the start of a drive, if more than the bank needs to settle.
     block_s : float
         Length of a block. [s]
 
     Returns
     -------
     DriveSummary
-        Blocks of all drives; those with too few valid samples are not among them.
+        Blocks of all drives, except those with too few valid samples.
 
     Raises
     ------
     DriveError
-        If no block has enough valid samples, or the bank is of other inputs or of another period.
+        If no block has enough valid samples, or the bank has other inputs or another period.
     """
     bank = plain_bank(drives[0].input_names, period_s=period_s) if bank is None else bank
     K, W = drives[0].currents_a.shape[1], bank.width
@@ -107,7 +107,7 @@ def summarise_samples(
         if temperatures_c is not None:
             warm_c[:T] = temperatures_c[number]
         is_known = use & np.isfinite(warm_c.reshape(blocks, length))
-        with np.errstate(invalid="ignore"):  # NaN where no temperature of a block is known
+        with np.errstate(invalid="ignore"):  # NaN if no temperature of a block is known
             mean_c = np.where(is_known, warm_c.reshape(blocks, length), 0.0).sum(axis=1) / is_known.sum(axis=1)
         parts.append(
             (
@@ -136,7 +136,7 @@ def summarise_samples(
 
 @compiled
 def _add_levels(table: Array, used: Mask, first: int, level_of_ampere: NDArray[np.int64], levels: Array) -> None:
-    """Add the rows of blocks that are used to the sums of the level of each of their currents."""
+    """Add each used row of the blocks, for each branch, to the sums of the level that its current has."""
     K, L, wide = levels.shape
     for block in range(len(table)):
         for t in range(table.shape[1]):
@@ -153,7 +153,7 @@ def _add_levels(table: Array, used: Mask, first: int, level_of_ampere: NDArray[n
 
 @compiled
 def _white_noise_a2(currents: Array, length: int) -> Array:
-    """Variance of white noise per block from the median third difference; gaps (NaN) take no part. [A^2]"""
+    """Estimate the variance of white noise per block from the median third difference, without gaps (NaN). [A^2]"""
     T, K = currents.shape
     blocks = -(-T // length)
     noise, third = np.zeros((blocks, K)), np.empty((K, length))
@@ -173,7 +173,7 @@ def _white_noise_a2(currents: Array, length: int) -> Array:
 
 
 def second_differences(currents_a: Array, used: Mask) -> Array:
-    """Distance of each sample from the mean of its neighbours; zero where one of the three is not used.
+    """Return the distance of each sample from the mean of its two neighbours; zero if one of the three is not used.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def second_differences(currents_a: Array, used: Mask) -> Array:
     Returns
     -------
     ndarray of shape (..., T - 2, K)
-        White noise of variance s^2 has 1.5 s^2 here; currents that change slowly have nothing. [A]
+        The distances. White noise of variance s^2 has variance 1.5 s^2 here; slow changes of a current vanish. [A]
     """
     inner = used[..., 1:-1] & used[..., :-2] & used[..., 2:]
     distance = currents_a[..., 1:-1, :] - 0.5 * (currents_a[..., :-2, :] + currents_a[..., 2:, :])
@@ -205,20 +205,20 @@ def find_spikes(currents_a: Array, used: Mask) -> NDArray[np.int8]:
     Returns
     -------
     ndarray of int of shape (T, K)
-        1 for an upward, -1 for a downward spike, 0 for none. A Hampel test of the residual of the junction law, whose
-        gains are those of these samples.
+        1 for an upward, -1 for a downward spike, 0 for none. The test is a Hampel test of the residual of the junction
+        law, with gains fitted to these samples.
     """
     found = np.zeros(currents_a.shape, np.int8)
     K = currents_a.shape[1]
     kept = used
-    for _ in range(2):  # the second time with gains that the spikes did not bend
+    for _ in range(2):  # the second time with gains that the spikes no longer distort
         if kept.sum() < FEWEST_FOR_GAINS * K:
             return found
         weights = _junction_weights(currents_a, kept)
         residual = currents_a @ weights
         change = np.abs(np.diff(residual))[used[1:] & used[:-1]]
         if not change.max(initial=0.0) > max(STEP_OF_SPIKE * float(np.median(change)), LEAST_SPIKE_A):
-            return found  # mostly: what follows takes longer
+            return found  # the usual case; it saves the slow rest
         far = residual - median_filter(residual, SPIKE_WINDOW, mode="nearest")
         spread = MAD_TO_SD * float(np.median(np.abs(far[kept])))
         suspects = used & (np.abs(far) > max(SPIKE_SDS * spread, LEAST_SPIKE_A))
@@ -238,7 +238,7 @@ def find_spikes(currents_a: Array, used: Mask) -> NDArray[np.int8]:
 
 
 def _junction_weights(currents_a: Array, kept: Mask) -> Array:
-    """Weights of the branches in the junction law, that of the branch that moves most being one, by least squares."""
+    """Fit the branches' weights in the junction law by least squares; the branch that varies most has weight 1."""
     x = currents_a if kept.all() else currents_a[kept]
     mean = x.mean(axis=0)
     gram = x.T @ x - len(x) * np.outer(mean, mean)

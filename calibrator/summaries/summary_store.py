@@ -1,10 +1,10 @@
 """A store of summaries: ``STORE/summaries.json`` and ``STORE/buckets/BBBBB-NNNNN.parquet``.
 
 Vehicles are spread over a fixed number of buckets by a hash of their names, so that any number of vehicles makes a
-moderate number of files, a vehicle is found without an index, and each bucket is a random sample of the fleet. What is
-added to a bucket is a file of its own, numbered upwards: it costs what it is, not what the store is. A file
-``BBBBB-NNNNN.whole.parquet`` stands for all that was there before it; older ones are removed after it is written, and
-do not count if a run was killed before.
+moderate number of files, a vehicle is found without an index, and each bucket is a random sample of the fleet. Each
+addition to a bucket is a file of its own, numbered upwards, so its cost does not depend on the size of the store. A
+file ``BBBBB-NNNNN.whole.parquet`` replaces all earlier files of its bucket; these are removed after it is written, and
+are ignored if a run was killed before it could remove them.
 """
 
 import re
@@ -36,7 +36,7 @@ __all__ = [
 
 _FILE = re.compile(r"(?P<bucket>[0-9]{5})-(?P<number>[0-9]{5})(?P<whole>\.whole)?\.parquet")
 Records = Mapping[str, Sequence[Record]]
-"""By vehicle."""
+"""Records by vehicle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +46,9 @@ class SummaryStore:
     Attributes
     ----------
     storage : Storage
-        Where it is.
+        Where the store is.
     identity : StoreIdentity
-        What its summaries have in common.
+        What all its summaries have in common.
     """
 
     storage: Storage
@@ -75,12 +75,12 @@ class SummaryStore:
         return dict(sorted(found.items()))
 
     def buckets(self) -> list[int]:
-        """Buckets in which there are vehicles, in order.
+        """Return the numbers of the buckets that have a file, in order.
 
         Raises
         ------
         FleetError
-            If there is a file that would not be read, though it looks like one with vehicles.
+            If there is a Parquet file whose name does not belong to any bucket, so that it would not be read.
         """
         found, count = set[int](), self.identity.buckets
         for name in self._files.names():
@@ -95,28 +95,28 @@ class SummaryStore:
         return sorted(found)
 
     def files(self, bucket: int) -> tuple[list[str], list[str]]:
-        """Files of a bucket that count, and those that do not any more, in the order of their addition."""
+        """Return the files of a bucket that count, and those that were replaced, each in the order of addition."""
         names = [name for name in self._files.names(f"{bucket:05d}-") if _FILE.fullmatch(name)]
         first = max((k for k, name in enumerate(names) if ".whole." in name), default=0)
         return names[first:], names[:first]
 
     def versions(self) -> dict[str, str]:
-        """What tells whether a file was changed, by name."""
+        """Return the version of each file by name; a version changes when its file changes."""
         return {entry.name: entry.version for entry in self._files.contents()[1]}
 
     def size_bytes(self) -> int:
-        """Size of its files. [byte]"""
+        """Return the size of all files. [byte]"""
         return sum(entry.size for entry in self._files.contents()[1])
 
     def read(self, bucket: int, *, whole: bool = True) -> dict[str, list[Record]]:
-        """Records of a bucket by vehicle, in the order of their names, and of their addition; none if it is empty.
+        """Return the records of a bucket by vehicle, vehicles sorted by name, records in the order of addition.
 
         Parameters
         ----------
         bucket : int
             Number of the bucket.
         whole : bool
-            Whether to read what their drives tell, too, and not only which they are.
+            Whether to read the summaries as well, and not only the names of the drives.
 
         Raises
         ------
@@ -137,11 +137,14 @@ class SummaryStore:
         return dict(sorted(found.items()))
 
     def outlines(self, bucket: int) -> list[Outline]:
-        """What there is of each vehicle of a bucket; raises as :meth:`read`."""
+        """Return the outline of each vehicle of a bucket; raise UserError as :meth:`read` does."""
         return [Outline.of(records) for records in self.read(bucket, whole=False).values()]
 
     def append(self, bucket: int, records: Records, *, whole: bool = False) -> None:
-        """Add records to a bucket, or replace it, whole or not at all; UserError if they cannot be written."""
+        """Add records to a bucket, or replace its content if `whole`; UserError if they cannot be written.
+
+        The file is written whole or not at all.
+        """
         old = [name for names in self.files(bucket)[::-1] for name in names]
         number = int(old[-1][6:11]) + 1 if old else 0
         content = encode_records([record for name in sorted(records) for record in records[name]], self.identity)
@@ -152,10 +155,10 @@ class SummaryStore:
     def change(
         self, bucket: int, change: Callable[[Record], Record | None], new: Sequence[Record] = (), *, whole: bool = False
     ) -> None:
-        """Add records to a bucket, and put what a function makes of each in its place; None: it is removed.
+        """Add records to a bucket, and replace each old record by what `change` returns for it; None removes it.
 
-        The function must not look at what drives tell. Only where it changes something, or `whole` says so, the bucket
-        is written anew. Other processes of this machine wait meanwhile; other storage than folders has no locks.
+        `change` must not look at the summaries, which may not be loaded. The bucket is rewritten only if `change`
+        alters a record or `whole` is true. Other processes of this machine wait meanwhile; object storage has no locks.
         """
         added = {record.vehicle: [record] for record in new}
         with self.storage.locked():
@@ -173,12 +176,12 @@ class SummaryStore:
 
 
 def require_store_or_nothing(storage: Storage) -> None:
-    """Refuse a place for summaries, before any drive is read, that is not empty and no store of them.
+    """Check, before any drive is read, that a place for summaries is either empty or a store of summaries.
 
     Raises
     ------
     FleetError
-        If it is another folder, a file, or one that does not last.
+        If it is a folder with other content, a file, or storage that does not last.
     """
     if storage.is_local and Path(storage.url).is_file():
         raise FleetError(f"{storage.url}: is a file; name a folder for the summaries, or a URL")
@@ -186,7 +189,7 @@ def require_store_or_nothing(storage: Storage) -> None:
         raise FleetError(
             f"{storage.url}: is gone when the command ends; name a folder for the summaries, or another URL"
         )
-    there = storage.names()  # before its identity: another machine may make the store just now
+    there = storage.names()  # listed before the identity is read, as another machine may be making the store
     if there and read_identity(storage) is None:
         raise FleetError(
             f"{storage.url}: no store of summaries, and not empty: {few(there)}; choose an empty or new folder"
@@ -206,21 +209,21 @@ def open_store(
     Parameters
     ----------
     storage : Storage
-        Where it is, or will be.
+        Where the store is, or will be.
     equipment, database, fleet : Equipment, VehicleDatabase, FleetSource
-        Whose drives are to be added.
+        Branches and inputs, DBC and layout, and the fleet whose drives are to be added.
     bank : FilterBank or None
-        Filters of their inputs; None: those of the store, or the plain inputs for a new one.
+        Filters of the inputs; None: those of the store, or the plain inputs for a new one.
 
     Returns
     -------
     SummaryStore
-        To add to.
+        The open store.
 
     Raises
     ------
     FleetError
-        If there is a store of another layout, other branches or other inputs.
+        If there is a store with another layout, other branches or other inputs.
     """
     identity = read_identity(storage, database)
     if bank is None and identity is not None and identity.fleet_inputs == equipment.fleet_inputs:
@@ -233,7 +236,7 @@ def open_store(
     wanted = store_identity(equipment, database, bank=bank, vehicles=len(fleet.vehicles), fleet=fleet.name)
     if identity is None:
         write_identity(storage, wanted)
-        identity = read_identity(storage, database)  # another process may have made the store just now
+        identity = read_identity(storage, database)  # another process may have just made the store
         assert identity is not None
     if difference := identity.difference(wanted):
         raise FleetError(f"{storage.url}: these drives cannot be added to this store: {difference}; use another store")
@@ -282,18 +285,18 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
     place : str
         Path or URL.
     whole : bool
-        Whether to read all that it holds, and to look for damage and for recordings that several vehicles have; else
-        names of vehicles and drives only.
+        Whether to read all that it holds, and look for damage and for recordings that several vehicles share; if not,
+        only names of vehicles and drives are read.
 
     Returns
     -------
     StoreReport
-        What was found; faults by vehicle or file.
+        What was found, with faults by vehicle or file.
 
     Raises
     ------
     FleetError
-        If it is no store.
+        If there is no store at the place.
     """
     store, owners = existing_store(place), dict[str, str]()
     about, buckets = store.identity, store.buckets()
@@ -328,7 +331,7 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
 
 
 def compact_store(place: str) -> int:
-    """Make one file of each bucket; of how many. FleetError if it is no store."""
+    """Merge the files of each bucket into one; return how many buckets had several. FleetError if it is no store."""
     store = existing_store(place)
     many = [bucket for bucket in store.buckets() if sum(map(len, store.files(bucket))) > 1]
     for bucket in shown(many, "put files together", len(many), "buckets"):

@@ -1,4 +1,4 @@
-"""From the drives of one vehicle to its summary: delays between branches, zero-current windows, second moments."""
+"""Summarise the drives of one vehicle: delays between branches, zero-current windows, second moments."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -36,22 +36,22 @@ __all__ = [
 ]
 
 LEAST_DURATION_S = 120.0
-"""Valid data below which a vehicle is left out: fewer than four blocks do not tell how sure anything is. [s]"""
+"""A vehicle with less valid data is left out: fewer than four blocks give no uncertainty. [s]"""
 COARSEST_PERIOD_S = 5.0
-"""Frames of a fleet farther apart leave too few in a block of 30 s. [s]"""
+"""Largest distance of the frames of a fleet: if it is larger, a block of 30 s has too few. [s]"""
 
 MOST_OVER_FULL_SCALE = 10.0
-"""Largest current that is taken for one, over full scale. [1]"""
+"""Larger currents, relative to full scale, are not plausible. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ZeroCurrent:
-    """Offsets that K branches of one vehicle showed; NaN where there was no window.
+    """Offsets that K branches of one vehicle showed in zero-current windows; NaN for a branch without a window.
 
     Attributes
     ----------
     offset_a, sd_a : ndarray of shape (K,)
-        Mean of the windows' medians and its standard deviation. [A]
+        Mean of the medians of the windows, and its standard deviation. [A]
     """
 
     offset_a: Array
@@ -60,20 +60,20 @@ class ZeroCurrent:
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleSummary:
-    """One vehicle as the posterior sees it.
+    """Summary of one vehicle: all that the estimator knows of it.
 
     Attributes
     ----------
     vehicle : str
-        Name.
+        Name of the vehicle.
     drives : tuple of str
         Names of the drives used.
     summary : DriveSummary
-        Of all of them, delays taken out.
+        Moments of all these drives, with the delays taken out.
     delays : BranchDelays
-        Of its branches; the reference is the branch that moves most.
+        Delays of its branches; the reference is the branch whose current varies most.
     zero_current : ZeroCurrent
-        What the sensors showed while the contactors were open.
+        Offsets that the sensors showed while the contactors were open.
     """
 
     vehicle: str
@@ -84,10 +84,10 @@ class VehicleSummary:
 
 
 def added_summaries(parts: Sequence[VehicleSummary]) -> VehicleSummary:
-    """Summary of all drives of several summaries of one vehicle, at least one.
+    """Add several summaries, at least one, of one vehicle.
 
-    Delays are those of the part that knows most of them, and these best, as drives are aligned with their own; readings
-    in zero-current windows are averaged by their precision.
+    The delays are those of the part that knows most of them, and among equals most precisely; they are not averaged, as
+    the drives of each part were aligned with its own. Zero-current readings are averaged, weighted by precision.
     """
     offset_a, sd_a = weighted_mean(*((part.zero_current.offset_a, part.zero_current.sd_a) for part in parts))
     delays = [part.delays for part in parts]
@@ -121,12 +121,12 @@ def summarise_drives(
     bank : FilterBank or None
         Filters of the fleet model's inputs; None: the plain inputs.
     known_s : float
-        Usable data of the vehicle besides, of which these drives may be a short addition. [s]
+        Duration of usable data that the vehicle has already, so that an addition may be short. [s]
 
     Returns
     -------
     VehicleSummary
-        The vehicle.
+        Summary of the vehicle.
 
     Raises
     ------
@@ -151,7 +151,10 @@ def summarise_drives(
 def aligned_drives(
     drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, *, known_s: float = 0.0
 ) -> tuple[BranchDelays, list[Samples]]:
-    """Delays of the branches of one vehicle, and its drives on one time base without them; as summarise_drives."""
+    """Return the delays of a vehicle's branches, and its drives without them on one time base.
+
+    Arguments and errors are those of :func:`summarise_drives`.
+    """
     layout = database.layout
     for drive in drives:
         require_possible(drive, layout)
@@ -168,7 +171,7 @@ def aligned_drives(
 
 
 def too_slow(period_s: float) -> str:
-    """Why frames so far apart cannot be used in a fleet; empty if they can."""
+    """Say why frames at this distance cannot be used in a fleet; empty if they can."""
     if period_s <= COARSEST_PERIOD_S:
         return ""
     alone = "a vehicle by itself is calibrated at any distance, with --trusted"
@@ -176,7 +179,7 @@ def too_slow(period_s: float) -> str:
 
 
 def too_short(duration_s: float, drives: int) -> str:
-    """Why so much data cannot be used; empty if it can."""
+    """Say why data of this duration is too short to be used; empty if it is long enough."""
     if duration_s >= LEAST_DURATION_S:
         return ""
     found = f"{duration_s:.1f} s of usable data in {counted(drives, 'drive')}"
@@ -184,14 +187,14 @@ def too_short(duration_s: float, drives: int) -> str:
 
 
 def _temperature_c(channel: Channel | None, samples: Samples) -> Array:
-    """Temperature at the instants of samples, NaN if it was not recorded; it changes slowly, so gaps do not matter."""
+    """Interpolate the temperature at the samples, across gaps because it changes slowly; NaN if not recorded. [degC]"""
     if channel is None or not channel.good.any():
         return np.full(len(samples.time_s), np.nan)
     return np.interp(samples.time_s, channel.time_s[channel.good], channel.value[channel.good])
 
 
 def require_possible(drive: Drive, layout: Layout) -> None:
-    """Refuse currents that no sensor of this junction shows, and numbers that are none."""
+    """Raise DriveError for currents that no sensor of this junction can show, and for inputs that are not finite."""
     for name, channel in drive.branches.items():
         largest = float(np.abs(channel.value[channel.good]).max(initial=0.0))
         if not largest <= MOST_OVER_FULL_SCALE * layout.full_scale_a:
@@ -205,7 +208,7 @@ def require_possible(drive: Drive, layout: Layout) -> None:
 
 
 def most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
-    """Branches by falling variance; of one that a drive lacks, which is noticed later, that of the others."""
+    """Sort branches by falling variance over the drives that have them; that some lack one is noticed later."""
 
     def variance_a2(name: str) -> float:
         channels = [drive.branches[name] for drive in drives if name in drive.branches]
@@ -219,21 +222,23 @@ def most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple
 
 
 def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], database: VehicleDatabase) -> ZeroCurrent:
-    """Read the offsets in all windows of a vehicle's drives.
+    """Read the offsets of the sensors in all zero-current windows of a vehicle's drives.
 
     Parameters
     ----------
     drives : sequence of Drive
-        Of one vehicle.
+        Drives of one vehicle.
     branches : sequence of str
         Names of the K branches.
     database : VehicleDatabase
-        Its layout says which input tells that the contactors are open; if none does, no window is known.
+        DBC and layout. The layout names the input that tells when the contactors are open; without it there is no
+        window.
 
     Returns
     -------
     ZeroCurrent
-        Of the branches. How far pieces of windows differ counts once per window: pieces of one wander together.
+        Offsets of the branches. Their standard deviation contains the spread of pieces of windows, divided by the root
+        of the number of windows and not of pieces, because the pieces of one window wander together.
     """
     offset, sd = np.full(len(branches), np.nan), np.full(len(branches), np.nan)
     for k, name in enumerate(branches):
@@ -255,7 +260,7 @@ def _medians_of_pieces(current: Channel) -> Array:
 
 
 def _shown(drive: Drive, branch: str, layout: Layout) -> Iterator[Channel]:
-    """Good samples of a branch well inside each window of one drive; a gap in the state ends a window."""
+    """Yield the good samples of a branch well inside each window of a drive; a gap in the state ends a window."""
     if layout.contactor is None:
         return
     state, current = drive.inputs.get(layout.contactor.input), drive.branches.get(branch)
@@ -277,7 +282,7 @@ def _is_open(state: Channel, contactor: Contactor) -> Array:
 
 
 def weighted_mean(*readings: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Mean by precision of values with standard deviations, NaN where neither tells, and its standard deviation."""
+    """Average values with standard deviations by precision; return mean and deviation, NaN if no value is known."""
     told = [np.isfinite(value) & np.isfinite(sd) for value, sd in readings]
     precision = [np.where(there, 1.0 / np.square(sd), 0.0) for there, (_, sd) in zip(told, readings, strict=True)]
     total = np.sum(precision, axis=0)
