@@ -57,7 +57,7 @@ class Characteristic(NamedTuple):
     name : str
         Unique; letters, digits, underscores and dots.
     text : str
-        What it is, in one line of ASCII.
+        Description in one line of ASCII.
     branch : str
         Name of its branch; empty if it belongs to the whole vehicle.
     unit : str

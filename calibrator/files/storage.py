@@ -60,7 +60,7 @@ class Storage:
     Attributes
     ----------
     url : str
-        As the user named it: a path, or a URL such as ``s3://bucket/fleet``.
+        Absolute path, or a URL such as ``s3://bucket/fleet``.
     """
 
     url: str

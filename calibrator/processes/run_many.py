@@ -90,12 +90,8 @@ class Workers:
     processes : int
         Number of processes on this machine.
     scheduler : str or None
-        Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead.
-
-    Raises
-    ------
-    FleetError
-        If a scheduler is named and Dask is missing.
+        Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead. FleetError is raised if Dask
+        is missing.
     """
 
     processes: int = 1

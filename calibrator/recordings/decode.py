@@ -119,7 +119,7 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
     signal : Signal
         The signal; its multiplexing is ignored.
     data, length : ndarray
-        As in :func:`decode_signal`.
+        Payloads, and bytes of each frame, as in :func:`decode_signal`.
 
     Returns
     -------
@@ -131,7 +131,7 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
     Raises
     ------
     DatabaseError
-        As in :func:`decode_signal`.
+        If the signal has a width that cannot be decoded, as in :func:`decode_signal`.
     """
     bits = signal.length
     if bits > _WORD_BITS or (signal.is_float and bits not in _FLOATS):

@@ -87,7 +87,7 @@ def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a file; inside the block every exception becomes a LogError, and asammdf prints and warns nothing."""
+    """Open a file; in the block any exception but MemoryError becomes a LogError, and asammdf prints nothing."""
     if importlib.util.find_spec("asammdf") is None:
         raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'hv-current-correction[mf4]'")
     reason, hook = "", sys.unraisablehook

@@ -98,7 +98,8 @@ class Table:
     units : dict of str to str
         Unit by header, where it has one: ``A`` for ``Ibat [A]``, ``Ibat (Amps)`` or ``Ibat_A``.
     bad : dict of str to ndarray of bool, shape (n,)
-        Where a column has a text or an infinite number instead of a number; columns without such cells are absent.
+        Rows in which a column has a text or an infinite number instead of a number; columns without such rows are
+        absent.
     texts : dict of str to str
         For columns without any number, by header: the first cell that is no number and where it stands, for messages.
     found : str

@@ -1,4 +1,4 @@
-"""``calibrator repository``: what a manufacturer does so that vehicles get their parameters, and only these."""
+"""``calibrator repository``: commands with which a manufacturer gives each vehicle its parameters, and no others."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,8 @@
-"""Drives of a fleet into a store of summaries: each drive is read once, ever, and only its summary travels.
+"""Summarise the drives of a fleet into a store: each drive is read only once, ever, and workers send only its summary.
 
-The store is its own checkpoint: a bucket whose vehicles are read is written, and what a killed run has left is whole.
-A recording counts once. One that two vehicles of a run have counts for neither, as it cannot be told whose it is.
+The store is its own checkpoint: a bucket is written as soon as its vehicles are read, and a killed run leaves only
+complete files. A recording counts once for a vehicle. If two vehicles of a run have the same recording, it counts for
+neither, as nobody can tell whose it is.
 """
 
 import hashlib
@@ -48,24 +49,24 @@ __all__ = [
 ]
 
 COPY = "same recording as"
-"""How the problem of a recording begins that is there already."""
+"""First words of the problem of a record whose recording is already there."""
 
 
 @dataclass(kw_only=True)
 class SummariseReport:
-    """What was summarised.
+    """Result of a run: what was summarised and what was left out.
 
     Attributes
     ----------
     store : str
         Path or URL of the store.
     vehicles, drives : int
-        Vehicles of which something was summarised, and these drives; neither what was in the store already counts nor
-        what was left out.
+        Numbers of vehicles with new summaries, and of drives in these; drives that were already in the store or left
+        out do not count.
     left_out : dict of str to str
-        Vehicles whose drives could not be used, files whose vehicle is unclear, and why.
+        Why vehicles or files were left out: their drives could not be used, or the vehicle of a file is unclear.
     notices : list of str
-        What else the user should know.
+        Further notices for the user.
     """
 
     store: str
@@ -111,7 +112,7 @@ def summarise_fleet(
     branches : tuple of str or None
         Branches to use; None: those that the fleet has.
     bank : FilterBank or None
-        Filters of their inputs; None: those of the store, or the plain inputs for a new one.
+        Filters of the inputs; None: those of the store, or the plain inputs for a new one.
     workers : Workers
         Where the drives are read.
     time_limit_s : float
@@ -120,7 +121,7 @@ def summarise_fleet(
     Returns
     -------
     SummariseReport
-        What was read; it is in the store then.
+        What was read, and is now in the store.
 
     Raises
     ------
@@ -145,12 +146,12 @@ def add_drives(
     workers: Workers,
     time_limit_s: float = TIME_LIMIT_S,
 ) -> SummariseReport:
-    """Summarise the drives of a fleet that a store does not have yet.
+    """Summarise the drives of a fleet that an open store does not have yet.
 
     Parameters
     ----------
     store : SummaryStore
-        Where to; what is new in a bucket is written when all of its vehicles are read.
+        Store to add to; the new records of a bucket are written when all its vehicles are read.
     fleet, database : FleetSource, VehicleDatabase
         The drives; DBC and layout.
     workers : Workers
@@ -193,10 +194,10 @@ def add_drives(
 
 
 class _Task(NamedTuple):
-    """What is read at a time: new drives of one vehicle.
+    """Unit of reading: the new drives of one vehicle.
 
-    ``digests`` and ``known_s`` are those of its other recordings [s], ``versions`` of all its drives, ``size`` that of
-    the fleet since the task before. [byte]
+    `digests` and `known_s` are the digests and the duration [s] of its recordings in the store, `versions` those of the
+    files of all its drives. `size` is the size of all vehicles since the task before, this one included. [byte]
     """
 
     bucket: int
@@ -209,7 +210,10 @@ class _Task(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class _Owners:
-    """Whose recording is whose, by the first half of its digest, as a fleet has many; those that several share."""
+    """The vehicle that has each recording first, and all vehicles of the recordings that several share.
+
+    Keys are the first half of a digest, to save memory in a large fleet.
+    """
 
     first: dict[int, str] = field(default_factory=dict)
     shared: dict[int, set[str]] = field(default_factory=dict)
@@ -221,7 +225,7 @@ class _Owners:
                 self.shared.setdefault(key, {other}).add(vehicle)
 
     def without_copies(self, record: Record) -> Record:
-        """A record, without its summary if several vehicles have a recording of it."""
+        """Return a record, without its summary if another vehicle has one of its recordings too."""
         sharing = set[str]().union(*(self.shared.get(_key(digest), ()) for digest in record.digests))
         if not sharing - {record.vehicle}:
             return record
@@ -235,7 +239,7 @@ def _key(digest: str) -> int:
 
 
 def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator[_Task]:
-    """Drives to read, bucket by bucket; owners are told of those that the store has."""
+    """Yield the drives to read, bucket by bucket; recordings that the store has are noted in `owners`."""
     size = 0
     for bucket, names in store.by_bucket(fleet.vehicles).items():
         records = store.read(bucket, whole=False)
@@ -253,13 +257,13 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator
 
 
 def _stays(record: Record, versions: Mapping[str, str]) -> bool:
-    """Whether a record is still right, or cannot be made anew as not all of its drives are given."""
+    """Check whether to keep a record: its drives are unchanged, or not all are given, so it cannot be made again."""
     known = zip(record.drives, record.sources, strict=True)
     return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
 
 
 def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase) -> Record:
-    """Record of some drives of one vehicle."""
+    """Read the new drives of one vehicle and make their record."""
     made, drives, digests = dict[str, VehicleSummary](), dict[str, Drive](), list[str]()
     for entry in task.drives:
         if is_onboard(entry):
@@ -301,7 +305,7 @@ def _keep(
     versions: Mapping[str, Mapping[str, str]],
     report: SummariseReport,
 ) -> None:
-    """Put new records into a bucket, beside what others have put there meanwhile."""
+    """Put new records into a bucket, keep what other processes have added meanwhile, and update the report."""
     read = {record.vehicle: set(record.drives) for record in new}
 
     def kept(old: Record) -> Record | None:
@@ -328,7 +332,7 @@ def _keep(
 
 
 def read_samples(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> list[Samples]:
-    """Load the drives of one vehicle as aligned samples, delays taken out; UserError if they cannot be used."""
+    """Load the drives of one vehicle as aligned samples without delays; UserError if they cannot be used."""
     return aligned_drives([load_drive(entry, database) for entry in entries], equipment, database)[1]
 
 
@@ -346,28 +350,29 @@ def read_vehicle_summary(
 def _read_onboard(
     path: Path, store: StoreIdentity, database: VehicleDatabase, *, vehicle: str, name: str
 ) -> VehicleSummary:
-    """Read a record as a summary with the branches and inputs of a store.
+    """Read a record that a node made on board as a summary with the branches and inputs of a store.
 
     Parameters
     ----------
     path : Path
         The file.
     store : StoreIdentity
-        Of the store.
+        Identity of the store.
     database : VehicleDatabase
         DBC and layout.
     vehicle, name : str
-        Whose record it must be, and what it is called.
+        Vehicle to which the record must belong, and name of the drive.
 
     Returns
     -------
     VehicleSummary
-        A block for each batch of the record.
+        Summary with one block per batch of the record.
 
     Raises
     ------
     DriveError
-        If the file is damaged, of another vehicle, layout or DBC, or lacks a branch or input of the store.
+        If the file is damaged, belongs to another vehicle, layout or DBC, lacks a branch or input of the store, or if
+        the store has a filter bank with poles.
     """
     record = read_onboard_record(path, database)
     if record.vehicle != vehicle:
@@ -394,7 +399,7 @@ def _read_onboard(
 
 
 def _onboard_summary(record: SummaryFile, bank: str) -> DriveSummary:
-    """Moments from means and covariances; ValueError or IndexError if there are too few or too many numbers."""
+    """Make moments from the record's means and covariances; ValueError or IndexError if its numbers do not fit."""
     B, M, K = len(record.count), len(record.inputs), len(record.branches)
     p = M + K + 1
     count, mean, covariance = np.array(record.count, np.float64), np.ones((B, p)), np.zeros((B, p, p))
@@ -424,7 +429,7 @@ def _onboard_summary(record: SummaryFile, bank: str) -> DriveSummary:
 
 
 def _symmetric(content: bytes, rows: int, size: int) -> Array:
-    """Symmetric matrices of their lower triangles, shape (rows, size, size)."""
+    """Make symmetric matrices from their lower triangles, shape (rows, size, size)."""
     full, lower = np.zeros((rows, size, size)), np.tril_indices(size)
     full[:, lower[0], lower[1]] = full[:, lower[1], lower[0]] = _numbers(content, rows, len(lower[0]))
     return full
