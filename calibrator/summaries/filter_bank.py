@@ -1,13 +1,13 @@
-"""Filter bank: fixed A and B of the state space (2) of [1]_, shared by identical vehicles; each has its own read-out.
+"""Filter bank: fixed A and B of the state space (2) of [1]_, the same for identical vehicles; C and D are per vehicle.
 
-The columns of the bank are the inputs u themselves and, per pole p, each input through x(t+1) = p x(t) + (1 - p) u(t):
-a low-pass for a real pole, a resonance for a complex one, whose real and imaginary parts are two columns. All columns
-depend on inputs alone, so noise of the sensors leaves no bias in a read-out (output error).
+Columns of the bank are the inputs u themselves and, per pole p, each input filtered by x(t+1) = p x(t) + (1 - p) u(t).
+This is a low-pass for a real pole, and a resonance for a complex one, whose real and imaginary part are two columns.
+All columns depend on the inputs alone, so sensor noise leaves no bias in a read-out (output error).
 
-The loop over samples is compiled. Its causal rule for invalid samples: an input keeps its last valid value for a
-limited time. After a longer gap, and at the start of a drive, the filters start in the steady state of the first valid
-input. Their output is not used until they have settled, that is, until all but a small share of an error in that
-starting state has decayed. A bank without poles has nothing to settle: its columns are the plain inputs.
+Over invalid samples an input keeps its last valid value for a limited time. After a longer gap, and at the start of a
+drive, the filters start in the steady state of the first valid input, and their output is not used until they have
+settled, that is until only a small share of an error of that start remains. A bank without poles has nothing to
+settle: its columns are the plain inputs. The filters run sample by sample in compiled code.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -26,12 +26,11 @@ from calibrator.errors import DriveError
 __all__ = ["FilterBank", "low_passes", "plain_bank", "read_bank"]
 
 LONGEST_HOLD_S = 1.0
-"""Time that an input may keep its last valid value: currents of a drive seldom change much within it. [s]"""
+"""Longest time that an input may keep its last valid value; currents seldom change much within it. [s]"""
 UNSETTLED = 0.05
-"""Share of an error in the starting state that may remain: it is reached after three time constants of the slowest
-pole. [1]"""
+"""Share of an error of the start that remains in settled filters: three time constants of the slowest pole. [1]"""
 LARGEST_RADIUS = 1.0 - 1e-9
-"""Largest magnitude of a pole; beyond it the filter never settles. [1]"""
+"""Largest magnitude of a pole; one any closer to the unit circle does not settle. [1]"""
 
 Poles = tuple[tuple[float, float], ...]
 
@@ -44,15 +43,15 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     input_names : tuple of str
         Names of the M inputs.
     period_s : float
-        Distance of the samples. [s]
+        Time between samples. [s]
     poles : tuple of (float, float)
-        Real and imaginary part of each pole in the z-plane, all inside the unit circle; a complex pair is given by its
-        pole with positive imaginary part. Empty: the plain inputs.
+        Real and imaginary part of each pole in the z-plane, inside the unit circle. A complex pair is given by its pole
+        with positive imaginary part. Empty: the plain inputs.
 
     Raises
     ------
     DriveError
-        If a pole is unstable or not in the upper half plane, the period is not positive, or two inputs share a name.
+        If a pole is unstable or in the lower half plane, the period is not positive, or two inputs have one name.
     """
 
     input_names: tuple[str, ...]
@@ -60,7 +59,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     poles: Poles = ()
 
     def __post_init__(self) -> None:
-        """Raise DriveError if the bank cannot be run."""
+        """Check period, names and poles."""
         if not (np.isfinite(self.period_s) and self.period_s > 0.0):
             raise DriveError(f"filter bank: period {self.period_s} s; expected a positive number")
         if len(set(self.input_names)) < len(self.input_names):
@@ -74,7 +73,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def identity(self) -> str:
-        """Digest of input names, period and poles; only summaries with the same digest may be added up."""
+        """Digest of input names, period and poles; summaries made with different banks must not be mixed."""
         return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
 
     @property
@@ -84,7 +83,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def states(self) -> int:
-        """Number of states n of all inputs together."""
+        """Number of filter states n, over all inputs."""
         return len(self.input_names) * sum(1 if imag == 0.0 else 2 for _, imag in self.poles)
 
     @property
@@ -94,12 +93,12 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def settling(self) -> int:
-        """Samples after a start that are not used."""
+        """Number of samples after a start that are not used, as the filters have not settled."""
         slowest = max((float(np.hypot(*pole)) for pole in self.poles), default=0.0)
         return int(np.ceil(np.log(UNSETTLED) / np.log(slowest))) if slowest > 0.0 else 0
 
     def system(self) -> tuple[Array, Array]:
-        """Return A (n, n) and B (n, M); the states are in the order of the columns that follow the inputs."""
+        """Return A (n, n) and B (n, M); states have the order of the columns of :meth:`run` after the inputs."""
         M = len(self.input_names)
         real, pairs = _by_kind(self.complex_poles)
         own = np.concatenate([real, pairs.real, pairs.real])
@@ -111,7 +110,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return A, np.kron(gains[:, None], np.eye(M))
 
     def run(self, inputs: Array, valid: Mask, *, settling: int = 0) -> tuple[Array, Mask]:
-        """Filter a drive.
+        """Filter the inputs of a drive.
 
         Parameters
         ----------
@@ -120,15 +119,15 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         valid : ndarray of bool of shape (T,)
             Samples that may be used.
         settling : int
-            Samples to leave out after a start, if more than :attr:`settling`, so that this bank uses the same samples
-            as a slower one with which it is compared.
+            Number of samples not used after a start, if larger than :attr:`settling`; with that of a slower bank, both
+            banks are compared on the same samples.
 
         Returns
         -------
         columns : ndarray of shape (T, W)
-            Inputs and states; zero where not used.
+            W = :attr:`width` columns, inputs and states; zero where not used.
         used : ndarray of bool of shape (T,)
-            Which samples are valid and come from settled filters.
+            Valid samples at which the filters have settled.
         """
         columns, used = np.zeros((len(inputs), self.width)), np.zeros(len(inputs), np.bool_)
         real, pairs = _by_kind(self.complex_poles)
@@ -142,7 +141,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
     def described(self) -> str:
-        """Describe the poles: the time constant of each low-pass, frequency and time constant of each resonance."""
+        """Return the poles in words: time constant of each low-pass, frequency and time constant of each resonance."""
         words = [_described(pole, self.period_s) for pole in self.complex_poles]
         return ", ".join(words) or "the plain inputs"
 
@@ -160,12 +159,12 @@ def low_passes(time_constants_s: Array, *, period_s: float) -> Poles:
     time_constants_s : ndarray of shape (m,)
         Time constants. [s]
     period_s : float
-        Distance of the samples. [s]
+        Time between samples. [s]
 
     Returns
     -------
     tuple of (float, float)
-        Real and imaginary part (0) of each pole, as in :class:`FilterBank`.
+        Real and imaginary part of each pole, as in :class:`FilterBank`.
     """
     return tuple((float(pole), 0.0) for pole in np.exp(-period_s / np.asarray(time_constants_s)))
 
@@ -199,7 +198,7 @@ def read_bank(path: Path) -> FilterBank:
 
 
 def _by_kind(poles: Complex) -> tuple[Array, Complex]:
-    """Split poles into the real ones, and one of each complex pair."""
+    """Split poles into the real ones and one of each complex pair."""
     return poles.real[poles.imag == 0.0], poles[poles.imag > 0.0]
 
 
@@ -214,7 +213,7 @@ def _described(pole: complex, period_s: float) -> str:
 def _filter(
     samples: tuple[Array, Mask], poles: Complex, real: int, limits: NDArray[np.int64], out: tuple[Array, Mask]
 ) -> None:
-    """Run the bank, sample by sample; the first `real` poles are real, the others are complex and have two columns."""
+    """Run the bank sample by sample; the first `real` poles are real, the others make two columns per input."""
     inputs, valid = samples
     columns, used = out
     M, m = inputs.shape[1], len(poles)

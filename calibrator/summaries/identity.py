@@ -1,4 +1,4 @@
-"""Identity of a store of summaries: they add up only if branches, inputs, filters and time base are the same."""
+"""Identity of a store: its summaries add up only if branches, inputs, filters and time base are the same."""
 
 import hashlib
 from typing import Annotated
@@ -25,11 +25,10 @@ __all__ = [
 SCHEMA_VERSION = 4
 FILE = "summaries.json"
 FEWEST_BUCKETS, MOST_BUCKETS = 16, 32_768
-"""Bounds for the buckets of a store: enough that an interrupted bucket loses few vehicles, and few enough that their
-folder can be listed. [1]"""
+"""Range of the number of buckets: with more, a killed run loses fewer vehicles; with too many, listing takes long."""
 _HASH_BYTES = 8
 VEHICLES_PER_BUCKET = 256
-"""Number aimed at: such a bucket has a few megabytes and is read in a fraction of a second. [1]"""
+"""Intended size of a bucket: a few megabytes, which are read in a fraction of a second."""
 
 
 class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -40,13 +39,13 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     schema_version : int
         Version of the store's format.
     layout, layout_sha256, dbc_sha256 : str
-        Name of the layout, and digests of layout and DBC, which define what the signals mean.
+        Name of the layout, and digests of layout and DBC.
     branches, inputs, fleet_inputs : tuple of str
         Branches and model inputs of the fleet, see :class:`~calibrator.drive.Equipment`.
     notices : tuple of str
-        Notices of what the layout has and the fleet lacks.
+        Branches and inputs of the layout that the store does not use, and why, in words.
     bank : FilterBank
-        Filters of the fleet inputs.
+        Filters of the inputs ``fleet_inputs``.
     block_s : float
         Length of a block. [s]
     buckets : int
@@ -76,7 +75,7 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         )
 
     def difference(self, other: "StoreIdentity") -> str:
-        """Say in words why summaries of another store do not fit into this one; empty if they fit."""
+        """Say in words why summaries of another store cannot be added to this one; return an empty text if they can."""
         for name in ("layout_sha256", "dbc_sha256", "branches", "fleet_inputs", "bank", "block_s"):
             mine, its = getattr(self, name), getattr(other, name)
             if mine != its:
@@ -91,7 +90,7 @@ def _short(value: object) -> str:
 
 
 def bucket_of(vehicle: str, buckets: int) -> int:
-    """Return the bucket of a vehicle, from 0 to ``buckets - 1``; it depends on nothing but the name and `buckets`."""
+    """Return the bucket of a vehicle, 0 to ``buckets - 1``; it depends on nothing but the vehicle's name."""
     digest = hashlib.blake2b(vehicle.encode(), digest_size=_HASH_BYTES).digest()
     return int.from_bytes(digest, "big") % buckets
 
@@ -104,7 +103,7 @@ def store_identity(
     fleet: str,
     bank: FilterBank | None = None,
 ) -> StoreIdentity:
-    """Make the identity of a new store.
+    """Return the identity of a new store.
 
     Parameters
     ----------
@@ -122,7 +121,7 @@ def store_identity(
     Returns
     -------
     StoreIdentity
-        The identity, with the present schema version.
+        Identity with the present schema version.
     """
     wanted = 1 << max(vehicles // VEHICLES_PER_BUCKET, 1).bit_length()
     return StoreIdentity(
@@ -153,7 +152,7 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
     storage : Storage
         Folder of the store.
     database : VehicleDatabase or None
-        DBC and layout that the store must have been made with; None: any.
+        DBC and layout with which the store must have been made; None: any.
 
     Returns
     -------
@@ -163,7 +162,8 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
     Raises
     ------
     FleetError
-        If the store has another version, layout or DBC, or contains impossible numbers or names.
+        If the file is damaged or holds impossible values, or the store has another version, layout, DBC or length of
+        blocks.
     """
     content, where = storage.read_if_there(FILE), f"{storage.url}/{FILE}"
     if content is None:

@@ -1,9 +1,9 @@
 """DriveSummary: all that the estimator needs of recorded drives, in a size that does not grow with the sampling rate.
 
 For each block of :data:`BLOCK_S` it holds the second moments of (columns of a filter bank, measured currents, 1).
-Summaries of drives add up, and the spread between blocks gives the uncertainty of everything computed from them. Second
-moments cannot distinguish a nonlinear sensor from a gain error; the :class:`FitSums` beside them can, and
-:mod:`calibrator.estimator.checks` reads them.
+Summaries of drives add up, and the spread between blocks shows the uncertainty of everything that is computed from
+them. Second moments cannot tell a sensor with a bent characteristic from a gain error; the :class:`FitSums` beside them
+can, and :mod:`calibrator.estimator.checks` reads them.
 """
 
 from collections.abc import Sequence
@@ -23,17 +23,17 @@ LEVEL_EDGES_A: Array = np.array([*(-a for a in reversed(LEVELS_A)), *LEVELS_A], 
 
 @dataclass(frozen=True, kw_only=True)
 class FitSums:
-    """Sums that tell whether linear sensors explain the drives: B blocks, K branches, M inputs, L levels.
+    """Sums that show whether linear sensors explain the drives: B blocks, K branches, M inputs, L levels.
 
     Attributes
     ----------
     levels : ndarray of shape (K, L, M + K + 2)
-        For each level of the current of branch k, see :data:`LEVEL_EDGES_A`: sums of (inputs, measured currents [A], 1)
-        and of the square of the measured current k [A^2].
+        Sums over the samples in which current k is in a level (see :data:`LEVEL_EDGES_A`): of (inputs, measured
+        currents [A], 1), and of the square of the measured current k [A^2].
     fast_a2 : ndarray of shape (B, K, K)
         Sums of products of the second differences of the measured currents. [A^2]
     spikes : ndarray of shape (B, K, 2)
-        Number of samples left out of all sums because one branch has an upward or a downward spike there.
+        Number of upward and of downward spikes of each branch; samples with a spike are left out of all sums.
     temperature_c : ndarray of shape (B,)
         Mean temperature of the sensors; NaN where it is not known. [degC]
     starts : ndarray of bool of shape (B,)
@@ -62,11 +62,11 @@ class DriveSummary:
     branches : int
         Number of branches K.
     period_s : float
-        Distance of the samples. [s]
+        Time between samples. [s]
     bank : str
         Identity of the filter bank, see :class:`~calibrator.summaries.filter_bank.FilterBank`.
     fit : FitSums or None
-        Sums for the check of fit; None if the moments were not made from samples, and then nothing is checked.
+        Sums for the check of fit; None if the moments were not made from samples: then nothing is checked.
     """
 
     moments: Array
@@ -88,7 +88,7 @@ class DriveSummary:
 
     @property
     def duration_s(self) -> float:
-        """Time summarised. [s]"""
+        """Duration of the samples summed up. [s]"""
         return float(self.moments[:, -1, -1].sum()) * self.period_s
 
     @property
@@ -105,11 +105,11 @@ class DriveSummary:
 
     @property
     def variance_a2(self) -> Array:
-        """Variance of the measured currents, which offsets do not change, shape (K,). [A^2]"""
+        """Variance of the measured currents, which does not depend on their offsets, shape (K,). [A^2]"""
         return np.asarray(np.diag(self.mean_product_a2) - self.mean_a**2)
 
     def __add__(self, other: "DriveSummary") -> "DriveSummary":
-        """Return the summary of the drives of both, the blocks of `other` after those of this one.
+        """Return the summary of the drives of both; the blocks of `other` follow those of this one.
 
         Raises
         ------
@@ -139,7 +139,7 @@ class DriveSummary:
         )
 
     def take_branches(self, order: Sequence[int], inputs: Sequence[int] | None = None) -> "DriveSummary":
-        """Return the summary of the branches at these indices, in that order, and of some or all of the inputs."""
+        """Return the summary of the branches with these indices, in this order, and of some inputs (None: all)."""
         chosen, M = list(order), self.inputs
         columns = [*(range(M) if inputs is None else inputs), *(M + k for k in chosen), M + self.branches]
         return replace(
@@ -157,7 +157,7 @@ class DriveSummary:
         )
 
     def shortened(self, most: int) -> "DriveSummary":
-        """Return the summary in at most `most` blocks, with neighbours added up; means are weighted by samples."""
+        """Return the summary with neighbouring blocks added up into at most `most`; means are weighted by samples."""
         count, samples, fit = len(self.moments), self.moments[:, -1, -1], self.fit
         if count <= most:
             return self
@@ -179,12 +179,12 @@ class DriveSummary:
 
 
 def common_bank(summaries: Sequence[DriveSummary]) -> str:
-    """Return the identity of the filter bank with which all summaries, at least one, were made.
+    """Return the identity of the filter bank with which all of one or more summaries were made.
 
     Raises
     ------
     DriveError
-        If there is more than one: their columns do not mean the same.
+        If they were made with different banks, so that their columns mean different things.
     """
     banks = dict.fromkeys(summary.bank for summary in summaries)
     if len(banks) > 1:

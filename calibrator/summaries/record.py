@@ -1,8 +1,8 @@
-"""Records of a store: the result of one reading of a vehicle's drives, one row each in a Parquet file.
+"""Records of a store: each is the result of reading some drives of one vehicle, and one row of a Parquet file.
 
 Moments are symmetric, so only their upper triangles are stored, row by row, one block after the other. A record has at
-most :data:`MOST_BLOCKS` blocks: for longer drives neighbouring blocks are added, so the size of a record, on disk and
-in memory, does not grow with the hours driven between two summaries. Records of a vehicle add up.
+most :data:`MOST_BLOCKS` blocks: neighbouring blocks of longer drives are added up, so a vehicle's size on disk and in
+memory does not grow with the hours that it is driven between two summaries. Records of a vehicle add up.
 """
 
 import hashlib
@@ -29,13 +29,13 @@ from calibrator.terminal.text import counted
 __all__ = ["SCHEMA", "Outline", "Record", "decode_records", "drives_digest", "encode_records", "joined_records"]
 
 IMPOSSIBLE = "its summary holds impossible numbers; look at its recordings, and summarise them again"
-"""Reason why a vehicle with such a summary is left out."""
+"""Reason for leaving a vehicle out, as the user reads it."""
 FEWEST_BLOCKS = 4
-"""Fewer blocks give no uncertainty. A vehicle may have so few because a node's own blocks last several minutes. [1]"""
+"""Least number of blocks of a vehicle: fewer do not show the uncertainty. A block made on board takes minutes. [1]"""
 MOST_BLOCKS = 256
-"""Most blocks of a record: they cover two hours and more, and their spread is known to a tenth. [1]"""
+"""Most blocks of a record: they cover two hours or more, and show the spread between blocks to a tenth. [1]"""
 MOST_MOMENT, MOST_VARIANCE_A2 = 1e30, 1e10
-"""Larger sums of products (in any unit) or variances of a current [A^2] are impossible: no recording comes near."""
+"""Limits of sums of products (in any unit) and of the variance of a current [A^2], far beyond any real recording."""
 
 _FLOATS, _NAMES = pa.list_(pa.float64()), pa.list_(pa.string())
 SCHEMA = pa.schema(
@@ -61,13 +61,13 @@ SCHEMA = pa.schema(
     ]
 )
 _ABOUT = ["vehicle", "drives", "sources", "digests", "problem", "duration_s"]
-"""Columns that say which drives a record holds, without the numbers of their summary."""
+"""Columns that describe a record; the others hold the numbers of its summary."""
 _NUMBERS = [field.name for field in SCHEMA if field.type in {_FLOATS, pa.list_(pa.bool_())}]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """Some drives of one vehicle that were read together.
+    """Result of reading some drives of one vehicle together.
 
     Attributes
     ----------
@@ -76,11 +76,11 @@ class Record:
     drives : tuple of str
         Names of the drives.
     sources : tuple of str
-        Which version of each drive's file was read, see :class:`.DriveFile`.
+        Version of each drive's file when it was read, see :class:`.DriveFile`.
     digests : tuple of str
-        Digest of each drive's content, see :func:`.recording_digest`; drives that could not be read have none.
+        Digest of the content of each drive, see :func:`.recording_digest`; empty if the drives could not be read.
     found : VehicleSummary or None
-        Summary of the drives; None if they cannot be used, or if only their names were read from the store.
+        Summary of the drives; None if they cannot be used, or if it was left unread (``whole=False``).
     problem : str
         Why the drives cannot be used; empty if they can.
     """
@@ -92,11 +92,11 @@ class Record:
     problem: str = ""
     digests: tuple[str, ...] = ()
     duration_s: float = 0.0
-    """Duration of the usable data in the drives, as stored. [s]"""
+    """Duration of the usable data in the drives, as it is stored. [s]"""
 
 
 class Outline(NamedTuple):
-    """Outline of one vehicle: names of its usable drives, and why it cannot be calibrated (empty if it can)."""
+    """Usable drives of one vehicle by name, and why the vehicle cannot be calibrated (empty if it can)."""
 
     vehicle: str
     drives: tuple[str, ...]
@@ -104,7 +104,7 @@ class Outline(NamedTuple):
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> "Outline":
-        """Make the outline of a vehicle from its records, which need not hold summaries."""
+        """Return the outline of a vehicle from its records, which may come without their summaries."""
         usable = [record for record in records if not record.problem]
         drives = tuple(name for record in usable for name in record.drives)
         duration_s = sum(record.duration_s for record in usable)
@@ -112,7 +112,7 @@ class Outline(NamedTuple):
 
 
 def drives_digest(records: Sequence[Record]) -> str:
-    """Return a digest of the usable drives of a vehicle; it changes when a drive is added or changed."""
+    """Return a digest of the usable drives of a vehicle; it changes when a drive is added or its file changes."""
     known = sorted(
         pair for record in records if record.found for pair in zip(record.drives, record.sources, strict=True)
     )
@@ -120,12 +120,12 @@ def drives_digest(records: Sequence[Record]) -> str:
 
 
 def joined_records(records: Sequence[Record]) -> VehicleSummary:
-    """Join the records of one vehicle, at least one, to one summary; see :func:`.added_summaries`.
+    """Add up the summaries of one or more records of one vehicle, see :func:`.added_summaries`.
 
     Raises
     ------
     DriveError
-        If no record can be used, all together are too short, or they hold impossible numbers.
+        If no record can be used, all are too short together, or their numbers are impossible.
     """
     usable = [record.found for record in records if record.found is not None]
     if not usable:
@@ -146,7 +146,7 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
 
 
 def encode_records(records: Sequence[Record], identity: StoreIdentity) -> bytes:
-    """Return records, which must have the inputs and branches of the store, as the content of a Parquet file."""
+    """Return the content of a Parquet file with records; they must have the inputs and branches of the store."""
     buffer = io.BytesIO()
     table = pa.Table.from_pylist([_row(record, identity) for record in records], schema=SCHEMA)
     pq.write_table(
@@ -198,19 +198,19 @@ def decode_records(
     where : str
         Where the files are, for messages.
     whole : bool
-        Whether to read the summaries as well, and not only the names of the drives.
+        Whether to read the summaries as well, and not only names, versions, digests and problems of the drives.
 
     Returns
     -------
     list of Record
-        The records in the order of the files.
+        Records in the order of the files.
 
     Raises
     ------
     FleetError
-        If a file is damaged, cut or not a file of records.
+        If a file is damaged or cut, or is not a file of summaries.
     DriveError
-        If a vehicle has a name that is no file name.
+        If the name of a vehicle cannot be a file name.
     """
     found: list[Record] = []
     for content in contents:
@@ -223,7 +223,7 @@ def decode_records(
                 continue
         except (pa.ArrowException, OSError):
             reason = "it is cut or changed, or no Parquet file"
-        except ValueError:  # lists have other lengths than those of this store
+        except ValueError:  # lists of wrong lengths
             pass
         raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again")
     return found
@@ -251,7 +251,7 @@ def _records(table: pa.Table, identity: StoreIdentity, where: str, *, whole: boo
 
 
 def _values(table: pa.Table, name: str) -> list[Array]:
-    """Return the numbers in each row of a column of lists: NaN for a null, an empty array if there is no list."""
+    """Return the numbers in each row of a column of lists: NaN for a null number, an empty array for a null list."""
     lists = table.column(name).combine_chunks()
     values = np.asarray(lists.values.to_numpy(zero_copy_only=False), np.float64)
     return [values[start:stop] for start, stop in pairwise(lists.offsets.to_numpy().tolist())]
@@ -260,7 +260,7 @@ def _values(table: pa.Table, name: str) -> list[Array]:
 def _vehicle(
     row: Mapping[str, Any], numbers: Mapping[str, Array], identity: StoreIdentity, bank: str
 ) -> VehicleSummary:
-    """Make the summary of one row; raise ValueError if it has too few or too many numbers."""
+    """Return the summary in a row; raise ValueError if it has too few or too many numbers."""
     K, L = len(identity.branches), len(LEVEL_EDGES_A) + 1
     p = identity.bank.width + K + 1
     noise_a2 = numbers["noise_a2"].reshape(-1, K)

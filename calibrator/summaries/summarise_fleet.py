@@ -1,8 +1,8 @@
-"""Summarise the drives of a fleet into a store: each drive is read only once, ever, and workers send only its summary.
+"""Summarise the drives of a fleet into a store: each drive is read only once, and only its summary is passed on.
 
-The store is its own checkpoint: a bucket is written as soon as its vehicles are read, and a killed run leaves only
-complete files. A recording counts once for a vehicle. If two vehicles of a run have the same recording, it counts for
-neither, as nobody can tell whose it is.
+The store is its own checkpoint: a bucket is written when all its vehicles are read, and a killed run leaves only
+complete files. A recording counts once. If two vehicles have the same recording, it counts for neither, as it is
+unclear to which it belongs.
 """
 
 import hashlib
@@ -49,22 +49,22 @@ __all__ = [
 ]
 
 COPY = "same recording as"
-"""First words of the problem of a record whose recording is already there."""
+"""Beginning of the problem text of a record with a recording that is in the store already."""
 
 
 @dataclass(kw_only=True)
 class SummariseReport:
-    """Result of a run: what was summarised and what was left out.
+    """Result of a run: what was summarised, and what was left out.
 
     Attributes
     ----------
     store : str
         Path or URL of the store.
     vehicles, drives : int
-        Numbers of vehicles with new summaries, and of drives in these; drives that were already in the store or left
-        out do not count.
+        Number of vehicles with newly summarised drives, and of these drives, without what was in the store before and
+        what was left out.
     left_out : dict of str to str
-        Why vehicles or files were left out: their drives could not be used, or the vehicle of a file is unclear.
+        Reasons by vehicle whose drives could not be used, or by file whose vehicle is unclear.
     notices : list of str
         Further notices for the user.
     """
@@ -110,9 +110,9 @@ def summarise_fleet(
     out : str
         Path or URL of the store; made if there is none.
     branches : tuple of str or None
-        Branches to use; None: those that the fleet has.
+        Branches to use; None: those found in the fleet.
     bank : FilterBank or None
-        Filters of the inputs; None: those of the store, or the plain inputs for a new one.
+        Filters of the fleet's inputs; None: those of the store, or the plain inputs for a new one.
     workers : Workers
         Where the drives are read.
     time_limit_s : float
@@ -121,7 +121,7 @@ def summarise_fleet(
     Returns
     -------
     SummariseReport
-        What was read, and is now in the store.
+        What was added to the store, and what was left out.
 
     Raises
     ------
@@ -146,12 +146,12 @@ def add_drives(
     workers: Workers,
     time_limit_s: float = TIME_LIMIT_S,
 ) -> SummariseReport:
-    """Summarise the drives of a fleet that an open store does not have yet.
+    """Add summaries of the drives of a fleet that an open store does not have yet.
 
     Parameters
     ----------
     store : SummaryStore
-        Store to add to; the new records of a bucket are written when all its vehicles are read.
+        Store to add to; a bucket is written when all of its vehicles are read.
     fleet, database : FleetSource, VehicleDatabase
         The drives; DBC and layout.
     workers : Workers
@@ -162,7 +162,7 @@ def add_drives(
     Returns
     -------
     SummariseReport
-        What was read. A vehicle whose drives cannot be used has a record that says why.
+        What was added and left out. A vehicle whose drives cannot be used gets a record that says why.
     """
     report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
     read = partial(_read_record, store=store.identity, database=database)
@@ -194,10 +194,11 @@ def add_drives(
 
 
 class _Task(NamedTuple):
-    """Unit of reading: the new drives of one vehicle.
+    """Unit of work: the drives of one vehicle that are not in the store yet.
 
-    `digests` and `known_s` are the digests and the duration [s] of its recordings in the store, `versions` those of the
-    files of all its drives. `size` is the size of all vehicles since the task before, this one included. [byte]
+    ``digests`` and ``known_s`` (duration [s]) describe the recordings of the vehicle that the store has, ``versions``
+    gives the file version of each of its drives. ``size`` is what the progress bar advances by: the size of this
+    vehicle's drives and of the vehicles skipped since the task before. [byte]
     """
 
     bucket: int
@@ -210,10 +211,7 @@ class _Task(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class _Owners:
-    """The vehicle that has each recording first, and all vehicles of the recordings that several share.
-
-    Keys are the first half of a digest, to save memory in a large fleet.
-    """
+    """First vehicle seen with each recording, and all vehicles of shared ones, by half digests to save memory."""
 
     first: dict[int, str] = field(default_factory=dict)
     shared: dict[int, set[str]] = field(default_factory=dict)
@@ -225,7 +223,7 @@ class _Owners:
                 self.shared.setdefault(key, {other}).add(vehicle)
 
     def without_copies(self, record: Record) -> Record:
-        """Return a record, without its summary if another vehicle has one of its recordings too."""
+        """Return the record; if other vehicles share a recording of it, with a problem in place of its summary."""
         sharing = set[str]().union(*(self.shared.get(_key(digest), ()) for digest in record.digests))
         if not sharing - {record.vehicle}:
             return record
@@ -239,7 +237,7 @@ def _key(digest: str) -> int:
 
 
 def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator[_Task]:
-    """Yield the drives to read, bucket by bucket; recordings that the store has are noted in `owners`."""
+    """Yield the drives to read, bucket by bucket; enter recordings that the store has already in `owners`."""
     size = 0
     for bucket, names in store.by_bucket(fleet.vehicles).items():
         records = store.read(bucket, whole=False)
@@ -257,13 +255,13 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator
 
 
 def _stays(record: Record, versions: Mapping[str, str]) -> bool:
-    """Check whether to keep a record: its drives are unchanged, or not all are given, so it cannot be made again."""
+    """Check whether to keep a record: its drives are unchanged, or it cannot be remade as the fleet lacks some."""
     known = zip(record.drives, record.sources, strict=True)
     return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
 
 
 def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase) -> Record:
-    """Read the new drives of one vehicle and make their record."""
+    """Read the drives of a task and summarise them; a recording that the vehicle has already is skipped."""
     made, drives, digests = dict[str, VehicleSummary](), dict[str, Drive](), list[str]()
     for entry in task.drives:
         if is_onboard(entry):
@@ -305,7 +303,7 @@ def _keep(
     versions: Mapping[str, Mapping[str, str]],
     report: SummariseReport,
 ) -> None:
-    """Put new records into a bucket, keep what other processes have added meanwhile, and update the report."""
+    """Put new records into a bucket and keep what other processes have added meanwhile; count them in the report."""
     read = {record.vehicle: set(record.drives) for record in new}
 
     def kept(old: Record) -> Record | None:
@@ -332,7 +330,7 @@ def _keep(
 
 
 def read_samples(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> list[Samples]:
-    """Load the drives of one vehicle as aligned samples without delays; UserError if they cannot be used."""
+    """Load the drives of one vehicle and align them with delays taken out; UserError if they cannot be used."""
     return aligned_drives([load_drive(entry, database) for entry in entries], equipment, database)[1]
 
 
@@ -350,29 +348,29 @@ def read_vehicle_summary(
 def _read_onboard(
     path: Path, store: StoreIdentity, database: VehicleDatabase, *, vehicle: str, name: str
 ) -> VehicleSummary:
-    """Read a record that a node made on board as a summary with the branches and inputs of a store.
+    """Read a record that a node made on board, as a summary with the branches and inputs of a store.
 
     Parameters
     ----------
     path : Path
-        The file.
+        File of the record.
     store : StoreIdentity
         Identity of the store.
     database : VehicleDatabase
         DBC and layout.
     vehicle, name : str
-        Vehicle to which the record must belong, and name of the drive.
+        Vehicle to which the record must belong, and name of the drive for which it stands.
 
     Returns
     -------
     VehicleSummary
-        Summary with one block per batch of the record.
+        Summary with a block for each batch of the record.
 
     Raises
     ------
     DriveError
-        If the file is damaged, belongs to another vehicle, layout or DBC, lacks a branch or input of the store, or if
-        the store has a filter bank with poles.
+        If the file is damaged, of another vehicle, layout or DBC, or lacks a branch or input of the store, or the store
+        has filters, which need samples.
     """
     record = read_onboard_record(path, database)
     if record.vehicle != vehicle:
@@ -399,7 +397,7 @@ def _read_onboard(
 
 
 def _onboard_summary(record: SummaryFile, bank: str) -> DriveSummary:
-    """Make moments from the record's means and covariances; ValueError or IndexError if its numbers do not fit."""
+    """Compute moments from means and covariances; ValueError or IndexError if there are wrong or missing numbers."""
     B, M, K = len(record.count), len(record.inputs), len(record.branches)
     p = M + K + 1
     count, mean, covariance = np.array(record.count, np.float64), np.ones((B, p)), np.zeros((B, p, p))
@@ -429,7 +427,7 @@ def _onboard_summary(record: SummaryFile, bank: str) -> DriveSummary:
 
 
 def _symmetric(content: bytes, rows: int, size: int) -> Array:
-    """Make symmetric matrices from their lower triangles, shape (rows, size, size)."""
+    """Unpack symmetric matrices, shape (rows, size, size), from their lower triangles."""
     full, lower = np.zeros((rows, size, size)), np.tril_indices(size)
     full[:, lower[0], lower[1]] = full[:, lower[1], lower[0]] = _numbers(content, rows, len(lower[0]))
     return full

@@ -1,4 +1,4 @@
-"""Summarise samples of drives: filter the inputs, leave out spikes, add up by blocks, also for the check of fit."""
+"""Summarise samples: filter inputs, leave spikes out, sum moments by blocks, and add sums for the check of fit."""
 
 from collections.abc import Sequence
 
@@ -31,7 +31,7 @@ from ecu_node.summary import (
 __all__ = ["find_spikes", "second_differences", "summarise_samples"]
 
 LEVEL_OF_AMPERE: NDArray[np.int64] = np.searchsorted(LEVELS_A, np.arange(LEVELS_A[-1] + 1), side="right")
-"""For each number of whole amperes: how many levels its level is away from the middle one."""
+"""How many levels a current lies away from the middle one, by its magnitude in whole amperes."""
 
 
 def summarise_samples(
@@ -50,25 +50,25 @@ def summarise_samples(
     drives : sequence of Samples
         Aligned samples with the same branches and inputs.
     period_s : float
-        Distance of the samples. [s]
+        Time between samples. [s]
     bank : FilterBank or None
         Filters of the inputs; None: the plain inputs.
     temperatures_c : sequence of ndarray of shape (T,), or None
         Temperature of the sensors in each drive, NaN where it is not known. [degC]
     settling : int
-        Samples to leave out after the start of a drive, if more than the bank needs to settle.
+        Number of samples not used after a start, if larger than the bank needs; see :meth:`.FilterBank.run`.
     block_s : float
         Length of a block. [s]
 
     Returns
     -------
     DriveSummary
-        Blocks of all drives, except those with too few valid samples.
+        Blocks of all drives, without those that have too few valid samples.
 
     Raises
     ------
     DriveError
-        If no block has enough valid samples, or the bank has other inputs or another period.
+        If no block has enough valid samples, or the bank was made for other inputs or another period.
     """
     bank = plain_bank(drives[0].input_names, period_s=period_s) if bank is None else bank
     K, W = drives[0].currents_a.shape[1], bank.width
@@ -136,7 +136,7 @@ def summarise_samples(
 
 @compiled
 def _add_levels(table: Array, used: Mask, first: int, level_of_ampere: NDArray[np.int64], levels: Array) -> None:
-    """Add each used row of the blocks, for each branch, to the sums of the level that its current has."""
+    """Add each used row (sample) of the blocks, for each of its currents, to the sums of that current's level."""
     K, L, wide = levels.shape
     for block in range(len(table)):
         for t in range(table.shape[1]):
@@ -153,7 +153,7 @@ def _add_levels(table: Array, used: Mask, first: int, level_of_ampere: NDArray[n
 
 @compiled
 def _white_noise_a2(currents: Array, length: int) -> Array:
-    """Estimate the variance of white noise per block from the median third difference, without gaps (NaN). [A^2]"""
+    """Estimate the white noise variance per block from the median third difference; gaps (NaN) are left out. [A^2]"""
     T, K = currents.shape
     blocks = -(-T // length)
     noise, third = np.zeros((blocks, K)), np.empty((K, length))
@@ -173,7 +173,7 @@ def _white_noise_a2(currents: Array, length: int) -> Array:
 
 
 def second_differences(currents_a: Array, used: Mask) -> Array:
-    """Return the distance of each sample from the mean of its two neighbours; zero if one of the three is not used.
+    """Return the distance of each sample from the mean of its two neighbours; zero where one of the three is not used.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def second_differences(currents_a: Array, used: Mask) -> Array:
     Returns
     -------
     ndarray of shape (..., T - 2, K)
-        The distances. White noise of variance s^2 has variance 1.5 s^2 here; slow changes of a current vanish. [A]
+        White noise of variance s^2 has variance 1.5 s^2 here; slow changes of a current hardly show. [A]
     """
     inner = used[..., 1:-1] & used[..., :-2] & used[..., 2:]
     distance = currents_a[..., 1:-1, :] - 0.5 * (currents_a[..., :-2, :] + currents_a[..., 2:, :])
@@ -193,32 +193,32 @@ def second_differences(currents_a: Array, used: Mask) -> Array:
 
 
 def find_spikes(currents_a: Array, used: Mask) -> NDArray[np.int8]:
-    """Label spikes: samples at which one branch, and it alone, leaves the junction law and its own neighbours.
+    """Label spikes: samples at which one branch alone breaks the junction law and stands out from its own neighbours.
 
     Parameters
     ----------
     currents_a : ndarray of shape (T, K)
-        Measured currents of neighbouring samples, zero where not used; some minutes. [A]
+        Measured currents of some minutes of consecutive samples, zero where not used. [A]
     used : ndarray of bool of shape (T,)
         Samples that may be used.
 
     Returns
     -------
     ndarray of int of shape (T, K)
-        1 for an upward, -1 for a downward spike, 0 for none. The test is a Hampel test of the residual of the junction
-        law, with gains fitted to these samples.
+        1 for an upward, -1 for a downward spike, 0 for none. Spikes are found by a Hampel test of the residual of the
+        junction law, with gains fitted to the same samples.
     """
     found = np.zeros(currents_a.shape, np.int8)
     K = currents_a.shape[1]
     kept = used
-    for _ in range(2):  # the second time with gains that the spikes no longer distort
+    for _ in range(2):  # the second time with gains that are fitted without the spikes
         if kept.sum() < FEWEST_FOR_GAINS * K:
             return found
         weights = _junction_weights(currents_a, kept)
         residual = currents_a @ weights
         change = np.abs(np.diff(residual))[used[1:] & used[:-1]]
         if not change.max(initial=0.0) > max(STEP_OF_SPIKE * float(np.median(change)), LEAST_SPIKE_A):
-            return found  # the usual case; it saves the slow rest
+            return found  # the usual case; what follows takes longer
         far = residual - median_filter(residual, SPIKE_WINDOW, mode="nearest")
         spread = MAD_TO_SD * float(np.median(np.abs(far[kept])))
         suspects = used & (np.abs(far) > max(SPIKE_SDS * spread, LEAST_SPIKE_A))
@@ -238,7 +238,7 @@ def find_spikes(currents_a: Array, used: Mask) -> NDArray[np.int8]:
 
 
 def _junction_weights(currents_a: Array, kept: Mask) -> Array:
-    """Fit the branches' weights in the junction law by least squares; the branch that varies most has weight 1."""
+    """Fit the weights of branches in the junction law by least squares; the branch that varies most has weight 1."""
     x = currents_a if kept.all() else currents_a[kept]
     mean = x.mean(axis=0)
     gram = x.T @ x - len(x) * np.outer(mean, mean)

@@ -2,9 +2,9 @@
 
 Vehicles are spread over a fixed number of buckets by a hash of their names, so that any number of vehicles makes a
 moderate number of files, a vehicle is found without an index, and each bucket is a random sample of the fleet. Each
-addition to a bucket is a file of its own, numbered upwards, so its cost does not depend on the size of the store. A
-file ``BBBBB-NNNNN.whole.parquet`` replaces all earlier files of its bucket; these are removed after it is written, and
-are ignored if a run was killed before it could remove them.
+addition to a bucket BBBBB is a new file with the next number NNNNN, so its cost depends on its own size, not on that of
+the store. A file ``BBBBB-NNNNN.whole.parquet`` replaces all earlier files of its bucket; these are removed once it is
+written, and are ignored if a run was killed before it removed them.
 """
 
 import re
@@ -48,7 +48,7 @@ class SummaryStore:
     storage : Storage
         Where the store is.
     identity : StoreIdentity
-        What all its summaries have in common.
+        What all summaries in it have in common.
     """
 
     storage: Storage
@@ -64,23 +64,23 @@ class SummaryStore:
         return self.storage.folder("buckets")
 
     def bucket_of(self, vehicle: str) -> int:
-        """Bucket of a vehicle."""
+        """Return the bucket of a vehicle."""
         return bucket_of(vehicle, self.identity.buckets)
 
     def by_bucket(self, vehicles: Iterable[str]) -> dict[int, list[str]]:
-        """Vehicles by the bucket that they are in."""
+        """Group vehicles by bucket, in the order of the buckets."""
         found: dict[int, list[str]] = defaultdict(list)
         for vehicle in vehicles:
             found[self.bucket_of(vehicle)].append(vehicle)
         return dict(sorted(found.items()))
 
     def buckets(self) -> list[int]:
-        """Return the numbers of the buckets that have a file, in order.
+        """List the buckets that have files, in order.
 
         Raises
         ------
         FleetError
-            If there is a Parquet file whose name does not belong to any bucket, so that it would not be read.
+            If there is a Parquet file whose name is not that of a file of this store; it would never be read.
         """
         found, count = set[int](), self.identity.buckets
         for name in self._files.names():
@@ -95,13 +95,13 @@ class SummaryStore:
         return sorted(found)
 
     def files(self, bucket: int) -> tuple[list[str], list[str]]:
-        """Return the files of a bucket that count, and those that were replaced, each in the order of addition."""
+        """Return the files of a bucket that count, and those that have been replaced, each in the order of addition."""
         names = [name for name in self._files.names(f"{bucket:05d}-") if _FILE.fullmatch(name)]
         first = max((k for k, name in enumerate(names) if ".whole." in name), default=0)
         return names[first:], names[:first]
 
     def versions(self) -> dict[str, str]:
-        """Return the version of each file by name; a version changes when its file changes."""
+        """Return the version of each file by name; it changes when the file does."""
         return {entry.name: entry.version for entry in self._files.contents()[1]}
 
     def size_bytes(self) -> int:
@@ -109,19 +109,19 @@ class SummaryStore:
         return sum(entry.size for entry in self._files.contents()[1])
 
     def read(self, bucket: int, *, whole: bool = True) -> dict[str, list[Record]]:
-        """Return the records of a bucket by vehicle, vehicles sorted by name, records in the order of addition.
+        """Read the records of a bucket by vehicle: vehicles sorted by name, records of each in the order of addition.
 
         Parameters
         ----------
         bucket : int
             Number of the bucket.
         whole : bool
-            Whether to read the summaries as well, and not only the names of the drives.
+            Whether to read the summaries as well, and not only which drives there are.
 
         Raises
         ------
         UserError
-            If the bucket cannot be read, is damaged, or holds vehicles of another one.
+            If the bucket cannot be read, is damaged, or holds vehicles that belong into another one.
         """
         names, found = self.files(bucket)[0], dict[str, list[Record]]()
         where = f"{self._files.url}/{names[0] if len(names) == 1 else f'{bucket:05d}-*.parquet'}" if names else ""
@@ -137,14 +137,11 @@ class SummaryStore:
         return dict(sorted(found.items()))
 
     def outlines(self, bucket: int) -> list[Outline]:
-        """Return the outline of each vehicle of a bucket; raise UserError as :meth:`read` does."""
+        """Return the outline of each vehicle of a bucket without reading summaries; errors as for :meth:`read`."""
         return [Outline.of(records) for records in self.read(bucket, whole=False).values()]
 
     def append(self, bucket: int, records: Records, *, whole: bool = False) -> None:
-        """Add records to a bucket, or replace its content if `whole`; UserError if they cannot be written.
-
-        The file is written whole or not at all.
-        """
+        """Write records as a new file of a bucket; with `whole` it replaces the bucket. UserError if that fails."""
         old = [name for names in self.files(bucket)[::-1] for name in names]
         number = int(old[-1][6:11]) + 1 if old else 0
         content = encode_records([record for name in sorted(records) for record in records[name]], self.identity)
@@ -155,10 +152,11 @@ class SummaryStore:
     def change(
         self, bucket: int, change: Callable[[Record], Record | None], new: Sequence[Record] = (), *, whole: bool = False
     ) -> None:
-        """Add records to a bucket, and replace each old record by what `change` returns for it; None removes it.
+        """Replace each record of a bucket by what a function returns for it (None: remove it), and add new records.
 
-        `change` must not look at the summaries, which may not be loaded. The bucket is rewritten only if `change`
-        alters a record or `whole` is true. Other processes of this machine wait meanwhile; object storage has no locks.
+        The function must not look at summaries: it is called without them first. The bucket is rewritten only if the
+        function changes a record, or if `whole` is true. The bucket is locked against other processes of this machine;
+        storage that is not a folder has no locks.
         """
         added = {record.vehicle: [record] for record in new}
         with self.storage.locked():
@@ -176,12 +174,12 @@ class SummaryStore:
 
 
 def require_store_or_nothing(storage: Storage) -> None:
-    """Check, before any drive is read, that a place for summaries is either empty or a store of summaries.
+    """Check, before any drive is read, that a place is a store of summaries, empty, or not there yet.
 
     Raises
     ------
     FleetError
-        If it is a folder with other content, a file, or storage that does not last.
+        If it is a folder with other content, a file, or storage that ends with this process (``memory://``).
     """
     if storage.is_local and Path(storage.url).is_file():
         raise FleetError(f"{storage.url}: is a file; name a folder for the summaries, or a URL")
@@ -213,17 +211,17 @@ def open_store(
     equipment, database, fleet : Equipment, VehicleDatabase, FleetSource
         Branches and inputs, DBC and layout, and the fleet whose drives are to be added.
     bank : FilterBank or None
-        Filters of the inputs; None: those of the store, or the plain inputs for a new one.
+        Filters of the fleet's inputs; None: those of the store, or the plain inputs for a new one.
 
     Returns
     -------
     SummaryStore
-        The open store.
+        Store to which the drives can be added.
 
     Raises
     ------
     FleetError
-        If there is a store with another layout, other branches or other inputs.
+        If there is a store with another layout, DBC, branches, inputs or filter bank, or the bank has other inputs.
     """
     identity = read_identity(storage, database)
     if bank is None and identity is not None and identity.fleet_inputs == equipment.fleet_inputs:
@@ -285,13 +283,13 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
     place : str
         Path or URL.
     whole : bool
-        Whether to read all that it holds, and look for damage and for recordings that several vehicles share; if not,
+        Whether to read everything, and to look for damage and for recordings that several vehicles share; otherwise
         only names of vehicles and drives are read.
 
     Returns
     -------
     StoreReport
-        What was found, with faults by vehicle or file.
+        What the store holds, and its faults by vehicle, bucket or file.
 
     Raises
     ------
@@ -331,7 +329,7 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
 
 
 def compact_store(place: str) -> int:
-    """Merge the files of each bucket into one; return how many buckets had several. FleetError if it is no store."""
+    """Merge the files of each bucket into one; return how many buckets that changed. FleetError if it is no store."""
     store = existing_store(place)
     many = [bucket for bucket in store.buckets() if sum(map(len, store.files(bucket))) > 1]
     for bucket in shown(many, "put files together", len(many), "buckets"):

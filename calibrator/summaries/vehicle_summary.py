@@ -1,4 +1,4 @@
-"""Summarise the drives of one vehicle: delays between branches, zero-current windows, second moments."""
+"""Summarise the drives of one vehicle: delays between branches, zero-current windows and second moments."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -36,17 +36,17 @@ __all__ = [
 ]
 
 LEAST_DURATION_S = 120.0
-"""A vehicle with less valid data is left out: fewer than four blocks give no uncertainty. [s]"""
+"""A vehicle with less valid data is left out: fewer than four blocks do not show the uncertainty. [s]"""
 COARSEST_PERIOD_S = 5.0
-"""Largest distance of the frames of a fleet: if it is larger, a block of 30 s has too few. [s]"""
+"""Longest time between samples of a fleet; a longer one leaves too few samples in a block of 30 s. [s]"""
 
 MOST_OVER_FULL_SCALE = 10.0
-"""Larger currents, relative to full scale, are not plausible. [1]"""
+"""Largest magnitude of a measured current that is believed, in multiples of full scale. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ZeroCurrent:
-    """Offsets that K branches of one vehicle showed in zero-current windows; NaN for a branch without a window.
+    """Offsets that the sensors of K branches showed in zero-current windows; NaN for a branch without a window.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class ZeroCurrent:
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleSummary:
-    """Summary of one vehicle: all that the estimator knows of it.
+    """All that the estimator knows of the drives of one vehicle.
 
     Attributes
     ----------
@@ -69,9 +69,9 @@ class VehicleSummary:
     drives : tuple of str
         Names of the drives used.
     summary : DriveSummary
-        Moments of all these drives, with the delays taken out.
+        Moments of all these drives, made after the delays were taken out.
     delays : BranchDelays
-        Delays of its branches; the reference is the branch whose current varies most.
+        Delays between the branches; the reference is the branch whose current varies most.
     zero_current : ZeroCurrent
         Offsets that the sensors showed while the contactors were open.
     """
@@ -84,10 +84,10 @@ class VehicleSummary:
 
 
 def added_summaries(parts: Sequence[VehicleSummary]) -> VehicleSummary:
-    """Add several summaries, at least one, of one vehicle.
+    """Add up one or more summaries of one vehicle.
 
-    The delays are those of the part that knows most of them, and among equals most precisely; they are not averaged, as
-    the drives of each part were aligned with its own. Zero-current readings are averaged, weighted by precision.
+    The delays are those of the summary that knows most of them, and of equals of the most precise one; they are not
+    averaged, as the drives of each summary were aligned with its own. Zero-current readings are averaged by precision.
     """
     offset_a, sd_a = weighted_mean(*((part.zero_current.offset_a, part.zero_current.sd_a) for part in parts))
     delays = [part.delays for part in parts]
@@ -121,17 +121,18 @@ def summarise_drives(
     bank : FilterBank or None
         Filters of the fleet model's inputs; None: the plain inputs.
     known_s : float
-        Duration of usable data that the vehicle has already, so that an addition may be short. [s]
+        Usable data that the vehicle has besides these drives; it counts towards the least duration. [s]
 
     Returns
     -------
     VehicleSummary
-        Summary of the vehicle.
+        Summary of these drives.
 
     Raises
     ------
     DriveError
-        If there is too little valid data; the message says how much.
+        If there is too little valid data (the message says how much), the samples are too far apart, a branch is
+        missing, or a current or input has impossible values.
     """
     delays, samples = aligned_drives(drives, equipment, database, known_s=known_s)
     name, temperatures_c = database.layout.temperature, None
@@ -151,7 +152,7 @@ def summarise_drives(
 def aligned_drives(
     drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, *, known_s: float = 0.0
 ) -> tuple[BranchDelays, list[Samples]]:
-    """Return the delays of a vehicle's branches, and its drives without them on one time base.
+    """Estimate the delays of a vehicle's branches, take them out and align each drive to the period of the layout.
 
     Arguments and errors are those of :func:`summarise_drives`.
     """
@@ -171,7 +172,7 @@ def aligned_drives(
 
 
 def too_slow(period_s: float) -> str:
-    """Say why frames at this distance cannot be used in a fleet; empty if they can."""
+    """Say why samples `period_s` apart cannot be used in a fleet; return an empty text if they can."""
     if period_s <= COARSEST_PERIOD_S:
         return ""
     alone = "a vehicle by itself is calibrated at any distance, with --trusted"
@@ -179,7 +180,7 @@ def too_slow(period_s: float) -> str:
 
 
 def too_short(duration_s: float, drives: int) -> str:
-    """Say why data of this duration is too short to be used; empty if it is long enough."""
+    """Say why usable data of this duration is too little; return an empty text if it is enough."""
     if duration_s >= LEAST_DURATION_S:
         return ""
     found = f"{duration_s:.1f} s of usable data in {counted(drives, 'drive')}"
@@ -187,14 +188,14 @@ def too_short(duration_s: float, drives: int) -> str:
 
 
 def _temperature_c(channel: Channel | None, samples: Samples) -> Array:
-    """Interpolate the temperature at the samples, across gaps because it changes slowly; NaN if not recorded. [degC]"""
+    """Interpolate the temperature at the samples [degC], NaN if not recorded; it is slow, so gaps do no harm."""
     if channel is None or not channel.good.any():
         return np.full(len(samples.time_s), np.nan)
     return np.interp(samples.time_s, channel.time_s[channel.good], channel.value[channel.good])
 
 
 def require_possible(drive: Drive, layout: Layout) -> None:
-    """Raise DriveError for currents that no sensor of this junction can show, and for inputs that are not finite."""
+    """Raise DriveError if a current is far beyond the full scale of the junction, or an input is not finite."""
     for name, channel in drive.branches.items():
         largest = float(np.abs(channel.value[channel.good]).max(initial=0.0))
         if not largest <= MOST_OVER_FULL_SCALE * layout.full_scale_a:
@@ -208,7 +209,7 @@ def require_possible(drive: Drive, layout: Layout) -> None:
 
 
 def most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
-    """Sort branches by falling variance over the drives that have them; that some lack one is noticed later."""
+    """Sort branches by falling variance; drives that lack a branch are skipped here and refused later."""
 
     def variance_a2(name: str) -> float:
         channels = [drive.branches[name] for drive in drives if name in drive.branches]
@@ -231,14 +232,13 @@ def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], datab
     branches : sequence of str
         Names of the K branches.
     database : VehicleDatabase
-        DBC and layout. The layout names the input that tells when the contactors are open; without it there is no
-        window.
+        Its layout names the input that shows whether the contactors are open; without it there are no windows.
 
     Returns
     -------
     ZeroCurrent
-        Offsets of the branches. Their standard deviation contains the spread of pieces of windows, divided by the root
-        of the number of windows and not of pieces, because the pieces of one window wander together.
+        Offsets of the branches. Windows are cut into pieces to see how far an offset wanders; this scatter is averaged
+        over the number of windows, not of pieces, as the pieces of one window wander together.
     """
     offset, sd = np.full(len(branches), np.nan), np.full(len(branches), np.nan)
     for k, name in enumerate(branches):
@@ -260,7 +260,7 @@ def _medians_of_pieces(current: Channel) -> Array:
 
 
 def _shown(drive: Drive, branch: str, layout: Layout) -> Iterator[Channel]:
-    """Yield the good samples of a branch well inside each window of a drive; a gap in the state ends a window."""
+    """Yield a branch's good samples well inside each window of one drive; a gap in the contactor state ends one."""
     if layout.contactor is None:
         return
     state, current = drive.inputs.get(layout.contactor.input), drive.branches.get(branch)
@@ -282,7 +282,7 @@ def _is_open(state: Channel, contactor: Contactor) -> Array:
 
 
 def weighted_mean(*readings: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Average values with standard deviations by precision; return mean and deviation, NaN if no value is known."""
+    """Return mean and standard deviation of readings (value, sd) weighted by precision; NaN where none is finite."""
     told = [np.isfinite(value) & np.isfinite(sd) for value, sd in readings]
     precision = [np.where(there, 1.0 / np.square(sd), 0.0) for there, (_, sd) in zip(told, readings, strict=True)]
     total = np.sum(precision, axis=0)
