@@ -1,7 +1,7 @@
-"""Handle SIGTERM, and Ctrl-C while libraries are imported.
+"""Ctrl-C while libraries are imported, and SIGTERM.
 
-During imports KeyboardInterrupt does not suffice: libraries swallow exceptions of their own imports, or turn them into
-others. SIGTERM ends the program at once, as a kill does, but with a line that says so.
+During an import KeyboardInterrupt is of no use, as libraries swallow it or turn it into another exception; Ctrl-C then
+ends the process directly. SIGTERM ends the program at once, as a kill would, but prints one line.
 """
 
 import os
@@ -20,20 +20,20 @@ TERMINATED = 143
 """Exit code that shells give to a program ended by SIGTERM."""
 ENDED = "ended by SIGTERM"
 SHOW_CURSOR = "\x1b[?25h"
-"""Escape sequence that shows the cursor again, which a progress bar hides."""
+"""Escape sequence that shows the cursor of the terminal again, which a progress bar hides."""
 GO_ON = ("import", "summarise")
-"""Commands that continue where they were interrupted when they are run again."""
+"""Commands that continue where they stopped when they are run again."""
 
 
 def interrupted_message(arguments: Sequence[str], how: str = "interrupted") -> str:
-    """Return the message for a command ended by Ctrl-C or as `how` says; `arguments` are the command line's."""
+    """Return the message after a command was ended; `arguments` start with the command, `how` says what ended it."""
     command = next((argument for argument in arguments if not argument.startswith("-")), "")
     kept = "; it goes on with what it had read" if command in GO_ON else ""
     return f"calibrator: {how}; run the same command again{kept}"
 
 
 def ending_at_sigterm() -> None:
-    """Let SIGTERM end the program with one line and exit code :data:`TERMINATED`, unless it is handled already."""
+    """Make SIGTERM end the program with one line and exit code :data:`TERMINATED`, unless it has a handler already."""
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
@@ -48,7 +48,7 @@ def ending_at_sigterm() -> None:
 
 
 def _descendants(process: str = "self") -> list[int]:
-    """Return all descendants of a process (children, their children ...) that ``/proc`` lists."""
+    """Return the ids of all processes that a process has started, directly or not, as far as /proc shows them."""
     found: list[int] = []
     for task in Path(f"/proc/{process}/task").glob("*/children"):
         with suppress(OSError):
@@ -58,5 +58,5 @@ def _descendants(process: str = "self") -> list[int]:
 
 
 def importing() -> AbstractContextManager[None]:
-    """Let Ctrl-C end the program at once while the block imports libraries; no file is open yet."""
+    """Let Ctrl-C end the program at once while the block imports what a command needs; no file is open yet."""
     return ending_at_interrupt(interrupted_message(sys.argv[1:]))

@@ -1,11 +1,11 @@
 """Apply one function to many items: in this process, in processes of this machine, or on a Dask cluster.
 
-Results come in the order of the items and do not depend on where they were computed. A few items per worker are in
-flight, so memory does not grow with the number of items. An item whose worker dies gets a second attempt. An item that
-kills its process twice, or exceeds its time limit, is lost, and the others go on.
+Results come in the order of the items and do not depend on where they were computed. Only a few items per worker are
+in flight, so memory does not grow with the number of items. If a worker dies, its item is tried a second time; an item
+that kills its process twice, or exceeds its time limit, has no result, and the others go on.
 
-Every worker process is a pebble pool of one process: processes of one pool share pipes and locks, so killing one can
-break the others.
+Every worker process has its own pool of one process (pebble). The processes of one pool share pipes and locks, so
+killing one of them can bring down the others.
 """
 
 import gc
@@ -49,15 +49,15 @@ from ecu_node.program import load_python_can, say_error
 __all__ = ["Failed", "Workers", "run_many", "try_many", "try_many_shown"]
 
 AHEAD_PER_WORKER = 4
-"""Items in flight per worker: enough to go on while one takes long, few enough results to keep in memory. [1]"""
+"""Items in flight per worker: enough that others go on while one takes long, few enough to keep results small. [1]"""
 CONNECT_S, RETURN_S = 10.0, 60.0
-"""Time for the scheduler's first answer; time for it and a worker to come back after they were lost. [s]"""
+"""Longest wait for the first answer of a scheduler; for a lost scheduler to return, or for a worker to join. [s]"""
 SENT_AT_ONCE = 100
-"""Items per message to the scheduler; a message should stay below 10 MB. [1]"""
+"""Items in one message to the scheduler, which should stay below 10 MB. [1]"""
 COUNT_EVERY_S = 1.0
-"""Time between two requests for the number of workers, which may come and go. [s]"""
+"""Interval at which workers of the cluster are counted, as they come and go. [s]"""
 MEMORY_SHARE, LEAST_MEMORY_BYTES = 0.8, 1 << 30
-"""Share of the machine's memory for all reading processes together; least memory limit of each. [1], [byte]"""
+"""Share of the machine's memory for all reading processes together; least limit of a single one. [1], [byte]"""
 PRELOADED = [
     "numba",
     "numpy",
@@ -68,11 +68,11 @@ PRELOADED = [
     "threadpoolctl",
     "typer",
 ]
-"""Modules that are slow to import, so the fork server imports them once for all processes. This package is not among
-them, as the fork server may find another copy of it; nor is cantools, as its import would make python-can import
-asammdf, see :func:`.load_python_can`."""
+"""Modules that are slow to import; the fork server imports them once for all processes. This package is not among them,
+as the fork server may find another copy of it, nor is cantools: it would make python-can import asammdf, see
+:func:`.load_python_can`."""
 LARGEST_GREETING = 1 << 20
-"""Largest first message of a Dask scheduler. [byte]"""
+"""Largest length that a scheduler announces first; a larger number comes from another kind of server. [byte]"""
 MEGABYTE = 1_000_000
 AGAIN = ", and run the same command again"
 REMEDY = "remove the file if it is damaged, cut it if it is long"
@@ -88,7 +88,7 @@ class Workers:
     Attributes
     ----------
     processes : int
-        Number of processes on this machine.
+        Number of processes on this machine; without a scheduler they do the work.
     scheduler : str or None
         Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead. FleetError is raised if Dask
         is missing.
@@ -109,8 +109,7 @@ class Failed:
     Attributes
     ----------
     reason : str
-        One line that says what happened and what to do; for a fault of the program it begins with
-        :data:`.INTERNAL_ERROR`.
+        What happened and what to do, in one line; it begins with :data:`.INTERNAL_ERROR` if the program is at fault.
     """
 
     reason: str
@@ -119,16 +118,16 @@ class Failed:
 def run_many(
     function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers
 ) -> Generator[_Result, None, None]:
-    """Apply a function to each item; its exceptions are raised here, when the result of the item is due.
+    """Apply a function to each item; an exception that it raises is raised here when the result of its item is due.
 
     Parameters
     ----------
     function : callable
-        A function at module level, or a partial of one, because it is sent to other processes.
+        Function of module level, or a partial of one, as it is pickled for other processes.
     items : iterable
-        The arguments, taken as they are needed.
+        Items, which are consumed as they are needed.
     workers : Workers
-        Where to compute; a single process on this machine means the current process.
+        Where to compute; ``processes=1`` without a scheduler means in this process.
 
     Yields
     ------
@@ -141,7 +140,7 @@ def run_many(
         If an item killed its process twice, or the cluster cannot be reached.
     """
     if workers.scheduler is None and workers.processes == 1:
-        with threadpool_limits(1):  # as in worker processes, because sums depend on the number of threads
+        with threadpool_limits(1):  # as in other processes, because sums depend on the number of threads
             yield from map(function, items)
         return
     with closing(_outcomes(function, items, workers, limit_s=None)) as outcomes:
@@ -154,22 +153,22 @@ def run_many(
 def try_many(
     function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers, *, limit_s: float = TIME_LIMIT_S
 ) -> "Generator[tuple[_Item, _Result | Failed], None, None]":
-    """Apply a function to each item, always in other processes, because the items are files that cannot be trusted.
+    """Apply a function to each item in other processes only, as items are files that cannot be trusted.
 
     Parameters
     ----------
-    function, items, workers : callable, iterable, Workers
-        What to apply to what, and where, as for :func:`run_many`.
+    function, items, workers
+        Function, its items and where to compute, as for :func:`run_many`.
     limit_s : float
         Longest time for one item. [s]
 
     Yields
     ------
     item : object
-        The items in their order.
+        The items, in their order.
     outcome : object or Failed
-        Result of the function, or why there is none: an error of the data, time or memory above the limits, or a fault
-        of the program. The other items go on.
+        Result of the function for the item, or why there is none: an error in the data, time or memory above the
+        limits, or a fault of the program. A failed item does not stop the others.
     """
     yield from _outcomes(partial(_attempt, function), items, workers, limit_s=limit_s)
 
@@ -184,7 +183,7 @@ def try_many_shown(
     size: int,
     size_of: Callable[[_Item], int],
 ) -> "Generator[tuple[_Item, _Result | Failed], None, None]":
-    """Apply a function to each item as :func:`try_many`, with a progress bar; `size` is that of all items. [byte]"""
+    """Run :func:`try_many` with a progress bar; `size` is that of all items, `size_of` returns that of one. [byte]"""
     done, total = 0, size // MEGABYTE + 1
     with (
         progress_bar(label, total, "MB") as progress,
@@ -233,7 +232,7 @@ def _outcomes(
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """A pickled function, and the longest time for one item [s]; None: no limit, as the data can be trusted."""
+    """A pickled function and the longest time for one item [s]; None: items are trusted, without limits."""
 
     function: bytes
     limit_s: float | None
@@ -241,15 +240,15 @@ class _Job:
 
 
 class _Processes:
-    """A growing set of processes, each running one item at a time within a memory limit of its own."""
+    """Worker processes, each running one item at a time; one is added when :meth:`run` finds none idle."""
 
     def __init__(self, memory_bytes: int) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="calibrator-", ignore_cleanup_errors=True)
         self._memory_bytes = max(memory_bytes, LEAST_MEMORY_BYTES)
         self._idle: LifoQueue[_Process] = LifoQueue()
         self._all: list[_Process] = []
-        resource_tracker.ensure_running()  # else the fork server starts it, and that would unblock SIGINT
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # all forked processes inherit the mask
+        resource_tracker.ensure_running()  # otherwise ensure_running() below starts it, and unblocks SIGINT
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # all that it forks inherit this
         try:
             forkserver.set_forkserver_preload(PRELOADED)
             forkserver.ensure_running()
@@ -257,7 +256,7 @@ class _Processes:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
     def run(self, job: _Job, item: Any) -> Any:
-        """Run the function on one item, in an idle or a new process; return its result, or why the item was lost."""
+        """Run the function of a job on an item; return its result, or Failed if the item was lost."""
         try:
             process = self._idle.get_nowait()
         except Empty:
@@ -278,7 +277,7 @@ class _Processes:
 
 
 class _Process:
-    """One process, replaced when it dies or takes too long."""
+    """One worker process, which is replaced when it dies or takes too long."""
 
     def __init__(self, folder: str, memory_bytes: int) -> None:
         self._folder, self._memory_bytes = folder, memory_bytes
@@ -297,10 +296,10 @@ class _Process:
                     self._future.cancel()
                 return self._future.result()
             except CancelledError:
-                self.join()  # the pool may have been started only after stop() was called
+                self.join()  # its pool may have been created only after stop()
                 raise
             except TimeoutError:
-                if job.limit_s is None:  # without a limit, the function itself raised it
+                if job.limit_s is None:  # raised by the function itself
                     raise
                 self.join()
                 why = f"reading took more than {job.limit_s:g} s and was ended; {REMEDY}, or allow more with"
@@ -341,7 +340,7 @@ class _Process:
 
 
 class _ForkedProcess(ForkServerProcess):
-    """A process that starts without running the user's script once more."""
+    """Process that starts without running the user's main script again."""
 
     starting = threading.Lock()
 
@@ -363,19 +362,19 @@ _pickled_function = b""
 
 
 def _begin(environment: dict[str, str], folder: str, memory_bytes: int | None, function: bytes) -> None:
-    """Set up a worker process. It must not raise: the process would be replaced again and again."""
+    """Set up a worker process; it must not raise, as the process would then be replaced again and again."""
     global _pickled_function  # noqa: PLW0603 (the process runs this function alone)
     _pickled_function = function
     os.environ.clear()
     os.environ.update(environment)
     tempfile.tempdir = folder
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    load_python_can()  # first, as the readers' own import of python-can would take seconds
+    load_python_can()  # before readers import it together with asammdf, which takes seconds
     _one_thread()
-    with suppress(Exception):  # its imports shall not count as an item's time; an error comes again with the first item
+    with suppress(Exception):  # imports must not count as time of an item; errors show at the first item
         _loaded(function)
     if memory_bytes is not None:
-        most = resource.getrlimit(resource.RLIMIT_DATA)[1]  # the limit of the user's shell
+        most = resource.getrlimit(resource.RLIMIT_DATA)[1]  # hard limit, which may be set in the user's shell
         resource.setrlimit(
             resource.RLIMIT_DATA, (memory_bytes if most == resource.RLIM_INFINITY else min(memory_bytes, most), most)
         )
@@ -387,7 +386,7 @@ def _call(item: Any) -> Any:
 
 @lru_cache(maxsize=2)
 def _loaded(function: bytes) -> Callable[[Any], Any]:
-    loaded: Callable[[Any], Any] = pickle.loads(function)  # noqa: S301 (of the parent)
+    loaded: Callable[[Any], Any] = pickle.loads(function)  # noqa: S301 (pickled by the parent process)
     return loaded
 
 
@@ -419,21 +418,21 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
                 try:
                     if time.monotonic() - counted_s > COUNT_EVERY_S:
                         workers, counted_s = max(len(client.nthreads()), 1), time.monotonic()
-                        continue  # take as many items as the workers need
+                        continue  # fill up the flight for this number of workers first
                     while unsent := list(islice(flight, len(futures), len(futures) + SENT_AT_ONCE)):
                         futures.extend(client.map(partial(_on_worker, job), unsent, pure=False))
                     try:
-                        error = futures[0].exception(timeout=CONNECT_S)  # waits for it
-                        # many at a time, as each request to the scheduler costs milliseconds; others keep workers busy
+                        error = futures[0].exception(timeout=CONNECT_S)  # waits until it is finished
+                        # many at once: each request to the scheduler costs milliseconds; other items keep workers busy
                         done = list(takewhile(lambda future: future.status == "finished", islice(futures, workers)))
-                        # with a time-out, as gather waits for a new worker if one ends before it hands its result over
+                        # with a timeout: if a worker ends now, gather waits for its results until another worker comes
                         fetch = partial(client.gather, done, asynchronous=True)
                         outcomes = client.sync(fetch, callback_timeout=RETURN_S)
                     except TimeoutError:
                         _wait_for_worker(client, address)
                         continue
                     if error is None and not done:
-                        raise CancelledError  # the future was lost with its worker or scheduler
+                        raise CancelledError  # the result was lost
                 except (CancelledError, OSError):
                     client.close(timeout=1)
                     client = _connect(address, RETURN_S, lost=True)
@@ -471,7 +470,7 @@ def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
 
 
 def _require_scheduler(address: str, patience_s: float) -> None:
-    """Raise OSError if another kind of server listens at the address, as Client would wait for ever for its answer."""
+    """Raise OSError if another kind of server listens at the address: Dask's Client would wait for it for ever."""
     from distributed.comm.addressing import get_address_host_port  # noqa: PLC0415 (an extra)
 
     if not address.startswith("tcp://"):
@@ -479,9 +478,9 @@ def _require_scheduler(address: str, patience_s: float) -> None:
     try:
         server = socket.create_connection(get_address_host_port(address), patience_s)
     except OSError:
-        return  # Client waits for a scheduler to start, and says why none did
+        return  # Client waits for a scheduler to start, and says why it failed
     with server:
-        first = server.recv(8)  # a scheduler sends the first message, which begins with its length
+        first = server.recv(8)  # a scheduler sends first, beginning with a length
     if not 0 < int.from_bytes(first, "little") < LARGEST_GREETING:
         raise OSError("another kind of server listens there")
 
@@ -497,7 +496,7 @@ def _wait_for_worker(client: Any, address: str) -> None:
 
 
 def _on_worker(job: _Job, item: Any) -> Any:
-    """Run one item on a worker of a cluster; untrusted files are read in a process of its own, which it can kill."""
+    """Run an item on a worker of a cluster; untrusted files are read in a process of its own, which it can kill."""
     if job.version != __version__:
         advice = f"install version {job.version} there"
         raise FleetError(f"a worker of the cluster has version {__version__} of hv-current-correction; {advice}")
@@ -511,7 +510,7 @@ def _on_worker(job: _Job, item: Any) -> Any:
 def _own_processes() -> _Processes:
     from distributed import get_worker  # noqa: PLC0415
 
-    multiprocessing.current_process().daemon = False  # a daemon could not start processes
+    multiprocessing.current_process().daemon = False  # daemonic processes may not start others
     return _Processes(get_worker().memory_manager.memory_limit or _memory_bytes())
 
 
@@ -521,7 +520,7 @@ def _memory_bytes() -> int:
 
 @contextmanager
 def _silenced() -> Iterator[None]:
-    """Silence the loggers of Dask and asyncio in the block; they print tracebacks of errors reported here in a line."""
+    """Silence loggers within the block that would print tracebacks of errors that are reported here in one line."""
     names = ("distributed", "distributed.client", "tornado.application", "asyncio")
     levels = {logger: logger.level for logger in map(logging.getLogger, names)}
     for logger in levels:
@@ -529,6 +528,6 @@ def _silenced() -> Iterator[None]:
     try:
         yield
     finally:
-        gc.collect()  # asyncio logs unfinished tasks when they are collected, so collect them while it is silent
+        gc.collect()  # asyncio logs unfinished tasks when they are collected: now, while silenced
         for logger, level in levels.items():
             logger.setLevel(level)

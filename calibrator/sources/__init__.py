@@ -1,1 +1,1 @@
-"""Find the drives of a fleet, wherever they are, and which log belongs to which vehicle; import logs as drives."""
+"""Find and load the drives of a fleet on disk or in object storage: which log belongs to which vehicle."""

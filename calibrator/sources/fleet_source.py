@@ -1,9 +1,9 @@
-"""The drives of a fleet, wherever they are: a drive store, or folders of logs, on this machine or in object storage.
+"""Find and load the drives of a fleet: in a drive store or folders of logs, on this machine or in object storage.
 
-The rule: a log belongs to the vehicle that its folder is named after, and the drive has the name of the file without
-its suffixes: ``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders and ``.zip`` archives
-are searched at any depth; an archive stands for a folder of its name. Three things are left out and reported: logs that
-lie beside the folders of vehicles, vehicles that have two folders of one name, and drives that two files claim.
+A log belongs to the vehicle that its folder is named after, and its drive is named after the file without suffixes:
+``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders and ``.zip`` archives are searched
+at any depth; an archive counts as a folder of its name. Logs that lie beside the folders of vehicles, vehicles with
+two folders of the same name, and drives for which there are two files, are left out, and the report names them.
 """
 
 from collections import Counter
@@ -50,15 +50,15 @@ __all__ = [
 _Vehicle = TypeVar("_Vehicle")
 LOGS_FOLDER = "logs"
 PROBED_VEHICLES = 7
-"""Number of vehicles whose drives are read to learn which branches and inputs the fleet has. [1]"""
+"""Number of vehicles that are read to find out which branches and inputs the fleet has."""
 
 
 _Place = Storage | list[DriveFile]
-"""Where the drives of a vehicle are: a folder, which is listed each time it is needed, or single files."""
+"""Where the drives of a vehicle are: a folder, which is listed again when they are needed, or single files."""
 
 
 class _Vehicles(Mapping[str, tuple[DriveFile, ...]]):
-    """Drives by vehicle. Only the places are kept in memory, so a large fleet takes little of it."""
+    """Drives by vehicle. Folders are listed on access, so of a large fleet only names and folders are in memory."""
 
     def __init__(self, places: Mapping[str, _Place]) -> None:
         self._places = dict(sorted(places.items()))
@@ -81,18 +81,18 @@ class _Vehicles(Mapping[str, tuple[DriveFile, ...]]):
 
 
 def find_fleet(place: str | Path) -> FleetSource:
-    """Find the drives of a fleet; nothing is opened.
+    """Find the drives of a fleet without reading them.
 
     Parameters
     ----------
     place : str or Path
-        A drive store, a fleet of ``calibrator simulate``, a folder with a folder of logs per vehicle, or a log. Path or
-        URL.
+        Path or URL of a drive store, of a fleet that ``calibrator simulate`` wrote, of a folder with a folder of logs
+        per vehicle, or of a log.
 
     Returns
     -------
     FleetSource
-        At least one vehicle.
+        The fleet, with at least one vehicle.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     Returns
     -------
     FleetSource
-        The drives, perhaps none, and what is left out and why. No log is opened.
+        The drives, possibly none, and what is left out; the drives are not read yet.
     """
     places: dict[str, dict[str, _Place]] = {}
     usable, sizes = dict[str, bool](), Counter[str]()
@@ -191,10 +191,10 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
 
 
 def _logs_in(storage: Storage, shown: str, problems: list[str]) -> Iterator[tuple[str, list[Entry], Storage | None]]:
-    """Search a folder, an archive or a single log, and yield each folder with logs in it.
+    """Yield each folder with logs in a folder or an archive, or that of a single log.
 
-    Yields the folder's path or URL, its logs, and its storage, which is None in an archive or if only a single log was
-    named. A folder or archive inside that cannot be read is added to `problems`.
+    It is given as (path or URL, logs, storage); the storage is None for an archive or a single log. A folder or archive
+    inside that cannot be read is added to the problems.
     """
     path = Path(storage.url)
     if storage.is_local and not path.exists():
@@ -228,7 +228,7 @@ def _entry(path: Path) -> Entry:
 
 
 def _is_log(folder: Storage, name: str) -> bool:
-    """Check whether a file is a log: by its suffix, and a text file on this machine also by its content."""
+    """Check by its suffix whether a file is a log or a record made on board; a local text file also by its content."""
     if folder.is_local:
         return name.endswith(SUFFIX) or is_log(Path(folder.url) / name)
     return name.endswith(SUFFIX) or (not name.endswith(".txt") and is_log(Path(name)))
@@ -243,12 +243,12 @@ def _drive_name(file: str) -> str:
 
 
 def _without_suffix(name: str, suffix: str) -> str:
-    """Remove a suffix, given in lower case, from a name that has it in any case."""
+    """Return a name without a suffix, which may be in lower or upper case."""
     return name[: -len(suffix)] if name.lower().endswith(suffix) else name
 
 
 def _drives(vehicle: str, folder: str, logs: Iterable[Entry]) -> list[DriveFile]:
-    """Return a vehicle's drives for the logs of a folder; logs whose name no drive can have are skipped."""
+    """Return the drives of a vehicle whose logs are in a folder; logs with unusable names are skipped."""
     return [
         DriveFile(
             vehicle=vehicle,
@@ -263,7 +263,7 @@ def _drives(vehicle: str, folder: str, logs: Iterable[Entry]) -> list[DriveFile]
 
 
 def _by_name(drives: Iterable[DriveFile]) -> dict[str, list[DriveFile]]:
-    """Group drives by name; a name with several files is claimed by all of them."""
+    """Group drives by name; a name with more than one drive was given to several files."""
     found: dict[str, list[DriveFile]] = {}
     for drive in sorted(drives, key=lambda item: item.place):
         found.setdefault(drive.name, []).append(drive)
@@ -271,7 +271,7 @@ def _by_name(drives: Iterable[DriveFile]) -> dict[str, list[DriveFile]]:
 
 
 def is_onboard(entry: DriveFile) -> bool:
-    """Check whether a file is a summary that a node made on board, which has no samples."""
+    """Check whether a file is a record that a node made on board: a summary, without samples."""
     return entry.place.endswith(SUFFIX)
 
 
@@ -296,13 +296,13 @@ def read_vehicles(
     names: Sequence[str] | None = None,
     label: str = "read drives",
 ) -> tuple[list[_Vehicle], dict[str, str]]:
-    """Read the drives of vehicles; a vehicle that cannot be read never stops the others.
+    """Read the vehicles of a fleet in worker processes; a bad one never stops the others.
 
     Parameters
     ----------
     read : callable
-        Function that reads one vehicle from its DriveFiles, `equipment` and `database`, and returns what the caller
-        needs of it. It must be at module level, because it is sent to other processes.
+        Function of module level (it is pickled) that turns the DriveFiles of a vehicle, `equipment` and `database` into
+        what a method needs of this vehicle.
     fleet, equipment, database : FleetSource, Equipment, VehicleDatabase
         The fleet, its branches and inputs, DBC and layout.
     workers : Workers
@@ -310,16 +310,16 @@ def read_vehicles(
     limit_s : float
         Longest time for one vehicle; one that takes longer is left out. [s]
     names : sequence of str or None
-        Names of the vehicles to read; None: all.
+        Vehicles to read; None: all.
     label : str
         Text beside the progress bar.
 
     Returns
     -------
     vehicles : list
-        What `read` returned for the vehicles that can be used, in the order of the fleet.
+        What `read` returned for the vehicles that can be used, in the order of the fleet, or of `names`.
     left_out : dict of str to str
-        Why the others cannot be used, by name.
+        Why the others cannot be used, by name; problems that were found with the fleet are included.
 
     Raises
     ------
@@ -359,9 +359,10 @@ def probe_equipment(
     modelled: bool = True,
     drives: Sequence[Drive] = (),
 ) -> Equipment:
-    """Learn from some vehicles which branches and inputs the fleet has.
+    """Find out from some vehicles which branches and inputs the fleet has.
 
-    A branch counts if more than half of the vehicles looked at have it; later, a vehicle that lacks it is left out.
+    The first drive of each is read. A branch counts if more than half of these drives have it, an input if one has it;
+    a vehicle that lacks a chosen branch is left out later.
 
     Parameters
     ----------
@@ -374,21 +375,21 @@ def probe_equipment(
     limit_s : float
         Longest time for one drive. [s]
     modelled : bool
-        Whether the branches are modelled from inputs, as those of a fleet are.
+        Whether the branches are modelled from inputs, as in a fleet; if not, no inputs are chosen.
     drives : sequence of Drive
-        One drive of each vehicle to look at, if they were read already.
+        One drive of each vehicle to look at, if they have been read already; none are read then.
 
     Returns
     -------
     Equipment
-        At least two branches and, if they are modelled, at least one input.
+        Branches, at least two, and inputs, at least one if the branches are modelled.
 
     Raises
     ------
     FleetError
-        If no vehicle can be read, there are too few branches or inputs, or a branch is asked for twice.
+        If no vehicle can be read, there are too few branches or inputs, or a branch is named twice.
     LayoutError
-        If a branch is asked for that the layout does not have.
+        If a branch is named that the layout does not have.
     """
     layout = database.layout
     names, errors = [_names_in(drive) for drive in drives], list[str]()
@@ -441,7 +442,7 @@ def probe_equipment(
 
 
 def _names(entry: DriveFile, database: VehicleDatabase) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the branches and inputs that a drive has."""
+    """Read the names of the branches and inputs that a drive has."""
     if not is_onboard(entry):
         return _names_in(load_drive(entry, database))
     with local_copy(entry.place) as path:

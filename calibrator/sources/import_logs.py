@@ -1,4 +1,4 @@
-"""Import logs of one or many vehicles as drives of a store. One bad log never stops the others."""
+"""Import logs of one or many vehicles as drives of a store. A bad log never stops the others."""
 
 import time
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ class ImportReport:
     store: str
     drives: tuple[ImportedDrive, ...]
     already_there: tuple[str, ...]
-    """Drives (VEHICLE/NAME) that an earlier import wrote; they were not read again."""
+    """Drives (VEHICLE/NAME) that an earlier import wrote; their logs were not read again."""
     left_out: dict[str, str]
 
     def as_json(self) -> str:
@@ -47,7 +47,7 @@ class ImportReport:
         return dumps({**vars(self), "drives": drives})
 
     def as_text(self) -> str:
-        """The report as text for people; a notice that several drives share is shown once."""
+        """The report for people; a notice that several drives share appears once."""
         rows = [(d.vehicle, d.name, f"{d.duration_s:.1f}", ", ".join(d.branches)) for d in self.drives]
         notices = [f"  {line}" for line in merged_notices({(d.vehicle, d.name): d.notices for d in self.drives})]
         parts = [
@@ -77,7 +77,7 @@ def import_logs(
     database : VehicleDatabase
         DBC and layout.
     store : str or Path
-        Path or URL of the store; made if there is none.
+        Path or URL of the store; it is made if there is none.
     workers : Workers
         Where the logs are read.
     limit_s : float
@@ -91,7 +91,7 @@ def import_logs(
     Raises
     ------
     UserError
-        If a drive cannot be written: the others could not be either.
+        If a drive cannot be written, as the others could not be written either.
     """
     found, start_s = find_logs(logs), time.time()
     left_out, drives, already_there = dict(found.left_out), list[ImportedDrive](), list[str]()
