@@ -240,7 +240,7 @@ class _Job:
 
 
 class _Processes:
-    """Worker processes, each running one item at a time; one is added when :meth:`run` finds none idle."""
+    """Worker processes that run one item each at a time, in limited memory if items are not trusted."""
 
     def __init__(self, memory_bytes: int) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="calibrator-", ignore_cleanup_errors=True)
@@ -248,7 +248,7 @@ class _Processes:
         self._idle: LifoQueue[_Process] = LifoQueue()
         self._all: list[_Process] = []
         resource_tracker.ensure_running()  # otherwise ensure_running() below starts it, and unblocks SIGINT
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # all that it forks inherit this
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # fork server and its children inherit this
         try:
             forkserver.set_forkserver_preload(PRELOADED)
             forkserver.ensure_running()

@@ -191,7 +191,7 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
 
 
 def _logs_in(storage: Storage, shown: str, problems: list[str]) -> Iterator[tuple[str, list[Entry], Storage | None]]:
-    """Yield each folder with logs in a folder or an archive, or that of a single log.
+    """Yield each folder with logs that is in a folder or an archive, or the folder of a single log.
 
     It is given as (path or URL, logs, storage); the storage is None for an archive or a single log. A folder or archive
     inside that cannot be read is added to the problems.
@@ -263,7 +263,7 @@ def _drives(vehicle: str, folder: str, logs: Iterable[Entry]) -> list[DriveFile]
 
 
 def _by_name(drives: Iterable[DriveFile]) -> dict[str, list[DriveFile]]:
-    """Group drives by name; a name with more than one drive was given to several files."""
+    """Group drives by name, as several files may have the same drive name."""
     found: dict[str, list[DriveFile]] = {}
     for drive in sorted(drives, key=lambda item: item.place):
         found.setdefault(drive.name, []).append(drive)

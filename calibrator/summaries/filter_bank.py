@@ -93,7 +93,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def settling(self) -> int:
-        """Number of samples after a start that are not used, as the filters have not settled."""
+        """Number of samples after a start that are not used, because the filters have not settled yet."""
         slowest = max((float(np.hypot(*pole)) for pole in self.poles), default=0.0)
         return int(np.ceil(np.log(UNSETTLED) / np.log(slowest))) if slowest > 0.0 else 0
 

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 COPY = "same recording as"
-"""Beginning of the problem text of a record with a recording that is in the store already."""
+"""Beginning of the problem text of a record whose recording this vehicle, or another one, has already."""
 
 
 @dataclass(kw_only=True)
@@ -64,7 +64,7 @@ class SummariseReport:
         Number of vehicles with newly summarised drives, and of these drives, without what was in the store before and
         what was left out.
     left_out : dict of str to str
-        Reasons by vehicle whose drives could not be used, or by file whose vehicle is unclear.
+        Why drives were not used: by name of the vehicle, or as ``problem 1`` ... for files whose vehicle is unclear.
     notices : list of str
         Further notices for the user.
     """

@@ -121,7 +121,7 @@ class SummaryStore:
         Raises
         ------
         UserError
-            If the bucket cannot be read, is damaged, or holds vehicles that belong into another one.
+            If the bucket cannot be read, is damaged, or holds vehicles that belong in another one.
         """
         names, found = self.files(bucket)[0], dict[str, list[Record]]()
         where = f"{self._files.url}/{names[0] if len(names) == 1 else f'{bucket:05d}-*.parquet'}" if names else ""

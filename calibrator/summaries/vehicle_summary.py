@@ -237,8 +237,8 @@ def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], datab
     Returns
     -------
     ZeroCurrent
-        Offsets of the branches. Windows are cut into pieces to see how far an offset wanders; this scatter is averaged
-        over the number of windows, not of pieces, as the pieces of one window wander together.
+        Offsets of the branches. How far an offset wanders is seen from pieces of the windows; the scatter of their
+        medians is divided by the root of the number of windows, not of pieces, as those of one window wander together.
     """
     offset, sd = np.full(len(branches), np.nan), np.full(len(branches), np.nan)
     for k, name in enumerate(branches):
@@ -282,7 +282,7 @@ def _is_open(state: Channel, contactor: Contactor) -> Array:
 
 
 def weighted_mean(*readings: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return mean and standard deviation of readings (value, sd) weighted by precision; NaN where none is finite."""
+    """Return the precision-weighted mean of readings (value, sd) and the sd of this mean; NaN where none is finite."""
     told = [np.isfinite(value) & np.isfinite(sd) for value, sd in readings]
     precision = [np.where(there, 1.0 / np.square(sd), 0.0) for there, (_, sd) in zip(told, readings, strict=True)]
     total = np.sum(precision, axis=0)
