@@ -1,1 +1,1 @@
-"""Worker processes, and the signals that end them and this one."""
+"""Worker processes, and the signals that end them and the program itself."""
