@@ -36,7 +36,7 @@ MAX_SAMPLES = 20_000_000
 """Most samples of a drive, which is 23 days at 0.1 s; a longer drive has a wrong time. [1]"""
 
 SLOWER = 1.5
-"""If the frames are more than this many periods apart, the period is made as long as their distance. [1]"""
+"""If even the fastest branch's frames are this many periods or more apart, the period becomes their distance. [1]"""
 _STALE, _NOT_GOOD = "stale", "not good"
 
 
