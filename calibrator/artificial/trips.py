@@ -190,7 +190,7 @@ class BuiltinTrips:
         return BUILTIN_BRANCHES
 
     def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
-        """Drive a trip for vehicle ``number``."""
+        """Return the ideal currents and inputs of the trip of vehicle ``number``, to learn from or to test on."""
         number = 0 if self.common else number
         rng = random_stream(_STREAM[purpose], self.seed, number)
         duration_s = self.duration_s if purpose == "calibration" else self.unseen_s

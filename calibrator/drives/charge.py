@@ -82,7 +82,7 @@ class ChargeCurve:
         return _band(time_s, self.time_s, self.pieces, shift_s, weight)
 
     def covers(self, time_s: Array, margin_s: float) -> Mask:
-        """Check at which instants this much time on both sides lies within the samples and touches no gap."""
+        """Return for each instant whether the margin on both sides lies within the samples and touches no gap."""
         first, last = time_s - margin_s, time_s + margin_s
         inside = (first >= self.time_s[0]) & (last <= self.time_s[-1])
         gap_s = np.interp(last, self.time_s, self.gap_s) - np.interp(first, self.time_s, self.gap_s)

@@ -66,7 +66,7 @@ class FleetTask:
     believed : frozenset of str
         Trusted vehicles whose currents do not contradict the trust in them.
     fleet_size : int
-        Number of vehicles of the fleet that can be used.
+        Number of usable vehicles in the whole fleet, not only in the sample.
     """
 
     reference: FleetReference
@@ -141,7 +141,8 @@ def learn_task(
     Parameters
     ----------
     vehicles : sequence of VehicleSummary
-        All to learn from, all that are trusted, and all that were checked on a bench.
+        Sample of the fleet, with every trusted vehicle and every one that has a bench reading. Those held out are not
+        learnt from.
     settings : CalibrationSettings
         The user's choices.
     bench : mapping

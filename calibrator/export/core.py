@@ -239,7 +239,7 @@ def _layout_digest(database: VehicleDatabase) -> int:
 
 
 class Image(NamedTuple):
-    """Place of the calibration in a compiled program."""
+    """Address and byte order of the calibration data (symbol ``hv_calibration``) in a compiled program."""
 
     address: int
     order: Literal["little", "big"]
@@ -369,7 +369,7 @@ def c_text(checked: Checked) -> str:
 
 
 def _message(database: VehicleDatabase, message: Message, has_branches: bool) -> tuple[object, ...]:
-    """Return a message and the numbers of its C struct ``hv_message_t``."""
+    """Return the name of a message and the values of the fields of its C struct ``hv_message_t``."""
     entry, key = database.layout.protection(message.name), key_of(message)
     profile, offset, step, data_id = "HV_UNPROTECTED", 0, 0, [0]
     if isinstance(entry, ProfileP01):

@@ -129,7 +129,7 @@ class RecordedJunction:
 
     @property
     def mean_a(self) -> float:
-        """Greatest magnitude that the mean of any branch has in a drive. [A]"""
+        """Mean current of each branch in each drive: the greatest magnitude of them all. [A]"""
         return float(max((np.abs(part[:, :-1].mean(axis=0)).max() for part in self.currents_a), default=0.0))
 
     @cached_property

@@ -211,7 +211,7 @@ class LiveBranch(HeardSignal):
 
     @property
     def deadline_s(self) -> float:
-        """Time by which its next frame must have come; infinity for a branch that is not fitted. [s]"""
+        """Instant by which the next frame of the branch is due; infinity if the vehicle has no such branch. [s]"""
         if self.seen:
             return self.time_s + self.timeout_s
         return self._waited_s + max(self.timeout_s, self._start_s) if self._is_named else float("inf")
@@ -503,7 +503,7 @@ class JunctionWatch:
         self.restart()
 
     def judge_only(self, state: HeardSignal, valid: frozenset[int]) -> None:
-        """Judge sums only while a state has one of these codes: only then are all currents of the junction measured."""
+        """Judge sums only while signal ``state`` has a code of ``valid``: only then are all currents measured."""
         self._whole = state, valid
 
     def is_whole(self, now_s: float) -> bool:

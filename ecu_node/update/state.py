@@ -53,7 +53,7 @@ class ParameterSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of the file; revocations name a file by it."""
+        """SHA-256 of the parameter file; revocations name the file by it."""
         return hashlib.sha256(self.content.encode()).hexdigest()
 
     @property

@@ -202,7 +202,7 @@ def test_heading_levels_are_in_order_and_controls_have_names(page: webdriver.Chr
     assert "at hand" in page.title
 
 
-def test_report_of_a_junction_opens_without_an_error(
+def test_report_of_a_single_vehicle_opens_without_an_error(
     browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
 ) -> None:
     rivals = [Explanation(probability=0.6), Explanation(probability=0.4, offset_a={"motor": 2.2})]

@@ -97,7 +97,7 @@ def test_asymmetric_fleet_defeats_the_mean_reference_but_not_the_default() -> No
     assert default > 0.8
 
 
-def test_ceiling_method_needs_the_distribution_of_the_faults() -> None:
+def test_method_with_known_prior_is_refused_if_the_distribution_of_the_faults_is_unknown() -> None:
     case = replace(CASE, vehicles=12)
     trial = common_trial(smooth_drive(), case, 0)
     ceiling, default = (method.estimate(trial).confidence for method in (CEILING, POSTERIOR))

@@ -75,7 +75,7 @@ def test_faults_can_be_drawn_from_the_learnt_prior_for_the_same_trips(fleet: Rec
     assert judge(POSTERIOR.estimate(own), own)["recovery_rate"].mean() >= 0.8
 
 
-def test_case_with_minutes_has_the_requested_number_of_vehicles(fleet: RecordedFleet) -> None:
+def test_recorded_case_of_a_given_drive_length_has_the_requested_number_of_vehicles(fleet: RecordedFleet) -> None:
     trial = recorded_trial(fleet, RecordedCase(vehicles=15, minutes=2.0), 0)
     assert len(trial.truth) == len(trial.evidence.slopes) == 15
     with pytest.raises(FleetError, match="3 usable trips, at least 4 are needed"):

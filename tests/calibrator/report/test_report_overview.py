@@ -75,7 +75,9 @@ def test_next_steps_name_action_and_vehicles(result: Path) -> None:
     assert left_out == f"Find out why log of {EVIL} could not be used; most often: cannot be read: {EVIL}."
 
 
-def test_next_steps_combine_vehicles_with_the_same_question(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_next_steps_combine_vehicles_that_the_same_measurement_would_decide(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
     held = sensor(0.0, 8.0, held_back="harm limit")
     window = "a zero-current window (contactors open) would decide: the motor sensor then shows +{} A or +0 A"
     needs = {"V1": window.format(7), "V2": window.format(3), "V3": window.format(7)}

@@ -211,7 +211,7 @@ def test_disagreeing_zero_current_windows_increase_the_uncertainty() -> None:
     assert (found.sd_a > 0.3).all()
 
 
-def test_uncertainty_covers_wandering_offsets_within_a_window() -> None:
+def test_sd_of_a_zero_current_offset_covers_an_offset_that_wanders_in_the_window() -> None:
     z = []
     for seed in range(100):
         wander = np.cumsum(np.random.default_rng(seed).normal(0.0, 0.3 / np.sqrt(600.0), 1200))
