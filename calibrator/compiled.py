@@ -55,13 +55,17 @@ def _cache_folder() -> Path | None:
 
 
 _FOLDER = _cache_folder()
-if _FOLDER is not None:
-    numba.config.CACHE_DIR = str(_FOLDER)
 
 
 def compiled(function: _Function) -> _Function:
     """Compile a function that Python calls, at its first call; division by zero gives infinity, as in NumPy arrays."""
-    return cast("_Function", _dispatcher(function, cache=_FOLDER is not None))
+    if _FOLDER is None:
+        return cast("_Function", _dispatcher(function))
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_FOLDER)  # for this function, not for those of users
+    try:
+        return cast("_Function", _dispatcher(function, cache=True))
+    finally:
+        numba.config.CACHE_DIR = before
 
 
 def inner(function: _Function) -> _Function:
