@@ -71,7 +71,8 @@ MISTAKES = [
     # looking at a recording
     ("calibrator kirchhoff none.csv --branches battery=I,motor=J", 1, "none.csv: no such file"),
     ("calibrator kirchhoff empty.csv --branches battery=I,motor=J", 1, "empty.csv: "),
-    ("calibrator kirchhoff noise --branches battery=I,motor=J", 2, "a log of frames needs --layout"),
+    ("calibrator kirchhoff noise --branches battery=I,motor=J", 1, "noise: no table: only one line"),
+    ("calibrator kirchhoff logs/v1/drive.log --branches battery=I,motor=J", 2, "a log of frames needs --layout"),
     ("calibrator kirchhoff texts.csv --branches battery=I,motor=J", 1, "texts.csv: "),
     ("calibrator kirchhoff drive.csv", 2, "--branches"),
     ("calibrator kirchhoff drive.csv --branches battery=Ibat", 1, "two or more are expected"),

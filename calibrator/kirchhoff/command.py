@@ -55,14 +55,12 @@ def kirchhoff(
         from calibrator.kirchhoff.junction import look_at_junction
         from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
         from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_text, save_table
-        from calibrator.recordings.log_files import files_in
-        from calibrator.recordings.log_formats import is_log
+        from calibrator.recordings.log_formats import is_log, is_table, logs_in
         from calibrator.recordings.readers import open_recording
-        from calibrator.recordings.tables import is_table, layout_from_branches, read_table
+        from calibrator.recordings.tables import layout_from_branches, read_table
         from ecu_node.parameters import check_fit, read_parameters
 
-    logs = filter(is_log, files_in(log))
-    read = {path.resolve() for path in filter(None, (log, *logs, layout, parameters))}
+    read = {path.resolve() for path in filter(None, (log, *logs_in(log), layout, parameters))}
     for path, ends in ((plot, PAGES), (table, TABLES)):
         if path is not None and path.suffix.lower() not in ends:
             raise typer.BadParameter(f"{path}: expected a file name that ends with {', '.join(ends)}")
@@ -72,7 +70,7 @@ def kirchhoff(
             require_possible_file(path)
     if layout is not None:
         database = with_voltages(vehicle_database(layout))
-    elif is_table(log) or not log.exists():
+    elif is_table(log) or not log.exists() or not (is_log(log) or logs_in(log)):
         database = layout_from_branches(str(branches), table=read_table(log))
     else:
         raise typer.BadParameter(

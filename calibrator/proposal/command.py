@@ -51,8 +51,7 @@ def propose(
     """
     with importing():
         from calibrator.proposal.proposal import candidate_lines, layout_text, look_at, parsed_branches
-        from calibrator.recordings.log_formats import is_log
-        from calibrator.recordings.tables import is_table
+        from calibrator.recordings.log_formats import is_log, is_table
 
     if more:
         line = f"calibrator layout init {source} --log {more[0]}"

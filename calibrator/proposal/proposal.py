@@ -22,8 +22,8 @@ from calibrator.proposal.branches import (
 )
 from calibrator.proposal.candidates import Candidate, of_database, of_table, with_log, with_table
 from calibrator.proposal.inputs import FOR_FLEETS, computed_motor, derive, find_inputs
-from calibrator.recordings.log_formats import read_frames
-from calibrator.recordings.tables import bare_name, is_table, layout_from_branches, likely_full_scale_a, read_table
+from calibrator.recordings.log_formats import is_table, read_frames
+from calibrator.recordings.tables import bare_name, layout_from_branches, likely_full_scale_a, read_table
 from calibrator.words import places_of, words_of
 from ecu_node.database import read_database
 from ecu_node.errors import DatabaseError, printable

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePath, PurePosixPath
-from typing import Any, BinaryIO, TextIO, cast
+from typing import Any, BinaryIO, Literal, TextIO, cast
 
 import pandas as pd
 from isal import igzip, isal_zlib
@@ -30,7 +30,7 @@ __all__ = [
     "files_in",
     "is_bus_log",
     "is_candump",
-    "is_table",
+    "kind_of_text",
     "open_log",
     "read_rows",
     "read_undamaged",
@@ -54,6 +54,8 @@ PRINTED_CANDUMP = re.compile(
     re.MULTILINE | re.IGNORECASE,
 )
 """A line as candump prints it without ``-L``."""
+_NUMBER = re.compile(r"(?<![\w.:-])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?![\w.:-])")
+"""A number in a line of a table, no part of a date, a time or a word."""
 _LOGGED = re.compile(rb"\(\d+\.\d+\) \S+ [\dA-Fa-f]{3,8}#")
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf4")
 FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
@@ -157,23 +159,19 @@ def is_bus_log(path: Path) -> bool:
         return content.find(_FRAME_CHANNEL) >= 0
 
 
-def is_table(path: Path) -> bool:
-    """Check whether a file is a table: by its suffix and, if logs of frames share that suffix, by its content."""
-    suffix = suffix_of(path)
-    if suffix == ".zip" or path.is_dir():
-        return any(is_table(file) for file in files_in(path)[:1])
-    if suffix not in TABLE_SUFFIXES or not exists(path):
-        return False
-    try:
-        with readable(path) as file:
-            if suffix == ".mf4":
-                return not is_bus_log(file)
-            if suffix in {".csv", ".tsv", ".txt"}:
-                head = text_head(file)[0]
-                return not is_candump(head) and not any(_is_frame_header(line) for line in head.splitlines()[:5])
-    except UNREADABLE:
-        return suffix != ".txt"
-    return True
+def kind_of_text(head: str, *, headed: bool = True) -> Literal["candump", "frames", "table", ""]:
+    """Tell what the beginning of a text is: lines of candump, a CSV of frames, a table, or (empty) none of these.
+
+    A text that is neither of the first two is a table if it is `headed`, else if most lines below the first have
+    several numbers.
+    """
+    lines = head.splitlines()
+    if is_candump(head):
+        return "candump"
+    if any(_is_frame_header(line) for line in lines[:5]):
+        return "frames"
+    rows = [line for line in lines[1:50] if line.strip()]
+    return "table" if headed or 2 * sum(len(_NUMBER.findall(row)) > 1 for row in rows) > len(rows) else ""
 
 
 def _is_frame_header(line: str) -> bool:

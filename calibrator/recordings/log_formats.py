@@ -4,7 +4,8 @@ Each format is one function and one line of :data:`READERS`.
 
 A damaged file is refused; the message gives the place of the damage and the number of frames before it. Its readable
 part is not used, because nobody can tell what else is missing. Many logs have single broken lines, or frames with an
-impossible length or time: these are left out and counted, up to :data:`MAX_DAMAGED_SHARE`.
+impossible length or time: these are left out and counted, up to :data:`MAX_DAMAGED_SHARE`. Formats that python-can
+reads are refused at the first line that it does not understand.
 """
 
 from collections.abc import Callable
@@ -18,8 +19,8 @@ from calibrator.recordings.log_files import (
     UNREADABLE,
     exists,
     files_in,
-    is_candump,
-    is_table,
+    is_bus_log,
+    kind_of_text,
     readable,
     reason_of,
     suffix_of,
@@ -28,7 +29,7 @@ from calibrator.recordings.log_files import (
 from calibrator.recordings.mf4 import read_mf4
 from calibrator.recordings.text_logs import read_asc, read_candump, read_csv, read_trc
 
-__all__ = ["LOG_SUFFIXES", "is_log", "read_frames"]
+__all__ = ["LOG_SUFFIXES", "is_log", "is_table", "logs_in", "read_frames"]
 
 READERS: dict[str, Callable[[Path], Frames]] = {
     ".log": read_candump,
@@ -53,10 +54,37 @@ def is_log(path: Path) -> bool:
     if suffix == ".txt":
         try:
             with readable(path) as file:
-                return exists(path) and (is_candump(text_head(file)[0]) or is_table(file))
+                return exists(path) and kind_of_text(text_head(file)[0], headed=False) != ""
         except (LogError, *UNREADABLE):
             return True
     return suffix in LOG_SUFFIXES or suffix in TABLE_SUFFIXES
+
+
+def logs_in(path: Path) -> list[Path]:
+    """List the logs and tables in a folder, at any depth, or in an archive; LogError if the archive is damaged."""
+    return [inner for inner in files_in(path) if is_log(inner)]
+
+
+def is_table(path: Path) -> bool:
+    """Check whether a file is a table, or a folder or archive has nothing but tables.
+
+    If tables and logs of frames share a suffix, the content decides.
+    """
+    suffix = suffix_of(path)
+    if suffix == ".zip" or path.is_dir():
+        found = logs_in(path)
+        return bool(found) and all(map(is_table, found))
+    if suffix not in TABLE_SUFFIXES or not exists(path):
+        return False
+    try:
+        with readable(path) as file:
+            if suffix == ".mf4":
+                return not is_bus_log(file)
+            if suffix in {".csv", ".tsv", ".txt"}:
+                return kind_of_text(text_head(file)[0], headed=suffix != ".txt") == "table"
+    except UNREADABLE:
+        return suffix != ".txt"
+    return True
 
 
 def read_frames(path: Path) -> Frames:
@@ -79,14 +107,14 @@ def read_frames(path: Path) -> Frames:
         If the file cannot be opened, has an unknown suffix, is a table, damaged, cut or empty.
     """
     if path.is_dir() or path.suffix.lower() == ".zip":
-        logs = [inner for inner in files_in(path) if is_log(inner)]
+        logs = logs_in(path)
         if not logs:
             raise LogError(f"{path}: no logs in it; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
         return concatenate_frames([read_frames(log) for log in logs])
     reader = READERS.get(suffix_of(path))
     if not exists(path):
         raise LogError(f"{path}: no such file; give a log that is there")
-    if reader is None and not is_table(path):
+    if not is_log(path):
         raise LogError(f"{path}: not a known log format; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
     if reader is None or (reader is not read_mf4 and is_table(path)):
         raise LogError(f"{path}: {_IS_TABLE}")

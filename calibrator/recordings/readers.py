@@ -21,8 +21,8 @@ from calibrator.drives.align import at_instants, evaluate_formula
 from calibrator.errors import LogError
 from calibrator.recordings.decode import decode_signal, message_is_sound, signal_range
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S, EXTENDED_BIT, Frames, frame_key, repaired_time
-from calibrator.recordings.log_formats import read_frames
-from calibrator.recordings.tables import Table, is_table, read_table
+from calibrator.recordings.log_formats import is_table, read_frames
+from calibrator.recordings.tables import Table, read_table
 from calibrator.terminal.text import Notice
 from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, usual_unit
 from ecu_node.database import VehicleDatabase, codes_of_no_value

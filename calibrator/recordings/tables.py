@@ -28,8 +28,6 @@ from calibrator.recordings.frame_arrays import LATEST_TIME_STAMP_NS, repaired_ti
 from calibrator.recordings.log_files import (
     UNREADABLE,
     exists,
-    files_in,
-    is_table,
     open_log,
     read_rows,
     readable,
@@ -37,13 +35,14 @@ from calibrator.recordings.log_files import (
     suffix_of,
     text_head,
 )
+from calibrator.recordings.log_formats import logs_in
 from calibrator.recordings.mf4 import read_mf4_table
 from ecu_node.core.signals import AMPERE, usual_unit
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError
 from ecu_node.layout import layout_of
 
-__all__ = ["Table", "bare_name", "is_table", "layout_from_branches", "likely_full_scale_a", "peak_of", "read_table"]
+__all__ = ["Table", "bare_name", "layout_from_branches", "likely_full_scale_a", "peak_of", "read_table"]
 
 MOST_SHARING = 1.5
 """The time is too coarse if more rows than this, on average, share one instant: loggers repeat a few instants. [1]"""
@@ -196,13 +195,14 @@ def read_table(path: Path) -> Table:
     LogError
         If the file cannot be read, has no header, no time or no other numbers.
     """
-    files = files_in(path)
+    files = logs_in(path)
     if len(files) == 1:
         return read_table(files[0])
     if files:
-        raise LogError(f"{path}: {len(files)} files in it; give one table, or import the folder as drives")
+        raise LogError(f"{path}: {len(files)} tables in it; give one table, or import the folder as drives")
     if not exists(path):
-        raise LogError(f"{path}: no such file; give a table that is there")
+        what = "no table in it" if path.is_dir() else "no such file"
+        raise LogError(f"{path}: {what}; give a table that is there")
     units: dict[str, str] = {}
     found = ""
     try:

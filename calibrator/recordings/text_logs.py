@@ -15,6 +15,7 @@ import io
 import re
 import sys
 import warnings
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -103,7 +104,7 @@ def read_csv(path: Path) -> Frames:
         return read_candump(path)
     header = head.partition("\n")[0]
     if "arbitration_id" in header:
-        return _read_by_python_can(path, _csv_messages)
+        return _read_messages(path, _csv_messages)
     columns = [name.strip() for name in header.split(",")]
     for name in ("Time Stamp", "ID", "Extended", "Bus", "LEN", "D1"):
         if name not in columns:
@@ -120,12 +121,12 @@ def read_asc(path: Path) -> Frames:
         frames = None if _DECIMAL.search(head) else _read_lines(path, _parse_plain_asc)
     except _CanFdError:
         frames = None
-    return frames if frames is not None and len(frames) else _read_by_python_can(path, can.ASCReader)
+    return frames if frames is not None and len(frames) else _read_messages(path, can.ASCReader)
 
 
 def read_trc(path: Path) -> Frames:
     """Read a TRC file of any version."""
-    return _read_by_python_can(path, can.TRCReader)
+    return _read_messages(path, can.TRCReader)
 
 
 def _read_lines(path: Path, parse: _Parse, *, at_once: bool = False) -> Frames:
@@ -183,11 +184,14 @@ def _seconds(time: str) -> float:
         return nan
 
 
+_EXTENDED = {"true": True, "1": True, "false": False, "0": False}
+
+
 def _gvret_as_logged(text: bytes, columns: Sequence[str]) -> bytes:
     """Turn rows of GVRET (time in us, identifier and bytes hexadecimal) into lines of ``candump -L``, one for one."""
     lines = list[str]()
     for line in text.splitlines():
-        row = [cell.strip() for cell in line.decode("latin-1").split(",")]
+        row = [cell.strip() for cell in line.removeprefix(BOM_UTF8).decode("latin-1").split(",")]
         if not line.strip() or row == columns:
             lines.append("")
             continue
@@ -197,7 +201,7 @@ def _gvret_as_logged(text: bytes, columns: Sequence[str]) -> bytes:
             data = bytes(int(cells[f"D{k}"], 16) for k in range(1, int(cells["LEN"]) + 1))
             if any(row[len(columns) :]) or not 0 <= identifier <= LARGEST_IDENTIFIER:
                 raise ValueError
-            name = f"{identifier:08X}" if extended == "true" else f"{identifier:03X}"
+            name = f"{identifier:08X}" if _EXTENDED[extended] else f"{identifier:03X}"
             fd = "##0" if len(data) > CLASSIC_BYTES else "#"
             lines.append(f"({time_us // 10**6}.{time_us % 10**6:06d}) {cells['Bus']} {name}{fd}{data.hex()}")
         except (ValueError, KeyError):
@@ -215,8 +219,10 @@ def _csv_messages(text: TextIO) -> Iterator[can.Message]:
         yield message
 
 
-def _read_by_python_can(path: Path, reader: Callable[[TextIO], Iterable[can.Message]]) -> Frames:
-    """Read every message of a text; any exception of python-can becomes a LogError with the line.
+def _read_messages(path: Path, reader: Callable[[TextIO], Iterable[can.Message]]) -> Frames:
+    """Read every message of a text that a reader, such as those of python-can, finds in it.
+
+    Any exception of the reader becomes a LogError with the line.
 
     A binary file with the suffix of a text is refused first, as python-can would silently skip what it does not know.
     """

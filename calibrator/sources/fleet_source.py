@@ -28,8 +28,7 @@ from calibrator.drives.store import (
 from calibrator.errors import DriveError, FleetError, LogError
 from calibrator.files.storage import Entry, Storage, is_url, local_copy, open_storage, walk
 from calibrator.processes.run_many import Failed, Workers, try_many, try_many_shown
-from calibrator.recordings.log_files import files_in
-from calibrator.recordings.log_formats import LOG_SUFFIXES, is_log
+from calibrator.recordings.log_formats import LOG_SUFFIXES, is_log, logs_in
 from calibrator.recordings.readers import read_recording
 from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import few, few_reasons
@@ -218,7 +217,7 @@ def _logs_in(storage: Storage, shown: str, problems: list[str]) -> Iterator[tupl
 
 def _in_archive(path: Path) -> Iterator[tuple[str, list[Entry], None]]:
     version = _entry(path).version
-    for folder, logs in groupby(filter(is_log, files_in(path)), key=lambda inner: inner.parent):
+    for folder, logs in groupby(logs_in(path), key=lambda inner: inner.parent):
         yield str(folder), [Entry(log.name, 0, version) for log in logs], None
 
 

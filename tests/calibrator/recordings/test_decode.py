@@ -137,7 +137,7 @@ def test_frames_of_any_length_decode_as_in_cantools(pair: tuple[Message, Signal]
 
 
 @pytest.mark.parametrize("code", [-32768, 0x8000])
-def test_code_for_not_available_is_not_good_in_signed_or_unsigned_notation(code: int) -> None:
+def test_code_for_not_available_gives_no_value_in_signed_or_unsigned_notation(code: int) -> None:
     message, signal = one_signal(16, signed=True, scale=0.02, choices={code: "SNA", 1: "Standby"})
     decoded = decode_signal(message, signal, *payloads([b"\x00\x80", b"\x01\x00", b"\xff\xff"], 8))
     assert decoded.good.tolist() == [False, True, True]

@@ -89,6 +89,7 @@ def lines(form: str, head: str = "") -> Callable[[Path], None]:
                 "id8": f"{number:08X}",
                 "idx": f"{number:X}x" if extended else f"{number:X}",
                 "extended": str(extended).lower(),
+                "is_extended": int(extended),
                 "data": data.hex(" ").upper(),
                 "cells": data.hex(",").upper(),
                 "digits": data.hex().upper(),
@@ -129,6 +130,7 @@ LOGS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "python-can MF4": ("x.mf4", write_with_python_can),
     "python-can candump": ("frames.log", write_with_python_can),
     "SavvyCAN": ("x.csv", lines("{us},{id8},{extended},Rx,0,8,{cells},", GVRET)),
+    "GVRET with 0 and 1": ("x.csv", lines("{us},{id8},{is_extended},Rx,0,8,{cells},", "\ufeff" + GVRET)),
     "candump -ta": ("x.log", lines(" ({epoch:.6f})  can0  {id}   [8]  {data}")),
     "candump -tA": ("x.log", lines(" (2023-11-14 22:13:{second:09.6f})  can0  {id}   [8]  {data}")),
     "candump -tz": ("x.txt", lines(" ({time:010.6f})  can0  {id}   [8]  {data}")),
@@ -182,10 +184,16 @@ def test_archives_and_folders_are_imported_and_calibrated_as_vehicles(tmp_path: 
     assert [(drive["vehicle"], drive["name"]) for drive in drives] == [("V2", "tuesday"), ("car", "inner")]
 
 
-def test_logs_in_a_folder_are_one_recording_with_gaps(tmp_path: Path, layout: Path) -> None:
+def test_logs_in_a_folder_are_one_recording_with_gaps_whatever_notes_lie_beside_them(
+    tmp_path: Path, layout: Path
+) -> None:
+    (tmp_path / "logs").mkdir()
     for name in ("1.csv", "2.csv"):
-        (tmp_path / "logs").mkdir(exist_ok=True)
         LOGS["SavvyCAN"][1](tmp_path / "logs" / name)
+    for name in ("0.txt", "notes.txt"):
+        (tmp_path / "logs" / name).write_text(
+            "2026-11-03 12:00 two laps\n2026-11-03 12:40 heater on, 3 of 3\nbattery 80 %\n"
+        )
     found = before(tmp_path / "logs", layout)
     assert found["sum"]["mean_a"] == pytest.approx(2.2, abs=2e-3)
     assert any("the clock was set 1 times" in notice for notice in found["notices"])

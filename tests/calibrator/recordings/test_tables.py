@@ -12,7 +12,8 @@ import pandas as pd
 import pytest
 from asammdf import MDF, Signal
 
-from calibrator.recordings.tables import is_table, read_table
+from calibrator.recordings.log_formats import is_table
+from calibrator.recordings.tables import read_table
 from tests.calibrator.command_here import calibrator
 
 ROWS = 100
