@@ -23,7 +23,6 @@ from ecu_node.layout import Layout
 from ecu_node.summary import INSTANT_SLACK, TIME_RESOLUTION_S
 
 __all__ = [
-    "Samples",
     "align",
     "align_channels",
     "at_instants",

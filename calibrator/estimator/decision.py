@@ -239,8 +239,8 @@ class SensorEstimate:
     points : sequence of N Points
         The posterior.
     order : tuple of int
-        Order of the branches in the points: position of each in the vehicles' own order. Offsets of the points are in
-        fractions of full scale.
+        Branches in the order of the points: branch k of the points is branch ``order[k]`` of the vehicles. Offsets of
+        the points are in fractions of full scale.
     full_scale_a : float
         Full scale of the junction. [A]
     """
@@ -355,7 +355,7 @@ def estimate_rows(
     usual : ndarray of shape (2, K)
         The same moments of the fleet's usual drive.
     order : sequence of int or None
-        Order of the branches in the rows: position of each in the vehicles' own order; None: both are the same.
+        Branches in the order of the rows: branch k of the rows is branch ``order[k]`` of the vehicles; None: branch k.
     full_scale_a : float
         Full scale of the junction; 1: the offsets of the estimate are fractions of it. [A]
 

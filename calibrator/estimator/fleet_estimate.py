@@ -30,15 +30,13 @@ from calibrator.estimator.learning import LEAST_SHARED, centre_rows, learn_fault
 from calibrator.estimator.posterior import FaultModel
 from calibrator.estimator.prior import Prior
 from calibrator.estimator.readings import FEWEST_TRUSTED, untrusted_vehicles, with_knowledge
-from calibrator.estimator.settings import FEWEST_VEHICLES, HARM_LIMIT
+from calibrator.estimator.settings import CONFIDENT, FEWEST_VEHICLES, HARM_LIMIT, SUSPECTED
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.parameters import Explanation, SensorFinding
 
 __all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "estimate_vehicles", "learn_fleet"]
 
-CONFIDENT, SUSPECTED = 0.95, 0.5
-"""Confidence from which on a vehicle counts as sound, and probability from which on hardware is suspected. [1]"""
 MOST_RATIO, SURE = 3.0, 0.9
 """Gain ratio that no two sensors have, and partial correlation from which on a ratio is not due to noise. [1]"""
 LEAST_OWN = 1e-9
@@ -62,7 +60,7 @@ class FleetReference:
     branches : tuple of str
         Names of the K branches, in the vehicles' own order.
     order : tuple of int
-        Order of the branches in the estimator, the one that moves most first: position of each in their own order.
+        Branches in the order of the estimator, the one that moves most first: branch k there is ``branches[order[k]]``.
     feed : int
         Place in that order of the branch that feeds the others, and any load without a sensor.
     read_out : ndarray of shape (M + 1, K)

@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrator.drive import Array, Equipment, FleetSource
-from calibrator.drives.align import Samples
+from calibrator.drive import Array, Equipment, FleetSource, Samples
 from calibrator.errors import DriveError
 from calibrator.estimator.evidence import covariances
 from calibrator.processes.run_many import Workers

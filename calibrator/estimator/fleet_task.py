@@ -17,7 +17,6 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError, FleetError, internal_error
 from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
-from calibrator.estimator.parameter_files import RunIdentity
 from calibrator.estimator.readings import (
     CONTRADICTION,
     FEWEST_TRUSTED,
@@ -30,7 +29,8 @@ from calibrator.estimator.readings import (
 )
 from calibrator.estimator.results import PARTS, encode_chunk, part_file, read_part
 from calibrator.estimator.settings import CalibrationSettings, require_learning
-from calibrator.estimator.vehicle_report import explained_faults, impossible, parameters_of
+from calibrator.estimator.vehicle_parameters import RunIdentity, impossible, parameters_of
+from calibrator.estimator.vehicle_report import explained_faults
 from calibrator.summaries.record import Record, drives_digest, joined_records
 from calibrator.summaries.summary_store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary

@@ -27,8 +27,8 @@ from calibrator.errors import FleetError
 from calibrator.estimator.checks import CAUSES, UsualMisfits, find_misfits
 from calibrator.estimator.decision import FleetEstimate, Points, decided, harm_probability, recovery_probability
 from calibrator.estimator.evidence import junction_regression, stack_summaries
-from calibrator.estimator.fleet_estimate import SUSPECTED
 from calibrator.estimator.readings import CONTRADICTION, TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
+from calibrator.estimator.settings import SUSPECTED
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.layout import Layout, UnmeasuredLoad

@@ -10,13 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from calibrator.drive import Array, Drive, DriveFile, Equipment, FleetSource
-from calibrator.drives.align import Samples, align, at_pace
+from calibrator.drive import Array, Drive, DriveFile, Equipment, FleetSource, Samples
+from calibrator.drives.align import align, at_pace
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.junction import SEEN, JunctionKnowledge, estimate_junction, named_ratios
-from calibrator.estimator.parameter_files import RunIdentity
 from calibrator.estimator.readings import (
     TRUSTED_DRIFT_SD,
     TRUSTED_OFFSET_SD,
@@ -28,7 +27,8 @@ from calibrator.estimator.readings import (
 )
 from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
-from calibrator.estimator.vehicle_report import parameters_of, sensor_texts
+from calibrator.estimator.vehicle_parameters import RunIdentity, parameters_of
+from calibrator.estimator.vehicle_report import sensor_texts
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.summaries.moments import BLOCK_S

@@ -119,7 +119,7 @@ def with_knowledge(
     trusted : ndarray of bool of shape (N,)
         Vehicles whose sensors are all known to be right.
     order : sequence of int
-        Order of the branches in the rows: position of each in the vehicles' own order.
+        Branches in the order of the rows: branch k of the rows is branch ``order[k]`` of the vehicles.
     full_scale_a : float
         Full scale of the junction. [A]
     load : UnmeasuredLoad or None

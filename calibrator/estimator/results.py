@@ -22,7 +22,8 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.parameter_files import held_back_lines
+from calibrator.estimator.settings import CONFIDENT
+from calibrator.estimator.vehicle_report import held_back_lines
 from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 from ecu_node.documents import write_atomically
@@ -58,8 +59,6 @@ MOST_SORTED = 100_000
 """Largest number of rows of results that are sorted by vehicle."""
 MOST_NAMED = 1000
 """Largest number of vehicles that a report names one by one; all of them are in ``results.parquet``."""
-CONFIDENT = 0.95
-"""Confidence below which a report states it beside the branches that are corrected. [1]"""
 PARTS, FILES, ROWS = "buckets", "params", "results.parquet"
 LEFT_OUT = "left out"
 """In place of the verdict of a vehicle without parameters, or of a file whose vehicle is unclear."""

@@ -22,7 +22,6 @@ from calibrator.drive import Equipment, FleetSource
 from calibrator.drives.store import DRIVES_FOLDER
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
-from calibrator.estimator.parameter_files import RunIdentity, time_of_run
 from calibrator.estimator.readings import BenchTable, check_bench_table, read_bench_table
 from calibrator.estimator.results import (
     MOST_NAMED,
@@ -39,6 +38,7 @@ from calibrator.estimator.results import (
     write_run,
 )
 from calibrator.estimator.settings import CalibrationSettings, Method, require_learning
+from calibrator.estimator.vehicle_parameters import RunIdentity, time_of_run
 from calibrator.files.folders import require_new_folder, whole_folder
 from calibrator.files.storage import Storage, open_storage
 from calibrator.processes.run_many import Workers, run_many

@@ -12,12 +12,22 @@ from calibrator.terminal.text import counted, few, few_reasons
 from ecu_node.documents import text_digest
 from ecu_node.layout import UnmeasuredLoad, file_digest
 
-__all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "Method", "require_learning"]
+__all__ = [
+    "CONFIDENT",
+    "FEWEST_VEHICLES",
+    "HARM_LIMIT",
+    "SUSPECTED",
+    "CalibrationSettings",
+    "Method",
+    "require_learning",
+]
 
 FEWEST_VEHICLES = 5
 """Least size of a fleet that is compared with itself: in a smaller one it is not clear which vehicle differs."""
 HARM_LIMIT = 0.001
 """Default limit: a branch is corrected if the probability of making it worse is below this. [1]"""
+CONFIDENT, SUSPECTED = 0.95, 0.5
+"""Confidence from which on a vehicle counts as known, and probability from which on a fault is suspected. [1]"""
 
 
 class Method(StrEnum):

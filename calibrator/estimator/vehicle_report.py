@@ -1,45 +1,38 @@
-"""Report on one vehicle: its parameters, the evidence that would decide where they are in doubt, and both in words."""
+"""What was found for a vehicle, in words: its sensors, why faults are not corrected, and what evidence would decide."""
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.drives.delays import BranchDelays
-from calibrator.estimator.fleet_estimate import CONFIDENT, SUSPECTED, FleetEstimate
-from calibrator.estimator.parameter_files import REASONS, RunIdentity, by_branch, held_back_lines, junction_residual
-from calibrator.summaries.vehicle_summary import VehicleSummary
-from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, HeldBack, VehicleParameters, Verdict
+from ecu_node.parameters import BranchParameters, Explanation, HeldBack, VehicleParameters
+
+if TYPE_CHECKING:
+    from calibrator.estimator.decision import FleetEstimate  # its import takes a second, which reports need not wait
 
 __all__ = [
+    "REASONS",
     "deciding_evidence",
     "explained",
     "explained_faults",
     "explanation_text",
-    "impossible",
-    "parameters_of",
+    "held_back_lines",
     "sensor_texts",
 ]
 
-MOST_REPORTED, LEAST_REPORTED = 3, 0.02
-"""Largest number of explanations that are reported, and least probability of one after the first. [1]"""
+REASONS: dict[HeldBack, str] = {
+    "beyond the limits": "it is beyond the limits of the layout: replace the sensor",
+    "does not fit": "no gain error and offset explain what the sensor shows",
+    "reference in doubt": "what it is compared with, the fleet or a known sensor, is in doubt",
+    "moved too little": "its current moved too little for the gain to be known",
+    "harm limit": "the correction might do harm",
+}
+"""Why a fault that was found is not corrected, in words."""
 LEAST_RIVAL, LEAST_IN_THE_WAY = 0.02, 1e-4
 """Probability from which on another explanation is a rival, and from which on it can hold a correction back. [1]"""
 RESOLVED = 0.002
 """Smallest difference that a zero-current window or a bench check shows: drifts, offsets over full scale. [1]"""
-
-
-def impossible(estimate: FleetEstimate, j: int, branches: Sequence[str]) -> str:
-    """Return why a parameter file cannot describe the sensors of vehicle j; empty if it can."""
-    possible = np.abs(estimate.drift[j]) < 1.0  # as in the schema of the parameter file
-    if possible.all():
-        return ""
-    branch = branches[int(np.argmin(possible))]
-    return next((each.text for each in estimate.findings[j] if each.branch == branch), "") or (
-        f"its {branch} current does not follow its inputs as in the rest of the fleet: parked, stuck, or another kind "
-        f"of vehicle? record a drive in which it is used"
-    )
 
 
 def explained_faults(explanation: Explanation, branches: Sequence[str]) -> Array:
@@ -47,101 +40,8 @@ def explained_faults(explanation: Explanation, branches: Sequence[str]) -> Array
     return np.array([[part.get(name, 0.0) for name in branches] for part in (explanation.drift, explanation.offset_a)])
 
 
-def parameters_of(
-    vehicle: VehicleSummary,
-    estimate: FleetEstimate,
-    j: int,
-    *,
-    identity: RunIdentity,
-    branches: Sequence[str],
-    expected_a: float,
-    fleet_size: int,
-    decisive: str | None = None,
-) -> VehicleParameters:
-    """Write down what was found for vehicle j of an estimate.
-
-    Parameters
-    ----------
-    vehicle, estimate, j : VehicleSummary, FleetEstimate, int
-        The vehicle, the estimate, and the position of the vehicle in it.
-    identity : RunIdentity
-        Identity of the run.
-    branches : sequence of str
-        Names of the K branches.
-    expected_a : float
-        Mean junction sum that faultless sensors show. [A]
-    fleet_size : int
-        Number of vehicles that can be used.
-    decisive : str or None
-        Evidence that would decide what is in doubt; None: it is found from the explanations.
-
-    Returns
-    -------
-    VehicleParameters
-        Content of its parameter file.
-    """
-    corrected, held_back = estimate.corrected[j], estimate.held_back[j] != ""
-    reported, deciding = list[Explanation](), decisive or ""
-    if estimate.verdicts[j] == "cannot tell" or not estimate.confidence[j] >= CONFIDENT or held_back.any():
-        first, *others = estimate.explanations[j][:MOST_REPORTED]
-        reported = [first, *(each for each in others if each.probability >= LEAST_REPORTED)]
-        if decisive is None:
-            deciding, rival = deciding_evidence(estimate, j, branches, layout=identity.database.layout.path.name)
-            reported += [rival] if rival is not None and rival not in reported else []
-    hardware, inputs = _probability(estimate.hardware_probability[j]), vehicle.summary.inputs
-    return VehicleParameters(
-        vehicle=vehicle.vehicle,
-        layout=identity.layout,
-        dbc=identity.dbc,
-        verdict=cast("Verdict", estimate.verdicts[j]),
-        confidence=_probability(estimate.confidence[j]),
-        branches={name: _branch(vehicle.delays, estimate, (j, k), name) for k, name in enumerate(branches)},
-        hardware_fault=HardwareFault(
-            suspected=hardware is not None and hardware > SUSPECTED,
-            drift=float(estimate.hardware_drift[j]),
-            offset_a=by_branch(branches, estimate.hardware_offset_a[j]),
-            probability=hardware,
-        ),
-        explanations=reported,
-        deciding_evidence=deciding,
-        findings=list(estimate.findings[j]),
-        junction_residual=junction_residual(
-            vehicle.summary.moments[:, inputs:, inputs:],
-            gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
-            offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
-            expected_a=expected_a,
-        ),
-        provenance=identity.provenance(
-            fleet_size=fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s
-        ),
-    )
-
-
-def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int], name: str) -> BranchParameters:
-    k = delays.branches.index(name)
-    delay_s, delay_sd_s = (float(values[k]) if delays.known[k] else None for values in (delays.delay_s, delays.sd_s))
-    numbers: dict[str, Any] = {
-        each: float(getattr(estimate, each)[place]) for each in ("drift", "offset_a", "drift_sd", "offset_sd_a")
-    }
-    return BranchParameters(
-        **numbers,
-        apply=bool(estimate.corrected[place]),
-        held_back=cast("HeldBack | None", str(estimate.held_back[place]) or None),
-        delay_s=delay_s,
-        delay_sd_s=delay_sd_s,
-        fault_probability=_probability(estimate.fault_probability[place]),
-        harm_probability=_probability(estimate.harm_probability[place]),
-        identifiable=bool(estimate.identifiable[place]),
-    )
-
-
-def _probability(value: float) -> float | None:
-    """Clip a probability to its range, which rounding may exceed; None where it is not known (NaN)."""
-    return None if np.isnan(value) else float(np.clip(value, 0.0, 1.0))
-
-
 def deciding_evidence(
-    estimate: FleetEstimate, j: int, branches: Sequence[str], *, layout: str
+    estimate: "FleetEstimate", j: int, branches: Sequence[str], *, layout: str
 ) -> tuple[str, Explanation | None]:
     """Say what evidence would decide which sensor is faulty, or would allow a correction that is held back.
 
@@ -244,6 +144,18 @@ def explained(parameters: VehicleParameters) -> str:
     lines += [] if parameters.deciding_evidence in said else [parameters.deciding_evidence]
     lines.append(f"junction sum: {residual.measured_a:.2f} A RMS as measured, {residual.corrected_a:.2f} A corrected")
     return "\n".join(lines)
+
+
+def held_back_lines(parameters: VehicleParameters) -> list[str]:
+    """Say which faults that were found are not corrected, and why: a line per reason."""
+    lines = []
+    for reason, why in REASONS.items():
+        held_back = {name: branch for name, branch in parameters.branches.items() if branch.held_back == reason}
+        harm = [branch.harm_probability for branch in held_back.values() if branch.harm_probability is not None]
+        shares = ", ".join(f"{share:.2%}" for share in harm)
+        more = f", with a probability of {shares} (see --harm-limit)" if reason == "harm limit" and harm else ""
+        lines += [f"{', '.join(held_back)} not corrected, because {why}{more}"] if held_back else []
+    return lines
 
 
 def sensor_texts(parameters: VehicleParameters) -> dict[str, str]:

@@ -15,7 +15,7 @@ from typing import Any
 import pandas as pd
 
 from calibrator.errors import FleetError
-from calibrator.estimator.parameter_files import time_of_run
+from calibrator.estimator.vehicle_parameters import time_of_run
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, common_trial
 from calibrator.experiments.experiments import CALIBRATION, KEYS, Experiment, ExperimentResult, Setting
 from calibrator.experiments.figures import ALL, calibration_errors, figure_rows, judge, pool_figures, pool_tenths

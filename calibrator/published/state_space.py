@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
-from calibrator.drive import Array, Complex, Mask
-from calibrator.drives.align import Samples
+from calibrator.drive import Array, Complex, Mask, Samples
 from calibrator.errors import DriveError
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.terminal.text import counted

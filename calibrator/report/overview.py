@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.estimator.parameter_files import REASONS
+from calibrator.estimator.vehicle_report import REASONS
 from calibrator.report.fleet_table import FleetTable, ParameterDetails
 from calibrator.terminal.text import few
 from ecu_node.parameters import HeldBack

@@ -18,8 +18,8 @@ from plotly.offline import get_plotlyjs
 
 from calibrator.drive import Array
 from calibrator.errors import FleetError
-from calibrator.estimator.parameter_files import REASONS
 from calibrator.estimator.results import written_of
+from calibrator.estimator.vehicle_report import REASONS
 from calibrator.files.templates import templates_of
 from calibrator.report.fleet_table import FleetTable, ParameterDetails, read_details, read_fleet_table
 from calibrator.report.overview import (

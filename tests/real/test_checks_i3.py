@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.drive import Array
-from calibrator.drives.align import Samples
+from calibrator.drive import Array, Samples
 from calibrator.estimator.checks import find_misfits, learn_usual_misfits
 from calibrator.estimator.evidence import fit_fleet_model, stack_summaries
 from calibrator.experiments.figures import judge

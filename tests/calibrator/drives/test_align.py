@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.align import Samples, align, align_channels, choose_inputs
+from calibrator.drive import Array, Channel, Drive, Samples
+from calibrator.drives.align import align, align_channels, choose_inputs
 from calibrator.errors import DriveError
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from calibrator.drive import Array
-from calibrator.drives.align import Samples
+from calibrator.drive import Array, Samples
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise_samples

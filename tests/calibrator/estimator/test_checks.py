@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrator.drive import Array
-from calibrator.drives.align import Samples
+from calibrator.drive import Array, Samples
 from calibrator.estimator.checks import find_misfits, learn_usual_misfits
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.summaries.moments import DriveSummary

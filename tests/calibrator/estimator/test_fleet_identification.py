@@ -10,13 +10,12 @@ from scipy.signal import lfilter
 from typer.testing import CliRunner, Result
 
 from calibrator.cli import app
-from calibrator.drive import Array, Channel, Drive, DriveFile, Equipment
-from calibrator.drives.align import Samples
+from calibrator.drive import Array, Channel, Drive, DriveFile, Equipment, Samples
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
 from calibrator.estimator.fleet_identification import choose_filter_bank, held_out_snr_db
-from calibrator.estimator.parameter_files import current_moments, junction_residual
 from calibrator.estimator.published_fleet import read_vehicle_model
+from calibrator.estimator.vehicle_parameters import current_moments, junction_residual
 from calibrator.published.state_space import VehicleModel
 from calibrator.summaries.filter_bank import FilterBank, read_bank
 from calibrator.summaries.summariser import summarise_samples

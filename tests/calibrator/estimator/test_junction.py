@@ -81,7 +81,7 @@ def test_charge_balance_determines_an_offset(missing: float, gain: float) -> Non
 
 
 def test_several_junctions_are_calibrated_independently() -> None:
-    """From six on they are read vehicle by vehicle, and their drives are not kept."""
+    # more vehicles than are read together
     frames = {f"V{number}": recording(number, gain=(0.0, 0.05, 0.0), seconds=60.0) for number in range(6)}
     rows = found(frames, trusted=["battery"]).xs("motor", level="branch")
     assert rows.gain_error.to_numpy() == pytest.approx(np.full(6, 0.05), abs=0.01)

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.align import Samples
+from calibrator.drive import Array, Channel, Drive, Samples
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank, low_passes
 from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, FitSums

@@ -1,40 +1,47 @@
-"""What every parameter file of one run has in common."""
+"""The parameters of a vehicle as written for the node: what was found, the sum before and after, and by whom."""
 
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any, cast
 
 import numpy as np
 
 from calibrator.drive import Array
+from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
-from calibrator.estimator.settings import Method
+from calibrator.estimator.decision import FleetEstimate
+from calibrator.estimator.settings import CONFIDENT, SUSPECTED, Method
+from calibrator.estimator.vehicle_report import deciding_evidence
+from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import FileReference, HeldBack, JunctionResidual, Provenance, VehicleParameters
+from ecu_node.parameters import (
+    BranchParameters,
+    Explanation,
+    FileReference,
+    HardwareFault,
+    HeldBack,
+    JunctionResidual,
+    Provenance,
+    VehicleParameters,
+    Verdict,
+)
 
 __all__ = [
-    "REASONS",
     "RunIdentity",
     "by_branch",
     "current_moments",
-    "held_back_lines",
+    "impossible",
     "junction_residual",
+    "parameters_of",
     "time_of_run",
 ]
 
-REASONS: dict[HeldBack, str] = {
-    "beyond the limits": "it is beyond the limits of the layout: replace the sensor",
-    "does not fit": "no gain error and offset explain what the sensor shows",
-    "reference in doubt": "what it is compared with, the fleet or a known sensor, is in doubt",
-    "moved too little": "its current moved too little for the gain to be known",
-    "harm limit": "the correction might do harm",
-}
-"""Why a fault that was found is not corrected, in words."""
-
-
+MOST_REPORTED, LEAST_REPORTED = 3, 0.02
+"""Largest number of explanations that are reported, and least probability of one after the first. [1]"""
 QUIET_SHARE = 0.25
 """Share of the blocks, those with the least throughput, that show how far sums at rest are from what is expected."""
 STABILITY = 0.01
@@ -188,13 +195,106 @@ def _spread(moments: Array, sums: Array) -> tuple[float, float]:
     return math.sqrt(rest_a2), min(math.hypot(math.sqrt(growth), STABILITY), 1.0)  # 1 with a dead sensor
 
 
-def held_back_lines(parameters: VehicleParameters) -> list[str]:
-    """Say which faults that were found are not corrected, and why: a line per reason."""
-    lines = []
-    for reason, why in REASONS.items():
-        held_back = {name: branch for name, branch in parameters.branches.items() if branch.held_back == reason}
-        harm = [branch.harm_probability for branch in held_back.values() if branch.harm_probability is not None]
-        shares = ", ".join(f"{share:.2%}" for share in harm)
-        more = f", with a probability of {shares} (see --harm-limit)" if reason == "harm limit" and harm else ""
-        lines += [f"{', '.join(held_back)} not corrected, because {why}{more}"] if held_back else []
-    return lines
+def impossible(estimate: FleetEstimate, j: int, branches: Sequence[str]) -> str:
+    """Return why a parameter file cannot describe the sensors of vehicle j; empty if it can."""
+    possible = np.abs(estimate.drift[j]) < 1.0  # as in the schema of the parameter file
+    if possible.all():
+        return ""
+    branch = branches[int(np.argmin(possible))]
+    return next((each.text for each in estimate.findings[j] if each.branch == branch), "") or (
+        f"its {branch} current does not follow its inputs as in the rest of the fleet: parked, stuck, or another kind "
+        f"of vehicle? record a drive in which it is used"
+    )
+
+
+def parameters_of(
+    vehicle: VehicleSummary,
+    estimate: FleetEstimate,
+    j: int,
+    *,
+    identity: RunIdentity,
+    branches: Sequence[str],
+    expected_a: float,
+    fleet_size: int,
+    decisive: str | None = None,
+) -> VehicleParameters:
+    """Return the parameters of vehicle j of an estimate: faults, explanations, findings, and where they come from.
+
+    Parameters
+    ----------
+    vehicle, estimate, j : VehicleSummary, FleetEstimate, int
+        The vehicle, the estimate, and the position of the vehicle in it.
+    identity : RunIdentity
+        Identity of the run.
+    branches : sequence of str
+        Names of the K branches.
+    expected_a : float
+        Mean junction sum that faultless sensors show. [A]
+    fleet_size : int
+        Number of vehicles that can be used.
+    decisive : str or None
+        Evidence that would decide what is in doubt; None: it is found from the explanations.
+
+    Returns
+    -------
+    VehicleParameters
+        Content of its parameter file.
+    """
+    corrected, held_back = estimate.corrected[j], estimate.held_back[j] != ""
+    reported, deciding = list[Explanation](), decisive or ""
+    if estimate.verdicts[j] == "cannot tell" or not estimate.confidence[j] >= CONFIDENT or held_back.any():
+        first, *others = estimate.explanations[j][:MOST_REPORTED]
+        reported = [first, *(each for each in others if each.probability >= LEAST_REPORTED)]
+        if decisive is None:
+            deciding, rival = deciding_evidence(estimate, j, branches, layout=identity.database.layout.path.name)
+            reported += [rival] if rival is not None and rival not in reported else []
+    hardware, inputs = _probability(estimate.hardware_probability[j]), vehicle.summary.inputs
+    return VehicleParameters(
+        vehicle=vehicle.vehicle,
+        layout=identity.layout,
+        dbc=identity.dbc,
+        verdict=cast("Verdict", estimate.verdicts[j]),
+        confidence=_probability(estimate.confidence[j]),
+        branches={name: _branch(vehicle.delays, estimate, (j, k), name) for k, name in enumerate(branches)},
+        hardware_fault=HardwareFault(
+            suspected=hardware is not None and hardware > SUSPECTED,
+            drift=float(estimate.hardware_drift[j]),
+            offset_a=by_branch(branches, estimate.hardware_offset_a[j]),
+            probability=hardware,
+        ),
+        explanations=reported,
+        deciding_evidence=deciding,
+        findings=list(estimate.findings[j]),
+        junction_residual=junction_residual(
+            vehicle.summary.moments[:, inputs:, inputs:],
+            gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
+            offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
+            expected_a=expected_a,
+        ),
+        provenance=identity.provenance(
+            fleet_size=fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s
+        ),
+    )
+
+
+def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int], name: str) -> BranchParameters:
+    k = delays.branches.index(name)
+    delay_s, delay_sd_s = (float(values[k]) if delays.known[k] else None for values in (delays.delay_s, delays.sd_s))
+    numbers: dict[str, Any] = {
+        each: float(getattr(estimate, each)[place]) for each in ("drift", "offset_a", "drift_sd", "offset_sd_a")
+    }
+    return BranchParameters(
+        **numbers,
+        apply=bool(estimate.corrected[place]),
+        held_back=cast("HeldBack | None", str(estimate.held_back[place]) or None),
+        delay_s=delay_s,
+        delay_sd_s=delay_sd_s,
+        fault_probability=_probability(estimate.fault_probability[place]),
+        harm_probability=_probability(estimate.harm_probability[place]),
+        identifiable=bool(estimate.identifiable[place]),
+    )
+
+
+def _probability(value: float) -> float | None:
+    """Clip a probability to its range, which rounding may exceed; None where it is not known (NaN)."""
+    return None if np.isnan(value) else float(np.clip(value, 0.0, 1.0))
