@@ -32,7 +32,7 @@ from calibrator.estimator.posterior import evidence_of, row_residuals
 from calibrator.experiments.trial import CommonEvidence, Trial
 from calibrator.faults import Faults
 
-__all__ = ["BASELINES"]
+__all__ = ["SOLVERS"]
 
 PENALTY = float(np.log(10_000.0))
 """Price of a parameter in the Bayesian information criterion: log of the samples of a quarter of an hour at 10 Hz."""
@@ -71,7 +71,11 @@ def lasso(trial: Trial) -> Faults:
 
 
 def fleet_median(trial: Trial) -> Faults:
-    """Take deviations of slopes and intercepts from the fleet's median as faults of the sensors."""
+    """Take what is far from the fleet's median as faults of the sensors.
+
+    Compared are slopes and intercepts (15) of each vehicle over the fleet model. Far is beyond :data:`BEYOND` robust
+    standard deviations.
+    """
     rows, order = _evidence_rows(trial)
 
     def apart(values: Array) -> Array:
@@ -108,7 +112,7 @@ def reconciliation(trial: Trial) -> Faults:
     return _sensors_alone((slope - 1.0) * wrong[:, None], offset_a * wrong[:, None])
 
 
-BASELINES = {
+SOLVERS = {
     "best subset": best_subset,
     "LASSO": lasso,
     "fleet median": fleet_median,
@@ -173,13 +177,13 @@ class _Linear:
         return np.asarray(left + theta @ self.design.T)
 
     def fit(self, support: Mask) -> tuple[Array, Array]:
-        """Parameters (N, 3K) and chi2 (N,) of least squares with a support (N, 3K) for each vehicle."""
+        """Parameters (N, 3K), 0 outside a support (N, 3K) of each vehicle, and chi2 (N,), by least squares."""
         theta = np.zeros(support.shape)
         design = (self.whiten @ self.design) * support[:, None, :]
         solve = np.linalg.pinv(design, rcond=1e-9)
         for _ in range(ROUNDS):
             y = np.einsum("nij,nj->ni", self.whiten, self.values(theta))
-            theta = np.clip(np.einsum("npi,ni->np", solve, y), -2.0, 2.0)
+            theta = np.clip(np.einsum("npi,ni->np", solve, y), -2.0, 2.0) * support
         y = np.einsum("nij,nj->ni", self.whiten, self.values(theta))
         return theta, np.sum((y - np.einsum("nip,np->ni", design, theta)) ** 2, axis=1)
 

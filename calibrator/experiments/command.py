@@ -25,6 +25,9 @@ def experiment(
     quick: Annotated[
         bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")
     ] = False,
+    only: Annotated[
+        str | None, typer.Option("--only", metavar="TEXT", help="Only settings with this text in their name.")
+    ] = None,
     repetitions: Annotated[
         int | None,
         whole_option("--repetitions", 1, MAX_REPETITIONS, "Trials per setting (without it 10, with --quick 2)"),
@@ -71,10 +74,11 @@ def experiment(
     names = ", ".join(row.name for row in EXPERIMENTS.values() if row.recorded)
     unheeded, reason = ["drives", "layout"], f"{name} takes the built-in vehicle; this is only for {names}"
     if rows == [CALIBRATION]:
-        unheeded += ["quick", "repetitions", "seed", "workers"]
+        unheeded += ["quick", "only", "repetitions", "seed", "workers"]
         reason = "calibration runs nothing, it pools what is recorded in --out"
     if not recorded and (given := given_options(context, unheeded)):
         raise typer.BadParameter(reason, param_hint=given[0])
+    rows = [row.only(only) for row in rows] if only else rows
     if rows == [CALIBRATION] and out is None:
         first = "first run 'calibrator experiment all --out FOLDER', or some experiments by their names"
         raise typer.BadParameter(f"calibration pools what is recorded there; {first}", param_hint="--out")

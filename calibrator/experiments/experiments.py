@@ -111,6 +111,10 @@ class Experiment:
     panels: tuple[str, ...] = ("recovery_rate", "confidence")
     pooled: bool = True
 
+    def __post_init__(self) -> None:
+        if self.settings and (unknown := self.quick.keys() - {setting.series for setting in self.settings}):
+            raise FleetError(f"{self.name}: --quick keeps {', '.join(sorted(unknown))}, which no setting is called")
+
     @property
     def recorded(self) -> bool:
         """Whether its vehicles drive recorded trips."""
@@ -126,7 +130,15 @@ class Experiment:
                 case = replace(case, vehicles=fewer, training_vehicles=QUICK_TRAINING_VEHICLES)
             if not self.quick or each.x in self.quick.get(each.series, ()):
                 kept.append(replace(each, case=case))
-        return replace(self, settings=tuple(kept))
+        return replace(self, settings=tuple(kept), quick={})  # all that is left
+
+    def only(self, text: str) -> "Experiment":
+        """Return the experiment with those settings whose series has a text in it; FleetError if there are none."""
+        kept = tuple(setting for setting in self.settings if text in setting.series)
+        if not kept:
+            names = ", ".join(dict.fromkeys(setting.series or "(without a name)" for setting in self.settings))
+            raise FleetError(f"{self.name}: no setting has {text!r} in its name; there are {names}")
+        return replace(self, settings=kept, quick={})
 
 
 READINGS = (("", 60.0), ("3 of 6", 50.0))
@@ -143,7 +155,7 @@ QUICK_LEVELS = {"": (60.0, 80.0), "3 of 6": (60.0,)}
 
 
 def _paper(method: ComparedMethod, names: str, *rows: tuple[float, ...]) -> dict[tuple[float, str], dict[str, float]]:
-    """Build the figures of the paper for a method; each row holds x and the values of the named figures."""
+    """Build the figures of the paper for a method: ``names`` with blanks between, and rows of x and their values."""
     return {(x, method.name): dict(zip(names.split(), values, strict=True)) for x, *values in rows}
 
 
@@ -312,7 +324,7 @@ TABLE = (
         settings=tuple(
             Setting(x=K, series=world, case=RecordedCase(branches=K, world=world)) for world in WORLDS for K in (2, 3)
         ),
-        quick={"load 5 A in 30%": (2,), "inverted in 10%": (2,)},
+        quick={"load 5 A in 30%": (2,), "quadratic 5-20 %": (2,)},
         note="S = 80; where no share is named, 30 % of the vehicles have what the world does.",
         picture="dots",
         shown=("corrected", "harmed", "worst_a", "named", "misnamed", "sure_wrong"),

@@ -159,10 +159,10 @@ def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
     Returns
     -------
     figures : DataFrame
-        A row per figure: ``figure``, ``value``, ``sd`` over the trials (0 for a single one), ``of`` how many
-        values, and of a share the ends ``low`` and ``high`` of its 95 % interval.
+        A row per figure: its name (``figure``), ``value``, standard deviation ``sd`` over the trials (0 for a single
+        one), and number of values it is made ``of``; for a share also its 95 % interval, from ``low`` to ``high``.
     tenths : DataFrame
-        From :func:`tenths_of`.
+        Vehicles by tenths of their confidence, see :func:`tenths_of`.
     """
     names = dict.fromkeys(name for trial in trials for name in trial)
     parts = {name: [trial[name] for trial in trials if len(trial.get(name, ()))] for name in names}

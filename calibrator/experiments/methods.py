@@ -15,7 +15,7 @@ from calibrator.estimator import decision
 from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_vehicles, learn_fleet
 from calibrator.estimator.learning import learn_fault_models
 from calibrator.estimator.prior import Prior, known_prior
-from calibrator.experiments.baselines import BASELINES as SOLVERS
+from calibrator.experiments.baselines import SOLVERS
 from calibrator.experiments.trial import CommonEvidence, Estimate, FaultDistribution, Trial
 from calibrator.faults import Faults
 from calibrator.published.classify import Classification, classify_by_threshold, classify_by_trees, classify_by_truth

@@ -15,8 +15,8 @@ from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
 from calibrator.artificial.simulate import Vehicle, vehicle_drive
 from calibrator.artificial.trips import GroundTruth, balance_branch, choose_branches, read_recorded_trips, with_branches
-from calibrator.drive import Array
-from calibrator.drives.align import Samples, align, choose_inputs, evaluate_formula
+from calibrator.drive import Array, Samples
+from calibrator.drives.align import align, choose_inputs, evaluate_formula
 from calibrator.drives.delays import estimate_delays, without_delays
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
@@ -181,7 +181,7 @@ class RecordedCase(FaultSettings):
         Method from whose prior, learnt from this very fleet, the faults are drawn, so that its prior is right.
     vehicles, minutes : int or None, float or None
         Number of vehicles and length of their drives, each of which starts at a random instant of the trips and goes
-        on from trip to trip; None: each trip is a vehicle.
+        on from trip to trip. Without minutes each trip is a vehicle; without vehicles there are as many as trips.
     delay_max_s : float or None
         Record through asynchronous frames at 100 Hz, each branch late by a uniform delay of 0 to this. [s]
     delays_left_in : bool
@@ -198,6 +198,10 @@ class RecordedCase(FaultSettings):
     minutes: float | None = None
     delay_max_s: float | None = None
     delays_left_in: bool = False
+
+    def __post_init__(self) -> None:
+        if self.vehicles is not None and self.minutes is None:
+            raise FleetError(f"a case with {self.vehicles} vehicles, and each trip is one: give minutes as well")
 
     @property
     def faults(self) -> FaultSettings:

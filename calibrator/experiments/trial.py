@@ -102,7 +102,7 @@ class Trial:
     unseen : UnseenDrive
         Drive on which corrections are judged.
     record : callable
-        Makes what the default is given: the drive summaries of the N vehicles, or the evidence of their common drive.
+        Makes what the posterior method is given: drive summaries of the N vehicles, or evidence of their common drive.
     collect : callable
         Makes the evidence of the published method.
     drawn_from : FaultDistribution or None
@@ -132,7 +132,7 @@ class Trial:
 
     @cached_property
     def recorded(self) -> Sequence[DriveSummary] | CommonEvidence:
-        """Summaries or evidence that the default is given, made once."""
+        """Summaries or evidence that the posterior method is given, made once."""
         return self.record()
 
     @cached_property

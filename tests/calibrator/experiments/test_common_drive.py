@@ -123,6 +123,8 @@ def test_builtin_drive_has_the_requested_branches_and_a_different_unseen_drive()
 
 # Baselines: each finds what it is made for
 
+METHODS = {method.name: method for method in BASELINES}
+
 
 def rate(method: MethodRow, trial: Trial) -> float:
     return float(judge(method.estimate(trial), trial)["recovery_rate"].mean())
@@ -130,7 +132,7 @@ def rate(method: MethodRow, trial: Trial) -> float:
 
 def test_best_subset_lasso_and_median_recover_single_faults() -> None:
     trial = recorded_trial(small_fleet(), RecordedCase(), 0)
-    best, lasso, median, *_ = BASELINES
+    best, lasso, median = (METHODS[name] for name in ("best subset", "LASSO", "fleet median"))
     assert rate(best, trial) >= 0.8
     assert np.mean(best.estimate(trial).hardware == trial.truth.has_hardware_fault) >= 0.8
     assert rate(lasso, trial) >= 0.6
@@ -139,10 +141,10 @@ def test_best_subset_lasso_and_median_recover_single_faults() -> None:
     assert rate(best, common_trial(smooth_drive(), case, 0)) >= 0.9
 
 
-@pytest.mark.parametrize("baseline", BASELINES[3:], ids=lambda baseline: baseline.name)
-def test_methods_using_only_the_junction_law_find_the_gain_ratio(baseline: MethodRow) -> None:
+@pytest.mark.parametrize("name", ["total least squares", "VDI 2048"])
+def test_methods_using_only_the_junction_law_find_the_gain_ratio(name: str) -> None:
     trial = common_trial(smooth_drive(), CommonCase(vehicles=40, sparsity=80.0), 0)
-    found = baseline.estimate(trial)
+    found = METHODS[name].estimate(trial)
     np.testing.assert_array_equal(found.hardware, False)
     corrected = np.all(found.corrected, axis=1)
     gains, true = (1.0 + found.faults.drift, 1.0 + trial.truth.drift)

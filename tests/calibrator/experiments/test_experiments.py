@@ -189,6 +189,23 @@ def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
     assert {each.case.vehicles for each in small.settings} == {20}
 
 
+def test_settings_are_chosen_by_a_text_in_their_name() -> None:
+    kept = EXPERIMENTS["attacks"].only("cubic").small().settings
+    assert [(each.series, each.x) for each in kept] == [("cubic 5-20 %", 2.0), ("cubic 5-20 %", 3.0)]
+    ran = CliRunner().invoke(app, ["experiment", "asymmetry", "--only", "0.3"])
+    assert "asymmetry: no setting has '0.3' in its name; there are 0, 0.2, 0.4, 0.5" in str(ran.exception)
+
+
+def test_settings_that_quick_keeps_must_exist() -> None:
+    with pytest.raises(FleetError, match="small: --quick keeps K=9, which no setting is called"):
+        replace(EXPERIMENTS["small"], quick={"K=9": (6.0,)})
+
+
+def test_number_of_vehicles_without_length_of_their_drives_is_refused() -> None:
+    with pytest.raises(FleetError, match="40 vehicles, and each trip is one: give minutes as well"):
+        RecordedCase(vehicles=40)
+
+
 def test_experiment_command_runs_records_and_pools(tmp_path: Path) -> None:
     out = ("--out", str(tmp_path / "results"))
     ran = CliRunner().invoke(app, ["experiment", "calibration", *out])
