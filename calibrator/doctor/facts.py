@@ -77,7 +77,7 @@ class Facts:
         - ``low``, ``high``: least and greatest good value, of branches positive into the junction; NaN without any;
         - ``clipped``: good values at an end of the signal's range, several in a row.
     junction : RecordedJunction
-        The sum of the branches.
+        The sum of the branches; its database has the layout at the pace of the logs, with hidden inputs for voltages.
     """
 
     database: VehicleDatabase
@@ -172,7 +172,10 @@ def _channel(
 
 
 def _clipped(signal: Signal, value: Array) -> int:
-    """Count values at an end, other than 0, of an integer signal's range, :data:`FEWEST_CLIPPED` or more in a row."""
+    """Count values at the least or greatest value that an integer signal can show, unless that is 0.
+
+    Only :data:`FEWEST_CLIPPED` or more in a row count.
+    """
     if signal.is_float:
         return 0
     (low, high), span = bit_range(signal), signal_range(signal)

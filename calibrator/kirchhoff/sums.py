@@ -188,7 +188,7 @@ def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
 
 
 def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
-    """Return the step in which the current of a branch is resolved; 0 if it is not known. [A]
+    """Return the finest step that the current of a branch can show; 0 if it is not known. [A]
 
     It is the least distance of two values seen, or the scale of its signal if that is less. For a power it is the scale
     of the power over the median voltage, if the voltage is recorded.

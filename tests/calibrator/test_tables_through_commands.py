@@ -77,7 +77,7 @@ def test_calibration_from_drives_or_summaries_of_tables_is_the_same(place: Path,
 def test_doctor_finds_no_error_in_a_good_table(place: Path) -> None:
     drive = place / "logs" / "V2" / "drive.csv"
     findings = json.loads(run(place, "doctor", "--log", drive, "--json"))
-    assert not [each for each in findings["findings"] if each["level"] == "error"]
+    assert not [each for each in findings["findings"] if each["severity"] == "error"]
     assert "battery" in run(place, "kirchhoff", drive)
 
 

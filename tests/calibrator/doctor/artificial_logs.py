@@ -107,7 +107,7 @@ class DoctorRun:
 def examined(layout: Path, *logs: Path) -> DoctorRun:
     """Run the command; its exit code must match its findings."""
     done = calibrator("doctor", "--layout", layout, *(word for log in logs for word in ("--log", log)), "--json")
-    assert done.stderr == ""
+    assert not done.stderr, done.stderr
     doctor = DoctorRun(code=done.returncode, report=json.loads(done.stdout))
     assert doctor.code == (1 if doctor.errors else 0)
     return doctor

@@ -44,16 +44,16 @@ def test_c_core_matches_the_node_for_all_codes_of_8_to_24_bits(tmp_path: Path) -
 
 
 @needs("gcc")
-@pytest.mark.parametrize("part", PARTS)
-def test_c_core_matches_the_node_for_random_frames(part: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("seed", PARTS)
+def test_c_core_matches_the_node_for_random_frames(seed: int, tmp_path: Path) -> None:
     checked = vehicle()
-    assert check_frames(checked, build(checked, tmp_path), Random(part), 100_000) > 30_000
+    assert check_frames(checked, build(checked, tmp_path), Random(seed), 100_000) > 30_000
 
 
 @needs("clang")
-@pytest.mark.parametrize("part", PARTS)
-def test_c_core_matches_the_node_for_random_vehicles_under_sanitizers(part: int, tmp_path: Path) -> None:
-    vehicles, rng, changed = drawn_vehicles(Random(part), tmp_path), Random(part), 0
+@pytest.mark.parametrize("seed", PARTS)
+def test_c_core_matches_the_node_for_random_vehicles_under_sanitizers(seed: int, tmp_path: Path) -> None:
+    vehicles, rng, changed = drawn_vehicles(Random(seed), tmp_path), Random(seed), 0
     for _ in range(6):
         checked = next(vehicles)
         changed += check_frames(checked, build(checked, tmp_path, compiler="clang", flags=SANITIZED), rng, 3_000)
