@@ -37,6 +37,7 @@ from calibrator.summaries.vehicle_summary import (
     VehicleSummary,
     most_moving_first,
     require_possible,
+    with_noise_of_steps,
     zero_current_offsets,
 )
 from calibrator.terminal.progress import shown
@@ -106,6 +107,7 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
     longest_s = max(BLOCK_S, FULL_BLOCK * layout.period_s)
     block_s = max(min(longest_s, duration_s / BLOCKS), SHORTEST_BLOCK_S, layout.period_s)
     summary = summarise_samples(samples, period_s=layout.period_s, block_s=block_s)
+    summary = with_noise_of_steps(summary, drives, branches, database)
     if len(summary.moments) < len(branches) + FEWEST_BLOCKS:
         raise DriveError(
             f"{duration_s:.1f} s of usable samples on a time base of {layout.period_s:g} s tell too little: at least "

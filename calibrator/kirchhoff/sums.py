@@ -28,17 +28,16 @@ import numpy as np
 import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.align import align_channels, at_pace
+from calibrator.drives.align import align_channels, at_pace, step_of
 from calibrator.drives.delays import MAX_DELAY_S
 from calibrator.errors import DriveError
-from ecu_node.core.signals import VOLT, WATT, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
 from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
 from ecu_node.summary import DIFFERENCE_GAIN, MAD_TO_SD
 
-__all__ = ["BAND", "SUM", "VOLTAGE", "Comparison", "compare_kirchhoff", "step_of", "with_voltages"]
+__all__ = ["BAND", "SUM", "VOLTAGE", "Comparison", "compare_kirchhoff", "with_voltages"]
 
 VOLTAGE = "_junction_voltage"
 """Input that is the battery's voltage; drives may lack it."""
@@ -48,8 +47,6 @@ BAND = 2.0
 """Half width of the band, in standard deviations: 19 of 20 instants of right sensors lie in it. [1]"""
 MOVES = 5.0
 """A branch whose variation is less than this many times its noise gets no share in the sum. [1]"""
-LEVELS = 10
-"""Fewer different values do not show a step: a heater is on or off. [1]"""
 FEWEST = 50
 """Fewest valid instants from which the sum is divided into shares."""
 _AFTER = " (corrected)"
@@ -174,9 +171,10 @@ def _noise(value: Array) -> float:
 
 
 def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
-    """Return the database with more inputs: voltages of branches that are powers (:func:`step_of`) and :data:`VOLTAGE`.
+    """Return the database with more inputs: :data:`VOLTAGE`, and the voltages of branches that are powers.
 
-    :data:`VOLTAGE` is the first signal by which powers are divided, or else the first input in volts.
+    The latter are for :func:`.step_of`. :data:`VOLTAGE` is the first signal by which powers are divided, or else the
+    first input in volts.
     """
     layout = database.layout
     volts = [item.signal for item in layout.input if database.signal(item.signal)[1].unit == "V"]
@@ -185,25 +183,6 @@ def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
         divisors[VOLTAGE] = signal
     more = [Input(name=name, signal=signal) for name, signal in divisors.items()]
     return replace(database, layout=msgspec.structs.replace(layout, input=[*layout.input, *more]))
-
-
-def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
-    """Return the finest step that the current of a branch can show; 0 if it is not known. [A]
-
-    It is the least distance of two values seen, or the scale of its signal if that is less. For a power it is the scale
-    of the power over the median voltage, if the voltage is recorded.
-    """
-    branch, channel = database.layout.find_branch(name), drive.branches[name]
-    if branch.power is not None and branch.voltage is not None:
-        signal, voltage = database.signal(branch.power)[1], drive.inputs.get(f"_voltage_{name}")
-        if signal.is_float or voltage is None:
-            return 0.0
-        volts = np.median(np.abs(voltage.value[voltage.good]))
-        per_volt = unit_factor(signal, WATT, name) / unit_factor(database.signal(branch.voltage)[1], VOLT, name)
-        return float(abs(float(signal.scale)) * per_volt / volts)
-    levels_a = np.unique(np.round(channel.value[channel.good], 9))
-    steps_a = [float(np.diff(levels_a).min())] if len(levels_a) >= LEVELS else []
-    return min([*steps_a, *filter(None, [database.current_step_a(name)])], default=0.0)
 
 
 def compare_kirchhoff(

@@ -1,7 +1,7 @@
 """Summarise the drives of one vehicle: delays between branches, zero-current windows and second moments."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import pairwise
 from operator import add
@@ -9,7 +9,7 @@ from operator import add
 import numpy as np
 
 from calibrator.drive import Array, Channel, Drive, Equipment, Samples
-from calibrator.drives.align import align, at_pace
+from calibrator.drives.align import align, at_pace, step_of
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank
@@ -32,6 +32,7 @@ __all__ = [
     "too_short",
     "too_slow",
     "weighted_mean",
+    "with_noise_of_steps",
     "zero_current_offsets",
 ]
 
@@ -140,10 +141,11 @@ def summarise_drives(
         temperatures_c = [
             _temperature_c(drive.inputs.get(name), part) for drive, part in zip(drives, samples, strict=True)
         ]
+    summary = summarise_samples(samples, period_s=database.layout.period_s, bank=bank, temperatures_c=temperatures_c)
     return VehicleSummary(
         vehicle=drives[0].vehicle,
         drives=tuple(drive.name for drive in drives),
-        summary=summarise_samples(samples, period_s=database.layout.period_s, bank=bank, temperatures_c=temperatures_c),
+        summary=with_noise_of_steps(summary, drives, equipment.branches, database),
         delays=delays,
         zero_current=zero_current_offsets(drives, equipment.branches, database),
     )
@@ -169,6 +171,18 @@ def aligned_drives(
     if problem := too_short(known_s + layout.period_s * sum(int(part.valid.sum()) for part in samples), len(drives)):
         raise DriveError(problem)
     return delays, samples
+
+
+def with_noise_of_steps(
+    summary: DriveSummary, drives: Sequence[Drive], branches: Sequence[str], database: VehicleDatabase
+) -> DriveSummary:
+    """Return a summary of drives with no less noise of each current than the steps make in which it was measured.
+
+    Rounding to steps of q has a variance of q^2 / 12, which changes from sample to sample do not show where the current
+    changes by less than a step.
+    """
+    step_a = np.array([max(step_of(database, name, drive) for drive in drives) for name in branches])
+    return replace(summary, noise_a2=np.maximum(summary.noise_a2, step_a**2 / 12.0))
 
 
 def too_slow(period_s: float) -> str:

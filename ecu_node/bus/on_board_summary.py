@@ -471,7 +471,8 @@ class OnBoardSummary:
         fast = [_second_differences([column[b] for b in kept], [used[b] for b in kept]) for column in columns[M:]]
         for name, own, column in zip(self._branches, parts[M:], columns[M:], strict=True):
             _add_levels(parts, own, self._levels[name])
-            noise = sum(sum(used[block]) * _white_noise_a2(column[block]) for block in kept)
+            least_a2 = self._database.current_step_a(name) ** 2 / 12.0  # of rounding
+            noise = sum(sum(used[block]) * max(_white_noise_a2(column[block]), least_a2) for block in kept)
             numbers["noise_a2"].append(noise / count)
         numbers["mean"] += means
         numbers["covariance"] += [part / count for part in _products(centred)]
