@@ -593,7 +593,7 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
                 grid: Sequence[float] | Array = TAILS
                 if name != "tail":
                     first = COARSE_LOW if name == "low" else COARSE_HIGH
-                    grid = first if coarse and not again else getattr(best, name) * FINE
+                    grid = np.append(first, getattr(best, name)) if coarse and not again else getattr(best, name) * FINE
                 tried = [replace(best, **{name: float(value)}, density=np.zeros(0)) for value in grid]
                 tried = [slab for slab in tried if slab.high > least * slab.low and slab.low > TAIL_RANGE[0]]
                 densities = np.stack([slab.density for slab in tried])
