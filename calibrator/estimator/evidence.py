@@ -31,7 +31,7 @@ residuals of an explanation (M11) exactly: :func:`calibrator.estimator.posterior
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -42,6 +42,7 @@ from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.faults import Index
 from calibrator.summaries.moments import DriveSummary, common_bank
+from ecu_node.summary import MAD_TO_SD
 
 __all__ = [
     "UNKNOWN_VARIANCE",
@@ -58,6 +59,7 @@ __all__ = [
     "fit_fleet_model",
     "junction_regression",
     "products",
+    "ratios_in_doubt",
     "regress_on_fleet",
     "regress_vehicles",
     "reported_evidence",
@@ -87,6 +89,8 @@ MOST_NOISE = 0.9
 """Largest share of a current's variance that is taken for noise. [1]"""
 LEAST_WEIGHT = 0.1
 """Least squared weight of a branch in the junction sum, where its share of the residual's noise is limited. [1]"""
+LEAST_APART, SURELY_APART = 0.002, 4.0
+"""Difference of a gain ratio of slow and of fast changes that matters, and in standard deviations that is sure. [1]"""
 MODEL_ROUNDS = 12
 """Rounds of alternating least squares; slopes change by less than 1e-4 after eight on all fleets tried. [1]"""
 RIDGE = 1e-9
@@ -375,6 +379,33 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
         residual_a2 = np.maximum(np.sum(sums * products(currents, sums), axis=1), 0.0)
         noise_a2 = _shared_noise_a2(residual_a2, bound_a2, np.maximum(sums[:, :K] ** 2, LEAST_WEIGHT))
     return fit
+
+
+def ratios_in_doubt(fleet: FleetMoments) -> Mask:
+    """Find gain ratios that slow and fast changes of the currents show differently, in the fleet as a whole (M8a).
+
+    Gains are the same at any speed. Filters of signals, means over a second, held values and loads that follow the
+    speed are not: what they add to a ratio looks like a gain error that all vehicles share.
+
+    Parameters
+    ----------
+    fleet : FleetMoments
+        Of N vehicles; the first branch should be the one that moves most.
+
+    Returns
+    -------
+    ndarray of bool of shape (K - 1,)
+        Whether the ratio of each branch but the first differs so.
+    """
+    sums, samples = fleet.moments[:, -1], fleet.moments[:, -1, -1]
+    of_means = sums[:, :, None] * sums[:, None, :] / samples[:, None, None]  # each block as if constant
+    slow = junction_regression(replace(fleet, moments=of_means, noise_a2=np.zeros_like(fleet.noise_a2)))
+    usual = junction_regression(fleet)
+    apart = (slow.estimate - usual.estimate)[:, :-1]
+    sd = np.hypot(slow.sd, usual.sd)[:, :-1]
+    centre = np.median(apart, axis=0)
+    scatter = np.maximum(MAD_TO_SD * np.median(np.abs(apart - centre), axis=0), np.median(sd, axis=0))
+    return np.asarray(np.abs(centre) > np.maximum(LEAST_APART, SURELY_APART * scatter / np.sqrt(len(fleet))))
 
 
 def _shared_noise_a2(residual_a2: Array, bound_a2: Array, weight: Array) -> Array:

@@ -7,7 +7,8 @@ The estimate of a vehicle does not depend on which others are estimated in the s
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from itertools import compress
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from calibrator.estimator.evidence import (
     densest_clusters,
     evidence_names,
     fit_fleet_model,
+    ratios_in_doubt,
     reported_evidence,
     stack_summaries,
 )
@@ -230,7 +232,23 @@ def learn_fleet(
     plain = stack_summaries(summaries)
     order = tuple(np.argsort(-np.median(plain.variance_a2, axis=0), kind="stable").tolist())
     fleet, ordered = stack_summaries(summaries, order), [branches[k] for k in order]
-    _require_balance(fleet, ordered)
+    balanced = _balanced(fleet, ordered)
+    if not balanced.all():
+        found = learn_fleet(
+            list(compress(summaries, balanced)),
+            full_scale_a=full_scale_a,
+            branches=branches,
+            readings=None if readings is None else readings[:, :, balanced],
+            trusted=None if trusted is None else trusted[balanced],
+            load=load,
+            expected_faults=expected_faults,
+            known=known,
+        )
+        used = np.flatnonzero(balanced).tolist()
+        distrusted = {used[j]: why for j, why in found.distrusted.items()}
+        if trusted is not None:
+            distrusted |= dict.fromkeys(np.flatnonzero(trusted & ~balanced).tolist(), "its currents do not balance")
+        return replace(found, distrusted=distrusted)
     feed = int(np.argmax(np.median(fleet.mean_a, axis=0)))
     read_out = fit_fleet_model(fleet)
     measured, usual_correlation = collect_rows(fleet, read_out, full_scale_a=full_scale_a)
@@ -242,13 +260,15 @@ def learn_fleet(
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
 
+    doubtful = ratios_in_doubt(fleet)
     models = learn_fault_models(
         rows,
         feed=feed,
-        fixed=_carried_centre(rows, carriers),
+        fixed=_carried_centre(rows, carriers, doubtful),
         load=None if load is None else load.mean_a / full_scale_a,
         known=known,
         expected_faults=expected_faults,
+        doubtful=doubtful,
     )
     everyone = estimate_rows(rows, models, feed=feed, mean=mean, mean_square=square, usual=usual)
     place = np.argsort(order)
@@ -272,8 +292,11 @@ def learn_fleet(
     )
 
 
-def _require_balance(fleet: FleetMoments, branches: Sequence[str]) -> None:
-    """Refuse a fleet whose currents mostly balance in a ratio that is no gain error: a sign or a unit is wrong."""
+def _balanced(fleet: FleetMoments, branches: Sequence[str]) -> Mask:
+    """Tell in which vehicles no sign or unit is wrong: currents balance in ratios that may be gain errors, shape (N,).
+
+    Nothing is learnt from the others. FleetError if they are most of the fleet.
+    """
     M, K = fleet.inputs, fleet.branches
     covariance = fleet.covariance[:, M:-1, M:-1]
     sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), np.finfo(float).tiny))
@@ -291,13 +314,14 @@ def _require_balance(fleet: FleetMoments, branches: Sequence[str]) -> None:
             f"{-np.median(ratio[:, k]):+.2g} A in branch {branches[0]}, expected -1 A; check sign and unit of branch "
             f"{alone}"
         )
+    return np.asarray(~wrong.any(axis=1))
 
 
-def _carried_centre(rows: EvidenceRows, carriers: Mask) -> Array:
+def _carried_centre(rows: EvidenceRows, carriers: Mask, doubtful: Mask) -> Array:
     """Return the centre (5K,) of the rows that enough trusted vehicles show; NaN in the others."""
     fixed = np.full(rows.values.shape[1], np.nan)
     if np.count_nonzero(carriers) >= FEWEST_TRUSTED:
-        for row in np.flatnonzero(centre_rows(rows.branches)):
+        for row in np.flatnonzero(centre_rows(rows.branches, doubtful)):
             shown = carriers & rows.known[:, row]
             if np.count_nonzero(shown) >= FEWEST_TRUSTED:
                 fixed[row] = np.median(rows.values[shown, row])

@@ -96,6 +96,9 @@ LEAST_GROUP, MOST_GROUPS, GROUP_GAIN = 2.0, 2, 5.0
 """Fewest vehicles of a group, most groups, and least log evidence that one must gain: three vehicles that agree do."""
 LEAST_SHARED_GAIN = (0.3, 0.004)
 """Share of the vehicles that agree, and size of a gain error from which on their sensors may share it. [1]"""
+MOST_SHARED_SPREAD = 0.003
+"""Most that shared gain errors differ between vehicles: sensors of one batch are alike. Where ratios are off, but not
+alike, it is not by gain errors: signals are filtered, clipped or held. [1]"""
 SURELY_SHARED = 2.0
 """Size from which on sensors may share a gain error, over the standard deviation of one vehicle's gain ratio. Errors of
 the noise that is taken out of the junction regression are alike in all vehicles: they bias all ratios
@@ -119,10 +122,16 @@ SIZE_STARTS = ((0.004, 1.0), (0.03, 0.4), (0.1, 0.2))
 """Bounds from which the prior is climbed again: several small faults together can look like fewer large ones."""
 
 
-def centre_rows(branches: int) -> Mask:
-    """Mark rows whose centre is learnt, shape (5K,): slopes, intercepts, junction constant; that of ratios is 0."""
+def centre_rows(branches: int, doubtful: Mask | None = None) -> Mask:
+    """Mark rows whose centre is learnt, shape (5K,): slopes, intercepts, junction constant.
+
+    The centre of a gain ratio is 0, except for those that are in doubt (K - 1,): of these only differences between
+    vehicles count.
+    """
     free, at = np.zeros(5 * branches, bool), RowPlaces(branches)
     free[at.slopes] = free[at.intercepts] = free[at.junction] = True
+    if doubtful is not None:
+        free[at.ratios] = doubtful
     return free
 
 
@@ -134,6 +143,7 @@ def learn_fault_models(
     load: float | None = None,
     known: Prior | None = None,
     expected_faults: float | None = None,
+    doubtful: Mask | None = None,
 ) -> list[FaultModel]:
     """Learn the fault models that explain a fleet.
 
@@ -152,6 +162,8 @@ def learn_fault_models(
         Prior of the faults, if it is known.
     expected_faults : float or None
         Share of vehicles with a sensor fault, if it is known. [1]
+    doubtful : ndarray of bool of shape (K - 1,) or None
+        Gain ratios that are in doubt in the whole fleet, see :func:`.ratios_in_doubt`; None: none is.
 
     Returns
     -------
@@ -165,7 +177,15 @@ def learn_fault_models(
 
     def learner_of(most: int) -> _Learner:
         some = order[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
-        return _Learner(rows.take(np.sort(some)), feed, fixed, known, expected_faults, declared=load is not None)
+        return _Learner(
+            rows.take(np.sort(some)),
+            feed,
+            fixed=fixed,
+            known=known,
+            expected_faults=expected_faults,
+            doubtful=doubtful,
+            declared=load is not None,
+        )
 
     learner, starter = learner_of(MOST_LEARNT), learner_of(MOST_STARTED)
     starts = [
@@ -184,17 +204,18 @@ class _Learner:
         self,
         rows: EvidenceRows,
         feed: int,
+        *,
         fixed: Array,
         known: Prior | None,
         expected_faults: float | None,
-        *,
+        doubtful: Mask | None,
         declared: bool,
     ) -> None:
         K = rows.branches
         self.rows, self.feed, self.fixed, self.known = rows, feed, fixed, known
         self.at, self.parameters = rows.places, ParameterPlaces(K)
         self.expected_faults, self.declared = expected_faults, declared
-        self.free = centre_rows(K) & np.isnan(fixed)
+        self.free = centre_rows(K, doubtful) & np.isnan(fixed)
         least_sd = np.empty(5 * K)
         least_sd[self.at.relative], least_sd[self.at.constant] = LEAST_SPREAD
         self.least = np.diag(least_sd**2)
@@ -282,10 +303,12 @@ class _Learner:
         constants = [*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0]
         constants += [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         constants = [constant for constant in constants if abs(constant) <= LARGEST_SHARED]
+        ratios = [self.clusters(row)[0] if self.free[row] else 0.0 for row in range(at.ratios.start, at.ratios.stop)]
         slopes, found = self.initial_slopes(), list[Array]()
         for constant in constants if np.isnan(self.fixed[at.junction]) else [float(self.fixed[at.junction])]:
             for zeros, slope in product(self.initial_intercepts(constant), slopes):
                 start = np.zeros(5 * K)
+                start[at.ratios] = ratios
                 start[at.slopes], start[at.intercepts], start[at.junction] = slope, zeros, constant
                 start = np.where(np.isnan(self.fixed), start, self.fixed)
                 if not any(np.abs(start - other).max() < SAME_START for other in found):
@@ -403,23 +426,28 @@ class _Learner:
 
     def _shared_gains(self) -> list[Array]:
         """List gains that the sensors of a branch may share, if enough vehicles break the junction law alike."""
-        K = self.rows.branches
-        off = np.zeros(K)
+        K, at = self.rows.branches, self.at
+        centre, sd, broken = np.zeros(K), np.full(K, np.inf), np.zeros(K, bool)
         for k in range(1, K):
-            values, sd = self.rows.shown(self.at.ratio(k))
-            for cluster in densest_clusters(values, sd, widest=1.0):  # at most one
-                least = max(LEAST_SHARED_GAIN[1], SURELY_SHARED * float(np.median(sd)))
-                if cluster.share > LEAST_SHARED_GAIN[0] and abs(cluster.centre) > least:
-                    off[k] = cluster.centre
-        if not off.any():
+            values, errors = self.rows.shown(at.ratio(k))
+            if self.free[at.ratio(k)] or not len(values):
+                continue
+            sd[k] = np.median(errors)
+            for cluster in densest_clusters(values, errors, widest=1.0):  # at most one
+                centre[k] = cluster.centre
+                alike = cluster.spread < MOST_SHARED_SPREAD and cluster.share > LEAST_SHARED_GAIN[0]
+                broken[k] = alike and abs(centre[k]) > max(LEAST_SHARED_GAIN[1], SURELY_SHARED * sd[k])
+        if not broken.any():
             return []
-        # lambda_1 - lambda_k is off: by the sensors of the first branch if all are alike, else by those of branch k
+        # lambda_1 - lambda_k is off: by the sensors of the first branch if that fits all ratios, else by those of k
         of_first: Array = np.zeros(2 * K + 1)
         of_others: Array = np.zeros(2 * K + 1)
-        of_first[K] = off[1:].mean()
-        of_others[K : 2 * K] = -off
-        alike = np.ptp(off[1:]) < LEAST_SHARED_GAIN[1]
-        return [of_first] * bool(alike) + [of_others] * bool(K == 2 or not alike)
+        of_first[K] = np.average(centre[broken], weights=sd[broken] ** -2.0)
+        of_others[K : 2 * K] = -np.where(broken, centre, 0.0)
+        apart = np.abs(centre - of_first[K])[1:]
+        if (apart > LEAST_SHARED_GAIN[1] + SURELY_SHARED * sd[1:]).any():
+            return [of_others]
+        return [of_first] if np.count_nonzero(broken) > 1 else [of_first, of_others]
 
     def with_modes(self, model: FaultModel) -> FaultModel:
         """Give the model all priors that explain the fleet about as well: from several starts, by one set of draws."""
@@ -473,10 +501,13 @@ class _Learner:
                 x = draws.values[..., load].ravel()
                 centre[g] = w @ x / w.sum()
                 sd[g] = np.sqrt((w @ (x - centre[g]) ** 2 + 2.0 * GROUP_SD**2) / (w.sum() + 2.0))
+        # as with faults (CVB0), a load is judged by those of the others: one vehicle must not confirm itself
+        own = (weight[..., 0] * loaded[:, :, None]).sum(axis=(1, 2))
+        others = own.sum() - np.square(own).sum() / max(own.sum(), 1e-300)
         return replace(
             prior,
             counts=counts,
-            load_share=float((weight[..., 0][loaded].sum() + 0.02) / (N + 2.0)),
+            load_share=float((others + 0.02) / (N + 1.0)),
             group_share=share,
             group_centre=centre,
             group_sd=np.maximum(sd, 0.7 * GROUP_SD),
@@ -593,9 +624,9 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
                 grid: Sequence[float] | Array = TAILS
                 if name != "tail":
                     first = COARSE_LOW if name == "low" else COARSE_HIGH
-                    grid = np.append(first, getattr(best, name)) if coarse and not again else getattr(best, name) * FINE
+                    grid = first if coarse and not again else getattr(best, name) * FINE
                 tried = [replace(best, **{name: float(value)}, density=np.zeros(0)) for value in grid]
-                tried = [slab for slab in tried if slab.high > least * slab.low and slab.low > TAIL_RANGE[0]]
+                tried = [slab for slab in tried if slab.high > least * slab.low and slab.low > TAIL_RANGE[0]] or [best]
                 densities = np.stack([slab.density for slab in tried])
                 evidence = size_evidence(draws, prior, kind, densities)
                 evidence += SIZE_FAULTS * np.log(densities) @ ANY_SIZE
