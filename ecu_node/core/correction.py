@@ -150,14 +150,13 @@ def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
     source, target, voltage = signals.source, signals.target, signals.voltage
     per_unit = 1 / (1 + as_written(fault.drift)) / target.scale
     offset_a = signals.sign * as_written(fault.offset_a)
-    # a current is treated as a power at a constant 1 V, for which there is no code
-    volts_per_code, volts_at_0 = (Fraction(0), Fraction(1)) if voltage is None else (voltage.scale, voltage.offset)
+    volts_at_0 = Fraction(1) if voltage is None else voltage.offset  # a current is treated as a power at 1 V
     terms = [(source.scale * per_unit, source)]
     if voltage is not None and offset_a:
-        terms.append((-offset_a * volts_per_code * per_unit, voltage))
+        terms.append((-offset_a * voltage.scale * per_unit, voltage))
     constant = (source.offset - offset_a * volts_at_0) * per_unit - target.offset / target.scale
     span = sum(codes.highest - codes.lowest for _, codes in terms)
-    needed = _ERROR_BITS + (span // 2 + 1).bit_length()
+    needed = _ERROR_BITS + span.bit_length()
     largest = abs(constant) + 1
     largest += sum(abs(factor) * max(abs(codes.lowest), abs(codes.highest)) for factor, codes in terms)
     shift = max(needed, _WORD_BITS - math.ceil(largest).bit_length())
