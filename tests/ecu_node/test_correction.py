@@ -88,6 +88,13 @@ def test_every_16_bit_code_is_corrected_exactly(
     assert got == [min(max(code, low), high) for code in wanted]
 
 
+def require_bound(plan: IntegerPlan, wanted: Fraction, code: int, voltage_code: int = 0) -> None:
+    """Before rounding the plan is not below the exact line, and above it by less than the largest error."""
+    line = Fraction(code * plan.gain + voltage_code * plan.voltage_gain + plan.bias, 1 << plan.shift)
+    assert 0 <= line - wanted < LARGEST_ERROR
+    assert plan.apply(code, voltage_code) == min(max(math.floor(line + HALF), plan.lowest), plan.highest)
+
+
 @given(
     length=st.integers(2, 64),
     signed=st.booleans(),
@@ -101,10 +108,7 @@ def test_correction_error_stays_within_its_bound_at_any_signal_width(
     source = current(0.02, -7.0, length=length, signed=signed)
     plan = integer_plan(source, source, sign=1, drift=drift, offset_a=offset)
     code = data.draw(st.integers(source.lowest, source.highest))
-    got = plan.apply(code)
-    wanted = exact(source, source, code, sign=1, drift=repr(drift), offset_a=repr(offset))
-    clamped = min(max(wanted, Fraction(source.lowest)), Fraction(source.highest))
-    assert abs(got - clamped) <= HALF + LARGEST_ERROR
+    require_bound(plan, exact(source, source, code, sign=1, drift=repr(drift), offset_a=repr(offset)), code)
 
 
 @given(
@@ -122,8 +126,24 @@ def test_power_is_corrected_with_the_offset_current_times_voltage(
     plan = correction_plan(signals, SensorFault(drift=drift, offset_a=offset))
     offset_w = sign * Fraction(repr(offset)) * voltage.scale * volts
     wanted = (power.scale * code - offset_w) / (1 + Fraction(repr(drift))) / power.scale
-    clamped = min(max(wanted, Fraction(plan.lowest)), Fraction(plan.highest))
-    assert abs(plan.apply(code, volts) - clamped) <= HALF + LARGEST_ERROR
+    require_bound(plan, wanted, code, volts)
+
+
+@pytest.mark.parametrize(
+    ("source", "drift", "offset_a"),
+    [
+        (current(), 0.0, 0.0),
+        (current(signed=False, limits=(0.0, 65534 * 0.02)), 0.0, 0.0),
+        (current(offset=1000.0), 0.0, 0.0),
+        (current(), -0.3, 100.0),
+    ],
+)
+def test_correction_uses_the_bits_of_a_64_bit_word_and_never_overflows_it(
+    source: Codes, drift: float, offset_a: float
+) -> None:
+    plan = integer_plan(source, current(), sign=1, drift=drift, offset_a=offset_a)
+    largest = max(abs(source.lowest), abs(source.highest)) * plan.gain + abs(plan.bias) + (1 << (plan.shift - 1))
+    assert 1 << 58 <= largest < 1 << 59
 
 
 @pytest.mark.parametrize("names", [{5: "SNA"}, {3: "Error", 5: "Signal not available"}, {5: "invalid", 9: "x"}])
