@@ -84,7 +84,7 @@ def _in_one_word(
             written.quality.put(ready, min(branch.quality, written.quality.highest))
             written.quality.put(taken, written.quality.highest)
     sign_bits, ready_bits = _from_bytes(signs, order), _from_bytes(ready, to)
-    kept_bits = (1 << 8 * made_length) - 1 & ~_from_bytes(taken, to)
+    kept_bits = ~_from_bytes(taken, to)
 
     def rewrite(payload: bytearray, before: bytearray, now_s: float) -> bytearray:
         word = _from_bytes(payload, order)
