@@ -4,6 +4,7 @@
 """
 
 import os
+from itertools import product
 from pathlib import Path
 from random import Random
 
@@ -14,6 +15,7 @@ from ecu_node.bus.wiring import Mode
 from ecu_node.core.corrector import Source
 from tests.ecu_node.oracle import require_right
 from tests.ecu_node.random_vehicles import draw_vehicle
+from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
 
 EACH, ALWAYS = 1_000, 3
 """Frames of a vehicle; vehicles that are tried in every run of the tests."""
@@ -30,6 +32,31 @@ def test_frames_of_random_vehicles_match_the_oracle_in_both_modes(seed: int, tmp
     drawn = [(identifier, data) for identifier, data in frames(database, rng, EACH) if data is not None]
     for mode in Mode:
         require_right(database, parameters, mode, drawn)
+
+
+@pytest.mark.parametrize("mode", Mode)
+@pytest.mark.parametrize(("sign", "offset", "missing"), [("-", "0", "-128"), ("+", "-12.8", "255")])
+def test_every_code_of_8_bits_matches_the_oracle_beside_any_other_bits(
+    make_database: MakeDatabase, mode: Mode, sign: str, offset: str, missing: str
+) -> None:
+    """Battery and motor of one frame, over their whole width: results are rounded, and clipped at either end."""
+    dbc = SMALL_DBC
+    for old, new in (
+        ("|16@0-", f"|8@0{sign}"),
+        ("16@1-", f"8@1{sign}"),
+        ("-32768", missing),
+        ("(0.1,0) [-3000|3000]", f"(0.1,{offset}) [0|0]"),
+        ("(-0.05,0) [-1600|1600]", f"(-0.05,{offset}) [0|0]"),
+    ):
+        dbc = dbc.replace(old, new)
+    database = make_database(dbc=dbc)
+    parameters = parameters_for(database, battery=(-0.2, 0.43), motor=(0.07, -0.31))
+    frames_of_pair = [
+        bytes([battery, rest, motor, *5 * [rest]])
+        for code, rest in product(range(256), (0x5A, 0xA5))
+        for battery, motor in ((code, 77), (77, code))
+    ]
+    require_right(database, parameters, mode, [(256, data) for data in frames_of_pair])
 
 
 @pytest.mark.parametrize(("mode", "method"), [(Mode.OVERLAY, "answer"), (Mode.GATEWAY, "forward")])
