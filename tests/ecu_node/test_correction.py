@@ -1,6 +1,7 @@
 """Integer plan against exact fractions."""
 
 import math
+from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
 
@@ -11,7 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ecu_node.core.correction import LARGEST_ERROR, IntegerPlan, SensorFault, Signals, correction_plan
-from ecu_node.core.signals import AMPERE, Codes, not_available_code, read_codes, require_reach, writable_range
+from ecu_node.core.signals import (
+    AMPERE,
+    VOLT,
+    WATT,
+    Codes,
+    factor_of,
+    not_available_code,
+    read_codes,
+    require_reach,
+    writable_range,
+)
 from ecu_node.errors import DatabaseError
 
 HALF = Fraction(1, 2)
@@ -146,6 +157,24 @@ def test_correction_uses_the_bits_of_a_64_bit_word_and_never_overflows_it(
     assert 1 << 58 <= largest < 1 << 59
 
 
+@pytest.mark.parametrize(
+    ("unit", "known", "factor"),
+    [
+        ("", AMPERE, 1.0),
+        (" [A] ", AMPERE, 1.0),
+        ("Unit_Amper", AMPERE, 1.0),
+        ("A_DC", AMPERE, 1.0),
+        ("milliamps", AMPERE, 1e-3),
+        ("kilovolt", VOLT, 1e3),
+        ("KW", WATT, 1e3),
+        ("mW", WATT, 1e-3),
+        ("MW", WATT, 1e6),
+    ],
+)
+def test_unit_is_known_in_the_spellings_of_several_makers(unit: str, known: Mapping[str, float], factor: float) -> None:
+    assert factor_of(unit, known, "test") == factor
+
+
 @pytest.mark.parametrize("names", [{5: "SNA"}, {3: "Error", 5: "Signal not available"}, {5: "invalid", 9: "x"}])
 def test_code_for_not_available_is_found_by_its_name(names: dict[int, str]) -> None:
     assert not_available_code(current(names=names), "test") == 5
@@ -178,7 +207,10 @@ def test_signal_that_cannot_be_a_current_is_refused(wrong: dict[str, Any], words
         current(**wrong)
 
 
-def test_dbc_limits_of_the_largest_double_do_not_restrict_the_range() -> None:
-    """The largest double, as tools write it in 15 digits."""
-    largest = float("1.79769313486232E+308")
-    assert whole_range(current(limits=(-largest, largest))) == whole_range(current())
+LARGEST = float("1.79769313486232E+308")
+"""The largest double, as tools write it in 15 digits."""
+
+
+@pytest.mark.parametrize("limits", [(-LARGEST, LARGEST), (2.0, 2.0), (2.0, -2.0)])
+def test_dbc_limits_that_are_no_range_do_not_restrict_the_codes(limits: tuple[float, float]) -> None:
+    assert whole_range(current(limits=limits)) == whole_range(current())
