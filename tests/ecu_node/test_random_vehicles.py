@@ -35,9 +35,12 @@ def test_frames_of_random_vehicles_match_the_oracle_in_both_modes(seed: int, tmp
 
 
 @pytest.mark.parametrize("mode", Mode)
-@pytest.mark.parametrize(("sign", "offset", "missing"), [("-", "0", "-128"), ("+", "-12.8", "255")])
+@pytest.mark.parametrize(
+    ("sign", "offset", "missing", "drift"),
+    [("-", "0", "-128", -0.2), ("+", "-12.8", "255", -0.2), ("+", "-12.8", "255", 0.2)],
+)
 def test_every_code_of_8_bits_matches_the_oracle_beside_any_other_bits(
-    make_database: MakeDatabase, mode: Mode, sign: str, offset: str, missing: str
+    make_database: MakeDatabase, mode: Mode, sign: str, offset: str, missing: str, drift: float
 ) -> None:
     """Battery and motor of one frame, over their whole width: results are rounded, and clipped at either end."""
     dbc = SMALL_DBC
@@ -50,7 +53,7 @@ def test_every_code_of_8_bits_matches_the_oracle_beside_any_other_bits(
     ):
         dbc = dbc.replace(old, new)
     database = make_database(dbc=dbc)
-    parameters = parameters_for(database, battery=(-0.2, 0.43), motor=(0.07, -0.31))
+    parameters = parameters_for(database, battery=(drift, 0.43), motor=(-drift, -0.31))
     frames_of_pair = [
         bytes([battery, rest, motor, *5 * [rest]])
         for code, rest in product(range(256), (0x5A, 0xA5))
