@@ -100,11 +100,11 @@ def test_status_is_starting_until_branches_arrive_then_correcting(database: Vehi
     before = status_of(database, corrector, 0.01)
     assert (before["State"], before["Reason"], before["ParameterSet"]) == (State.STARTING, Reason.NONE, 300 % 256)
     assert before["JunctionSumMeasured"] == before["JunctionSumCorrected"] == -3276.8
-    answers(corrector, battery(database, 0, 80.0), 0.02)
+    answers(corrector, battery(database, 0, 80.06), 0.02)
     answers(corrector, motor(database, 0, 60.0), 0.03)
     after = status_of(database, corrector, 0.04)
     assert (after["State"], after["Reason"]) == (State.CORRECTING, Reason.NONE)
-    assert after["JunctionSumMeasured"] == pytest.approx(80.0 - 60.0)
+    assert after["JunctionSumMeasured"] == pytest.approx(20.1), "20.06, rounded"
     assert after["JunctionSumCorrected"] == pytest.approx((80.0 - 5.0) / 1.25 - 60.0)
     assert (before["AliveCounter"], after["AliveCounter"]) == (0, 1)
 
@@ -402,8 +402,9 @@ def test_dbc_names_all_status_codes(database: VehicleDatabase, signal: str, code
     assert names == {code.value: code.name.replace("_", "") for code in codes}
 
 
-def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDatabase) -> None:
-    database = make_database()
+@pytest.mark.parametrize("offset", ["0", "-20"])
+def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDatabase, offset: str) -> None:
+    database = make_database(dbc=SMALL_DBC.replace("(0.01,0)", f"(0.01,{offset})"))
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0), heater=(0.25, 0.0))
     answers(corrector, frame_of(database, "Pair", Battery=50.0, Motor=40.0), 0.0)
     heater = frame_of(database, "Heater", Power=4000)
