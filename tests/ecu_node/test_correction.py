@@ -211,6 +211,14 @@ LARGEST = float("1.79769313486232E+308")
 """The largest double, as tools write it in 15 digits."""
 
 
-@pytest.mark.parametrize("limits", [(-LARGEST, LARGEST), (2.0, 2.0), (2.0, -2.0)])
-def test_dbc_limits_that_are_no_range_do_not_restrict_the_codes(limits: tuple[float, float]) -> None:
-    assert whole_range(current(limits=limits)) == whole_range(current())
+@pytest.mark.parametrize(
+    ("limits", "codes"),
+    [
+        ((-LARGEST, LARGEST), whole_range(current())),
+        ((2.0, 2.0), whole_range(current())),
+        ((2.0, -2.0), whole_range(current())),
+        ((1.99, 2.01), range(100, 101)),
+    ],
+)
+def test_dbc_limits_restrict_the_codes_only_if_they_are_a_range(limits: tuple[float, float], codes: range) -> None:
+    assert whole_range(current(limits=limits)) == codes
