@@ -15,7 +15,7 @@ from ecu_node.bus.wiring import Mode
 from ecu_node.core.corrector import Source
 from tests.ecu_node.oracle import require_right
 from tests.ecu_node.random_vehicles import draw_vehicle
-from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
+from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
 
 EACH, ALWAYS = 1_000, 3
 """Frames of a vehicle; vehicles that are tried in every run of the tests."""
@@ -23,6 +23,7 @@ VEHICLES = [
     number if number < ALWAYS else pytest.param(number, marks=pytest.mark.long)
     for number in range(-(-int(os.environ.get("HV_FRAMES", "40000")) // EACH))
 ]
+MOTOR_ENTRY = '    { name = "motor", sign = -1, signal = "Pair.Motor", corrected = "PairOut.Motor" },\n'
 
 
 @pytest.mark.parametrize("seed", VEHICLES)
@@ -36,13 +37,18 @@ def test_frames_of_random_vehicles_match_the_oracle_in_both_modes(seed: int, tmp
 
 @pytest.mark.parametrize("mode", Mode)
 @pytest.mark.parametrize(
-    ("sign", "offset", "missing", "drift"),
-    [("-", "0", "-128", -0.2), ("+", "-12.8", "255", -0.2), ("+", "-12.8", "255", 0.2)],
+    ("layout", "sign", "offset", "missing", "drift"),
+    [
+        (SMALL_LAYOUT, "-", "0", "-128", -0.2),
+        (SMALL_LAYOUT, "+", "-12.8", "255", -0.2),
+        (SMALL_LAYOUT, "+", "-12.8", "255", 0.2),
+        (SMALL_LAYOUT.replace(MOTOR_ENTRY, ""), "-", "0", "-128", 0.2),
+    ],
 )
 def test_every_code_of_8_bits_matches_the_oracle_beside_any_other_bits(
-    make_database: MakeDatabase, mode: Mode, sign: str, offset: str, missing: str, drift: float
+    make_database: MakeDatabase, mode: Mode, layout: str, sign: str, offset: str, missing: str, drift: float
 ) -> None:
-    """Battery and motor of one frame, over their whole width: results are rounded, and clipped at either end."""
+    """Over the whole width, of two branches in a frame or one: results are rounded, and clipped at either end."""
     dbc = SMALL_DBC
     for old, new in (
         ("|16@0-", f"|8@0{sign}"),
@@ -52,7 +58,7 @@ def test_every_code_of_8_bits_matches_the_oracle_beside_any_other_bits(
         ("(-0.05,0) [-1600|1600]", f"(-0.05,{offset}) [0|0]"),
     ):
         dbc = dbc.replace(old, new)
-    database = make_database(dbc=dbc)
+    database = make_database(layout, dbc)
     parameters = parameters_for(database, battery=(drift, 0.43), motor=(-drift, -0.31))
     frames_of_pair = [
         bytes([battery, rest, motor, *5 * [rest]])
