@@ -79,7 +79,7 @@ def _in_one_word(
         cells.append((at, ones, first - place.lowest, last - place.lowest, plan.gain, bias, plan.shift, to_at))
         place.put(signs, place.lowest)
         written.place.put(ready, written.place.lowest)
-        written.place.put(taken, -1 if written.place.signed else written.place.highest)
+        written.place.put(taken, written.place.highest)  # all but a sign bit, which is set anew
         if written.quality is not None:
             written.quality.put(ready, min(branch.quality, written.quality.highest))
             written.quality.put(taken, written.quality.highest)
