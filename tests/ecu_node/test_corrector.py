@@ -506,6 +506,11 @@ WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1-
             "code 3 of signal Sum means 'SNA', .* beyond 0.2",
         ),
         (SMALL_LAYOUT, SMALL_DBC.replace(*INIT), "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
+        (
+            SMALL_LAYOUT,
+            SMALL_DBC.replace(MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"'),
+            r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'",
+        ),
         (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery is written twice, or overlaps .*, or the E2E header"),
     ],
 )
