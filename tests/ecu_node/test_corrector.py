@@ -618,6 +618,15 @@ def test_node_may_send_messages_of_one_dbc_sender_or_of_none(make_database: Make
     assert corrector_for(database).status() is not None
 
 
+def test_alive_counter_of_the_status_starts_at_0_and_wraps_at_its_width(make_database: MakeDatabase) -> None:
+    dbc = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Alive : 16|2@1+ (1,0) [0|3] "" Node\n'
+    database = make_database(f'{SMALL_LAYOUT}{OWN_STATUS}alive_counter = "Alive"\n', dbc)
+    corrector = corrector_for(database)
+    sent = [bytes(message.data) for _ in range(5) if (message := corrector.status()) is not None]
+    found = [decoded(database, "Own", data)["Alive"] for data in sent]
+    assert found == [0, 1, 2, 3, 0]
+
+
 # Frames that are lost, repeated or damaged, of either mode
 
 
@@ -643,4 +652,5 @@ def test_frame_with_wrong_crc_is_counted_and_otherwise_ignored(database: Vehicle
     frames = (first, damaged(second), second, third, Frame(BATTERY, b""))
     used = [bool(take(corrector, frame, 0.02 * k)) for k, frame in enumerate(frames)]
     assert used == [True, False, True, True, False]
-    assert (corrector.counters.corrupt, corrector.counters.gaps, corrector.counters.repeated) == (2, 0, 0)
+    used_as = "answers 3" if mode is Mode.OVERLAY else "rewritten 3, held back 2"
+    assert corrector.counters.text() == f"frames in 5, {used_as}, corrupt 2"
