@@ -18,6 +18,7 @@ from ecu_node.core.signals import (
     WATT,
     Codes,
     factor_of,
+    impossible_values,
     not_available_code,
     read_codes,
     require_reach,
@@ -191,6 +192,17 @@ def test_named_code_within_the_measuring_range_is_refused(scale: float, code: in
     codes = current(scale, names={-32768: "SNA", code: "Odd"})
     with pytest.raises(DatabaseError, match=f"test: code {code} of signal I means 'Odd', .* and full scale is 400"):
         require_reach(codes, Fraction(400), "test")
+
+
+def test_named_codes_at_an_end_of_the_range_keep_no_value_out() -> None:
+    codes = current(length=8, names=dict.fromkeys([-128, *range(120, 128)], "Reserved"))
+    require_reach(codes, Fraction(400), "test")
+    assert writable_range(codes, "test") == (-127, 119)
+
+
+def test_values_that_a_scaled_signal_cannot_have_are_found() -> None:
+    signal = Signal("T", start=0, length=8, conversion=BaseConversion.factory(scale=0.5, offset=-40.0))
+    assert impossible_values(signal, [-40.0, 0.5, 87.5, -40.5, 0.25, 88.0]) == [-40.5, 0.25, 88.0]
 
 
 @pytest.mark.parametrize(
