@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
+from weakref import ref
 
 import pytest
 from e2e.p01 import e2e_p01_check
@@ -12,6 +13,7 @@ from msgspec.structs import replace
 
 from ecu_node.bus.wiring import InForce, Mode, put_in_force, wire
 from ecu_node.core.corrector import Corrector
+from ecu_node.core.junction import REMEMBERED_FRAMES
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
@@ -84,6 +86,7 @@ def test_code_without_value_is_published_as_not_available_or_invalid(
     corrector = corrector_for(database, battery=(0.25, 5.0))
     assert published(database, corrector, battery(database, 3, current), 0.0) == (-655.36, quality)
     assert sums_at(corrector, 0.0) == (None, None)
+    assert state_at(corrector, 0.0) == (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
 
 
 def test_corrected_value_beyond_the_signal_range_is_clamped_and_counted(database: VehicleDatabase) -> None:
@@ -217,6 +220,22 @@ def test_value_from_before_bus_sleep_or_reload_is_never_published(make_database:
     in_force = InForce(parameters=parameters_for(database, **faults))
     put_in_force(corrector, database, in_force, 3600.4, mode=Mode.OVERLAY)
     assert published(database, corrector, pair, 3600.4, "motor")[0] == no_value
+
+
+def test_old_payloads_are_not_kept(database: VehicleDatabase) -> None:
+    class Payload(bytearray):
+        """Unlike a bytearray, it can be referred to weakly."""
+
+    source = corrector_for(database, battery=(0.25, 5.0)).sources[BATTERY]
+    data = [battery(database, counter).data for counter in range(15)]
+    first = Payload(data[0])
+    is_kept = ref(first)
+    source.answer(first, 0.0)
+    del first
+    assert is_kept()
+    for k in range(1, 1 + REMEMBERED_FRAMES):
+        source.answer(bytearray(data[k % 15]), 0.01 * k)
+    assert not is_kept()
 
 
 def test_branches_going_silent_one_after_another_are_not_a_fault(database: VehicleDatabase) -> None:
