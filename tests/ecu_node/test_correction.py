@@ -200,9 +200,16 @@ def test_named_codes_at_an_end_of_the_range_keep_no_value_out() -> None:
     assert writable_range(codes, "test") == (-127, 119)
 
 
+TEMPERATURE = Signal("T", start=0, length=8, unit="degC", conversion=BaseConversion.factory(scale=0.5, offset=-40.0))
+
+
+def test_signal_of_no_wanted_unit_keeps_its_own() -> None:
+    codes = read_codes(TEMPERATURE, None, "test")
+    assert (codes.scale, codes.offset) == (HALF, Fraction(-40))
+
+
 def test_values_that_a_scaled_signal_cannot_have_are_found() -> None:
-    signal = Signal("T", start=0, length=8, conversion=BaseConversion.factory(scale=0.5, offset=-40.0))
-    assert impossible_values(signal, [-40.0, 0.5, 87.5, -40.5, 0.25, 88.0]) == [-40.5, 0.25, 88.0]
+    assert impossible_values(TEMPERATURE, [-40.0, 0.5, 87.5, -40.5, 0.25, 88.0]) == [-40.5, 0.25, 88.0]
 
 
 @pytest.mark.parametrize(

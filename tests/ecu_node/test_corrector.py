@@ -430,6 +430,7 @@ def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDa
     answers(corrector, heater, 0.0)
     assert sums_at(corrector, 0.0) == (None, None)
     answers(corrector, frame_of(database, "Net", Voltage=400.0), 0.0)
+    assert corrector.sources[NET].timeout_s == math.inf, "only frames of branches can be too old"
     assert answers(corrector, heater, 0.1) == []
     assert sums_at(corrector, 0.1) == pytest.approx((50.0 - 40.0 - 10.0, 50.0 - 40.0 - 8.0))
     answers(corrector, frame_of(database, "Net", Voltage=500.0), 0.2)
