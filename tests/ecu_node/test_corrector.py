@@ -222,11 +222,12 @@ def test_value_from_before_bus_sleep_or_reload_is_never_published(make_database:
     assert published(database, corrector, pair, 3600.4, "motor")[0] == no_value
 
 
-def test_old_payloads_are_not_kept(database: VehicleDatabase) -> None:
+def test_only_the_last_frames_are_remembered(database: VehicleDatabase) -> None:
     class Payload(bytearray):
         """Unlike a bytearray, it can be referred to weakly."""
 
     source = corrector_for(database, battery=(0.25, 5.0)).sources[BATTERY]
+    (branch,) = source.branches
     data = [battery(database, counter).data for counter in range(15)]
     first = Payload(data[0])
     is_kept = ref(first)
@@ -234,8 +235,10 @@ def test_old_payloads_are_not_kept(database: VehicleDatabase) -> None:
     del first
     assert is_kept()
     for k in range(1, 1 + REMEMBERED_FRAMES):
+        assert branch.time_s == pytest.approx(0.01 * (k - 1))
         source.answer(bytearray(data[k % 15]), 0.01 * k)
     assert not is_kept()
+    assert len([*branch.newest_first()]) == REMEMBERED_FRAMES
 
 
 def test_branches_going_silent_one_after_another_are_not_a_fault(database: VehicleDatabase) -> None:
