@@ -184,6 +184,7 @@ def test_silent_branch_stops_the_correction_until_the_bus_has_slept(
         assert corrector.state() == expected
         if expected == STALE:
             assert corrector.latched_branches == LATE
+            assert (corrector.watch.sums is None) == bool(silent)
             assert {branch.quality for branch in corrector.branches} == {Quality.PASSED_THROUGH}
 
 
@@ -382,18 +383,21 @@ def test_shadow_mode_reports_the_corrected_sum_but_publishes_measured_values(dat
     assert status["JunctionSumCorrected"] == pytest.approx((80.0 - 5.0) / 1.25 - 60.0)
 
 
-def test_delayed_branches_are_summed_at_the_same_instant(database: VehicleDatabase) -> None:
+@pytest.mark.parametrize("slope_a", [3.0, -3.0])
+def test_delayed_branches_are_summed_at_the_same_instant(database: VehicleDatabase, slope_a: float) -> None:
     parameters = parameters_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
     late = {**parameters.branches, "motor": replace(parameters.branches["motor"], delay_s=0.2)}
-    corrector = wire(database, InForce(parameters=replace(parameters, branches=late)), start_s=0.0)
-    worst = 0.0
+    start_s = 100.0
+    corrector = wire(database, InForce(parameters=replace(parameters, branches=late)), start_s=start_s)
+    sums_a = []
     for k in range(100):
-        answers(corrector, battery(database, k % 15, 3.0 * k), 0.05 * k)
-        answers(corrector, motor(database, k % 15, 3.0 * (k - 4)), 0.05 * k)
-        corrector.look(0.05 * k + 0.01)
-        if k > 10 and corrector.watch.sums is not None:
-            worst = max(worst, abs(corrector.watch.sums.measured_a))
-    assert worst < 0.03
+        now_s = start_s + 0.05 * k
+        answers(corrector, battery(database, k % 15, slope_a * k), now_s)
+        answers(corrector, motor(database, k % 15, slope_a * (k - 4)), now_s)
+        sums_a.append(sums_at(corrector, now_s + 0.01)[0])
+    assert sums_a[0] is None, "the battery's first frame is of 0.2 s later, and its timeout is 0.1 s"
+    assert None not in sums_a[3:]
+    assert sums_a[11:] == pytest.approx([0.0] * 89, abs=0.03)
 
 
 def test_junction_sum_is_not_interpolated_across_a_frame_without_value(database: VehicleDatabase) -> None:
@@ -426,7 +430,9 @@ def test_dbc_names_all_status_codes(database: VehicleDatabase, signal: str, code
 
 @pytest.mark.parametrize("offset", ["0", "-20"])
 def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDatabase, offset: str) -> None:
-    database = make_database(dbc=SMALL_DBC.replace("(0.01,0)", f"(0.01,{offset})"))
+    database = make_database(
+        dbc=SMALL_DBC.replace("(0.01,0)", f"(0.01,{offset})").replace("(-0.05,0)", f"(-0.05,{offset})")
+    )
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0), heater=(0.25, 0.0))
     answers(corrector, frame_of(database, "Pair", Battery=50.0, Motor=40.0), 0.0)
     heater = frame_of(database, "Heater", Power=4000)
