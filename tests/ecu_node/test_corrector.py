@@ -332,7 +332,8 @@ LOADED = JunctionResidual(measured_a=0.0, corrected_a=3.0, measured_mean_a=0.0, 
 @pytest.mark.parametrize(
     ("offset_a", "sums", "reason"),
     [
-        (3.0, JunctionResidual(measured_a=0.0, corrected_a=0.0), Reason.CORRECTION_WORSE),
+        (1.5, JunctionResidual(measured_a=0.0, corrected_a=0.0), Reason.CORRECTION_WORSE),
+        (0.5, JunctionResidual(measured_a=0.0, corrected_a=0.0), Reason.NONE),
         (3.0, JunctionResidual(measured_a=0.0, corrected_a=3.0), Reason.NONE),
         (3.0, LOADED, Reason.NONE),
         (-3.0, LOADED, Reason.CORRECTION_WORSE),
