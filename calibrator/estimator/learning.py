@@ -75,7 +75,7 @@ SPREAD_VEHICLES = 5.0
 SPREAD_OVER_SAMPLING, JUNCTION_SPREAD_OVER_SAMPLING = 2.0, 1.0
 """Guessed model spread over the usual sampling deviation, in rows of the fleet model and of the junction law: errors of
 the fleet model last for a whole drive. [1]"""
-COMMON_SPREADS = (0.0, 0.005)
+COMMON_SPREADS = (0.0, 0.005, 0.03)
 """Spreads, beyond the guess, that all branches of a vehicle have in common, to start from: on recorded trips it is 0.5
 to 0.8 %. If learning starts with a narrow spread, vehicles at its edge keep a small hardware fault each. [1]"""
 MOST_LOAD_SPREAD = 0.005
@@ -652,7 +652,7 @@ def _log_plausible(c0: float, offset: float, prior: Prior, *, of_sensor: bool) -
     shares = np.append(1.0 - prior.group_share.sum(), prior.group_share)
     sensors = offset + np.append(0.0, prior.group_centre if of_sensor else 0.0 * prior.group_centre)
     loads, affected = levels - sensors, np.abs(sensors) > LEAST_SHARED
-    value = 3.0 * np.log(max(1.0 - shares[affected].sum(), 0.3))
+    value = np.log(max(1.0 - shares[affected].sum(), 0.3))
     if (loads < -LEAST_SHARED).any() or (loads > LARGEST_SHARED).any():
         value -= 7.0
     if (affected & (np.abs(levels) < LEAST_SHARED)).any():
