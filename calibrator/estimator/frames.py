@@ -434,18 +434,19 @@ def _drives(
 
 
 def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction, *, alone: bool = False) -> None:
-    """Refuse values that cannot be amperes, and in a fleet constant branches; of one vehicle a heater may be off."""
+    """Refuse values that cannot be amperes, and a branch that is constant in most of a fleet; some heaters are off."""
     branches, scale_a = list(junction.branches), float(junction.full_scale_a)
-    largest = np.zeros((len(drives), len(branches)))
-    for j, (vehicle, parts) in enumerate(drives.items()):
+    largest, constant = np.zeros((len(drives), len(branches))), np.zeros((len(drives), len(branches)), bool)
+    for j, parts in enumerate(drives.values()):
         for k, name in enumerate(branches):
             values = np.concatenate([part.branches[name].value[part.branches[name].good] for part in parts])
             largest[j, k] = np.abs(values).max()
-            if not alone and not np.ptp(values):
-                raise DriveError(
-                    f"vehicle {vehicle}: branch {name} is {values[0]:g} A throughout: stuck, or not connected; leave "
-                    f"the vehicle out, or the branch if the junction has none"
-                )
+            constant[j, k] = not np.ptp(values)
+    if not alone and (still := constant.mean(axis=0) > 0.5).any():
+        raise DriveError(
+            f"branch {branches[int(np.argmax(still))]} never changes in most vehicles: stuck, or not connected; leave "
+            f"it out if the junction has none"
+        )
     small = largest < LEAST_OF_SCALE * scale_a
     strange = small & (small.all(axis=1, keepdims=True) | (np.median(largest, axis=0) > OTHER_UNIT * largest))
     if not alone:

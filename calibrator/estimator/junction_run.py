@@ -141,16 +141,16 @@ def _without_jumps(drives: Sequence[Samples], unknown: Sequence[str], layout: La
     return kept if 2 * after > before else list(drives)
 
 
-def _same_error(parameters: VehicleParameters, trusted: Collection[str]) -> list[str]:
-    """Say so if all gains are wrong alike against the only trusted sensor: then that sensor may be the wrong one."""
-    others = [branch for name, branch in parameters.branches.items() if name not in trusted]
+def _same_error(parameters: VehicleParameters, known: Collection[str]) -> list[str]:
+    """Say so if all gains are wrong alike against the only sensor whose gain is known: then that one may be wrong."""
+    others = [branch for name, branch in parameters.branches.items() if name not in known]
     drifts = np.array([branch.drift for branch in others])
     sds = np.array([branch.drift_sd for branch in others], dtype=float)
-    if len(trusted) != 1 or len(others) < 2 or not (np.abs(drifts) > SEEN * sds).all():
+    if len(known) != 1 or len(others) < 2 or not (np.abs(drifts) > SEEN * sds).all():
         return []
     if np.ptp(drifts) > SEEN * np.hypot(*np.sort(sds)[-2:]):
         return []
-    (reference,), error = trusted, drifts.mean()
+    (reference,), error = known, drifts.mean()
     own = 1.0 / (1.0 + error) - 1.0
     return [f"all others read {error:+z.1%} against {reference}: a gain error of its own of {own:+z.1%} looks the same"]
 
@@ -244,7 +244,8 @@ def calibrate_junctions(
                     f"gain ratios {said}; at zero current the sensors sum to {constant_a[0]:+.2f} +- "
                     f"{constant_a[1]:.2f} A: their offsets, and loads without a sensor"
                 )
-                notices += [f"{name}: {text}" for text in (*texts, *_same_error(mine, trusted))]
+                gains_known = [branches[k] for k in np.flatnonzero(np.isfinite(read[:, 0, 0, j]).any(axis=0))]
+                notices += [f"{name}: {text}" for text in (*texts, *_same_error(mine, gains_known))]
     details = {"junction": junctions, "declared_load_a": 0.0 if load is None else load.mean_a}
     return equipment, encode_chunk(parameters, left_out), details, notices
 

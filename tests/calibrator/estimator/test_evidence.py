@@ -102,12 +102,15 @@ def test_vehicle_with_an_input_in_a_wrong_unit_does_not_bias_the_fleet_model() -
 # Junction law
 
 
+def fleet_of(*currents_a: Array) -> evidence.FleetMoments:
+    """Moments of vehicles with these currents (T, K)."""
+    samples = [simulated_drives.samples_of(np.zeros((len(each), 0)), each) for each in currents_a]
+    return evidence.stack_summaries([summarise_samples([one], period_s=simulated_drives.PERIOD_S) for one in samples])
+
+
 def law_of(*currents_a: Array) -> evidence.VehicleRegressions:
     """Junction law of vehicles with these currents (T, K)."""
-    samples = [simulated_drives.samples_of(np.zeros((len(each), 0)), each) for each in currents_a]
-    return evidence.junction_regression(
-        evidence.stack_summaries([summarise_samples([each], period_s=simulated_drives.PERIOD_S) for each in samples])
-    )
+    return evidence.junction_regression(fleet_of(*currents_a))
 
 
 def currents_of(seed: int, size_a: tuple[float, ...], noise_a: tuple[float, ...], samples: int) -> tuple[Array, Array]:
@@ -120,6 +123,14 @@ def currents_of(seed: int, size_a: tuple[float, ...], noise_a: tuple[float, ...]
     d, o = (size * rng.uniform(-1.0, 1.0, size=(len(size_a) + 1,)) for size in (0.1, 5.0))
     truth = np.append(-(1.0 + d[0]) / (1.0 + d[1:]), (1.0 + d[0]) * np.sum(o / (1.0 + d)))
     return (1.0 + d) * i + o + rng.normal(size=i.shape) * np.array(noise_a), truth
+
+
+def test_signal_that_is_a_mean_over_a_second_puts_its_gain_ratios_in_doubt_but_gain_errors_do_not() -> None:
+    measured = [currents_of(seed, (60.0, 8.0), (0.2, 0.2, 0.2), 9000)[0] for seed in range(8)]
+    assert not evidence.ratios_in_doubt(fleet_of(*measured)).any()
+    window = np.ones(10) / 10.0
+    means = [np.column_stack([np.convolve(each[:, 0], window, "full")[: len(each)], each[:, 1:]]) for each in measured]
+    assert evidence.ratios_in_doubt(fleet_of(*means)).any()
 
 
 def test_standardised_errors_of_the_junction_law_are_standard_normal() -> None:

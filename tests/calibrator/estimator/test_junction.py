@@ -188,10 +188,14 @@ def test_meters_of_one_car_are_estimated_together() -> None:
     assert rows.gain_error["station_2", "charger"] == pytest.approx(0.03, abs=0.012)
 
 
-def test_equal_gain_error_of_all_others_is_reported_against_the_trusted_sensor() -> None:
-    wrong = JunctionCalibrator(trusted=["battery"]).fit(recording(gain=(0.05, 0.0, 0.0), seconds=1200.0), JUNCTION)
+BATTERY_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "drift": [0.0], "drift_sd": [0.002]})
+
+
+@pytest.mark.parametrize("known", [{"trusted": ["battery"]}, {"readings": BATTERY_READ}])
+def test_equal_gain_error_of_all_others_is_reported_against_the_only_known_sensor(known: dict[str, Any]) -> None:
+    wrong = JunctionCalibrator(**known).fit(recording(gain=(0.05, 0.0, 0.0), seconds=1200.0), JUNCTION)
     assert any("against battery: a gain error of its own of +5." in notice for notice in wrong.notices_)
-    right = JunctionCalibrator(trusted=["battery"]).fit(recording(gain=(0.0, 0.05, 0.0), seconds=1200.0), JUNCTION)
+    right = JunctionCalibrator(**known).fit(recording(gain=(0.0, 0.05, 0.0), seconds=1200.0), JUNCTION)
     assert not any("against battery" in notice for notice in right.notices_)
 
 

@@ -91,6 +91,63 @@ def test_uncertain_gain_ratios_are_not_taken_for_a_shared_gain_error(bias: float
     np.testing.assert_allclose(models[0].spread.mean[rows.places.slopes], 0.0, atol=0.002)
 
 
+@pytest.mark.parametrize("vague", [0.0005, 0.04])
+def test_gain_error_shared_in_one_branch_is_not_given_to_the_others_even_if_one_of_these_is_vague(vague: float) -> None:
+    faults = no_faults(16, 4)
+    faults.drift[:, 0] = 0.05
+    faults.drift[3, 1], faults.offset_a[5, 2] = -0.12, 0.1
+    rows = rows_of(faults, seed=7)
+    row = rows.places.ratio(3)
+    rows.covariance[:, row, row] += vague**2
+    rows.values[:, row] += vague * np.random.default_rng(7).normal(size=16)
+    assert shared_by(learn_fault_models(rows, feed=0)).keys() == {(4,)}
+
+
+def test_ratios_that_are_off_but_not_alike_are_no_shared_gain_error() -> None:
+    """As where the signal of one branch is a mean over a second: how far a ratio is off depends on the drive."""
+    rows = rows_of(no_faults(16, 3), seed=8)
+    by = np.zeros((16, 15))
+    by[:, rows.places.ratios] = 0.04 + 0.02 * np.random.default_rng(8).normal(size=(16, 1))
+    assert shared_by(learn_fault_models(moved(rows, by), feed=0)).keys() == {()}
+
+
+def test_ratios_in_doubt_are_compared_within_the_fleet_alone() -> None:
+    faults = no_faults(16, 3)
+    faults.drift[4, 1] = 0.1
+    rows, by = rows_of(faults, seed=9), np.zeros(15)
+    by[rows.places.ratio(1)] = 0.05
+    doubtful = np.array([True, False])
+    models = learn_fault_models(moved(rows, by), feed=0, doubtful=doubtful)
+    assert shared_by(models).keys() == {()}
+    np.testing.assert_allclose(models[0].spread.mean[rows.places.ratios], [0.05, 0.0], atol=0.002)
+
+
+def test_gain_errors_of_a_tenth_of_the_gain_can_be_learnt_from() -> None:
+    """As where half of the vehicles report a branch in another unit."""
+    faults = no_faults(12, 3)
+    faults.drift[:5, 2] = -0.9
+    assert learned(rows_of(faults, seed=10)).prior.gain.high > 0.8
+
+
+def test_load_of_one_vehicle_does_not_confirm_itself() -> None:
+    """It may be an offset of the feeding branch as well, of which the other vehicles have none either."""
+    faults = no_faults(8, 2)
+    faults.offset_a[0, 0] = 0.03
+    rows = rows_of(faults, seed=11)
+    model = learned(rows)
+    draws = explain(rows, model, feed=0)
+    loaded = (weigh(draws, model.prior)[0] * draws.fits.support[:, :, -1, None, None])[0].sum()
+    assert model.prior.load_share < 0.01
+    assert loaded < 0.9
+
+
+def test_offset_of_all_sensors_and_load_of_all_vehicles_are_about_as_probable_if_nothing_tells_them_apart() -> None:
+    faults = no_faults(12, 3)
+    faults.offset_a[:, 0] = 0.015
+    causes = shared_by(learn_fault_models(rows_of(faults, seed=12), feed=0))
+    assert 0.5 < causes[()] < 0.95
+
+
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_negative_junction_constant_is_an_offset_shared_by_a_branch(K: int) -> None:
     """Currents that sum to less than zero: no load gives current."""

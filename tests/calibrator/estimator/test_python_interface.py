@@ -277,6 +277,10 @@ def changed(**changes: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     return lambda: {name: changes.get(name, lambda each: each)(each) for name, each in frames().items()}
 
 
+def still(each: pd.DataFrame) -> pd.DataFrame:
+    return each.assign(motor=3.0)
+
+
 def retimed(change: Callable[[Any], Any]) -> Callable[[], Frames]:
     """Three vehicles, the second one at other times."""
     return changed(V2=lambda each: each.set_index(change(each.index)))
@@ -299,7 +303,7 @@ def of_all(change: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     (changed(V3=lambda each: each.assign(wind=1.0)), r"V3, frame 1: column wind, which vehicle V1, frame 1 has n"),
     (changed(V2=lambda each: each.astype({"motor": str})), r"V2, frame 1: column motor is of .*expected numbers"),
     (changed(V2=lambda each: each.assign(motor=np.nan)), r"V2, frame 1: column motor has no number at all"),
-    (changed(V2=lambda each: each.assign(motor=3.0)), r"vehicle V2: branch motor is 3 A throughout: stuck"),
+    (changed(V1=still, V2=still), r"branch motor never changes in most vehicles: stuck, or not connected"),
     (changed(V2=lambda each: each.iloc[::-1]), r"V2, frame 1: time runs back at row 1 \(299.0 -> 298.0\)"),
     (retimed(lambda time: time.where(time != 7.0, 6.0)), r"V2, frame 1: time twice at row 7 \(6.0 -> 6.0\)"),
     (changed(V2=lambda each: each.reset_index(drop=True)), r"V2, frame 1: its index counts rows; expected the tim"),
