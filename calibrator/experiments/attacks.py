@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
 from calibrator.artificial.random_fleet import Purpose, random_stream
@@ -215,6 +216,12 @@ def _low_pass(x: Array, time_constant_s: float) -> Array:
     return np.asarray(lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0])
 
 
+def _mean(x: Array, scene: Scene) -> Array:
+    """Return the mean of a current over the last seconds, as many as the size says."""
+    samples = round(HZ * abs(scene.size))
+    return np.asarray(uniform_filter1d(x, samples, mode="nearest", origin=(samples - 1) // 2))
+
+
 def _wander(x: Array, scene: Scene) -> Array:
     """Let the zero of a current walk at random; the size is its standard deviation at the end of a drive. [A]"""
     return np.asarray(x + scene.size * np.cumsum(scene.rng.standard_normal(len(x))) / np.sqrt(len(x)))
@@ -272,6 +279,7 @@ WORLDS = {
         0.15, (15.0, 15.0), lambda i, s: s.size * _on_off(s, len(i), (20.0, 120.0)), "switching"
     ),
     "inverted in 10%": World(share=0.1, causes=("inverted",), truth=lambda d, o, _: (-2.0 - d, -o)),
+    "inverted in 30%": World(causes=("inverted",), truth=lambda d, o, _: (-2.0 - d, -o)),
     "dead in 10%": World(share=0.1, causes=("dead",), truth=lambda d, o, _: (0.0 * d - 1.0, 0.0 * o)),
     "clipped at 40-70 %": _sensor(
         (0.4, 0.7), lambda x, s: np.clip(x, -abs(s.size) * s.peak_a, abs(s.size) * s.peak_a), "clipped", "saturating"
@@ -281,6 +289,7 @@ WORLDS = {
     "gain by sign 5-20 %": _sensor(BENT, lambda x, s: x * np.where(x > 0.0, 1.0 + s.size, 1.0), "sign"),
     "dead zone of 5 A": _sensor((5.0, 5.0), lambda x, s: x - np.clip(x, -abs(s.size), abs(s.size))),
     "low-pass of 1 s": _sensor((1.0, 1.0), lambda x, s: _low_pass(x, abs(s.size))),
+    "battery: means over 1 s in 100%": _sensor((1.0, 1.0), _mean, share=1.0, battery=True),
     "zero wanders by 5 A": _sensor((5.0, 5.0), _wander),
     "gain step of 15 % midway": _sensor(
         STEP, lambda x, s: _earlier(x, s, np.ceil(s.progress - 0.5)), "step", truth=_later_gain
