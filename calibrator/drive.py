@@ -38,11 +38,12 @@ class Channel:
     Attributes
     ----------
     time_s : ndarray of shape (n,)
-        Instants of the samples since the start of the drive, increasing. [s]
+        Times of the samples since the start of the drive, not decreasing. [s]
     value : ndarray of shape (n,)
         Values; branch currents positive into the junction [A], inputs in the unit of the DBC.
     good : ndarray of bool of shape (n,)
-        False where the sample is not available, not finite or outside the range that the DBC allows.
+        False where the sample must not be used: not available, not finite, outside the DBC's range, or of a frame that
+        fails its end-to-end check.
     """
 
     time_s: Array
@@ -61,7 +62,7 @@ class Drive:
     branches : mapping of str to Channel
         Measured branch currents, positive into the junction, by branch name. [A]
     inputs : mapping of str to Channel
-        Inputs by name, in the unit of the DBC. Derived inputs are not stored.
+        Recorded inputs by name, in the unit of the DBC; not those that the layout derives by a formula.
     """
 
     vehicle: str
@@ -86,7 +87,7 @@ def good_values(drives: Iterable[Drive], name: str) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """Aligned samples of one drive.
+    """Samples of one drive, with all channels at the same instants.
 
     Attributes
     ----------
@@ -110,7 +111,7 @@ class Samples:
     valid: Mask
 
     def with_inputs(self, names: Sequence[str]) -> "Samples":
-        """Keep these inputs, in the order of the names; names that are not there are ignored."""
+        """Return the samples with only the inputs in `names`, in that order; unknown names are ignored."""
         kept = [self.input_names.index(name) for name in names if name in self.input_names]
         chosen = tuple(self.input_names[i] for i in kept)
         return replace(self, input_names=chosen, inputs=np.ascontiguousarray(self.inputs[:, kept]))
@@ -127,9 +128,9 @@ class DriveFile:
     place : str
         Path of the file, possibly inside an archive, or its URL.
     size : int
-        Size of the file; 0 for a file in an archive. [byte]
+        Size of the file; 0 where it is not known, as in an archive. [byte]
     version : str
-        Text that changes when the file changes.
+        Text that changes when the file changes; empty where it is not known.
     """
 
     vehicle: str
@@ -141,14 +142,14 @@ class DriveFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Equipment:
-    """Branches and model inputs that a fleet has, and those of the layout that it lacks.
+    """Branches and inputs of the layout with which a fleet is calibrated, and those that are not used.
 
     Attributes
     ----------
     branches, inputs, fleet_inputs : tuple of str
-        Names of its branches, of the inputs for a model of each vehicle, and of those for the model that all share.
+        Names of the branches, of the inputs for a model of each single vehicle, and of those for the fleet model.
     notices : tuple of str
-        What the layout has and the fleet lacks.
+        What is not used, and why, such as ``model inputs not recorded, left out: heater``.
     """
 
     branches: tuple[str, ...]
@@ -159,18 +160,18 @@ class Equipment:
 
 @dataclass(frozen=True, kw_only=True)
 class FleetSource:
-    """A fleet whose drives have been located, so that they can be loaded.
+    """The files of a fleet's drives, found but not read yet.
 
     Attributes
     ----------
     place : str
         Path or URL, as the user named it.
     vehicles : mapping of str to tuple of DriveFile
-        Drives by vehicle, sorted.
+        Files of the drives by name of the vehicle; vehicles and drives are sorted by name.
     left_out : mapping of str to str
-        Why a vehicle, or a file where its vehicle is unclear, was left out.
+        Reasons: why a vehicle was left out, by its name; why a file or folder was, by ``problem 1``, ``problem 2`` ...
     sizes : mapping of str to int
-        Size of the drives of each vehicle. [byte]
+        Size of all drives together, by name of the vehicle. [byte]
     """
 
     place: str

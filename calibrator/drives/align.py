@@ -1,4 +1,4 @@
-"""Channels of a drive on one time base.
+"""Put the channels of a drive on one time base.
 
 The rule: The instants are whole multiples of the layout's period, over the span that every needed channel covers with
 good samples. At each instant a channel's value is interpolated linearly between its last good sample at or before and
@@ -40,13 +40,13 @@ MAX_SAMPLES = 20_000_000
 SLOWER = 1.5
 """If even the fastest branch's frames are this many periods or more apart, the period becomes their distance. [1]"""
 LEVELS, FEW_LEVELS, LOOKED_AT = 10, 4, 2000
-"""Fewest different values that show a step, and fewest if all are whole steps apart, as a heater may be on or off; most
-samples that are looked at. [1]"""
+"""In :func:`step_of`: fewest different values whose least distance is taken for the step; fewest if all are whole steps
+apart, as a heater may only be on or off; most samples that are looked at. [1]"""
 _STALE, _NOT_GOOD = "stale", "not good"
 
 
 def at_pace(layout: Layout, drives: Sequence[Drive]) -> Layout:
-    """Return the layout; if its period is too short even for the fastest branch, with that branch's frame distance."""
+    """Return the layout; if its period is too short for all branches, with the fastest one's frame distance instead."""
     channels = [channel for drive in drives for channel in drive.branches.values() if channel.good.sum() > 1]
     fastest_s = min((float(np.median(np.diff(each.time_s[each.good]))) for each in channels), default=0.0)
     if fastest_s < SLOWER * layout.period_s:
@@ -57,7 +57,7 @@ def at_pace(layout: Layout, drives: Sequence[Drive]) -> Layout:
 def choose_inputs(
     layout: Layout, available: Collection[str], *, names: Sequence[str] | None = None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Split inputs of the layout into those that a fleet has and those that no drive of it has.
+    """Split inputs of the layout into those that a fleet has and those that it lacks.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def choose_inputs(
     Returns
     -------
     kept, left_out : tuple of str
-        Names of the inputs whose recorded inputs are all available, and of the others.
+        Names of the wanted inputs that are available, or are derived from inputs that all are; and of all other ones.
     """
     wanted = layout.model_inputs if names is None else names
     kept = tuple(name for name in wanted if layout.base_inputs([name]) <= set(available))
@@ -89,7 +89,7 @@ _ARRAY_FUNCTIONS: Mapping[str, Callable[..., Any]] = {
 
 
 def evaluate_formula(formula: str, values: Mapping[str, Array]) -> Array:
-    """Evaluate a formula of the layout at each sample; NaN or infinite where it has no value.
+    """Return the values of a formula of the layout, shape (T,); NaN or infinite where it has none.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array,
 
 
 def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:
-    """Return the instants that the good samples of all channels cover."""
+    """Return the multiples of the period that the good samples of every channel cover, shape (T,). [s]"""
     start, stop = max(float(time_s[0]) for time_s in good_s), min(float(time_s[-1]) for time_s in good_s)
     slack = INSTANT_SLACK * period_s
     first, last = int(np.ceil((start - slack) / period_s)), int(np.floor((stop + slack) / period_s))
@@ -245,7 +245,7 @@ def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:
 
 
 def _interpolated(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, NDArray[np.uint8]]:
-    """Return the values at the instants, and labels of the instants whose neighbours are too far apart."""
+    """Return the values at the instants, and labels: 0, or ``_FAR`` or ``_SPOILT`` as :func:`_interpolate` says."""
     value, label = np.empty(len(time_s)), np.zeros(len(time_s), np.uint8)
     samples = (np.ascontiguousarray(channel.time_s), np.ascontiguousarray(channel.value), channel.good)
     _interpolate(samples, time_s, limit_s + TIME_RESOLUTION_S, value, label)
@@ -259,10 +259,11 @@ _FAR, _SPOILT = 1, 2
 def _interpolate(
     samples: tuple[Array, Array, Mask], time_s: Array, limit_s: float, value: Array, label: NDArray[np.uint8]
 ) -> None:
-    """Interpolate at increasing instants between the good samples before (or at) and after (or at) each of them.
+    """Fill `value` and `label` at increasing instants from the good samples before (or at) and after (or at) each.
 
     Of several samples at one instant the last counts. Before the first and after the last sample, that sample's value
-    is held. If the two samples are farther apart than the limit, the label says whether bad samples lie between them.
+    is held. If the two samples are farther apart than the limit, the label is ``_SPOILT`` with bad samples between
+    them, else ``_FAR``.
     """
     known_s, known, good = samples
     before, after = -1, _next_good(known_s, good, -1)

@@ -48,8 +48,8 @@ class ChargeCurve:
     time_s : ndarray of shape (n,)
         Instants of the good samples, strictly increasing, n >= 2. [s]
     pieces : ndarray of shape (4, n) or wider
-        Integral of the charge [A s^2], charge since the first sample [A s] and current [A] at the start of the line
-        after each sample but the last one, and the slope of that line [A/s].
+        Column k, at sample k: integral P of the charge [A s^2], charge Q since the first sample [A s], current i [A],
+        and slope of the line to sample k + 1 [A/s].
     gap_s : ndarray of shape (n,)
         Time spent in gaps before each sample. [s]
     period_s : float
@@ -90,7 +90,7 @@ class ChargeCurve:
 
 
 def covered(curves: Sequence[ChargeCurve], time_s: Array, margin_s: float) -> Mask:
-    """Check at which instants all curves cover this much time on both sides, without a gap."""
+    """Return at which instants all curves cover `margin_s` on both sides without a gap, shape (T,)."""
     return np.asarray(np.all([curve.covers(time_s, margin_s) for curve in curves], axis=0))
 
 
@@ -98,7 +98,7 @@ def covered(curves: Sequence[ChargeCurve], time_s: Array, margin_s: float) -> Ma
 def _band(time_s: Array, known_s: Array, pieces: Array, shift_s: Array, weight: Array) -> tuple[Array, Array]:
     """Compute a band and its slope, shape (T,) each, as weighted sums of P and Q at shifted instants.
 
-    The instants must increase, so that the search for the lines of each one starts at those of the one before.
+    The instants must increase: the search for the line at an instant starts at the line of the instant before.
     """
     x, slope = np.zeros(len(time_s)), np.zeros(len(time_s))
     for place in range(len(shift_s)):
@@ -144,10 +144,7 @@ def charge_curve(channel: Channel) -> ChargeCurve | None:
 
 @compiled
 def _integrate(samples: tuple[Array, Array, Mask], time_s: Array, pieces: Array) -> int:
-    """Fill in the good samples at different instants and the line after each, see :class:`ChargeCurve`.
-
-    Returns the number of these samples.
-    """
+    """Fill `time_s` and `pieces` of a :class:`ChargeCurve`, and return its number of samples n."""
     known_s, value, good = samples
     integral, charge, current = pieces[0], pieces[1], pieces[2]
     count = 0

@@ -7,10 +7,11 @@ the first branch, and g_k its gain ratio (1 + d_1) / (1 + d_k). Then, for each k
     e(t) = x_1(t) + sum over k > 1 of g_k x_k(t + tau_k),       sum over t of e x_k = 0,   sum over t of e f(x_k') = 0.
 
 The last equation uses the slopes x_k'. The function f weakens slopes that are no larger than the branch's noise, as a
-small branch shows its delay only in its few steps. Noise in x_k' would make the sums of f(x_k') g_k x_k', and so the
-confidence, too large; they are therefore formed with g_k x_k' - e', the slope that the other branches predict. The
-windows of x_k hold several samples of every branch: then the noise of a sensor has nearly the same power in e whatever
-the phase of its frames, and does not bias tau. Huber's weights limit the effect of wild samples.
+small branch shows its delay only in its few steps. Noise in x_k' would make the derivative of that equation by tau_k,
+the sum of f(x_k') g_k x_k', and so the confidence, too large; that sum is therefore formed with g_k x_k' - e', the
+slope that the other branches predict. The windows of x_k hold several samples of every branch: then the noise of a
+sensor has nearly the same power in e whatever the phase of its frames, and does not bias tau. Huber's weights limit the
+effect of wild samples.
 
 A delay is a property of the vehicle. To avoid local minima it is first searched on a grid of lags, and then refined by
 Newton steps, both in the few minutes in which the branches move most. One or two steps on all drives make it exact, and
@@ -54,8 +55,8 @@ FEWEST_BLOCKS = 6
 SEARCHED_BLOCKS = 60
 """Blocks in which delays are searched: ten minutes in which the branches move most. [1]"""
 HOPELESS = 3.0
-"""If the standard deviation of a branch, in these minutes, exceeds the largest allowed this many times, its delay is
-no longer estimated: it would wander and distort those of the other branches. [1]"""
+"""If the standard deviation of a delay, in the searched blocks, exceeds the largest allowed this many times, the delay
+is no longer estimated: it would wander and distort those of the other branches. [1]"""
 GAIN_RANGE = (1.0 / 3.0, 3.0)
 """Plausible gain ratios of two sensors, with gains of 0.6 to 1.4 and some loss to noise. A ratio outside means that
 another current than the branch's own was found. [1]"""
@@ -67,7 +68,7 @@ SEARCHED_INSTANTS = 1200
 SWEEPS = 2
 """Rounds in which each pair of branches takes its best lags; in the first, the other lags are still guesses. [1]"""
 SINGULAR = 1e-10
-"""Directions with less curvature or power than this share of the largest are left unchanged. [1]"""
+"""Unknowns do not change in directions with less curvature or power than this share of the largest. [1]"""
 
 MOST_STEPS, MOST_STEPS_ON_ALL = 10, 2
 """Most Newton steps in the searched minutes, where five are usual, and on all drives, where one is. The delay of a
@@ -108,13 +109,16 @@ class BranchDelays:
     known: Mask
 
     def by_branch(self) -> dict[str, float]:
-        """Delay of each branch, for :func:`without_delays`. [s]"""
+        """Return the delay of each branch by name, for :func:`without_delays`. [s]"""
         return dict(zip(self.branches, self.delay_s.tolist(), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Stretch:
-    """One drive: curves of its K branches, instants around which all are known, and the block of each instant."""
+    """One drive: curves of its K branches, instants around which all are known, and the block number of each instant.
+
+    Block numbers count on from drive to drive.
+    """
 
     curves: tuple[ChargeCurve, ...]
     time_s: Array
@@ -263,7 +267,10 @@ def _stretches(complete: Sequence[tuple[ChargeCurve, ...]], band: Band) -> tuple
 
 
 def _most_telling(stretches: Sequence[_Stretch], band: Band, blocks: int) -> Sequence[_Stretch]:
-    """Return the blocks in which the branches move most, each relative to its own total, as small ones seldom move."""
+    """Return the stretches with only those blocks in which the branches move most.
+
+    A branch's movement in a block counts as a share of its total, so that small branches count as much as large ones.
+    """
     if blocks <= SEARCHED_BLOCKS:
         return stretches
     K = len(stretches[0].curves)
@@ -308,7 +315,7 @@ def _search_lags(parts: Sequence[_Stretch], band: Band) -> Array:
 
 
 def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int], width: int) -> NDArray[np.intp]:
-    """Return the columns (lags) of the branches in `group` with which all branches best explain the first one."""
+    """Return columns of `moments` (lags), one for each branch in `group`: those that let all best explain the first."""
     choices = np.stack(np.meshgrid(*(width * k + np.arange(width) for k in group)), axis=-1).reshape(-1, len(group))
     tried = np.repeat(column[None, 1:], len(choices), axis=0)
     tried[:, np.array(group) - 1] = choices
@@ -371,7 +378,8 @@ def _add_products(  # noqa: PLR0917 (compiled: no keywords)
     """Add the equations of each instant to those of its block in `sums`, shape (B, 2K-2, 2K-1).
 
     The rows are products with the instruments (x, f(x')), the columns the derivatives by (g, tau); the last column
-    holds the values.
+    holds the values. `branches` are (x, x'), `residual` is (e, e'), `usual` the slope with weight one half in f,
+    `limit` the residual from which on Huber's weights fall.
     """
     (x, slope), (e, e_slope), others = branches, residual, len(gain)
     column = np.empty(2 * others + 1)
@@ -390,7 +398,10 @@ def _add_products(  # noqa: PLR0917 (compiled: no keywords)
 
 
 def _solve(moments: Array) -> Array:
-    """Solve n sets of equations (n, p, p+1); return shape (n, p), zero in directions without information."""
+    """Solve n sets of equations A y = b, given as (A, b) of shape (n, p, p + 1).
+
+    Returns y, shape (n, p), zero in directions without information.
+    """
     matrix, value = moments[:, :, :-1], moments[:, :, -1]
     size = np.sqrt(np.abs(np.einsum("nii->ni", matrix)))
     size = np.where(size > 0.0, size, 1.0)

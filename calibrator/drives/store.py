@@ -1,4 +1,4 @@
-"""Drives as files: ``STORE/drives/VEHICLE/DRIVE.parquet``, one row per channel.
+"""Write and read drives as files: ``STORE/drives/VEHICLE/DRIVE.parquet``, one row per channel.
 
 Columns: ``name``, ``kind`` (branch or input), ``time_s`` and ``value`` (lists of float64), ``good`` (list of bool). The
 file's metadata carries schema version, vehicle, drive, and name and digests of layout and DBC, because branch names and
@@ -131,7 +131,7 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
 
 
 def remove_leftovers(store: str | Path, vehicles: Iterable[str], *, before_s: float) -> None:
-    """Remove incomplete files of these vehicles that a killed process left before a time since 1970. [s]"""
+    """Remove incomplete files of these vehicles that a killed process left before `before_s` [s since 1970]."""
     for folder in (_folder(store, vehicle) for vehicle in vehicles):
         if folder.is_local:
             for left in Path(folder.url).glob(".*.parquet.*"):
@@ -197,7 +197,7 @@ def read_drive_file(path: Path, layout: Layout) -> Drive:
 
 
 def recording_digest(drive: Drive) -> str:
-    """Return a digest of a drive's channels, whatever drive and vehicle are called; two recordings differ by noise."""
+    """Return a digest of a drive's channels, without the names of drive and vehicle; two recordings differ by noise."""
     digest = hashlib.blake2b(digest_size=16)
     for channels in (drive.branches, drive.inputs):
         for name, channel in channels.items():
