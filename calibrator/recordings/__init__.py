@@ -1,1 +1,1 @@
-"""Recordings of real vehicles, CAN logs and CSV files: reading them into drives, and writing logs."""
+"""Read recordings of real vehicles (CAN logs, tables) into drives, and write logs."""

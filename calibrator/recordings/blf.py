@@ -39,7 +39,7 @@ from calibrator.recordings.log_files import UNREADABLE, open_log
 __all__ = ["blf_frames", "read_blf"]
 
 BATCH_BYTES = 1 << 21
-"""Content of containers that is parsed at a time. [byte]"""
+"""Containers are parsed together once their content is this long. [byte]"""
 LARGEST_OBJECT = 1 << 28
 """Objects of a larger size count as damage: containers have some 128 KiB. [byte]"""
 _FILE_HEADER = struct.Struct("<4sL8xQ16x8H")
@@ -131,7 +131,10 @@ def blf_frames(file: BinaryIO, name: str) -> Frames:
 
 
 def _batches(file: BinaryIO) -> Iterator[list[tuple[bytes, int]]]:
-    """Yield containers in batches of :data:`BATCH_BYTES`; those before a damage are yielded before its error."""
+    """Yield what :func:`_containers` yields, in lists with :data:`BATCH_BYTES` or more of content.
+
+    If the file is damaged, the containers before the damage are yielded before the error is raised.
+    """
     batch: list[tuple[bytes, int]] = []
     try:
         for container in _containers(file):
@@ -201,7 +204,7 @@ def _container_content(content: bytes, position: int) -> bytes:
 
 
 class _Numbers(NamedTuple):
-    """Views of some bytes: element k is the little-endian number of 1, 2, 4 or 8 bytes that starts at byte k."""
+    """Views of n bytes, shape (n,): element k is the little-endian number of 1 to 8 bytes that begins at byte k."""
 
     u8: NDArray[np.uint8]
     u16: NDArray[np.uint16]
@@ -219,11 +222,12 @@ class _Numbers(NamedTuple):
 def _take_apart(  # noqa: PLR0912, PLR0915 (see below)
     data: _Numbers, start_ns: int, columns: FrameColumns
 ) -> tuple[int, int, int, int]:
-    """Fill one row of `columns` per frame.
+    """Parse objects, and fill one row of `columns` per frame.
 
-    Returns how parsing ended, the number of rows, where the unparsed rest begins, and the impossible size, if any. All
-    is one function with a name for each array: arrays passed to another function, or taken out of a tuple, would be
-    reference-counted in each round of the loop, which takes seven times as long as all else.
+    Returns how parsing ended (such as ``_SOUND``), the number of rows filled, the byte at which the unparsed rest
+    begins, and the size of an impossible object (0: none). All is one function with a name for each array: arrays
+    passed to another function, or taken out of a tuple, would be reference-counted in each round of the loop, which
+    takes seven times as long as all else.
     """
     u8, u16, u32, u64 = data
     kinds, time_ns, keys, channels, lengths, payloads = columns

@@ -17,7 +17,7 @@ from ecu_node.program import say_error, write_output
 __all__ = ["replay"]
 
 _FASTEST = 1e6
-"""An hour in 4 ms: beyond what any bus takes. [1]"""
+"""Largest ``--speed``: an hour in 4 ms is faster than any bus. [1]"""
 
 
 def replay(

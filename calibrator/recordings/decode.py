@@ -87,8 +87,8 @@ def decode_signal(
     length : ndarray of uint8, shape (n,)
         Payload bytes of each frame.
     no_value : frozenset of int, optional
-        Codes that stand for no value, from :func:`codes_of_no_value` if there is a layout; by default those whose name
-        in the DBC means "not available".
+        Raw values that stand for no value, as :func:`ecu_node.database.codes_of_no_value` returns them; by default
+        those whose name in the DBC means "not available".
 
     Returns
     -------
@@ -202,7 +202,7 @@ def signal_range(signal: Signal, factor: float = 1.0) -> SignalRange:
 
 
 def _bit_run(signal: Signal) -> tuple[list[int], int]:
-    """Return the bytes of a signal, least significant first, and how many bits of the first lie below the signal."""
+    """Return the indices of a signal's bytes, least significant first, and how many bits of the first lie below it."""
     if signal.byte_order == "little_endian":
         first, shift = divmod(signal.start, 8)
         return list(range(first, (signal.start + signal.length - 1) // 8 + 1)), shift
@@ -212,7 +212,10 @@ def _bit_run(signal: Signal) -> tuple[list[int], int]:
 
 
 def _joined(data: NDArray[np.uint8], columns: list[int], shift: int) -> NDArray[np.uint64]:
-    """Join bytes to one integer, and cut off its lowest `shift` bits. A signal of 64 bits may touch nine bytes."""
+    """Join the bytes in some columns, least significant first, to one integer per row without its lowest `shift` bits.
+
+    A signal of 64 bits may touch nine bytes.
+    """
     word = np.zeros(len(data), np.uint64)
     for place, column in enumerate(columns):
         byte, move = data[:, column].astype(np.uint64), 8 * place - shift
@@ -223,7 +226,7 @@ def _joined(data: NDArray[np.uint8], columns: list[int], shift: int) -> NDArray[
 def _presence(
     message: Message, signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]
 ) -> tuple[Mask, Mask]:
-    """Return which frames carry a signal, and which are long enough to tell; if not, the signal counts as present.
+    """Return which frames carry a signal, and which are long enough to tell; shorter ones count as carrying it.
 
     No frame carries a signal whose multiplexer is missing from the message.
     """
@@ -292,7 +295,7 @@ def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: in
 def _crc_of_rows(
     data: NDArray[np.uint8], length: NDArray[np.uint8], table: NDArray[np.uint8], start: int, crc: NDArray[np.uint8]
 ) -> None:
-    """Compute for each row the CRC over its bytes after the first."""
+    """Fill `crc` with the CRC of each row over its bytes after the first, begun with the value `start`."""
     for row in range(len(data)):
         value = start
         for column in range(1, length[row]):

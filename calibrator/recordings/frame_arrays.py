@@ -1,4 +1,4 @@
-"""Frames of a log as arrays, so that all later steps work on whole columns; and the repair of a log's time stamps.
+"""Hold the frames of a log as arrays, so that all later steps work on whole columns, and repair their time stamps.
 
 A frame is kept as it was logged: time stamp, identifier, channel, length and payload. Error and remote frames carry no
 payload; they and damaged lines are counted.
@@ -76,7 +76,7 @@ class Frames:
         return (self.time_ns - self.time_ns[:1]) * 1e-9
 
     def take(self, index: NDArray[np.int64] | Mask) -> "Frames":
-        """Return some of the frames; the counts stay those of the log."""
+        """Return the frames with these indices, or those where a mask is true; the counts stay those of the log."""
         columns: dict[str, Any] = {name: getattr(self, name)[index] for name in _COLUMNS}
         return replace(self, **columns)
 
@@ -196,7 +196,7 @@ def frames_of(messages: Sequence[can.Message]) -> Frames:
 # ---- time
 
 LARGEST_DISORDER_S = 1.0
-"""Larger steps back are the clock's: loggers empty their buffers more often than this. [s]"""
+"""A larger step back shows that the clock was set: loggers mix up frames only within buffers emptied sooner. [s]"""
 LONGEST_PAUSE_S = 600.0
 """A bus that is silent for longer has been asleep; the pause is replaced by :data:`CLOCK_GAP_S`. [s]"""
 CLOCK_GAP_S = 60.0
@@ -214,9 +214,9 @@ class LogTime:
     time_s : ndarray of shape (n,)
         Time since the first frame, in that order, not decreasing. [s]
     disordered : int
-        Frames that were logged after a later one.
+        Number of frames whose time is before that of a frame logged earlier.
     clock_steps : int
-        Steps of the clock that were replaced by a gap of :data:`CLOCK_GAP_S`.
+        Number of steps of the clock, each replaced by a gap of :data:`CLOCK_GAP_S`.
     """
 
     order: NDArray[np.int64]

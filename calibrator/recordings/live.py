@@ -1,4 +1,4 @@
-"""A log played onto a live bus."""
+"""Play a log onto a live bus."""
 
 import time
 from collections.abc import Iterable, Iterator

@@ -59,9 +59,9 @@ _NUMBER = re.compile(r"(?<![\w.:-])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?![\w.:-]
 _LOGGED = re.compile(rb"\(\d+\.\d+\) \S+ [\dA-Fa-f]{3,8}#")
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf4")
 FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
-"""Headers of identifiers, lower case: a text file that has one of them beside a time is a log of CAN frames."""
+"""Headers of a column of identifiers, lower case; beside a column of data or length, it marks a log of CAN frames."""
 _FRAME_CHANNEL = bytes(8) + b"CAN_DataFrame\0"
-"""End of the header of an MDF text block, which is its number of links, 0, and then the text."""
+"""Bytes of an MDF text block with the name of a channel of frames: its number of links (0), then the text."""
 _HEAD_BYTES = 1 << 16
 _READ_BYTES = 1 << 13
 """Size of one read: each read allocates this much, and a damage inside it loses all of it. [byte]"""
@@ -145,14 +145,17 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_candump(head: str, *, printed: bool = False) -> bool:
-    """Check whether a text begins with lines of candump, of any form or, if `printed`, of the form without ``-L``."""
+    """Check whether a text begins with lines of candump: of any form, or only of that without ``-L`` if `printed`."""
     lines = [line for line in head.splitlines() if line.strip()][:50]
     forms = (PRINTED_CANDUMP,) if printed else (PRINTED_CANDUMP, _LOGGED)
     return 2 * sum(any(form.match(line.encode()) for form in forms) for line in lines) > len(lines)
 
 
 def is_bus_log(path: Path) -> bool:
-    """Check whether an MDF 4 file holds frames: it then contains ASAM's name of their channel, never compressed."""
+    """Check whether an MDF 4 file holds frames: their channel has a name set by ASAM, which is never compressed.
+
+    An empty file counts as one that holds frames.
+    """
     if not path.stat().st_size:
         return True
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -162,8 +165,8 @@ def is_bus_log(path: Path) -> bool:
 def kind_of_text(head: str, *, headed: bool = True) -> Literal["candump", "frames", "table", ""]:
     """Tell what the beginning of a text is: lines of candump, a CSV of frames, a table, or (empty) none of these.
 
-    A text that is neither of the first two is a table if it is `headed`, else if most lines below the first have
-    several numbers.
+    A text that is neither of the first two is a table if `headed` (its suffix promises a table with a header); if not,
+    it is one only if most lines below the first have several numbers.
     """
     lines = head.splitlines()
     if is_candump(head):
@@ -216,7 +219,7 @@ def _is_hidden(name: PurePath) -> bool:
 def readable(path: Path) -> Iterator[Path]:
     """Yield a path that readers can open: the file itself, or an unpacked copy for the time of the block.
 
-    A UserError that names the copy is raised with the path that the user knows.
+    A UserError in the block that names the copy is raised anew with `path` in its place.
     """
     archive, packed = _archive(path), path.name.lower().endswith(".gz") and suffix_of(path) in _BINARY
     if archive is None and not packed:

@@ -49,7 +49,7 @@ _IS_TABLE = "a table of values, not a log of frames, which is needed here"
 
 
 def is_log(path: Path) -> bool:
-    """Check whether a file is a log or a table: by its suffix, or a ``.txt`` by its content. A damaged one counts."""
+    """Check whether a file is a log or a table, by its suffix; a ``.txt`` is one by its content, or if damaged."""
     suffix = suffix_of(path)
     if suffix == ".txt":
         try:
@@ -66,7 +66,7 @@ def logs_in(path: Path) -> list[Path]:
 
 
 def is_table(path: Path) -> bool:
-    """Check whether a file is a table, or a folder or archive has nothing but tables.
+    """Check whether a file is a table, or a folder or archive has tables and no logs of frames.
 
     If tables and logs of frames share a suffix, the content decides.
     """

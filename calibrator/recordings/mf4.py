@@ -1,4 +1,4 @@
-"""MDF 4 files through asammdf: frames of a bus, or decoded channels. Needs the extra ``mf4``.
+"""Read MDF 4 files with asammdf: frames of a bus, or decoded channels. Needs the extra ``mf4``.
 
 The format is a graph of binary blocks that point at each other. A damaged file can keep its reader busy for ever or
 exhaust the memory; files that cannot be trusted are therefore read within the limits of :func:`.try_many`.

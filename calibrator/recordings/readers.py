@@ -61,10 +61,10 @@ class RecordingReport:
     ignored : mapping of str to int
         Number of frames from buses that the layout does not mean, by channel.
     found : str
-        How a table was read; empty for logs.
+        What was detected about a table, see :attr:`.Table.found`; empty for logs.
     unfit : tuple of str
-        What the layout asks for and the recording lacks, and what to do about it: channels of a ``[[bus]]`` that the
-        log does not have, columns of branches whose cells are not numbers. Empty if nothing is lacking.
+        (What the recording lacks, what to do about it), each a text: it lacks the channel of a ``[[bus]]``, or numbers
+        in the column of a branch. Empty if nothing is lacking.
     """
 
     channels: Collection[tuple[str, Channel]]
@@ -117,7 +117,7 @@ class Recording:
     corrected : mapping of str to Channel
         Corrected currents that a node published into the log, by branch name, positive into the junction. [A]
     report : RecordingReport
-        What was found and what was left out.
+        Counts of the frames that were read and left out, and what the recording lacks.
     """
 
     drive: Drive
@@ -153,14 +153,14 @@ def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name:
 
 
 def open_recording(path: Path, database: VehicleDatabase) -> "SignalSource":
-    """Read a log or a table, without making a drive of it yet; raise LogError as :func:`read_recording` does."""
+    """Read a log or a table, and return its signals; raise LogError as :func:`read_recording` does."""
     if is_table(path):
         return TableSource(read_table(path), database)
     return FrameSource(read_frames(path), database, str(path))
 
 
 class SignalSource(ABC):
-    """A recording in the order of time, with the look-ups that turn it into channels.
+    """A recording, sorted by time, that returns signals and branches as channels.
 
     Attributes
     ----------
@@ -190,14 +190,14 @@ class SignalSource(ABC):
 
     @abstractmethod
     def found_and_expected(self) -> str:
-        """Return what the recording has and what the branches need, as part of an error message."""
+        """Return which identifiers or columns the recording has, and which the branches need, as part of a message."""
 
     @abstractmethod
     def report(self, channels: Collection[tuple[str, Channel]]) -> RecordingReport:
         """Return the report on the recording, given its channels by name."""
 
     def recording(self, vehicle: str, name: str) -> Recording:
-        """Make the drive, with its report; raise LogError if the recording holds none of the branches."""
+        """Return the drive under these names, with its report; raise LogError if the recording holds no branch."""
         layout = self.database.layout
         branches = {branch.name: self.branch(branch, branch.source) for branch in layout.branch}
         if not any(channel.time_s.size for channel in branches.values()):
@@ -355,7 +355,7 @@ class FrameSource(SignalSource):
         return np.asarray(channel == main)
 
     def _ignore(self, channel: NDArray[np.uint32], known: Sequence[str]) -> None:
-        """Count the frames on channels that are not among the known ones."""
+        """Add to :attr:`ignored` how many of the frames are on channels other than the `known` ones."""
         counts = zip(self.frames.channels, np.bincount(channel, minlength=len(self.frames.channels)), strict=True)
         self.ignored.update({bus: int(count) for bus, count in counts if count and bus not in known})
 

@@ -1,4 +1,4 @@
-"""Tables of measured values: CSV and other text, Parquet, Feather, decoded MF4. One column is the time.
+"""Read tables of measured values: CSV and other text, Parquet, Feather, decoded MF4. One column is the time.
 
 The user need not describe a file: delimiter, decimal sign, encoding, header, units and the time column are detected,
 and :attr:`Table.found` says what was detected. Rows need not have a value in every column.
@@ -47,7 +47,7 @@ __all__ = ["Table", "bare_name", "layout_from_branches", "likely_full_scale_a", 
 MOST_SHARING = 1.5
 """The time is too coarse if more rows than this, on average, share one instant: loggers repeat a few instants. [1]"""
 _DELIMITERS = ("\t", ";", "|", ",", " ")
-"""In the order in which they are tried: a comma may be the decimal sign, and a blank may be part of a date."""
+"""Tried in this order: a comma may be the decimal sign, and a blank may be part of a date."""
 _EMPTY = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "null", "none"))
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
@@ -67,7 +67,7 @@ _TIME_UNITS = {
     **dict.fromkeys(("h", "hours"), 3600.0),
 }
 _SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""Numbers from which on a time since 1970 is taken to be in this unit; in the next larger unit it would be absurd."""
+"""Least numbers that are times since 1970 in this unit; in the next larger unit they would be absurd dates."""
 _LONG_STEPS = ((5000.0, "us"), (5.0, "ms"))
 """Times that are whole numbers without a unit are taken to be in this unit if their median step is this or more.
 
@@ -78,7 +78,7 @@ _SHORTEST_S = 60.0
 ON_OFF = "on/off"
 """Unit given to a column of true and false, so that it is not taken for a current."""
 HEADROOM = 2.0
-"""Full scale over the recorded peak: a drive hardly ever reaches the nominal maximum current. [1]"""
+"""Guessed full scale over the recorded peak: a drive hardly ever reaches the nominal maximum current. [1]"""
 ROUND = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 
@@ -102,7 +102,7 @@ class Table:
     texts : dict of str to str
         For columns without any number, by header: the first cell that is no number and where it stands, for messages.
     found : str
-        What was detected about the file, in words.
+        What was detected about the file, in words, such as ``decimal ',', utf-8-sig; time 'Zeit' in s``.
     disordered, clock_steps, without_time : int
         Rows that came after a later one and were sorted; steps of the clock that became gaps; rows left out because
         they have no time or more cells than the header.
@@ -120,7 +120,11 @@ class Table:
     without_time: int = 0
 
     def header(self, name: str) -> str | None:
-        """Return the header of a column named as written, without unit, or by its signal alone; None if none fits."""
+        """Return the header of the column that a name stands for; None if there is none, LogError if several fit.
+
+        The name needs no unit, and either may lack the message: ``Ibat`` stands for ``BMS.Ibat [A]``, ``BMS.Ibat`` for
+        ``Ibat [A]``. A header that equals the name comes first.
+        """
         return self._same(name, self.columns)
 
     def _same(self, name: str, headers: Iterable[str]) -> str | None:
@@ -164,7 +168,7 @@ class Table:
 
 
 def bare_name(header: str) -> str:
-    """Return the header of a column without its unit."""
+    """Return the header of a column without its unit: ``Ibat`` for ``Ibat [A]``."""
     return _name_and_unit(header)[0]
 
 
@@ -178,12 +182,12 @@ def _name_and_unit(header: str) -> tuple[str, str]:
 
 
 def read_table(path: Path) -> Table:
-    """Read a table.
+    """Read a table of measured values, and detect how it is written.
 
     Parameters
     ----------
     path : Path
-        The file; text may be gzipped.
+        The file, or a folder or archive with this table only; text may be gzipped.
 
     Returns
     -------
@@ -193,7 +197,7 @@ def read_table(path: Path) -> Table:
     Raises
     ------
     LogError
-        If the file cannot be read, has no header, no time or no other numbers.
+        If the file cannot be read, has no header, fewer than two rows, no time or no other numbers.
     """
     files = logs_in(path)
     if len(files) == 1:

@@ -1,4 +1,4 @@
-"""Text logs: candump, ASC (Vector), TRC (PEAK), CSV of SavvyCAN and of python-can.
+"""Read text logs: candump, ASC (Vector), TRC (PEAK), CSV of SavvyCAN and of python-can.
 
     (1740960798.000833) can0 2E5#000007320000DD00           candump -L: classic, 11 bits
     (1740960798.000833) can0 000002E5##1000007320000DD00    CAN FD, 29 bits; one digit of flags after ##
@@ -64,8 +64,8 @@ __all__ = ["parse_candump", "read_asc", "read_candump", "read_csv", "read_trc"]
 _DECIMAL = re.compile(r"^base\s+dec", re.MULTILINE | re.IGNORECASE)
 _RELATIVE = re.compile(r"^base\s+\w+\s+timestamps\s+relative", re.MULTILINE | re.IGNORECASE)
 _MOST_DISORDER = 0.1
-"""Share of lines with a time not after that of the line before: nearly none for absolute times, about half for times
-since the line before. More than this share means the latter. [1]"""
+"""Times count from the line before if more than this share of them is no larger than that of the line before: nearly
+none are if times are absolute, about half if they count from the line before. [1]"""
 _SINCE_1970_S = 1e8
 """Times above this are dates: no recording lasts so long since its start. [s]"""
 _NO_TEXT = frozenset(range(32)) - frozenset(b"\t\n\v\f\r\x1a")
@@ -80,7 +80,7 @@ _MOST_CHANNELS = 256
 _NANOSECOND_DIGITS = 9
 _NOT_HEX = 255
 HEX = np.array([int(c, 16) if c in "0123456789ABCDEFabcdef" else _NOT_HEX for c in map(chr, range(256))], np.uint8)
-"""Value of each character as a hexadecimal digit."""
+"""Value of each character as a hexadecimal digit; 255 for all other characters."""
 _Text = NDArray[np.uint8]
 _Parse = Callable[[bytes], tuple[Frames, NDArray[np.uint8]]]
 """Parser of some lines: returns their frames, and what each line is (``DATA``, ``DAMAGED`` ...)."""
@@ -91,14 +91,14 @@ class _CanFdError(Exception):
 
 
 def read_candump(path: Path) -> Frames:
-    """Read a log that ``candump -L`` wrote, or the text that candump prints without ``-L``."""
+    """Read the frames of a log that ``candump -L`` wrote, or of the text that candump prints without ``-L``."""
     if is_candump(text_head(path)[0], printed=True):
         return _read_lines(path, lambda text: parse_candump(_as_logged(text, path)), at_once=True)
     return _read_lines(path, parse_candump)
 
 
 def read_csv(path: Path) -> Frames:
-    """Read a CSV in the GVRET form (SavvyCAN and others) or of python-can; or a text of candump."""
+    """Read the frames of a CSV in the GVRET form (SavvyCAN and others) or of python-can, or of a text of candump."""
     head = text_head(path)[0]
     if is_candump(head):
         return read_candump(path)
@@ -113,7 +113,7 @@ def read_csv(path: Path) -> Frames:
 
 
 def read_asc(path: Path) -> Frames:
-    """Read an ASC file."""
+    """Read the frames of an ASC file; LogError if it is damaged, or its times count from the line before."""
     head = text_head(path)[0]
     if _RELATIVE.search(head):
         raise LogError(f"{path}: the time stamps are relative to the line before; save it with absolute ones")
@@ -125,7 +125,7 @@ def read_asc(path: Path) -> Frames:
 
 
 def read_trc(path: Path) -> Frames:
-    """Read a TRC file of any version."""
+    """Read the frames of a TRC file of any version; LogError if it is damaged."""
     return _read_messages(path, can.TRCReader)
 
 
@@ -306,7 +306,7 @@ def _parse_candump(  # noqa: PLR0912, PLR0915 (a line is judged from left to rig
 ) -> int:
     """Parse line by line into `columns`, and return the number of different channels.
 
-    `names` receives the start and end of each channel's name in the text, which must end with a line end. The result
+    The text must end with a line end. `names` receives where each channel's name starts and ends in it. The result
     is -1 if a payload does not fit into the columns. One loop without calls is three times as fast as a function per
     line. No step passes a line end, so parsing goes on safely after a fault in a line.
     """

@@ -54,7 +54,7 @@ def encode_message(
         Instants of the frames. [s]
     values : mapping of str to ndarray of shape (n,)
         Physical values by signal name, in the unit of the DBC. NaN, and every signal that is not given, becomes the
-        signal's code SNA where it has one, else 0. Values beyond the signal's range saturate.
+        signal's code SNA where it has one, else code 0. Values beyond the signal's range saturate.
 
     Returns
     -------
