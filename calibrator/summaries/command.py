@@ -60,7 +60,7 @@ def summarise(
 
 @store_app.command(epilog=example("calibrator store info summaries"))
 def info(store: StoreArgument, json: JsonOption = False) -> None:
-    """Tell how many vehicles, drives and hours a store holds, of what, and how large it is."""
+    """Show the layout, branches and inputs of a store, how many vehicles, drives and hours it holds, and its size."""
     with importing():
         from calibrator.summaries.summary_store import look_at_store
 
@@ -81,7 +81,7 @@ def check(store: StoreArgument, json: JsonOption = False) -> None:
 
 @store_app.command(epilog=example("calibrator store compact summaries"))
 def compact(store: StoreArgument, json: JsonOption = False) -> None:
-    """Put the files of each bucket together."""
+    """Merge the files of each bucket, which holds a part of the vehicles, into one."""
     with importing():
         from calibrator.summaries.summary_store import compact_store
 

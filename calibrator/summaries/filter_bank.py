@@ -1,4 +1,4 @@
-"""Filter bank: fixed A and B of the state space (2) of [1]_, the same for identical vehicles; C and D are per vehicle.
+"""Filter bank: A and B of the state-space model (2) of [1]_, the same for all vehicles; C and D are per vehicle.
 
 Columns of the bank are the inputs u themselves and, per pole p, each input filtered by x(t+1) = p x(t) + (1 - p) u(t).
 This is a low-pass for a real pole, and a resonance for a complex one, whose real and imaginary part are two columns.
@@ -28,7 +28,7 @@ __all__ = ["FilterBank", "low_passes", "plain_bank", "read_bank"]
 LONGEST_HOLD_S = 1.0
 """Longest time that an input may keep its last valid value; currents seldom change much within it. [s]"""
 UNSETTLED = 0.05
-"""Share of an error of the start that remains in settled filters: three time constants of the slowest pole. [1]"""
+"""Share of an error at the start that settled filters still have: after three time constants of the slowest. [1]"""
 LARGEST_RADIUS = 1.0 - 1e-9
 """Largest magnitude of a pole; one any closer to the unit circle does not settle. [1]"""
 
@@ -119,8 +119,8 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         valid : ndarray of bool of shape (T,)
             Samples that may be used.
         settling : int
-            Number of samples not used after a start, if larger than :attr:`settling`; with that of a slower bank, both
-            banks are compared on the same samples.
+            Least number of samples after a start that are not used, if larger than :attr:`settling`: that of a slower
+            bank makes both banks comparable on the same samples.
 
         Returns
         -------
@@ -198,7 +198,7 @@ def read_bank(path: Path) -> FilterBank:
 
 
 def _by_kind(poles: Complex) -> tuple[Array, Complex]:
-    """Split poles into the real ones and one of each complex pair."""
+    """Split poles into the real ones and the complex ones, each of which stands for a pair."""
     return poles.real[poles.imag == 0.0], poles[poles.imag > 0.0]
 
 
@@ -213,7 +213,10 @@ def _described(pole: complex, period_s: float) -> str:
 def _filter(
     samples: tuple[Array, Mask], poles: Complex, real: int, limits: NDArray[np.int64], out: tuple[Array, Mask]
 ) -> None:
-    """Run the bank sample by sample; the first `real` poles are real, the others make two columns per input."""
+    """Run the bank sample by sample; the first `real` poles are real, the others make two columns per input.
+
+    `limits` are the longest hold and the settling, in samples; `out` receives the columns and which samples are used.
+    """
     inputs, valid = samples
     columns, used = out
     M, m = inputs.shape[1], len(poles)

@@ -18,7 +18,7 @@ from ecu_node.summary import BLOCK_S, LEVELS_A
 __all__ = ["BLOCK_S", "LEVEL_EDGES_A", "DriveSummary", "FitSums", "common_bank"]
 
 LEVEL_EDGES_A: Array = np.array([*(-a for a in reversed(LEVELS_A)), *LEVELS_A], np.float64)
-"""Edges of the L = 33 levels of a measured current: symmetric, denser near zero, whole amperes. [A]"""
+"""The 32 edges between the L = 33 levels of a measured current: symmetric, denser near zero, whole amperes. [A]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,8 @@ class FitSums:
         Sums over the samples in which current k is in a level (see :data:`LEVEL_EDGES_A`): of (inputs, measured
         currents [A], 1), and of the square of the measured current k [A^2].
     fast_a2 : ndarray of shape (B, K, K)
-        Sums of products of the second differences of the measured currents. [A^2]
+        Sums of products of the second differences of the measured currents, which
+        :func:`~calibrator.summaries.summariser.second_differences` returns. [A^2]
     spikes : ndarray of shape (B, K, 2)
         Number of upward and of downward spikes of each branch; samples with a spike are left out of all sums.
     temperature_c : ndarray of shape (B,)
@@ -57,8 +58,8 @@ class DriveSummary:
         Sums over the samples of a block of the products of (inputs, measured currents [A], 1). Inputs here are the M
         columns of the filter bank: the inputs of the drive and their filtered forms.
     noise_a2 : ndarray of shape (B, K)
-        Variance of the white noise of each measured current in a block, of at least that of rounding to its steps; an
-        upper bound where the current itself changes fast. [A^2]
+        Variance of the white noise of each measured current in a block, never less than that of rounding to its steps;
+        an upper bound where the current itself changes fast. [A^2]
     branches : int
         Number of branches K.
     period_s : float
@@ -83,7 +84,7 @@ class DriveSummary:
 
     @property
     def total(self) -> Array:
-        """Moments of all blocks together."""
+        """Sum of the moments of all blocks, shape (M + K + 1, M + K + 1)."""
         return np.asarray(self.moments.sum(axis=0))
 
     @property

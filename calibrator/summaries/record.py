@@ -31,7 +31,7 @@ __all__ = ["SCHEMA", "Outline", "Record", "decode_records", "drives_digest", "en
 IMPOSSIBLE = "its summary holds impossible numbers; look at its recordings, and summarise them again"
 """Reason for leaving a vehicle out, as the user reads it."""
 FEWEST_BLOCKS = 4
-"""Least number of blocks of a vehicle: fewer do not show the uncertainty. A block made on board takes minutes. [1]"""
+"""Least number of blocks of a vehicle: fewer do not show the uncertainty. A block made on board spans minutes. [1]"""
 MOST_BLOCKS = 256
 """Most blocks of a record: they cover two hours or more, and show the spread between blocks to a tenth. [1]"""
 MOST_MOMENT, MOST_VARIANCE_A2 = 1e30, 1e10
@@ -80,7 +80,7 @@ class Record:
     digests : tuple of str
         Digest of the content of each drive, see :func:`.recording_digest`; empty if the drives could not be read.
     found : VehicleSummary or None
-        Summary of the drives; None if they cannot be used, or if it was left unread (``whole=False``).
+        Summary of the drives; None if they cannot be used, or if :func:`decode_records` did not read it.
     problem : str
         Why the drives cannot be used; empty if they can.
     """
@@ -96,7 +96,7 @@ class Record:
 
 
 class Outline(NamedTuple):
-    """Usable drives of one vehicle by name, and why the vehicle cannot be calibrated (empty if it can)."""
+    """Names of a vehicle's usable drives, and why the vehicle cannot be calibrated (an empty text if it can)."""
 
     vehicle: str
     drives: tuple[str, ...]
@@ -125,7 +125,7 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
     Raises
     ------
     DriveError
-        If no record can be used, all are too short together, or their numbers are impossible.
+        If no record can be used, all together are too short or have too few blocks, or numbers are impossible.
     """
     usable = [record.found for record in records if record.found is not None]
     if not usable:

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 COPY = "same recording as"
-"""Beginning of the problem text of a record whose recording this vehicle, or another one, has already."""
+"""Beginning of a record's problem if its recording is in the store already, for the same or another vehicle."""
 
 
 @dataclass(kw_only=True)
@@ -61,8 +61,8 @@ class SummariseReport:
     store : str
         Path or URL of the store.
     vehicles, drives : int
-        Number of vehicles with newly summarised drives, and of these drives, without what was in the store before and
-        what was left out.
+        Number of vehicles with newly summarised drives, and of these drives; drives that the store had before, or that
+        were left out, do not count.
     left_out : dict of str to str
         Why drives were not used: by name of the vehicle, or as ``problem 1`` ... for files whose vehicle is unclear.
     notices : list of str
@@ -211,19 +211,22 @@ class _Task(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class _Owners:
-    """First vehicle seen with each recording, and all vehicles of shared ones, by half digests to save memory."""
+    """First vehicle seen with each recording, and all vehicles of each recording that several vehicles have.
+
+    The key of a recording is the first half of its digest, which saves memory.
+    """
 
     first: dict[int, str] = field(default_factory=dict)
     shared: dict[int, set[str]] = field(default_factory=dict)
 
     def add(self, vehicle: str, digests: Iterable[str]) -> None:
-        """Note the recordings of a vehicle."""
+        """Enter the recordings of a vehicle, given by their digests."""
         for key in map(_key, digests):
             if (other := self.first.setdefault(key, vehicle)) != vehicle:
                 self.shared.setdefault(key, {other}).add(vehicle)
 
     def without_copies(self, record: Record) -> Record:
-        """Return the record; if other vehicles share a recording of it, with a problem in place of its summary."""
+        """Return the record; with a problem in place of its summary if another vehicle has one of its recordings."""
         sharing = set[str]().union(*(self.shared.get(_key(digest), ()) for digest in record.digests))
         if not sharing - {record.vehicle}:
             return record
@@ -237,7 +240,7 @@ def _key(digest: str) -> int:
 
 
 def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator[_Task]:
-    """Yield the drives to read, bucket by bucket; enter recordings that the store has already in `owners`."""
+    """Yield the drives to read, bucket by bucket; enter into `owners` the recordings that the store has already."""
     size = 0
     for bucket, names in store.by_bucket(fleet.vehicles).items():
         records = store.read(bucket, whole=False)
@@ -255,13 +258,13 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator
 
 
 def _stays(record: Record, versions: Mapping[str, str]) -> bool:
-    """Check whether to keep a record: its drives are unchanged, or it cannot be remade as the fleet lacks some."""
+    """Check whether to keep a record: its drives are unchanged, or the fleet lacks one, so it cannot be made anew."""
     known = zip(record.drives, record.sources, strict=True)
     return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
 
 
 def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase) -> Record:
-    """Read the drives of a task and summarise them; a recording that the vehicle has already is skipped."""
+    """Read the drives of a task and summarise them; a recording that the store has of this vehicle is skipped."""
     made, drives, digests = dict[str, VehicleSummary](), dict[str, Drive](), list[str]()
     for entry in task.drives:
         if is_onboard(entry):
@@ -303,7 +306,7 @@ def _keep(
     versions: Mapping[str, Mapping[str, str]],
     report: SummariseReport,
 ) -> None:
-    """Put new records into a bucket and keep what other processes have added meanwhile; count them in the report."""
+    """Put new records into a bucket, keep what other processes have added meanwhile, and report the new ones."""
     read = {record.vehicle: set(record.drives) for record in new}
 
     def kept(old: Record) -> Record | None:
@@ -364,7 +367,7 @@ def _read_onboard(
     Returns
     -------
     VehicleSummary
-        Summary with a block for each batch of the record.
+        Summary with a block for each of the B entries of the record, see :class:`~ecu_node.summary.SummaryFile`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Summarise samples: filter inputs, leave spikes out, sum moments by blocks, and add sums for the check of fit."""
+"""Summarise samples: filter inputs, leave spikes out, sum moments in blocks, and add the :class:`.FitSums`."""
 
 from collections.abc import Sequence
 
@@ -31,7 +31,7 @@ from ecu_node.summary import (
 __all__ = ["find_spikes", "second_differences", "summarise_samples"]
 
 LEVEL_OF_AMPERE: NDArray[np.int64] = np.searchsorted(LEVELS_A, np.arange(LEVELS_A[-1] + 1), side="right")
-"""How many levels a current lies away from the middle one, by its magnitude in whole amperes."""
+"""Element a: how many levels a current of magnitude a [A], in whole amperes, lies away from the middle level."""
 
 
 def summarise_samples(
@@ -136,7 +136,10 @@ def summarise_samples(
 
 @compiled
 def _add_levels(table: Array, used: Mask, first: int, level_of_ampere: NDArray[np.int64], levels: Array) -> None:
-    """Add each used row (sample) of the blocks, for each of its currents, to the sums of that current's level."""
+    """Add each used sample, once per branch, to the sums of the level in which the current of that branch lies.
+
+    `table` has the shape (blocks, samples, columns); its currents begin at column `first`.
+    """
     K, L, wide = levels.shape
     for block in range(len(table)):
         for t in range(table.shape[1]):
@@ -153,7 +156,10 @@ def _add_levels(table: Array, used: Mask, first: int, level_of_ampere: NDArray[n
 
 @compiled
 def _white_noise_a2(currents: Array, length: int) -> Array:
-    """Estimate the white noise variance per block from the median third difference; gaps (NaN) are left out. [A^2]"""
+    """Return the white noise variance of each block and branch, from the median third difference outside gaps (NaN).
+
+    Shape (B, K); blocks of `length` samples. [A^2]
+    """
     T, K = currents.shape
     blocks = -(-T // length)
     noise, third = np.zeros((blocks, K)), np.empty((K, length))

@@ -41,7 +41,7 @@ Records = Mapping[str, Sequence[Record]]
 
 @dataclass(frozen=True, kw_only=True)
 class SummaryStore:
-    """An open store.
+    """A store of summaries that exists.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class SummaryStore:
         return names[first:], names[:first]
 
     def versions(self) -> dict[str, str]:
-        """Return the version of each file by name; it changes when the file does."""
+        """Return the version of each file of all buckets by name; it changes when the file does."""
         return {entry.name: entry.version for entry in self._files.contents()[1]}
 
     def size_bytes(self) -> int:
@@ -246,7 +246,10 @@ def open_store(
 
 @dataclass(kw_only=True)
 class StoreReport:
-    """What a store holds; sizes in bytes, durations in hours."""
+    """What a store holds: size in bytes, duration in hours, and faults by vehicle, bucket or file.
+
+    `unusable` of the vehicles cannot be calibrated.
+    """
 
     store: str
     layout: str
@@ -276,7 +279,7 @@ class StoreReport:
 
 
 def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
-    """Look at a store.
+    """Count what a store holds, and find its faults.
 
     Parameters
     ----------

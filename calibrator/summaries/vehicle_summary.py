@@ -87,8 +87,9 @@ class VehicleSummary:
 def added_summaries(parts: Sequence[VehicleSummary]) -> VehicleSummary:
     """Add up one or more summaries of one vehicle.
 
-    The delays are those of the summary that knows most of them, and of equals of the most precise one; they are not
-    averaged, as the drives of each summary were aligned with its own. Zero-current readings are averaged by precision.
+    The delays are those of the summary that knows most of them; of several, of the most precise one. They are not
+    averaged, as each summary's drives were aligned with its own delays. Offsets in zero-current windows are averaged
+    by precision.
     """
     offset_a, sd_a = weighted_mean(*((part.zero_current.offset_a, part.zero_current.sd_a) for part in parts))
     delays = [part.delays for part in parts]
@@ -176,10 +177,9 @@ def aligned_drives(
 def with_noise_of_steps(
     summary: DriveSummary, drives: Sequence[Drive], branches: Sequence[str], database: VehicleDatabase
 ) -> DriveSummary:
-    """Return a summary of drives with no less noise of each current than the steps make in which it was measured.
+    """Return the summary with each current's noise variance at least that of rounding: q^2 / 12 for steps of q.
 
-    Rounding to steps of q has a variance of q^2 / 12, which changes from sample to sample do not show where the current
-    changes by less than a step.
+    Differences between samples do not show the noise of rounding while the current changes by less than a step.
     """
     step_a = np.array([max(step_of(database, name, drive) for drive in drives) for name in branches])
     return replace(summary, noise_a2=np.maximum(summary.noise_a2, step_a**2 / 12.0))
@@ -223,7 +223,7 @@ def require_possible(drive: Drive, layout: Layout) -> None:
 
 
 def most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
-    """Sort branches by falling variance; drives that lack a branch are skipped here and refused later."""
+    """Return the branches by falling variance; drives that lack a branch are skipped here and refused later."""
 
     def variance_a2(name: str) -> float:
         channels = [drive.branches[name] for drive in drives if name in drive.branches]
@@ -251,8 +251,8 @@ def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], datab
     Returns
     -------
     ZeroCurrent
-        Offsets of the branches. How far an offset wanders is seen from pieces of the windows; the scatter of their
-        medians is divided by the root of the number of windows, not of pieces, as those of one window wander together.
+        Offsets of the branches. Their standard deviations include how far an offset wanders: the scatter of the medians
+        of pieces of the windows, over the root of the number of windows, as pieces of one window wander together.
     """
     offset, sd = np.full(len(branches), np.nan), np.full(len(branches), np.nan)
     for k, name in enumerate(branches):
@@ -274,7 +274,10 @@ def _medians_of_pieces(current: Channel) -> Array:
 
 
 def _shown(drive: Drive, branch: str, layout: Layout) -> Iterator[Channel]:
-    """Yield a branch's good samples well inside each window of one drive; a gap in the contactor state ends one."""
+    """Yield a branch's good samples well inside each zero-current window of a drive.
+
+    A gap in the contactor state ends a window.
+    """
     if layout.contactor is None:
         return
     state, current = drive.inputs.get(layout.contactor.input), drive.branches.get(branch)
