@@ -128,7 +128,8 @@ def write_files(files: Mapping[Path, bytes]) -> None:
     Raises
     ------
     UserError
-        If one cannot be written; the message names it, and no file has changed unless only its renaming failed.
+        If one cannot be written; the message names it, and no file has changed, except those that were renamed before
+        a renaming failed.
     """
     partial: dict[Path, Path] = {}
     made: set[Path] = set()

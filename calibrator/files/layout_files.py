@@ -18,7 +18,7 @@ def checked_layout(path: Path) -> Layout:
 
 
 def check_formulas(layout: Layout) -> None:
-    """Check the formulas of a layout.
+    """Raise LayoutError if a formula of a layout cannot be evaluated.
 
     Raises
     ------

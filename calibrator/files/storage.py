@@ -55,7 +55,7 @@ class Entry:
 
 @dataclass(frozen=True, kw_only=True)
 class Storage:
-    """A folder of files.
+    """A folder of files, on this machine or in object storage; it need not exist yet.
 
     Attributes
     ----------
@@ -262,7 +262,7 @@ def open_storage(place: str | Path) -> Storage:
 def walk(
     storage: Storage, problems: list[str], *, above: frozenset[str] = frozenset()
 ) -> Iterator[tuple[Storage, list[Entry]]]:
-    """Yield each folder that holds files, at any depth, with its files. Each is listed only when it is its turn.
+    """Yield each folder that holds files, at any depth, with its files; a folder is listed just before it is yielded.
 
     An inner folder that cannot be read is added to `problems`, and the others go on. Links are followed, except those
     that lead back to a folder above.

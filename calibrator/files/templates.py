@@ -8,12 +8,12 @@ __all__ = ["templates_of"]
 
 
 def templates_of(package: str, folder: str = "templates", **settings: Any) -> Environment:
-    """Return the environment of the templates in a package, such as ``calibrator.report``; a missing value raises.
+    """Return jinja2's environment for the templates of a package; rendering without a value that one uses raises.
 
     Parameters
     ----------
     package, folder : str
-        Package, and its folder with the templates.
+        Package, such as ``calibrator.report``, and its folder with the templates.
     **settings
         Settings of jinja2's environment, beside those that all packages share (blocks leave no blank lines behind).
     """

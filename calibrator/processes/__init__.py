@@ -1,1 +1,1 @@
-"""Worker processes, and the signals that end them and the program itself."""
+"""Run functions in worker processes, and end these and the program at signals."""

@@ -1,4 +1,4 @@
-"""Ctrl-C while libraries are imported, and SIGTERM.
+"""End the program at Ctrl-C while libraries are imported, and at SIGTERM.
 
 During an import KeyboardInterrupt is of no use, as libraries swallow it or turn it into another exception; Ctrl-C then
 ends the process directly. SIGTERM ends the program at once, as a kill would, but prints one line.

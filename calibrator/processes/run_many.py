@@ -153,7 +153,7 @@ def run_many(
 def try_many(
     function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers, *, limit_s: float = TIME_LIMIT_S
 ) -> "Generator[tuple[_Item, _Result | Failed], None, None]":
-    """Apply a function to each item in other processes only, as items are files that cannot be trusted.
+    """Apply a function to each item, never in this process, as items are files that cannot be trusted.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def _outcomes(
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """A pickled function and the longest time for one item [s]; None: items are trusted, without limits."""
+    """A pickled function, the longest time for an item [s] (None: items are trusted, no limits), and our version."""
 
     function: bytes
     limit_s: float | None
@@ -520,7 +520,7 @@ def _memory_bytes() -> int:
 
 @contextmanager
 def _silenced() -> Iterator[None]:
-    """Silence loggers within the block that would print tracebacks of errors that are reported here in one line."""
+    """Silence, within the block, the loggers that would print tracebacks: this module reports errors in one line."""
     names = ("distributed", "distributed.client", "tornado.application", "asyncio")
     levels = {logger: logger.level for logger in map(logging.getLogger, names)}
     for logger in levels:

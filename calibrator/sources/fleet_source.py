@@ -49,7 +49,7 @@ __all__ = [
 _Vehicle = TypeVar("_Vehicle")
 LOGS_FOLDER = "logs"
 PROBED_VEHICLES = 7
-"""Number of vehicles that are read to find out which branches and inputs the fleet has."""
+"""So many readable vehicles are looked at to find out which branches and inputs the fleet has. [1]"""
 
 
 _Place = Storage | list[DriveFile]
@@ -192,8 +192,8 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
 def _logs_in(storage: Storage, shown: str, problems: list[str]) -> Iterator[tuple[str, list[Entry], Storage | None]]:
     """Yield each folder with logs that is in a folder or an archive, or the folder of a single log.
 
-    It is given as (path or URL, logs, storage); the storage is None for an archive or a single log. A folder or archive
-    inside that cannot be read is added to the problems.
+    Each is given as (path or URL, logs, storage); the storage is None for an archive or a single log. An inner folder
+    or archive that cannot be read is added to `problems`; `shown` is the place as the user named it.
     """
     path = Path(storage.url)
     if storage.is_local and not path.exists():

@@ -22,7 +22,7 @@ __all__ = ["ImportReport", "ImportedDrive", "import_logs"]
 
 @dataclass(frozen=True, kw_only=True)
 class ImportedDrive:
-    """One drive that was written."""
+    """One drive that was written, its duration [s], branches and notices."""
 
     vehicle: str
     name: str
