@@ -181,5 +181,5 @@ class FleetSource:
 
     @property
     def name(self) -> str:
-        """Name of the folder that holds the fleet."""
+        """Name of the fleet: the last part of its path or URL."""
         return self.place.rstrip("/").rpartition("/")[2] if "://" in self.place else Path(self.place).resolve().name

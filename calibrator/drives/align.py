@@ -206,7 +206,7 @@ def align_channels(
 
 
 def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, Mask]:
-    """Interpolate a channel, and say where the interpolation is valid.
+    """Return the values of a channel at some instants, interpolated, and where they are valid.
 
     Parameters
     ----------
@@ -309,8 +309,8 @@ def _next_good(known_s: Array, good: Mask, at: int) -> int:
 def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
     """Return the step in which the current of a branch was measured; 0 if it is not known. [A]
 
-    It is the least distance of two values seen; where few values were seen, the scale of its signal. For a power it is
-    the scale of the power over the median voltage, if the voltage is recorded.
+    It is the least distance of two values in the drive or, if these are few, the scale of the branch's signal. For a
+    power it is the scale of the power over the median voltage, if the voltage is recorded.
     """
     branch, channel = database.layout.find_branch(name), drive.branches[name]
     if branch.power is not None and branch.voltage is not None:

@@ -211,7 +211,7 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
 
 
 def without_delays(drive: Drive, delays: Mapping[str, float]) -> Drive:
-    """Take known delays out of a drive.
+    """Return a drive with known delays taken out.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ def name_problem(name: str, what: str) -> str:
 
 
 def require_plain_name(name: str, what: str) -> None:
-    """Refuse the name of a vehicle or drive that cannot be a file name on every system.
+    """Raise DriveError if the name of a vehicle or drive cannot be a file name on every system.
 
     Raises
     ------

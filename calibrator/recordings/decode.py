@@ -112,7 +112,7 @@ def decode_signal(
 
 
 def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]) -> tuple[Raw, Mask]:
-    """Raw values of one signal, as integers or floats.
+    """Return the raw values of one signal, and which frames are long enough for it.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
 
 @dataclass(frozen=True, kw_only=True)
 class SignalRange:
-    """Least and greatest value of a signal, and the tolerance for rounding."""
+    """Least and greatest physical value of a signal, and the tolerance for rounding."""
 
     low: float
     high: float

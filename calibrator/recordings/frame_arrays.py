@@ -98,7 +98,7 @@ _COUNTS = ("error_frames", "remote_frames", "damaged")
 
 
 def concatenate_frames(parts: Sequence[Frames]) -> Frames:
-    """Join the pieces of one log; counts add up, channels are merged by name."""
+    """Join the pieces of a log, or several logs, in their order; counts add up, channels are merged by name."""
     parts = parts or [FrameColumns.of(0, fd=False).frames()]
     if len(parts) == 1:
         return parts[0]

@@ -53,7 +53,7 @@ PRINTED_CANDUMP = re.compile(
     rb"(?:[\dA-F]{2} ?)*))[^\r\n]*",
     re.MULTILINE | re.IGNORECASE,
 )
-"""A line as candump prints it without ``-L``."""
+"""A line as candump prints it without ``-L``, such as ``can0  2E5   [4]  00 00 07 32``."""
 _NUMBER = re.compile(r"(?<![\w.:-])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?![\w.:-])")
 """A number in a line of a table, no part of a date, a time or a word."""
 _LOGGED = re.compile(rb"\(\d+\.\d+\) \S+ [\dA-Fa-f]{3,8}#")
