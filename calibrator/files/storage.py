@@ -167,7 +167,7 @@ class Storage:
             yield file
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a file, whole or not at all; one of that name is replaced. StorageError if it cannot be written."""
+        """Write a file, whole or not at all, in place of any older one; StorageError if it cannot be written."""
         try:
             if self.is_local:
                 Path(self.url).mkdir(parents=True, exist_ok=True)

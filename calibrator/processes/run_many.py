@@ -496,7 +496,7 @@ def _wait_for_worker(client: Any, address: str) -> None:
 
 
 def _on_worker(job: _Job, item: Any) -> Any:
-    """Run an item on a worker of a cluster; untrusted files are read in a process of its own, which it can kill."""
+    """Run an item on a worker of a cluster; untrusted files are read in another process, which the worker can kill."""
     if job.version != __version__:
         advice = f"install version {job.version} there"
         raise FleetError(f"a worker of the cluster has version {__version__} of hv-current-correction; {advice}")

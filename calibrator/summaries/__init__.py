@@ -1,1 +1,1 @@
-"""Summaries of a fleet's drives, which hold all that the estimator needs, on disk or in object storage."""
+"""Make and store summaries of drives, which hold all that the estimator needs, on disk or in object storage."""

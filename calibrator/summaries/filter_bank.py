@@ -36,7 +36,7 @@ Poles = tuple[tuple[float, float], ...]
 
 
 class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Poles that all vehicles of a fleet share.
+    """Inputs and poles of the filters that all vehicles of a fleet share.
 
     Attributes
     ----------

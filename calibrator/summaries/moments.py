@@ -140,7 +140,10 @@ class DriveSummary:
         )
 
     def take_branches(self, order: Sequence[int], inputs: Sequence[int] | None = None) -> "DriveSummary":
-        """Return the summary of the branches with these indices, in this order, and of some inputs (None: all)."""
+        """Return the summary with only the branches of the indices `order`, and the inputs of the indices `inputs`.
+
+        Both come in this order; None keeps all inputs.
+        """
         chosen, M = list(order), self.inputs
         columns = [*(range(M) if inputs is None else inputs), *(M + k for k in chosen), M + self.branches]
         return replace(
@@ -180,7 +183,7 @@ class DriveSummary:
 
 
 def common_bank(summaries: Sequence[DriveSummary]) -> str:
-    """Return the identity of the filter bank with which all of one or more summaries were made.
+    """Return the identity of the filter bank with which these summaries, at least one, were made.
 
     Raises
     ------

@@ -179,7 +179,7 @@ def _white_noise_a2(currents: Array, length: int) -> Array:
 
 
 def second_differences(currents_a: Array, used: Mask) -> Array:
-    """Return the distance of each sample from the mean of its two neighbours; zero where one of the three is not used.
+    """Return each sample minus the mean of its two neighbours; zero where one of the three is not used.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def second_differences(currents_a: Array, used: Mask) -> Array:
 
 
 def find_spikes(currents_a: Array, used: Mask) -> NDArray[np.int8]:
-    """Label spikes: samples at which one branch alone breaks the junction law and stands out from its own neighbours.
+    """Label spikes: samples at which one branch alone breaks the junction law and stands out from the samples beside.
 
     Parameters
     ----------
