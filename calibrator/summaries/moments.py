@@ -166,17 +166,23 @@ class DriveSummary:
         if count <= most:
             return self
         first = np.arange(0, count, -(-count // most))
-        added = np.add.reduceat(samples, first)
+
+        def means(values: Array) -> Array:
+            """Means of values (B, ...) over the blocks that are added up, NaN only where none of them is known."""
+            weight = samples.reshape(-1, *[1] * (values.ndim - 1)) * np.isfinite(values)
+            total = np.add.reduceat(weight, first)
+            return np.add.reduceat(np.nan_to_num(values) * weight, first) / np.where(total > 0.0, total, np.nan)
+
         return replace(
             self,
             moments=np.add.reduceat(self.moments, first),
-            noise_a2=np.add.reduceat(self.noise_a2 * samples[:, None], first) / added[:, None],
+            noise_a2=means(self.noise_a2),
             fit=fit
             and FitSums(
                 levels=fit.levels,
                 fast_a2=np.add.reduceat(fit.fast_a2, first),
                 spikes=np.add.reduceat(fit.spikes, first),
-                temperature_c=np.add.reduceat(fit.temperature_c * samples, first) / added,
+                temperature_c=means(fit.temperature_c),
                 starts=np.logical_or.reduceat(fit.starts, first),
             ),
         )

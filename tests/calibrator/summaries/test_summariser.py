@@ -60,6 +60,22 @@ def test_sum_of_summaries_equals_the_summary_of_all_drives() -> None:
     assert both.bank == together.bank
 
 
+def test_blocks_are_added_up_with_their_means_and_without_unknown_temperatures() -> None:
+    drive = a_drive(4, samples=120)
+    warm_c = np.where(drive.time_s < 30.0, np.nan, 20.0 + 0.1 * drive.time_s)
+    whole = summarise_samples([drive], period_s=PERIOD_S, temperatures_c=[warm_c])
+    short = whole.shortened(2)
+    assert len(whole.moments) == 4
+    assert whole.fit is not None
+    assert short.fit is not None
+    np.testing.assert_allclose(short.total, whole.total)
+    np.testing.assert_allclose(short.noise_a2, whole.noise_a2.reshape(2, 2, -1).mean(axis=1), rtol=0.01)
+    assert np.isnan(whole.fit.temperature_c).tolist() == [True, False, False, False]
+    np.testing.assert_allclose(
+        short.fit.temperature_c, [whole.fit.temperature_c[1], whole.fit.temperature_c[2:].mean()]
+    )
+
+
 def test_summaries_of_different_banks_or_branches_do_not_add_up() -> None:
     drive = a_drive(2)
     plain, filtered = (summarise_samples([drive], period_s=PERIOD_S, bank=bank) for bank in (None, a_bank(3.0)))
