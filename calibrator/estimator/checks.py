@@ -1,8 +1,9 @@
 """Check whether the best explanation fits each vehicle: find what no gain error and no offset of a sensor explains.
 
-The junction law is regressed once more on the vehicle's own data, with a column or a split for each cause that is not
-linear: by level of a current, by time, by temperature. The remaining residual shows noise and loads that switch. The
-fleet shows how much of each is usual; the junction law shows that something is wrong, the fleet model in which sensor.
+The junction law is regressed once more on the vehicle's own data for each cause that is not linear, with a further
+column: a curve over the level of a current, or gains that change with time or temperature. The remaining residual shows
+noise and loads that switch. The fleet shows how much of each is usual; the junction law shows that something is wrong,
+the fleet model in which sensor.
 Equations: (M22) to (M25) of docs/method.md, section "Does the best explanation fit?".
 """
 
@@ -30,23 +31,23 @@ LEAST_PROBABILITY = 0.5
 NAMED = 0.9
 """Probability from which on one sensor is named. [1]"""
 TAIL = 12.0
-"""Degrees of freedom of Student's t, the distribution of a fleet's vehicles: heavier tails than normal. [1]"""
+"""Degrees of freedom of Student's t, by which usual misfits are distributed over vehicles: heavy tails. [1]"""
 LEAST_MISFIT = 1e-5
 """Least value of the usual misfit of a fleet, in fractions of full scale: a smaller one harms no correction. [1]"""
 LARGEST_MISFIT = 0.2
 """Largest misfit, in fractions of full scale; before anything is seen, its size is log-uniform up to it. [1]"""
 EXPLAINED = 0.7
-"""Share of the unusual residual that a cause has to explain, or switching is reported, too, if much is left. [1]"""
+"""Share of the unusual residual that a cause has to explain; else it is reported as switching if much is left. [1]"""
 LEAST_NOISE_SPREAD = 0.2
 """Least spread over healthy vehicles of the logarithm of the mean square residual. [1]"""
 NOISE_RANGE = 9.0
-"""Range of that logarithm over which it is uniform in vehicles with noise. [1]"""
+"""The logarithm of the mean square residual of a vehicle with noise is uniform over a range of this width. [1]"""
 FEWEST = 30
-"""Least number of samples beyond a bend for it to be considered. [1]"""
+"""Least number of samples beyond a bend (current at which a gain changes) for it to be considered. [1]"""
 CLIPPED = 0.55
 """Share of the gain that is lost beyond a bend, from which on the sensor counts as clipped. [1]"""
 OVERSHOOT = 1.3
-"""Multiple of the bend that a clipped sensor does not reach, but another sensor does. [1]"""
+"""Without a fleet, clipping at a bend needs one sensor that never reads this multiple of it, and one that does. [1]"""
 CHANCE = 0.3
 """Correlation by chance between the fleet model and its errors in one vehicle. [1]"""
 GAIN_SD, DEAD_SD = 0.3, 0.04
@@ -54,7 +55,8 @@ GAIN_SD, DEAD_SD = 0.3, 0.04
 MOVING = 0.02
 """Least standard deviation of a current whose level is used, in fractions of full scale: others are noise. [1]"""
 NEAR_ZERO = 0.07
-"""A bend below this is taken for two gains by sign whose zero is not known better, in fractions of full scale. [1]"""
+"""A bend at a current below this, in fractions of full scale, counts as a gain that differs by sign: the zero is not
+known better. [1]"""
 SPIKE_RATE = 5e-4
 """Least value of the usual share of spikes among the samples. [1]"""
 NOISE_RATE = 0.015
@@ -68,9 +70,9 @@ RIDGE = 1e-10
 TINY = 1e-12
 """Replaces zero in denominators."""
 LEAST_STRETCH = 0.1
-"""Least gain of a transformed current that counts in its likelihood: a lower one means another, clipped sensor. [1]"""
+"""Least factor 1 - b h'(y) that counts in :meth:`_Checked._by_level`: a lower one means another, clipped sensor. [1]"""
 ALONE = 1e-6
-"""Least share of a column that gains and offsets do not explain, for the column to be used. [1]"""
+"""A column is used if gains and offsets leave at least this share of its square unexplained. [1]"""
 WHITE_GAIN = 1.5
 """Variance of the second difference of white noise of variance 1."""
 SHARE_SD = 0.15
@@ -79,8 +81,8 @@ SHARE_SD = 0.15
 BENDS_A: Array = np.array(
     [10.0, 15, 20, 25, 30, 37, 45, 55, 65, 77, 90, 105, 120, 140, 160, 185, 210, 245, 280, 325, 370, 430, 500]
 )
-"""Currents at which a gain may change, two per level; below them noise decides which level a sample is in. They are
-absolute, as the levels are: summaries are made without the full scale of the junction. [A]"""
+"""Currents at which a gain may change, two per level (bin of a current, by which summaries keep sums); below them noise
+decides which level a sample is in. They are absolute, as the levels are: summaries know no full scale. [A]"""
 CAUSES = ("quadratic", "cubic", "sign", "bend", "step", "ramp", "temperature")
 """Causes that are columns or splits of the junction law; a bend is a clipped or a saturating sensor."""
 
@@ -92,13 +94,14 @@ class UsualMisfits:
     Attributes
     ----------
     misfit_a : ndarray of shape (C,)
-        Scale of the misfit of each cause. [A]
+        Scale of the misfit of each of the C :data:`CAUSES`. [A]
     residual_a2, fast_a2 : float
         Mean square residual of the junction law, and its white part. [A^2]
     residual_spread : float
         Spread over the vehicles of the logarithm of ``residual_a2``. [1]
     slope_spread, model_error_a : ndarray of shape (K,)
-        Robust standard deviation of slopes over the fleet model [1], and of currents about it [A].
+        Robust standard deviation over vehicles of the slopes over the fleet model [1], and median standard deviation of
+        the currents about it [A].
     spike_rate : float
         Share of samples that are spikes. [1]
     """
@@ -115,14 +118,16 @@ class UsualMisfits:
 class _Checked:
     """Checks of N vehicles with fit sums: junction law, currents over the fleet model, and what each cause explains.
 
-    The residual of the law is r = y - g^T z: y the branch that moves most, z the others and 1.
+    The residual of the law is r = y - g^T z: y the branch that moves most, z the others and 1. B blocks, M inputs, K
+    branches, p = M + K + 1 columns (inputs, currents, 1), L levels of a current, C causes.
 
     Attributes
     ----------
     fleet : FleetMoments
         Moments of the vehicles.
     fast, levels : ndarray of shape (N, K, K), (N, K, L, p + 1)
-        Sums of the products of second differences [A^2], and of samples by level of each current.
+        Sums of products of second differences of the currents [A^2]; per level of each current, sums of the columns and
+        of that current's square over its samples.
     total : ndarray of shape (N, p, p)
         Moments of (inputs, measured currents, 1) of all blocks of a vehicle.
     samples : ndarray of shape (N,)
@@ -156,7 +161,7 @@ class _Checked:
     level_branch : ndarray of int of shape (N, C)
         Branch on whose level the cause depends; -1 for causes by time.
     branch_fit : ndarray of shape (N, C, K)
-        Log likelihood that the sensor of branch k has the cause, by the fleet model; 0 without one.
+        Log likelihood that the sensor of branch k has the cause, by the fleet model; 0 without a fleet.
     misfit_a : ndarray of shape (N, C)
         Root mean square of what each cause explains beyond gains and offsets. [A]
     residual_a2 : ndarray of shape (N, C + 1)
@@ -203,8 +208,8 @@ class _Checked:
         """Regress the junction law of each vehicle.
 
         The noise of z would bias g towards zero, so it is taken out of the moments. Noise makes fast changes that the
-        junction law does not balance: with the fast part q = sum w_l q_l of the residual, white noise of variance n_k
-        gives E[q_k q] = 1.5 n_k w_k.
+        junction law does not balance: with the fast part q_l of each current and q = sum w_l q_l that of the residual,
+        white noise of variance n_k in current k gives E[q_k q] = 1.5 n_k w_k.
         """
         fleet, total, samples = self.fleet, self.total, self.samples
         M, K, blocks, variance_a2 = fleet.inputs, fleet.branches, fleet.blocks, fleet.variance_a2
@@ -271,7 +276,7 @@ class _Checked:
         level_branch: ArrayLike = -1,
         stretch: ArrayLike = 0.0,
     ) -> tuple[Array, ...]:
-        """Return what a cause explains, and its entries of :attr:`fit` to :attr:`branch_fit`.
+        """Return how much of the sum of r^2 one cause explains (N,), then its :attr:`fit` to :attr:`branch_fit`.
 
         The fit is the log likelihood with noise of unknown size, less a penalty for the parameters (BIC). ``pattern``
         (N, p) and ``square`` (N,) are products of the misfit with all columns and with itself; ``stretch`` is the mean
@@ -411,7 +416,10 @@ class _Checked:
         )
 
     def _drifting(self, course: Array, *, least: float) -> tuple[Array, ...]:
-        """Fit a law that changes in proportion to a course (B,), such as time or temperature; NaN where not known."""
+        """Fit a law that changes in proportion to a course (B,), such as time or temperature; NaN where not known.
+
+        Vehicles in which the course has a standard deviation up to ``least`` are left out.
+        """
         z, blocks, own = self.z, self.fleet.blocks, self.fleet.moments[:, -1, -1]
         known = np.isfinite(course)
         course = np.where(known, course, 0.0)
@@ -433,7 +441,7 @@ class _Checked:
         )
 
     def of_slopes(self, usual: UsualMisfits) -> tuple[Array, Array]:
-        """Return the probabilities that each sensor is inverted, and that it is dead, shape (N, K)."""
+        """Return the probabilities that each sensor is inverted, and that it is dead, each of shape (N, K)."""
 
         def density(about: float, sd: Array) -> Array:
             return np.asarray(np.exp(-0.5 * ((self.slope - about) / sd) ** 2) / sd)
@@ -503,7 +511,7 @@ def find_misfits(
     full_scale_a: float,
     branches: Sequence[str],
 ) -> list[tuple[SensorFinding, ...]]:
-    """Find what linear sensors do not explain, in each vehicle by itself.
+    """Find in each vehicle, by itself, what gain errors and offsets of its sensors do not explain.
 
     Parameters
     ----------
@@ -550,11 +558,12 @@ def find_misfits(
 
 
 def _posterior(odds: ArrayLike) -> Array:
+    """Return the probability of a cause, given :data:`PRIOR` times its likelihood ratio."""
     return 1.0 - (1.0 - PRIOR) / (1.0 - PRIOR + np.asarray(odds, np.float64))
 
 
 def _probability(misfit_a: Array, usual_a: Array, largest_a: float) -> Array:
-    """Return the probability that a misfit is none of the usual ones: log-uniform size against half a Student's t."""
+    """Return the probability that a misfit is unusual: then its size is log-uniform, else half a Student's t."""
     z = np.maximum(misfit_a / usual_a, 1.0)
     alternative = 1.0 / (z * np.log(np.maximum(largest_a / usual_a, math.e)))
     return _posterior(PRIOR * alternative / np.maximum(2.0 * student_t.pdf(z, TAIL), 1e-300))
@@ -570,7 +579,7 @@ def _who(name: str | None) -> str:
 
 
 class _Vehicle(NamedTuple):
-    """Vehicle j of those checked; its methods put what is found in it into words."""
+    """One vehicle, number j of those checked; the methods put what is found in it into words."""
 
     misfits: _Checked
     usual: UsualMisfits
@@ -594,7 +603,10 @@ class _Vehicle(NamedTuple):
         return found
 
     def of_law(self, shape: Array, unusual: Array) -> list[SensorFinding]:
-        """Report the cause that explains most of the junction law's residual; noise or switching by what is left."""
+        """Report the cause that explains most of the junction law's residual; noise or switching if too much is left.
+
+        Probabilities: ``shape`` (C,) that each misfit is unusual, ``unusual`` (C + 1,) that :attr:`residual_a2` is.
+        """
         misfits, usual, j = self.misfits, self.usual, self.j
         fit, level, left = misfits.fit[j], misfits.level_branch[j], misfits.residual_a2[j]
         c = int(fit.argmax())

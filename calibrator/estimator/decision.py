@@ -9,6 +9,7 @@ confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive w
     alpha^2 E[i^2] + 2 alpha beta E[i] + beta^2  >  d^2 E[i^2] + 2 d o E[i] + o^2                               (M19)
 
 with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its probability is a sum over the draws.
+Equations (M18) and (M19) are those of docs/method.md.
 """
 
 from collections.abc import Sequence
@@ -45,7 +46,7 @@ CANDIDATES, LEAST_CANDIDATE = 8, 0.01
 EQUALLY_GOOD = 0.01
 """Difference of confidence below which the estimate of the more probable explanation is taken. [1]"""
 SAME = 1e-3
-"""Largest sum of two offsets that cancel, in fractions of full scale: neither is known better. [1]"""
+"""Two offsets cancel if the magnitude of their sum, over full scale, is at most this: neither is known better. [1]"""
 RESOLUTION = 3e-4
 """Drift [1] and offset in fractions of full scale below which they are zero: no sensor's resolution is finer."""
 MOST_GAIN_SD = 0.1
@@ -60,7 +61,7 @@ largest fault, plus this drift [1] or offset over full scale. [1]"""
 
 
 class Explained(NamedTuple):
-    """Weighted draws of N vehicles under one fault model of the fleet.
+    """Weighted draws of N vehicles under one fault model of the fleet: M draws of each of Q explanations, g groups.
 
     Attributes
     ----------
@@ -71,7 +72,7 @@ class Explained(NamedTuple):
     weight : ndarray of shape (N, Q, M, 1 + g)
         Weights of the draws, see :func:`calibrator.estimator.posterior.weigh`.
     group_centre : ndarray of shape (g,)
-        What the vehicles of each group share, in fractions of full scale.
+        Offset or load of the feeding branch that the vehicles of each group share, in fractions of full scale.
     """
 
     probability: float
@@ -103,7 +104,7 @@ class Points(NamedTuple):
 
 
 def posterior_points(models: Sequence[Explained]) -> list[Points]:
-    """Collect the posterior of each vehicle over all models that explain its fleet."""
+    """Return the posterior of each of N vehicles as weighted points, over all fault models that explain their fleet."""
     faults, weight, number, vehicle = [], [], [], []
     for i, model in enumerate(models):
         shared, feed, K = model.draws.shared, model.draws.feed, model.draws.values.shape[3] // 3
@@ -194,7 +195,7 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
 
 
 def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: Array) -> Array:
-    """Compute the probability that correction makes each branch worse (M19).
+    """Compute for each branch the probability that its correction makes it worse (M19).
 
     Parameters
     ----------
@@ -262,13 +263,14 @@ class SensorEstimate:
 
     @property
     def faulty(self) -> Mask:
-        """Branches that would be corrected if nothing spoke against it, shape (N, K)."""
+        """Whether a fault was found in each sensor: it is corrected if nothing speaks against it. Shape (N, K)."""
         return np.asarray((self.drift != 0.0) | (self.offset_a != 0.0))
 
     def pit(self, drift: Array, offset_a: Array) -> tuple[Array, Array]:
-        """Probability integral transform of the truth: share of the posterior below it, each of shape (N, K).
+        """Return the shares of the posterior below the true drifts [1] and below the true offsets [A], each (N, K).
 
-        Half of what lies exactly at the truth (a sensor without fault) counts as below.
+        This is the probability integral transform of the truth. Half of the share that lies exactly at the truth (of a
+        sensor without fault) counts as below.
         """
         place, N, K = np.argsort(self.order), *drift.shape
         truth = np.concatenate([drift[:, list(self.order)], offset_a[:, list(self.order)] / self.full_scale_a], axis=1)
@@ -312,7 +314,7 @@ class FleetEstimate(SensorEstimate):
     held_back : ndarray of str of shape (N, K)
         Why a fault that was found is not corrected; empty where it is, or where none was found.
     verdicts : sequence of N str
-        Verdict on each vehicle.
+        Verdict on each vehicle: "corrected", "no sensor fault" or "cannot tell".
     explanations : sequence of N sequences of Explanation
         Explanations by falling probability, at least one.
     findings : sequence of N sequences of SensorFinding
@@ -349,11 +351,11 @@ def estimate_rows(
     models : sequence of FaultModel
         Fault models that explain their fleet.
     feed : int
-        Branch that carries loads without a sensor.
+        Number of the branch that carries loads without a sensor, in the order of the rows.
     mean, mean_square : ndarray of shape (N, K)
-        Moments of the measured currents, in fractions of full scale and their squares.
+        Mean and mean square of the measured currents, over full scale and its square.
     usual : ndarray of shape (2, K)
-        The same moments of the fleet's usual drive.
+        The same two of the fleet's usual drive.
     order : sequence of int or None
         Branches in the order of the rows: branch k of the rows is branch ``order[k]`` of the vehicles; None: branch k.
     full_scale_a : float
@@ -362,7 +364,7 @@ def estimate_rows(
     Returns
     -------
     RowsEstimate
-        In the order of the rows.
+        Vehicles in the order of the rows; branches in their own order, except for ``points`` and ``supports``.
     """
     N, K = mean.shape
     order = tuple(range(K) if order is None else order)
@@ -416,7 +418,10 @@ def estimate_rows(
 
 
 def _unmeasured(models: Sequence[Explained]) -> tuple[Array, Array, Array]:
-    """Return probability and size of a load without a sensor, and the probability of each group, over all models."""
+    """Return probability (N,) and size over full scale (N,) of a load without a sensor, and probability of each group.
+
+    The latter has shape (N, g).
+    """
     own, size = [], []
     centres = max((model.group_centre for model in models), key=len)  # the first model's, if it has any
     groups = np.zeros((len(models[0].weight), len(centres)))
@@ -432,13 +437,13 @@ def _unmeasured(models: Sequence[Explained]) -> tuple[Array, Array, Array]:
 
 
 def _total(values: Array) -> Array:
-    """Sum over draws (N, Q, M, ...) one by one, so that the number of other vehicles' explanations has no effect."""
+    """Sum over draws (N, Q, M, ...) one by one, so that other vehicles have no effect to the last bit."""
     N, Q, M = values.shape[:3]
     return np.asarray(np.cumsum(values.reshape(N, Q * M, *values.shape[3:]), axis=1)[:, -1])
 
 
 def _central_sd(points: Points, estimate: Array) -> Array:
-    """Return the distance from the estimate within which 68 % of the posterior lies, shape (2K,)."""
+    """Return each parameter's distance from its estimate within which 68 % of the posterior lies, shape (2K,)."""
     sd, total = np.zeros(len(estimate)), points.weight.sum()
     exactly = points.weight @ (points.faults == estimate)
     for i in np.flatnonzero(exactly < CENTRAL * total):
@@ -450,7 +455,7 @@ def _central_sd(points: Points, estimate: Array) -> Array:
 
 
 def _supports(models: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
-    """List the explanations of a vehicle with mean parameters, merged over all models by support and signs."""
+    """List :attr:`RowsEstimate.supports` of vehicle j; explanations whose parameters have the same signs are merged."""
     K = points.faults.shape[1] // 2
     at, share = ParameterPlaces(K), np.bincount(points.explanation, points.weight)
     order = np.argsort(-share, kind="stable")
@@ -472,7 +477,7 @@ def _supports(models: Sequence[Explained], points: Points, j: int) -> list[tuple
 
 
 def _nearest(supports: list[tuple[float, Array]], estimate: Array) -> Array:
-    """Return the parameters of the most probable explanation whose sensor faults are like the estimate's."""
+    """Return the (4, K) values of the most probable of the supports whose sensor faults are like the estimate's."""
     K = len(estimate) // 2
     apart = [float(np.abs(np.concatenate(values[2:]) - estimate).max()) for _, values in supports]
     share, least = LIKE_ESTIMATE
@@ -481,7 +486,7 @@ def _nearest(supports: list[tuple[float, Array]], estimate: Array) -> Array:
 
 
 def _identifiable(rows: EvidenceRows) -> Mask:
-    """Find branches whose gain a slope, gain ratio or bench reading shows better than :data:`MOST_GAIN_SD`."""
+    """Return whether a slope, gain ratio or bench reading shows each gain better than :data:`MOST_GAIN_SD`, (N, K)."""
     at, sd = rows.places, np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
     best = np.minimum(sd[:, at.slopes], sd[:, at.gain_reads])
     best[:, 1:] = np.minimum(best[:, 1:], sd[:, at.ratios])

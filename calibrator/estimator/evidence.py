@@ -5,9 +5,9 @@
       -> slopes and intercepts over it (15), and each vehicle's own junction regression (M8)
       -> evidence rows (M9) to (M11) with their covariance (collect_rows)
 
-Every step is done for all vehicles at once. Covariances follow from how far each block of a drive moves an estimate
-(its influence): they include correlation in time and heteroscedasticity [1]_, and hold also between regressions on the
-same blocks.
+Equations (M..) are those of docs/method.md, the others those of [2]_. Every step is done for all vehicles at once.
+Covariances follow from how far each block of a drive moves an estimate (its influence): they include correlation in
+time and heteroscedasticity [1]_, and hold also between regressions on the same blocks.
 
 With lambda_k = log(1 + d_k), eta = log(1 + d_h) and omega_k = o_k / (1 + d_k), equations (11), (13) and (15) of [2]_
 and the junction's sum of currents sum_k (i_m,k - o_k) / (1 + d_k) = l (l: load that no branch measures) become
@@ -80,7 +80,7 @@ SINGULAR = 1e-12
 """Eigenvalue over the largest one below which a direction counts as unknown. [1]"""
 TINY = np.finfo(float).tiny
 LEAST_PRIOR = 100.0 * SINGULAR
-"""Least share of the prior in the diagonal of the normal equations where z stands still: it looks like the constant."""
+"""Least share of the prior in the diagonal of the normal equations, for a z that stands still, as the constant does."""
 GAIN_SD = 0.4
 """Prior deviation of a gain ratio from -1: no running sensor is farther off. [1]"""
 NOISE_ROUNDS = 3
@@ -88,9 +88,10 @@ NOISE_ROUNDS = 3
 MOST_NOISE = 0.9
 """Largest share of a current's variance that is taken for noise. [1]"""
 LEAST_WEIGHT = 0.1
-"""Least squared weight of a branch in the junction sum, where its share of the residual's noise is limited. [1]"""
+"""Least squared weight that a branch counts with when the residual is shared out among the branches as noise. [1]"""
 LEAST_APART, SURELY_APART = 0.002, 4.0
-"""Difference of a gain ratio of slow and of fast changes that matters, and in standard deviations that is sure. [1]"""
+"""Difference between the gain ratios of slow and of all changes that matters, and number of standard deviations from
+which on it is sure. [1]"""
 MODEL_ROUNDS = 12
 """Rounds of alternating least squares; slopes change by less than 1e-4 after eight on all fleets tried. [1]"""
 RIDGE = 1e-9
@@ -108,10 +109,11 @@ CONSTANT = 1e-12
 MOST_CENTRES = 200
 SPREADS = 12
 SHARE_STEPS = 8
+"""Most centres and number of spreads that :func:`densest_clusters` tries, and steps that fit each cluster's share."""
 MARGIN = 0.1
 """The background reaches beyond the values by this share of their range. [1]"""
 SD_OF_RANGE = 9.0
-"""Range of the background over the standard deviation of its Gaussian half, where faults set its width. [1]"""
+"""Range of the background over the standard deviation of its Gaussian half, where ``widest`` sets the range. [1]"""
 UNKNOWN_VARIANCE = 100.0
 """Variance of an unknown row: a standard deviation of ten times full scale, or of a factor of 20 000. [1]"""
 LEAST_GAIN = 0.3
@@ -215,7 +217,7 @@ class FleetMoments:
 
 
 def covariances(mean: Array) -> Array:
-    """Compute covariances from mean products (N, p, p) of columns, the last of them 1; zero where one is constant."""
+    """Compute covariances from mean products (N, p, p) of columns, the last of them 1; zero for a constant column."""
     means = mean[:, :, -1]
     covariance = mean - means[:, :, None] * means[:, None, :]
     varies = np.diagonal(covariance, axis1=1, axis2=2) > CONSTANT * means**2
@@ -382,7 +384,7 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
 
 
 def ratios_in_doubt(fleet: FleetMoments) -> Mask:
-    """Find gain ratios that slow and fast changes of the currents show differently, in the fleet as a whole (M8a).
+    """Find gain ratios that slow changes of the currents show otherwise than fast ones, in the fleet as a whole (M8a).
 
     Gains are the same at any speed. Filters of signals, means over a second, held values and loads that follow the
     speed are not: what they add to a ratio looks like a gain error that all vehicles share.
@@ -395,7 +397,7 @@ def ratios_in_doubt(fleet: FleetMoments) -> Mask:
     Returns
     -------
     ndarray of bool of shape (K - 1,)
-        Whether the ratio of each branch but the first differs so.
+        Whether the ratio of each branch but the first differs between slow and fast changes.
     """
     sums, samples = fleet.moments[:, -1], fleet.moments[:, -1, -1]
     of_means = sums[:, :, None] * sums[:, None, :] / samples[:, None, None]  # each block as if constant
@@ -409,7 +411,10 @@ def ratios_in_doubt(fleet: FleetMoments) -> Mask:
 
 
 def _shared_noise_a2(residual_a2: Array, bound_a2: Array, weight: Array) -> Array:
-    """Share the residual (N,) out as equal noise of the currents (N, K), of each at most its bound. [A^2]"""
+    """Share the residual (N,) out as noise of the currents (N, K): equal, but at most the bound. [A^2]
+
+    The weight is the square of each current's factor in the residual. [1]
+    """
     order = np.argsort(bound_a2, axis=1, kind="stable")
     bound, weight = np.take_along_axis(bound_a2, order, axis=1), np.take_along_axis(weight, order, axis=1)
     # level: noise of the currents from here on, if all before are at their bounds (water filling)
@@ -510,7 +515,7 @@ def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegres
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """One cluster of values that agree.
+    """One cluster of values that agree; centre and spread are in their unit.
 
     Attributes
     ----------
@@ -613,15 +618,15 @@ class RowPlaces:
         self.measured: NDArray[np.int64] = np.r_[self.slopes, self.ratios, self.intercepts, self.junction]
 
     def slope(self, branch: int) -> int:
-        """Row of the slope of a branch, counted from 0."""
+        """Row of the slope of a branch; branches and rows are counted from 0."""
         return int(self.slopes.start) + branch
 
     def ratio(self, branch: int) -> int:
-        """Row of the gain ratio of a branch, counted from 0; the first branch has none."""
+        """Row of the gain ratio of a branch, 1 to K - 1; branch 0 has none."""
         return int(self.ratios.start) + branch - 1
 
     def intercept(self, branch: int) -> int:
-        """Row of the intercept of a branch, counted from 0."""
+        """Row of the intercept of a branch; branches and rows are counted from 0."""
         return int(self.intercepts.start) + branch
 
 
@@ -648,13 +653,13 @@ class ParameterPlaces:
         self.gains, self.hardware_offsets, self.offsets = slice(1, K + 1), slice(K + 1, 2 * K), slice(2 * K, 3 * K)
 
     def offset(self, branch: int) -> int:
-        """Place of omega of the sensor of a branch, counted from 0."""
+        """Place of omega of the sensor of a branch; branches and places are counted from 0."""
         return int(self.offsets.start) + branch
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceRows:
-    """Evidence of N vehicles with K branches.
+    """Evidence of N vehicles with K branches: what drives and readings say, one number per row.
 
     Attributes
     ----------
@@ -719,7 +724,7 @@ class EvidenceRows:
         return _shifted(self.covariance, -_pivot(self.means, self.values), first=b.start)[:, b, b]
 
     def dispersed(self, dispersion: Array | float) -> tuple[Array, Array]:
-        """Return the covariance with the variance of the intercepts at their means multiplied by a factor.
+        """Return the covariance, with the variance of the intercepts at the mean currents multiplied by a factor.
 
         Parameters
         ----------
@@ -744,14 +749,14 @@ class EvidenceRows:
 def collect_rows(
     fleet: FleetMoments, read_out: Array, *, full_scale_a: float, usual_correlation: Array | None = None
 ) -> tuple[EvidenceRows, Array]:
-    """Collect the evidence of every vehicle of a fleet.
+    """Compute the evidence rows of every vehicle of a fleet from its moments, without bench readings.
 
     Parameters
     ----------
     fleet : FleetMoments
         Of N vehicles.
     read_out : ndarray of shape (M + 1, K)
-        Read-out of the model of the same fleet. [A]
+        Read-out of the fleet model, see :func:`fit_fleet_model`. [A]
     full_scale_a : float
         Full scale of the junction. [A]
     usual_correlation : ndarray of shape (3K, 3K), or None
@@ -763,7 +768,7 @@ def collect_rows(
     rows : EvidenceRows
         Slopes and intercepts over the fleet model, and the junction law; without bench readings.
     usual_correlation : ndarray of shape (3K, 3K)
-        The one that was used.
+        The argument, or the mean over these vehicles. [1]
     """
     M, K, N = fleet.inputs, fleet.branches, len(fleet)
     R = 2 * K - 1  # number of slopes and gain ratios: the first of the rows that are measured, before b and c
@@ -819,7 +824,7 @@ def collect_rows(
 
 
 def _pivot(means: Array, values: Array) -> Array:
-    """Change of b and c, as seen in true currents, per error of log a and log(-g), shape (N, K + 1, 2K - 1)."""
+    """Return by how much b and c, in true currents, change per error of log a and log(-g), shape (N, K + 1, 2K - 1)."""
     N, _, K = means.shape
     pivot = np.zeros((N, K + 1, 2 * K - 1))
     pivot[:, range(K), range(K)] = -means[:, 0]
@@ -828,14 +833,14 @@ def _pivot(means: Array, values: Array) -> Array:
 
 
 def _shifted(covariance: Array, by: Array, *, first: int) -> Array:
-    """Return the covariance after ``by`` (N, c, r) times the first r variables is added to the c from ``first`` on."""
+    """Return the covariance of variables x after x[first : first + c] += by @ x[:r], with ``by`` of shape (N, c, r)."""
     jacobian = np.tile(np.eye(covariance.shape[-1]), (len(covariance), 1, 1))
     jacobian[:, first : first + by.shape[1], : by.shape[2]] += by
     return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2))
 
 
 def row_design(branches: int, feed: int) -> Array:
-    """Build the design matrix of the rows over the parameters, which is linear in true currents.
+    """Build the matrix that turns a vehicle's fault parameters into its rows, with constants in true currents.
 
     Parameters
     ----------
@@ -862,7 +867,7 @@ def row_design(branches: int, feed: int) -> Array:
 
 
 def evidence_names(branches: Sequence[str]) -> list[str]:
-    """Names of the 5K rows.
+    """Return the names of the 5K rows for people, such as "slope battery" or "gain ratio battery / motor".
 
     Parameters
     ----------
@@ -872,7 +877,7 @@ def evidence_names(branches: Sequence[str]) -> list[str]:
     Returns
     -------
     list of str
-        Names of 3K - 1 ratios [1], then of 2K + 1 constants [A].
+        3K - 1 names of rows of ratios [1], then 2K + 1 of constants [A].
     """
     first = branches[0]
     return [

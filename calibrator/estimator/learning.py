@@ -1,7 +1,7 @@
 """Learn from a fleet what faults its vehicles have and how vehicles without faults differ: the fault models.
 
 A fault model is a prior of the faults and a model spread (how vehicles without faults differ). It is learnt by
-expectation maximisation on the fleet's own evidence (M14):
+expectation maximisation on the fleet's own evidence, (M14) of docs/method.md:
 
     expectation    explanations of each vehicle under the present model, weighted
     maximisation   numbers and sizes of faults, groups of vehicles that share a constant, centre and covariance of the
@@ -63,7 +63,8 @@ SAME_DENSITY = 0.2
 KEPT_LOG_ODDS = 7.0
 """Log odds of the best model over another one up to which the other is kept."""
 STARTED_LOG_ODDS, MOST_RIVALS = 15.0, 4
-"""Such log odds after the first rounds, which use fewer vehicles, and largest number of references that are kept."""
+"""Log odds of the best model over another one up to which the other is kept after the first rounds, which use fewer
+vehicles; and largest number of references that are kept."""
 SAME_START = 0.001
 """Difference in any row, in fractions of full scale, below which two starts count as one."""
 LEAST_SHARED = 0.001
@@ -89,11 +90,11 @@ TAIL_DEGREES = 8.0
 COUNT_VEHICLES = 2.5
 """Weight of the distribution (20) of sparse faults against the fleet's own numbers of faults, in vehicles."""
 OTHERS_STEPS, LEAST_OTHERS = 3, 1e-3
-"""Steps that count the faults of the other vehicles, and least share of each count that is left to them. [1]"""
+"""Steps of :func:`_tally`, and least share of each count that is left when a vehicle's own faults are taken out. [1]"""
 USED_FITS = 16
 """Number of explanations of each vehicle that the model spread is learnt from, the most probable ones."""
 LEAST_GROUP, MOST_GROUPS, GROUP_GAIN = 2.0, 2, 5.0
-"""Fewest vehicles of a group, most groups, and least log evidence that one must gain: three vehicles that agree do."""
+"""Fewest vehicles of a group, most groups, and log evidence that a group must add: three vehicles that agree do."""
 LEAST_SHARED_GAIN = (0.3, 0.004)
 """Share of the vehicles that agree, and size of a gain error from which on their sensors may share it. [1]"""
 MOST_SHARED_SPREAD = 0.003
@@ -123,9 +124,9 @@ SIZE_STARTS = ((0.004, 1.0), (0.03, 0.4), (0.1, 0.2))
 
 
 def centre_rows(branches: int, doubtful: Mask | None = None) -> Mask:
-    """Mark rows whose centre is learnt, shape (5K,): slopes, intercepts, junction constant.
+    """Return for which rows the centre is learnt, shape (5K,): slopes, intercepts, junction constant, ratios in doubt.
 
-    The centre of a gain ratio is 0, except for those that are in doubt (K - 1,): of these only differences between
+    The centre of other gain ratios is 0. Of a ratio in doubt (``doubtful``, shape (K - 1,)) only differences between
     vehicles count.
     """
     free, at = np.zeros(5 * branches, bool), RowPlaces(branches)
@@ -152,7 +153,7 @@ def learn_fault_models(
     rows : EvidenceRows
         Of N vehicles.
     feed : int
-        Branch that carries loads without a sensor.
+        Number of the branch that carries loads without a sensor, in the order of the rows.
     fixed : ndarray of shape (5K,) or None
         Centre of the rows for which trusted vehicles are the reference; NaN in the others. None: the whole fleet is the
         reference for all rows. [1]
@@ -198,7 +199,10 @@ def learn_fault_models(
 
 
 class _Learner:
-    """Expectation maximisation on the evidence of one fleet."""
+    """Expectation maximisation on the evidence of one fleet; parameters as in :func:`learn_fault_models`.
+
+    ``fixed`` has the declared load, too, and ``declared`` says whether there is one.
+    """
 
     def __init__(
         self,
@@ -223,7 +227,7 @@ class _Learner:
         self.design = row_design(K, feed)
 
     def _guessed_spread(self) -> Array:
-        """Guess the model spread: a multiple of the usual sampling covariance, in rows that come from drives."""
+        """Return a guess of the model spread (5K, 5K): diagonal, from the usual sampling variance of each row."""
         rows, K, at = self.rows, self.rows.branches, self.at
         variance = np.diagonal(rows.covariance, axis1=1, axis2=2).copy()
         variance[:, at.intercepts] = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)
@@ -236,7 +240,7 @@ class _Learner:
         return np.diag(factor**2 * guess)
 
     def clusters(self, row: int, most: int = 1, farthest: float = np.inf) -> list[float]:
-        """Find the centres of the densest clusters of a row; 0 if there is none."""
+        """Return the centres of the densest clusters of a row, the best first; [0.0] if there is none."""
         found = densest_clusters(*self.rows.shown(row), most=most, farthest=farthest)
         return [cluster.centre for cluster in found] or [0.0]
 
@@ -244,7 +248,8 @@ class _Learner:
         """Propose intercepts of vehicles without faults, each of shape (K,), that add up to the junction's constant.
 
         All but one are centres of clusters. The first proposal has the densest clusters, and the feeding branch takes
-        what is left. Others follow that about as many vehicles support, or more, as a cluster of few may be chance.
+        what is left. Further proposals have about as many votes of vehicles as the best one, as a cluster of few may be
+        chance.
         """
         K = self.rows.branches
         most = min(MOST_ZEROS, int(MOST_CHOICES ** (1.0 / K)))
@@ -291,7 +296,7 @@ class _Learner:
         return found
 
     def initial_centres(self) -> list[Array]:
-        """Propose centres to start from, by what vehicles agree on.
+        """Propose centres of the rows to start from, each of shape (5K,), by what vehicles agree on.
 
         Slopes and intercepts are those of clusters; of the feeding branch's intercept several clusters are tried. The
         intercepts of a centre add up to its junction constant, as those of a vehicle without faults do.
@@ -332,7 +337,10 @@ class _Learner:
         return FaultModel(spread=spread, priors=((1.0, self.known or first_prior(K)),))
 
     def climb(self, model: FaultModel, rounds: int, *, begun: bool = False) -> FaultModel:
-        """Do some rounds of expectation and maximisation, and return the best model of all rounds."""
+        """Do some rounds of expectation and maximisation, and return the best model of all rounds.
+
+        ``begun``: the model was climbed before, so bounds of sizes are tried near its own, and groups at once.
+        """
         best = replace(model, log_evidence=-np.inf)
         for n in range(rounds):
             draws = explain(self.rows, model, feed=self.feed)
@@ -346,7 +354,7 @@ class _Learner:
         return best if best.log_evidence > -np.inf else model
 
     def _recentred(self, model: FaultModel) -> FaultModel:
-        """Move the centre to the largest group, if that has more vehicles than are in no group."""
+        """Move the centre to the largest group and drop the groups, if it has more vehicles than are in no group."""
         prior, spread, at = model.prior, model.spread, self.at
         shares = prior.group_share
         if not shares.size or shares.max() <= 1.0 - shares.sum() or spread.shared.any() or not self.free[at.junction]:
@@ -357,7 +365,7 @@ class _Learner:
         return replace(model, spread=replace(spread, mean=mean), priors=((1.0, alone),), log_evidence=-np.inf)
 
     def rivals(self, models: Sequence[FaultModel], log_odds: float) -> list[FaultModel]:
-        """Select the best model, and those about as good with another reference: which of them is right is open."""
+        """Return the best model and, by falling evidence, those with another centre and at most these log odds less."""
         found = list[FaultModel]()
         for model in sorted(models, key=lambda model: -model.log_evidence):
             apart = (np.abs(model.spread.mean - other.spread.mean).max() > SAME_REFERENCE for other in found)
@@ -366,7 +374,10 @@ class _Learner:
         return found[:MOST_RIVALS]
 
     def variants(self, references: Sequence[FaultModel]) -> list[FaultModel]:
-        """Vary these models by the cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
+        """Make of each model one per cause of what vehicles share (loads, offsets or gains of a branch's sensors).
+
+        Return those that explain the fleet about as well, with their probabilities.
+        """
         K, at = self.rows.branches, self.at
         found = [
             (plausible, replace(model, spread=replace(model.spread, shared=shared)))
@@ -407,7 +418,7 @@ class _Learner:
         return [replace(model, probability=share) for share, (_, model) in kept if share]
 
     def _shared_constants(self, c0: float, prior: Prior) -> list[tuple[float, Array]]:
-        """List what vehicles may share in the junction's constant, and the logarithm of how plausible it is."""
+        """List causes of the junction's constant ``c0``: log prior, and what sensors share (:attr:`.Spread.shared`)."""
         K = self.rows.branches
         found: list[tuple[float, Array]] = []
         for of_sensor in (False, True) if len(prior.group_centre) else (False,):
@@ -425,7 +436,7 @@ class _Learner:
         return found
 
     def _shared_gains(self) -> list[Array]:
-        """List gains that the sensors of a branch may share, if enough vehicles break the junction law alike."""
+        """List gains that sensors may share (:attr:`.Spread.shared`), if many vehicles break the junction law alike."""
         K, at = self.rows.branches, self.at
         centre, sd, broken = np.zeros(K), np.full(K, np.inf), np.zeros(K, bool)
         for k in range(1, K):
@@ -450,7 +461,7 @@ class _Learner:
         return [of_first] if np.count_nonzero(broken) > 1 else [of_first, of_others]
 
     def with_modes(self, model: FaultModel) -> FaultModel:
-        """Give the model all priors that explain the fleet about as well: from several starts, by one set of draws."""
+        """Return the model with all priors that explain the fleet about as well, learnt from several starts."""
         if self.known is not None:
             return model
         draws = explain(self.rows, model, feed=self.feed)
@@ -473,6 +484,7 @@ class _Learner:
         return replace(model, priors=tuple((share / total, prior) for share, prior in odds))
 
     def _next_prior(self, draws: Draws, prior: Prior, *, coarse: bool, grouping: bool) -> Prior:
+        """Return a prior that fits the draws better; with ``grouping`` it may get one more group."""
         if self.known is not None:
             return self.known
         for _ in range(PRIOR_STEPS):
@@ -561,11 +573,11 @@ class _Learner:
         left = row_residuals(evidence, theta)
 
         def counted(square: Array, variance: Array) -> Array:
-            """Weights w of Student's t, row by row (M14a)."""
+            """Return the weights w of Student's t, row by row (M14a), shape (N, Q, r)."""
             return share[:, :, None] * (TAIL_DEGREES + 1.0) / (TAIL_DEGREES + square / variance)
 
         def expected(prior_covariance: Array, gain: Array) -> tuple[Array, Array]:
-            """Mean (N, Q, r) and covariance (N, Q, r, r) of a part of the error that has this prior and gain."""
+            """Return mean (N, Q, r) and covariance (N, Q, r, r) of a part of the error that has this prior and gain."""
             shown = (gain @ self.design)[:, None] @ root  # what the fitted parameters hide of it
             return np.einsum("nab,nqb->nqa", gain, left), prior_covariance + shown @ np.swapaxes(shown, 2, 3)
 
@@ -615,7 +627,11 @@ def _tally(draws: Draws, weight: Array, prior: Prior) -> Array:
 
 
 def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
-    """Update bounds and tail of the sizes of drifts and offsets, averaged over the values that the fleet allows."""
+    """Return the prior with new bounds, tail and density of the sizes of drifts and offsets.
+
+    The density is a mean over the bounds and tails that the fleet allows. ``coarse``: any bounds are tried first, else
+    only those near the present ones.
+    """
     slabs = [prior.gain, prior.offset]
     for kind in (GAIN, OFFSET):
         best, odds, least = slabs[kind], {}, LEAST_RANGE[kind]
@@ -643,7 +659,7 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
 
 
 def _log_plausible(c0: float, offset: float, prior: Prior, *, of_sensor: bool) -> float:
-    """Return the log prior of a cause of what vehicles share.
+    """Return the log prior that ``offset`` of a branch's sensors, and a load for the rest, make the constant ``c0``.
 
     An offset that most sensors share is rarer than one of a few; a load can only take current; and a load and an offset
     would cancel only by chance.

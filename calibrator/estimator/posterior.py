@@ -109,14 +109,14 @@ class Evidence(NamedTuple):
         Centre of the rows of vehicles without faults. [1]
     shared : ndarray of shape (2K + 1,)
         What all sensors of a branch share: K offsets, in fractions of full scale, which the centre includes, and K
-        logarithms of gains. The last entry is 1 if what a group of vehicles shares is an offset of the feeding sensor,
+        values log(1 + d). The last entry is 1 if what a group of vehicles shares is an offset of the feeding sensor,
         and 0 if it is a load: seen through a gain error an offset has another size, but a load has not (M16).
     precision, precision_relative : ndarray of shape (N, 5K, 5K)
-        Inverse covariance of all rows, and of the relative rows alone; zero for the others.
+        Inverse covariance of all rows, and of the relative rows alone, with zeros in the others.
     log_scale : ndarray of shape (N,)
         Logarithm of the probability density of the rows of a vehicle that are all at the centre.
     feed : int
-        Branch that carries a load without a sensor.
+        Number of the branch that carries a load without a sensor, in the order of the rows.
     """
 
     values: Array
@@ -179,7 +179,7 @@ def evidence_of(values: Array, covariance: Array, means: Array, *, centre: Array
 
 
 def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> Fits:
-    """Fit those supports that may matter in each vehicle.
+    """Fit to each vehicle the supports that may have a share in its posterior.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> F
     Returns
     -------
     Fits
-        The most probable supports of each vehicle.
+        The most probable supports of each vehicle, at most :data:`MOST_FITTED`.
     """
     N, rows = evidence.values.shape
     K = rows // 5
@@ -221,7 +221,7 @@ def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> F
 
 
 def row_residuals(evidence: Evidence, theta: Array) -> Array:
-    """Return the residuals of the rows of N vehicles with parameters (N, Q, P), shape (N, Q, 5K)."""
+    """Return the rows of N vehicles minus what Q sets of parameters (N, Q, P) predict (M11), shape (N, Q, 5K)."""
     left = np.empty((*theta.shape[:2], evidence.values.shape[1]))
     _all_residuals(evidence, theta, left)
     return left
@@ -229,6 +229,7 @@ def row_residuals(evidence: Evidence, theta: Array) -> Array:
 
 @compiled
 def _all_residuals(evidence: Evidence, theta: Array, left: Array) -> None:
+    """Fill ``left`` with what :func:`row_residuals` returns."""
     for j in range(theta.shape[0]):
         for q in range(theta.shape[1]):
             residual(theta[j, q], evidence, j, left[j, q])
@@ -268,6 +269,7 @@ def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
 
 @compiled
 def _fit_all(evidence: Evidence, log_prior: Array, best_ahead: Array, log_load: float, fits: Fits) -> None:
+    """Fill ``fits``, except for the numbers of faults; ``best_ahead`` is the best prior of as many faults or more."""
     for j in range(len(evidence.values)):
         scores, codes = _rough_weights(evidence, j, log_prior, best_ahead, log_load)
         kept = np.flatnonzero(scores > scores.max() - MARGIN)
@@ -286,7 +288,7 @@ def _fit_all(evidence: Evidence, log_prior: Array, best_ahead: Array, log_load: 
 def _normal_equations(
     evidence: Evidence, j: int, theta: Array, chosen: Integers, precision: Array
 ) -> tuple[Array, Array, float]:
-    """Return H and g of the Gauss-Newton step H step = g for the chosen parameters, prior included; and chi2."""
+    """Return H and g of the Gauss-Newton step, H step = g, of the chosen parameters under the wide prior; and chi2."""
     n, e = len(chosen), np.empty(evidence.values.shape[1])
     A = np.empty((n, len(e)))  # minus the derivatives, a row per parameter
     residual(theta, evidence, j, e)
@@ -321,7 +323,7 @@ def _without(H: Array, g: Array, i: int) -> tuple[Array, Array]:
 def _rough_weights(
     evidence: Evidence, j: int, log_prior: Array, best_ahead: Array, log_load: float
 ) -> tuple[Array, Integers]:
-    """Return rough log weights of the supports that may matter, and the supports as bits.
+    """Return rough log weights of the supports that may matter, and the supports: bit p is set if parameter p is.
 
     Once a set of gains is fitted to the relative rows, the constants are linear: they are eliminated one by one from
     the normal equations, depth first. A branch of the search ends where it could not matter even with all remaining
@@ -405,13 +407,13 @@ class Draws(NamedTuple):
     fits : Fits
         The explanations.
     values : ndarray of shape (N, Q, M, P)
-        Parameters. [1]
+        Parameters; 0 where the support lacks them. [1]
     place : ndarray of int of shape (N, Q, M, P)
-        Index in the grid of the prior of the size of each fault and load.
+        Index of the size of each fault and load in :data:`~calibrator.estimator.prior.GRID`.
     base : ndarray of shape (N, Q, M)
         Logarithm of p(rows | draw) / q(draw), with the probability of the signs and the change of variables to sizes.
     feed : int
-        Branch that carries loads without a sensor.
+        Number of the branch that carries loads without a sensor.
     shared : ndarray of shape (2K + 1,)
         What all sensors of a branch share, see :class:`calibrator.estimator.posterior.Evidence`.
     """
@@ -432,7 +434,7 @@ def _normal_draws(dimensions: int) -> Array:
 
 
 def draw_explanations(fits: Fits, evidence: Evidence) -> Draws:
-    """Spread the explanations of N vehicles over draws."""
+    """Draw :data:`DRAWS` sets of parameters from each explanation of N vehicles."""
     N, Q, P = fits.theta.shape
     values, place = np.zeros((N, Q, DRAWS, P)), np.zeros((N, Q, DRAWS, P), np.int16)
     base = np.full((N, Q, DRAWS), -np.inf)
@@ -442,12 +444,14 @@ def draw_explanations(fits: Fits, evidence: Evidence) -> Draws:
 
 @inner
 def _place(size: float) -> int:
+    """Return the index of the size of a fault in :data:`~calibrator.estimator.prior.GRID`."""
     index = int((log(max(size, 1e-300)) - LOG_FIRST) / LOG_STEP + 0.5)
     return min(max(index, 0), len(GRID) - 1)
 
 
 @compiled
 def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: NDArray[np.int16], base: Array) -> None:
+    """Fill ``values``, ``place`` and ``base`` of :class:`Draws`; ``normal`` (M, P) is standard normal."""
     N, P, M = fits.theta.shape[0], fits.theta.shape[2], len(normal)
     K = P // 3
     e = np.zeros(5 * K)
@@ -495,7 +499,7 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
 def _terms(
     draws: Draws, prior: "_Tables", j: int, q: int, m: int, places: Integers, kinds: Integers
 ) -> tuple[float, int]:
-    """Return a draw's log weight without sizes and feeding branch, and how many sizes it has; fill places and kinds."""
+    """Return a draw's log weight without its n sizes and the feeding branch, and n; fill their places and kinds."""
     fits, place = draws.fits, draws.place[j, q, m]
     K = place.shape[0] // 3
     n = 0
@@ -510,7 +514,10 @@ def _terms(
 def _feeding(
     draws: Draws, prior: "_Tables", j: int, q: int, m: int, g: int, places: Integers, kinds: Integers, n: int
 ) -> tuple[float, int]:
-    """Return the log prior of the feeding branch's constant in group g (0: no group), -inf if impossible; and n."""
+    """Return the log prior of the feeding branch's constant in group g (0: no group), and n with its size, if any.
+
+    It is -inf if the draw is impossible in the group.
+    """
     fits, x = draws.fits, draws.values[j, q, m]
     K = x.shape[0] // 3
     offset, load = 2 * K + draws.feed, 3 * K
@@ -581,6 +588,7 @@ def weigh(draws: Draws, prior: Prior) -> tuple[Array, Array]:
 
 @compiled
 def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array) -> None:
+    """Fill ``weight`` and ``log_evidence`` with what :func:`weigh` returns."""
     N, _, M, G = weight.shape
     P = draws.values.shape[3]
     places, kinds = np.empty(P, np.int64), np.empty(P, np.int64)
@@ -621,7 +629,7 @@ def size_evidence(draws: Draws, prior: Prior, kind: int, candidates: Array, *, e
     Returns
     -------
     ndarray of shape (C,)
-        Log evidence with each candidate, summed over the vehicles.
+        Log evidence with each candidate, summed over the vehicles, up to a constant that all candidates share.
     """
     evidence = np.zeros(len(candidates))
     _size_evidence(draws, _tables(prior), kind, np.ascontiguousarray(np.log(candidates).T), every, evidence)
@@ -630,6 +638,7 @@ def size_evidence(draws: Draws, prior: Prior, kind: int, candidates: Array, *, e
 
 @compiled
 def _size_evidence(draws: Draws, prior: _Tables, kind: int, candidates: Array, every: int, evidence: Array) -> None:
+    """Add to ``evidence`` what :func:`size_evidence` returns; ``candidates`` (G, C) are logarithms."""
     N, _, M, P = draws.values.shape
     G, C = 1 + len(prior.group_centre), len(evidence)
     places, kinds = np.empty(P, np.int64), np.empty(P, np.int64)
@@ -669,14 +678,14 @@ class Spread:
     Attributes
     ----------
     mean : ndarray of shape (5K,)
-        Centre of the fleet in each row: remaining error of the reference, and mean unmeasured load. [1]
+        Centre of each row: remaining error of the fleet model, and mean unmeasured load. [1]
     covariance : ndarray of shape (5K, 5K)
         Covariance over the vehicles. [1]
     dispersion : ndarray of shape (K,)
         Actual variance of each intercept over that expected from its blocks, at least 1: errors of a model last longer
         than a block.
     shared : ndarray of shape (2K + 1,)
-        See :class:`calibrator.estimator.posterior.Evidence`.
+        What all sensors of a branch share, see :class:`calibrator.estimator.posterior.Evidence`.
     """
 
     mean: Array
@@ -687,7 +696,7 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class FaultModel:
-    """One fault model that explains a fleet.
+    """One fault model that explains a fleet: how vehicles without faults differ, and which faults there are.
 
     Attributes
     ----------

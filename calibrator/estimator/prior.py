@@ -1,8 +1,9 @@
 """Prior of the faults of a fleet: how many a vehicle has, how large they are, and what several vehicles share.
 
 Sizes are uniform between two bounds (a slab), with a log-uniform tail far below and above them, so that no size is
-impossible. Numbers of faults follow (20) of [1]_: n of the 3K parameters are not zero, and in some vehicles no hardware
-parameter is (M13). Bounds, tail and numbers are learned from the fleet: :mod:`calibrator.estimator.learning`.
+impossible. The number n of the 3K parameters that are not zero follows (20) of [1]_; in some vehicles all hardware
+parameters are zero, (M13) of docs/method.md. Bounds, tail and numbers are learned from the fleet:
+:mod:`calibrator.estimator.learning`. The feeding branch is the one with the largest mean current, mostly the battery.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -29,23 +30,23 @@ one vehicle's load (:data:`LOAD_RANGE`), as sensors of a batch can be off by mor
 EDGE = 0.03
 """Relative width of the edges of a slab, so that its evidence is smooth in its bounds. [1]"""
 GUESSED_LOAD_SHARE = 0.01
-"""Share of vehicles with a load without a sensor of their own, before anything is known. [1]"""
+"""Share of vehicles that have their own load without a sensor, before anything is known. [1]"""
 GUESS_WEIGHT = 2.0
-"""Weight of the guessed distribution of the number of faults, in vehicles."""
+"""The guessed distribution of the number of faults counts as much as this many vehicles. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Slab:
-    """Density of the size of faults.
+    """Probability density of the size of a fault: uniform between two bounds, with a tail beyond them.
 
     Attributes
     ----------
     low, high : float
-        Most probable bounds: drifts [1], offsets in fractions of full scale.
+        Most probable bounds: of drifts [1], or of offsets in fractions of full scale.
     tail : float
-        Share of faults outside. [1]
+        Share of faults whose size is in the log-uniform tail. [1]
     density : ndarray of shape (G,)
-        Density at :data:`GRID`; may be an average over the bounds and tails that the fleet leaves possible.
+        Density at each size of :data:`GRID`; may be a mean over the bounds and tails that the fleet leaves possible.
     """
 
     low: float
@@ -60,7 +61,7 @@ class Slab:
 
     @property
     def smallest(self) -> float:
-        """Size below which 3 % of the faults are."""
+        """Size that 97 % of the faults exceed."""
         return float(np.interp(0.03, np.cumsum(self.density * np.gradient(GRID)), GRID))
 
 
@@ -71,12 +72,12 @@ class Prior:
     Attributes
     ----------
     counts : ndarray of shape (K + 1, 2K + 1)
-        Probability of each number of hardware faults (rows) and of sensor faults (columns); all supports with the same
-        numbers are equally likely.
+        Probability of each number of hardware faults (rows) and of sensor faults (columns); which parameters these are
+        is equally likely for all choices (supports).
     gain, offset : Slab
         Sizes of drifts, and of offsets.
     load_share : float
-        Share of vehicles that have a load without a sensor of their own; its size is log-uniform. [1]
+        Share of vehicles that have their own load without a sensor; its size is log-uniform in :data:`LOAD_RANGE`. [1]
     group_share, group_centre, group_sd : ndarray of shape (g,)
         Groups of vehicles that share a constant of the feeding branch, a load or an offset of its sensor: share of
         the fleet [1], centre and standard deviation in fractions of full scale.
@@ -102,14 +103,14 @@ class Prior:
 
     @property
     def log_supports(self) -> Array:
-        """Logarithm of the probability of one support, by its numbers of faults, shape (K + 1, 2K + 1)."""
+        """Logarithm of the probability of one support with h hardware and s sensor faults at [h, s], as ``counts``."""
         K = self.branches
         ways = np.outer([comb(K, h) for h in range(K + 1)], [comb(2 * K, s) for s in range(2 * K + 1)])
         return np.asarray(np.log(np.maximum(self.counts / ways, 1e-300)))
 
 
 def uniform_density(low: Array, high: Array) -> Array:
-    """Return uniform densities at :data:`GRID` between S pairs of bounds (S,) with soft edges, shape (G, S)."""
+    """Return S densities at :data:`GRID`, each uniform from its low to its high with soft edges, shape (G, S)."""
     x = np.log(GRID)[:, None]
     rise, fall = np.clip((x - np.log(low)) / EDGE, -50.0, 50.0), np.clip((x - np.log(high)) / EDGE, -50.0, 50.0)
     density = 1.0 / (1.0 + np.exp(-rise)) / (1.0 + np.exp(fall))
@@ -134,16 +135,16 @@ def first_prior(branches: int) -> Prior:
 
 
 def known_prior(counts: Array, magnitude: tuple[float, float]) -> Prior:
-    """Prior of a fleet whose faults were drawn in a known way: ``counts`` (K + 1, 2K + 1), and bounds of all sizes."""
+    """Make the prior of a fleet whose faults were drawn with known ``counts`` and bounds of sizes, ``magnitude``."""
     slab = Slab(low=magnitude[0], high=magnitude[1], tail=1e-6)
     return Prior(counts=counts + 1e-9, gain=slab, offset=slab, load_share=1e-9)
 
 
 def _sparse(K: int) -> Array:
-    """Probability of (n_h, n_s) if n parameters are drawn, shape (2, 3K + 1, K + 1, 2K + 1).
+    """Return the probability of h hardware and s sensor faults if n parameters are drawn, at [z, n, h, s].
 
-    The first is for vehicles where all supports of n parameters are equally likely; the second for vehicles whose
-    hardware parameters are then set to zero.
+    With z = 0 all choices of n of the 3K parameters are equally likely; with z = 1, too, but hardware parameters that
+    are drawn are then set to zero. Shape (2, 3K + 1, K + 1, 2K + 1).
     """
     given = np.zeros((2, 3 * K + 1, K + 1, 2 * K + 1))
     for h in range(K + 1):
@@ -164,8 +165,8 @@ def sparse_counts(tally: Array) -> Array:
     Returns
     -------
     ndarray of shape (K + 1, 2K + 1)
-        Probabilities of these numbers. The total number n of faults has a free distribution, drawn towards a binomial;
-        a share of the vehicles has no hardware faults.
+        Probabilities of these numbers. The distribution of the total number n of faults is free, but pulled towards a
+        binomial one; a share of the vehicles has no hardware faults.
     """
     K, N = len(tally) - 1, float(tally.sum())
     given, n = _sparse(K), np.arange(3 * K + 1)

@@ -48,7 +48,8 @@ FEWEST_TRUSTED = 3
 CONTRADICTION = 4.0
 """Difference of two readings of one sensor, in standard deviations, above which they contradict each other. [1]"""
 LEAST_GAIN, LEAST_OFFSET = 0.003, 0.001
-"""Standard deviations of what else than sensors changes a gain ratio, and the junction constant over full scale. [1]"""
+"""Standard deviations that causes other than sensors add to a gain ratio, and to the junction constant over full scale.
+[1]"""
 MOST_LOAD = 0.015
 """Largest load without a sensor that a trusted vehicle may have, over full scale: a DC/DC converter or a cooler that
 always runs. A fleet may share more (``prior.LARGEST_SHARED``), but trust in a vehicle must not hide that much. [1]"""
@@ -65,7 +66,7 @@ LARGEST = 0.9
 
 
 class BenchReading(NamedTuple):
-    """Bench reading of one sensor, values NaN where they were not read. [1], [A]"""
+    """Bench reading of one sensor: drifts [1], offsets [A]; NaN where they were not read."""
 
     drift: float
     drift_sd: float
@@ -81,13 +82,13 @@ BenchTable = Mapping[tuple[str, str], BenchReading]
 
 
 def window_readings(vehicles: Sequence[VehicleSummary]) -> Array:
-    """Return the offsets that the sensors showed in zero-current windows, in the form of :func:`bench_readings`."""
+    """Return offsets that sensors showed in zero-current windows, in the form of :func:`bench_readings`; drifts NaN."""
     shown = np.array([(each.zero_current.offset_a, each.zero_current.sd_a) for each in vehicles])
     return np.stack([np.full_like(shown, np.nan), shown]).transpose(2, 0, 1, 3)
 
 
 def bench_readings(bench: BenchTable, vehicles: Sequence[str], branches: Sequence[str]) -> Array:
-    """Look up the readings of N vehicles and K branches in a bench table, by their names.
+    """Return the readings of N vehicles and K branches, by their names in a bench table, as one array.
 
     Returns
     -------
@@ -108,7 +109,7 @@ def with_knowledge(
     full_scale_a: float,
     load: UnmeasuredLoad | None,
 ) -> EvidenceRows:
-    """Add to the evidence what is known from other sources than the drives.
+    """Return the evidence with what is known from other sources than the drives: readings, trust and load.
 
     Parameters
     ----------
@@ -157,7 +158,7 @@ def _text(path: Path) -> str:
 
 
 def read_bench_table(source: Path | str, branches: Names, *, full_scale_a: float) -> BenchTable:
-    """Read a table of bench readings.
+    """Read a table of bench readings from a CSV file or text.
 
     Parameters
     ----------
@@ -276,7 +277,7 @@ def check_bench_table(
 def merge_readings(
     vehicles: Sequence[VehicleSummary], bench: BenchTable, branches: Sequence[str]
 ) -> tuple[Array, list[str]]:
-    """Merge what the sensors showed on a bench with what they showed in zero-current windows.
+    """Return weighted means of what sensors showed on a bench and in zero-current windows.
 
     Parameters
     ----------
