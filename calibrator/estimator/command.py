@@ -142,7 +142,7 @@ def params(
     out: Annotated[Path, typer.Option("--out", help="Folder for VEHICLE.json; files of that name are replaced.")],
     json: JsonOption = False,
 ) -> None:
-    """Write the parameter files of some vehicles, of a fleet too large for a file each in one folder."""
+    """Write the parameter files of some vehicles; the result of a large fleet has no file for each vehicle."""
     with importing():
         from calibrator.estimator.results import written_of
 

@@ -80,7 +80,7 @@ NO_NODE_FILES = (
 
 
 def _with_sd(given: Any, what: str, least: float = -1e6) -> tuple[float, float]:
-    """Return an argument that is a value with its standard deviation; refuse any other."""
+    """Return an argument that is a pair (value, standard deviation); FleetError, naming ``what``, if it is none."""
     good = isinstance(given, Sequence) and len(given) == 2 and is_number(given[0], least, 1e6)
     above = " from 0" if least == 0.0 else ""
     require(good and is_number(given[1], 0.0, 1e6), what, given, f"a value{above} with its standard deviation")
@@ -88,7 +88,7 @@ def _with_sd(given: Any, what: str, least: float = -1e6) -> tuple[float, float]:
 
 
 def _in_python(text: str) -> str:
-    """Replace the options of the command in a message by the names of arguments."""
+    """Replace options of the command in a message by the names of arguments: --harm-limit by harm_limit."""
     text = text.replace("--charge", "charge_ah").replace("another --out", "another folder")
     return re.sub("--([a-z]+)-?([a-z]*)", lambda found: "_".join(filter(None, found.groups())), text)
 
@@ -115,7 +115,7 @@ class Fleet:
     has_layout : bool
         Whether there is a layout, as the node needs one.
     in_memory : bool
-        Whether it was made of data frames; the place is removed with the fleet then.
+        Whether it was made of data frames; its place is then a temporary folder that is deleted with the fleet.
     """
 
     place: str
@@ -244,7 +244,7 @@ class CalibratedVehicle:
 
 
 class _Calibrator:
-    """What both calibrators share: scikit-learn's conventions, and what was learned in attributes that end in ``_``."""
+    """Base of both calibrators: scikit-learn's methods, and what was learned in attributes that end in ``_``."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     parameters_: pd.DataFrame
@@ -381,7 +381,7 @@ class FleetCalibrator(_Calibrator):
     harm_limit : float
         A branch is corrected if the correction does harm with a probability below this. [1]
     trusted : collection of str
-        Vehicles with bench-checked sensors; three or more carry the reference.
+        Vehicles with bench-checked sensors; three or more of them are what the others are compared with.
     readings : path or DataFrame or None
         Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
     hold_out : collection of str
@@ -406,7 +406,7 @@ class FleetCalibrator(_Calibrator):
     left_out_ : dict of str to str
         Vehicles that could not be calibrated, and why.
     notices_ : list of str
-        What to know of the fleet as a whole.
+        What the user should know of the fleet as a whole.
 
     Examples
     --------
@@ -459,7 +459,8 @@ class JunctionCalibrator(_Calibrator):
     """Learns from recordings of one junction, and what is known of it, what its current sensors do wrong.
 
     No fleet is needed. The junction law gives every ratio of gains; a sensor that is known gives their scale, and a
-    zero-current window, a bench reading or a declared load the offsets. What stays open is reported with its deviation.
+    zero-current window, a bench reading or a declared load gives the offsets. What stays open is reported with its
+    standard deviation.
 
     Parameters
     ----------
@@ -501,8 +502,8 @@ class JunctionCalibrator(_Calibrator):
         Parameters
         ----------
         recordings : DataFrame, sequence of DataFrame, mapping of str to these, or path
-            Index: seconds or a DatetimeIndex; columns: every branch, positive into the junction [A]. A mapping is of
-            vehicles. A path is a log, a table, or a folder of them.
+            Index: seconds or a DatetimeIndex; columns: every branch, positive into the junction [A]. The keys of a
+            mapping are names of vehicles. A path is a log, a table, or a folder of them.
         junction : Junction, or path of a layout
             Says which columns or signals are branches; recordings on disk need a layout.
         y : None
@@ -516,7 +517,7 @@ class JunctionCalibrator(_Calibrator):
         Raises
         ------
         UserError
-            If the recordings are none of this junction, or a parameter makes no sense.
+            If the recordings cannot be of this junction, or a parameter makes no sense.
         """
         if not isinstance(junction, Junction):
             junction = Junction.from_layout(path_of(junction, "junction", "a Junction, or the path of a layout (TOML)"))
@@ -535,7 +536,7 @@ class JunctionCalibrator(_Calibrator):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedLog:
-    """One log of a vehicle, as its layout reads it.
+    """Signals of one log of a vehicle, and the layout that names them.
 
     Attributes
     ----------
@@ -555,7 +556,7 @@ class RecordedLog:
         -------
         DataFrame
             Index: seconds since the start of the log, spaced by the layout's period. Columns: branches [A], positive
-            into the junction, inputs, and derived inputs; NaN where any of them is missing.
+            into the junction, inputs, and derived inputs; a row is NaN where any of them is missing.
 
         Raises
         ------
@@ -581,7 +582,7 @@ def read_log(path: str | Path, layout: str | Path) -> RecordedLog:
     Parameters
     ----------
     path : str or Path
-        The log; its folder is the vehicle's name.
+        The log; the name of its folder is taken for that of the vehicle.
     layout : str or Path
         Layout (TOML) that says what the signals mean.
 

@@ -74,7 +74,7 @@ class FleetReference:
     usual : ndarray of shape (2, K)
         Mean and mean square of the measured currents on the fleet's usual drive, over full scale.
     misfits : UsualMisfits or None
-        How vehicles usually differ from linear sensors.
+        How far sensors of the fleet usually are from having one gain and one offset; None: not known.
     full_scale_a : float
         Full scale of the junction. [A]
     load : UnmeasuredLoad or None
@@ -84,7 +84,7 @@ class FleetReference:
     carried : bool
         Whether enough trusted vehicles carry the reference, so that the fleet may be small.
     agreeing : tuple of float
-        Per branch in their own order: share of the vehicles whose slopes agree. [1]
+        Share of the vehicles whose slopes agree, of each branch in ``branches``. [1]
     variants : tuple of float
         Logarithms of the factors on all currents of two variants of the vehicle; empty if there is only one. [1]
     distrusted : mapping of int to str
@@ -119,7 +119,7 @@ class FleetReference:
 
     @property
     def expected_a(self) -> float:
-        """Mean junction sum of faultless sensors, positive into the junction: the unmeasured load that leaves. [A]"""
+        """Mean junction sum that faultless sensors show: the unmeasured load, positive if it takes current. [A]"""
         spread, K = self.models[0].spread, len(self.branches)
         return float((spread.mean[RowPlaces(K).junction] - spread.shared[:K].sum()) * self.full_scale_a)
 
@@ -195,7 +195,7 @@ def learn_fleet(
     expected_faults: float | None = None,
     known: Prior | None = None,
 ) -> FleetReference:
-    """Learn what vehicles without faults are like, and which faults there are.
+    """Learn from a fleet what its vehicles without faults are like, and how many and how large faults are.
 
     Parameters
     ----------
@@ -206,10 +206,10 @@ def learn_fleet(
     branches : sequence of str
         Names of the K branches.
     readings : ndarray of shape (2, 2, N, K), or None
-        Direct readings of single sensors.
+        Direct readings of single sensors, see :func:`calibrator.estimator.readings.bench_readings`.
     trusted : ndarray of bool of shape (N,) or None
-        Vehicles whose sensors were found faultless on a bench; at least three carry the reference. Those that break
-        the junction law are not trusted.
+        Vehicles whose sensors were found faultless on a bench; if there are three or more, the others are compared with
+        these. Those that break the junction law are not trusted.
     load : UnmeasuredLoad or None
         Load that no branch measures, if it is known; None: estimated from the fleet.
     expected_faults : float or None
@@ -293,9 +293,9 @@ def learn_fleet(
 
 
 def _balanced(fleet: FleetMoments, branches: Sequence[str]) -> Mask:
-    """Tell in which vehicles no sign or unit is wrong: currents balance in ratios that may be gain errors, shape (N,).
+    """Return in which vehicles currents balance with ratios that may be gain errors, shape (N,).
 
-    Nothing is learnt from the others. FleetError if they are most of the fleet.
+    In the others a sign or unit is wrong, so nothing is learnt from them. FleetError if they are most of the fleet.
     """
     M, K = fleet.inputs, fleet.branches
     covariance = fleet.covariance[:, M:-1, M:-1]
@@ -318,7 +318,7 @@ def _balanced(fleet: FleetMoments, branches: Sequence[str]) -> Mask:
 
 
 def _carried_centre(rows: EvidenceRows, carriers: Mask, doubtful: Mask) -> Array:
-    """Return the centre (5K,) of the rows that enough trusted vehicles show; NaN in the others."""
+    """Return the median over trusted vehicles of each row that enough of them show, shape (5K,); NaN in the others."""
     fixed = np.full(rows.values.shape[1], np.nan)
     if np.count_nonzero(carriers) >= FEWEST_TRUSTED:
         for row in np.flatnonzero(centre_rows(rows.branches, doubtful)):
@@ -329,13 +329,13 @@ def _carried_centre(rows: EvidenceRows, carriers: Mask, doubtful: Mask) -> Array
 
 
 def _agreeing(rows: EvidenceRows, branch: int) -> float:
-    """Return the share of the vehicles whose slopes of a branch agree."""
+    """Return the share of the vehicles whose slopes of a branch agree, 0 to 1."""
     found = densest_clusters(*rows.shown(rows.places.slope(branch)), widest=1.0)
     return found[0].share if found else 0.0
 
 
 def _variants(hardware_drift: Array) -> tuple[float, ...]:
-    """Find two variants of the vehicle: two groups, each with one hardware drift in common; return their logarithms."""
+    """Find two groups of vehicles, each with its own hardware drift in common; return log(1 + drift) of both, or ()."""
     eta = np.log1p(hardware_drift)
     near = np.abs(eta[:, None] - eta[None, :]) < VARIANT_SPREAD
     centres: list[float] = []
@@ -351,7 +351,7 @@ def _variants(hardware_drift: Array) -> tuple[float, ...]:
 
 
 def _causes(models: Sequence[FaultModel], branches: Sequence[str]) -> str:
-    """Name the causes of what most vehicles share, with their probabilities."""
+    """Name the causes of a junction constant that most vehicles share, with their probabilities, for a notice."""
     share = {"a load without a sensor": 0.0}
     for model in models:
         offsets = model.spread.shared[: len(branches)]
@@ -372,7 +372,7 @@ def estimate_vehicles(
     harm_limit: float = HARM_LIMIT,
     limits: tuple[float, float] | None = None,
 ) -> FleetEstimate:
-    """Estimate vehicles, each by itself.
+    """Estimate the sensor faults of vehicles, each by itself, and decide which branches are corrected.
 
     Parameters
     ----------
@@ -381,11 +381,11 @@ def estimate_vehicles(
     reference : FleetReference
         Of their fleet.
     readings : ndarray of shape (2, 2, N, K), or None
-        Direct readings of their sensors.
+        Direct readings of their sensors, see :func:`calibrator.estimator.readings.bench_readings`.
     trusted : ndarray of bool of shape (N,) or None
         Vehicles that are trusted and do not break the junction law.
     harm_limit : float
-        Largest probability of harm with which a branch is corrected. [1]
+        A branch is corrected if the probability of harm is below this. [1]
     limits : tuple of float or None
         Largest drift [1] and offset [A] that are corrected; None: any.
 
@@ -450,7 +450,7 @@ def estimate_vehicles(
 
 
 def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
-    """Report loads without a sensor, batches and variants of each vehicle; these are explained, and not corrected."""
+    """Return for each vehicle findings of loads without a sensor, batches and variants: reported, not corrected."""
     feed, findings = reference.ordered[reference.feed], list[list[SensorFinding]]()
     sensor = sum(model.probability for model in reference.models if model.spread.shared[-1])
     cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
@@ -481,7 +481,7 @@ def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[lis
 
 
 def _unfit(findings: Sequence[SensorFinding], branches: Sequence[str]) -> list[bool]:
-    """Tell which branches findings concern: all, as they share the junction law, unless bad samples are left out."""
+    """Return for each branch whether a finding concerns it: spikes and outliers concern one, other findings all."""
     everywhere = any(each.cause not in LEFT_OUT_CAUSES or each.branch is None for each in findings)
     return [everywhere or any(each.branch == name for each in findings) for name in branches]
 

@@ -63,7 +63,7 @@ TINY = 1e-12
 
 
 def held_out_snr_db(summaries: Sequence[DriveSummary]) -> Array:
-    """Judge read-outs of vehicles by blocks that were held out.
+    """Return how well each vehicle's own read-out simulates blocks that it was not fitted to.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def _candidates(vehicles: Sequence[Sequence[Samples]], period_s: float) -> Itera
 
 
 def _error_db(bank: FilterBank, vehicles: Sequence[Sequence[Samples]], settling: int) -> float:
-    """Return the simulation error on held-out blocks over the signal, as mean dB over vehicles and branches."""
+    """Return error over signal on held-out blocks, as mean dB over vehicles and branches; inf if none can judge."""
     summaries = []
     for drives in vehicles:
         with suppress(DriveError):  # no block: this vehicle cannot judge

@@ -60,9 +60,9 @@ class FleetTask:
     identity : RunIdentity
         Identity of the run, for the parameter files.
     harm_limit : float
-        Largest probability of harm with which a branch is corrected. [1]
-    bench : mapping
-        Bench readings that are used.
+        A branch is corrected if the probability of harm is below this. [1]
+    bench : mapping of (str, str) to BenchReading
+        Bench readings that are used, by vehicle and branch.
     believed : frozenset of str
         Trusted vehicles whose currents do not contradict the trust in them.
     fleet_size : int
@@ -113,6 +113,7 @@ class FleetTask:
     def _written(
         self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int
     ) -> tuple[VehicleParameters, Array] | str:
+        """Return the parameters of vehicle j of an estimate and the evidence for them, or why it has none."""
         if why := impossible(estimate, j, self.branches):
             return why
         parameters = parameters_of(
@@ -136,7 +137,7 @@ def learn_task(
     identity: RunIdentity,
     fleet_size: int,
 ) -> tuple[FleetTask, list[str]]:
-    """Learn the reference of a fleet.
+    """Learn the reference of a fleet, and make the task with which each of its vehicles is calibrated.
 
     Parameters
     ----------
@@ -145,8 +146,8 @@ def learn_task(
         learnt from.
     settings : CalibrationSettings
         The user's choices.
-    bench : mapping
-        Bench readings; those that the drives contradict are not used.
+    bench : mapping of (str, str) to BenchReading
+        Bench readings by vehicle and branch; those that the drives contradict are not used.
     branches : tuple of str
         Names of the K branches.
     identity : RunIdentity
@@ -157,7 +158,7 @@ def learn_task(
     Returns
     -------
     task : FleetTask
-        Task with which every vehicle can be calibrated.
+        For every vehicle of the fleet.
     notices : list of str
         What the user should know.
 
@@ -258,7 +259,7 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
     Returns
     -------
     bytes
-        Part of the result: parameters, and which vehicles were left out and why.
+        Content of a part file of the result (Parquet): parameters, and which vehicles were left out and why.
     """
     if previous is not None and not (previous / PARTS).is_dir():
         raise FleetError(
@@ -299,8 +300,8 @@ def _what_holds(
 ) -> tuple[VehicleSummary, dict[str, str]]:
     """Return the summary of all drives of a vehicle, or of the new ones alone if they show that sensors have moved.
 
-    Return also which sensors have moved. Records are in the order in which they came. Those before the first one that
-    the earlier parameters were found from date from before a sensor moved.
+    Return also by branch how sensors have moved. Records are in the order in which they came. Those before the first
+    one that the earlier parameters were found from are not used: they are older than a move that was found earlier.
     """
     drives = set() if earlier is None else set(earlier.provenance.drives)
     known = [place for place, record in enumerate(records) if record.drives and set(record.drives) <= drives]

@@ -61,25 +61,25 @@ OTHER_UNIT = 100.0
 
 
 def require(good: Any, what: str, given: Any, expected: str) -> None:
-    """Refuse an argument unless it is good; the message shows it if it is short."""
+    """Raise FleetError unless ``good``; ``what`` names the argument, and the message shows it if it is short."""
     if not good:
         shown = text if len(text := repr(given)) < 80 and "\n" not in text else f"of type {type(given).__name__}"
         raise FleetError(f"{what} {shown}: expected {expected}")
 
 
 def path_of(given: Any, what: str, expected: str = "the path of a layout (TOML)") -> Path:
-    """Return an argument that names a file or folder as a path; refuse any other."""
+    """Return an argument that names a file or folder as a path; FleetError, naming ``what``, if it is none."""
     require(isinstance(given, (str, os.PathLike)) and os.fspath(given), what, given, expected)
     return Path(given)
 
 
 def is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
-    """Check whether an argument is a number within bounds."""
+    """Check whether an argument is a number of this kind from ``low`` to ``high``; bool is none."""
     return isinstance(given, kind) and not isinstance(given, bool) and low <= float(given) <= high
 
 
 def names_of(given: Any, what: str, *, sets: bool = False) -> tuple[str, ...]:
-    """Return the names in anything like a list, numbers as strings; a set, which has no order, only where allowed."""
+    """Return names in anything like a list, numbers as strings; FleetError if it is none, or a set without ``sets``."""
     no_list = (str, bytes, Mapping) if sets else (str, bytes, Mapping, set, frozenset)
     names: list[Any] = [None]
     with suppress(TypeError):
@@ -127,7 +127,7 @@ class Junction:
 
     @classmethod
     def from_layout(cls, path: str | Path, *, branches: Sequence[str] | None = None) -> "Junction":
-        """Junction of a layout (TOML), with its limits and derived inputs, and the DBC that the node needs.
+        """Make the junction that a layout (TOML) describes, with its limits, derived inputs and DBC.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class Junction:
         return None if self.database is None else self.database.layout
 
     def as_database(self, inputs: Sequence[str], period_s: float) -> VehicleDatabase:
-        """Return layout and DBC; without a layout, make one that stands for data frames, with signals on no bus."""
+        """Return layout and DBC; without them make a layout of these branches, inputs and period [s], and no DBC."""
         if self.database is not None:
             return self.database
 
@@ -182,7 +182,7 @@ class Junction:
 def summarise_frames(
     folder: Path, frames: Mapping[str, Any], junction: Junction, *, inputs: Sequence[str] | None
 ) -> VehicleDatabase:
-    """Make a store of summaries of data frames.
+    """Summarise the data frames of a fleet into a new store of summaries.
 
     Parameters
     ----------
@@ -216,14 +216,14 @@ def summarise_frames(
 
 
 def store_frames(folder: Path, frames: Mapping[str, Any], junction: Junction) -> VehicleDatabase:
-    """Make a drive store of data frames of single junctions.
+    """Write the data frames of single junctions into a drive store.
 
     Parameters
     ----------
     folder : Path
         Folder of the store.
     frames : mapping of str to DataFrame, or to a sequence of them
-        Drives by vehicle, with the branches of the junction; inputs are not needed, but the contactor's is used.
+        Drives by vehicle, with the branches of the junction; of the inputs only that of the contactor is used.
     junction : Junction
         Says which columns are branches.
 
@@ -335,7 +335,7 @@ def named_columns(frame: pd.DataFrame, where: str) -> pd.DataFrame:
 
 
 def require_columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> None:
-    """Refuse a frame that lacks columns."""
+    """Raise DriveError if a frame lacks one of the columns ``names``; ``where`` is what the message calls it."""
     if missing := [name for name in names if name not in frame.columns]:
         raise DriveError(f"{where}: no column {few(missing)}; it has {few(list(frame.columns)) or 'none'}")
 
@@ -392,7 +392,7 @@ def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: flo
 
 
 def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
-    """Return a column as floating-point numbers, NaN where there is none; DriveError if it does not hold numbers."""
+    """Return a column as floating-point numbers, NaN where a value is missing; DriveError if it holds no numbers."""
     column = frame[name]
     if isinstance(column, pd.DataFrame):
         raise DriveError(f"{where}: column {name} is there twice")
@@ -434,7 +434,10 @@ def _drives(
 
 
 def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction, *, alone: bool = False) -> None:
-    """Refuse values that cannot be amperes, and a branch that is constant in most of a fleet; some heaters are off."""
+    """Raise DriveError if values cannot be amperes, or a branch is constant in most vehicles; in few a heater is off.
+
+    With ``alone`` the vehicles are no fleet, and a branch may be constant.
+    """
     branches, scale_a = list(junction.branches), float(junction.full_scale_a)
     largest, constant = np.zeros((len(drives), len(branches))), np.zeros((len(drives), len(branches)), bool)
     for j, parts in enumerate(drives.values()):

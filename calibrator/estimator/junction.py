@@ -53,7 +53,7 @@ OFFSET_SIZES = (0.0015, 0.005, 0.02, 0.2)
 MOST_OFFSETS, MARGIN = 3, 12.0
 """Most offsets of one explanation, and distance of its log weight below the best from which on it is left out."""
 DRAWS, FEWEST_DRAWS = 8192, 64
-"""Draws in all, shared by weight of the explanations, and fewest of one: the harm limit is still several of them."""
+"""Draws in all, shared by weight of the explanations, and fewest of one: the usual harm limit of 0.001 is 8 draws."""
 USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
 """Usual misfit, due to curvature of good sensors, and usual residual of the sum, due to noise and switched loads, over
 full scale; and spread between cars of the logarithm of the latter's square. [1]"""
@@ -68,17 +68,20 @@ SEEN = 3.0
 
 
 class JunctionLaw(NamedTuple):
-    """Rows of the junction law (M8) of one vehicle: log(-g) of the K - 1 other branches, c over full scale. [1]"""
+    """K rows of the junction law (M8) of one vehicle: log(-g) of K - 1 branches, then c over full scale. [1]"""
 
     order: list[int]
-    """Branches, the one that moves most first."""
+    """Numbers of the K branches, the one that moves most first: the rows are log(-g) of ``order[1:]``."""
     value: Array
+    """Values of the rows, shape (K,)."""
     covariance: Array
+    """Covariance of their errors, shape (K, K)."""
     constant_a: tuple[float, float]
     """c with its standard deviation. [A]"""
 
 
 def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: float) -> JunctionLaw:
+    """Regress the junction law of a vehicle, ``where`` in messages; FleetError if a sign or unit is wrong."""
     order = np.argsort(-summary.variance_a2, kind="stable").tolist()
     fit = junction_regression(stack_summaries([summary], order))
     K, others, mean_a = len(order), order[1:], summary.mean_a
@@ -116,12 +119,16 @@ class JunctionKnowledge(NamedTuple):
     """Readings by zero-current windows, bench and trust: value and standard deviation, each of drifts [1] and offsets
     [A], shape (3, 2, 2, N, K); NaN where there are none."""
     load: UnmeasuredLoad | None
+    """Load that no branch measures; None: not known."""
     charge_a: Mapping[str, tuple[float, float, float]]
+    """By branch: mean current over all drives as measured, the same by its charge, and standard deviation of the
+    latter. [A]"""
     meter: str | None
+    """Branch that has another sensor in each of the N vehicles, which are recordings of one car then."""
 
 
 class _System:
-    """Rows y = design x + error of N recordings over x = (lambda of S sensors, their offsets, N loads).
+    """Linear equations y = design x + error of N recordings for x = (lambda of S sensors, S offsets, N loads).
 
     The first rows are the junction laws, then come the charges, and last what is known of single x. Offsets and loads
     are in fractions of full scale. The prior of all x is wide and centred on 0.
@@ -135,7 +142,7 @@ class _System:
     laws : list of N JunctionLaw
         The junction laws.
     known : list of (int, str)
-        Place in x, and name, of the unknown that each of the last rows gives.
+        For each of the last rows: place in x of the unknown that it gives, and what messages call this.
     """
 
     def __init__(
@@ -206,9 +213,9 @@ class _System:
         return any(place == p for place, _ in self.known)
 
     def condition(self, sd: Array, without: int | None = None) -> tuple[Array, Array, float]:
-        """Return mean (P,), covariance (P, P) and log evidence of x for a prior with these standard deviations (P,).
+        """Return mean (P,) and covariance (P, P) of x, and log evidence, for a prior of standard deviations (P,).
 
-        ``without`` is a row that is left out.
+        P = 2S + N is the length of x. ``without`` is a row that is left out.
         """
         used = np.arange(len(self.y)) != (len(self.y) if without is None else without)
         A, prior, y = self.design[used], np.diag(sd**2), self.y[used]
@@ -232,7 +239,10 @@ class _System:
 
 
 class _Posterior(NamedTuple):
-    """Weighted draws of x (n, P), and the number of the explanation of each draw; 0 is the most probable one."""
+    """Posterior of x as n weighted draws (n, P), each with the number of its explanation; 0 is the most probable one.
+
+    ``mean`` and ``sd`` (P,) are those of x over all explanations.
+    """
 
     draws: Array
     weight: Array
@@ -282,9 +292,10 @@ def _posterior(system: _System) -> _Posterior:
 
 
 def _fault_probability(mean: Array, sd: Array, prior_sd: float, sound_sd: float) -> Array:
-    """Return the probability of a fault: the prior of a faulty sensor against that of a sound one, given the data.
+    """Return for parameters with this posterior mean and sd the probability that they are faulty, all of shape (S,).
 
-    The data's likelihood is the posterior divided by the prior: Gaussian, of precision 1 / sd^2 - 1 / prior_sd^2.
+    The prior of a faulty one is Gaussian with ``prior_sd``, which the posterior includes, of a sound one with
+    ``sound_sd``. The likelihood is the posterior over the prior: Gaussian, of precision 1 / sd^2 - 1 / prior_sd^2.
     """
     precision = np.maximum(sd**-2.0 - prior_sd**-2.0, 1e-12)
     value, variance = mean / sd**2 / precision, 1.0 / precision
@@ -314,7 +325,7 @@ def estimate_junction(
     layout : Layout
         Has the full scale and the limits of corrections.
     harm_limit : float
-        Largest probability of harm with which a branch is corrected. [1]
+        A branch is corrected if the probability of harm is below this. [1]
 
     Returns
     -------
@@ -323,9 +334,9 @@ def estimate_junction(
     laws : list of N JunctionLaw
         The junction laws.
     deciding : list of N str
-        What would decide what is still open; empty if all is known.
+        Sentence on what is still open and what would decide it, for each vehicle; empty if all is known.
     contradictions : list of str
-        Where known values contradict each other.
+        Sentences on known values that the rest contradicts.
 
     Raises
     ------
@@ -406,7 +417,7 @@ def estimate_junction(
 
 
 def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a: float) -> list[list[SensorFinding]]:
-    """Find what linear sensors do not explain, by current, time or temperature; only a fleet tells whose it is."""
+    """Find per vehicle what gain errors and offsets do not explain; without a fleet no finding names the sensor."""
     K = len(branches)
     usual = UsualMisfits(
         misfit_a=np.full(len(CAUSES), USUAL_MISFIT * scale_a),
@@ -422,7 +433,7 @@ def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a
 
 
 def named_ratios(law: JunctionLaw, branches: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return gain ratios with standard deviations by name "a / b", a before b in the layout, not by movement. [1]"""
+    """Return K - 1 gain ratios (value, standard deviation) by name "a / b", where branch a comes before b. [1]"""
     first, *others = law.order
     ratios, sds = np.exp(law.value[:-1]).tolist(), np.sqrt(np.diagonal(law.covariance)[:-1]).tolist()
     found = {}
@@ -433,7 +444,10 @@ def named_ratios(law: JunctionLaw, branches: Sequence[str]) -> dict[str, tuple[f
 
 
 def _explanations(points: Points, branches: Sequence[str], scale_a: float) -> list[Explanation]:
-    """List explanations by falling probability, with their clear mean faults; those with the same ones are merged."""
+    """List explanations by falling probability, each with its mean faults above :data:`SEEN` deviations.
+
+    Explanations in which the same faults are that clear are merged.
+    """
     K, found = len(branches), dict[bytes, tuple[float, Array, Mask]]()
     for number in range(len(points.fit)):
         own = points.explanation == number

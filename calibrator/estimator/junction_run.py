@@ -51,8 +51,8 @@ __all__ = ["calibrate_junctions", "read_junction", "summarise_junction"]
 _Made = TypeVar("_Made")
 
 LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
-"""Least valid data, shortest block, number of blocks of a short recording, and least number of blocks beyond that of
-branches, so that uncertainties can be estimated. [s], [s]"""
+"""Least valid data [s], shortest block [s], number of blocks of a short recording, and by how many the blocks must
+outnumber the branches, so that uncertainties can be estimated."""
 FULL_BLOCK = 10
 """Number of samples of a block where there are enough."""
 MOST_MISSING = 0.05
@@ -142,7 +142,7 @@ def _without_jumps(drives: Sequence[Samples], unknown: Sequence[str], layout: La
 
 
 def _same_error(parameters: VehicleParameters, known: Collection[str]) -> list[str]:
-    """Say so if all gains are wrong alike against the only sensor whose gain is known: then that one may be wrong."""
+    """Return a notice if all gains are off alike against the only known one, which may be wrong then; else nothing."""
     others = [branch for name, branch in parameters.branches.items() if name not in known]
     drifts = np.array([branch.drift for branch in others])
     sds = np.array([branch.drift_sd for branch in others], dtype=float)
@@ -181,9 +181,10 @@ def calibrate_junctions(
     Returns
     -------
     equipment : Equipment
-        Has the K branches.
+        The K branches of the vehicles, without inputs.
     part : bytes
-        Part of the result: parameters of every vehicle that could be used, and why the others could not.
+        Content of a part file of the result (Parquet): parameters of every vehicle that could be used, and why the
+        others could not.
     details : dict of str to JSON values
         Gain ratios and constants, for the record of the run.
     notices : list of str
@@ -253,7 +254,7 @@ def calibrate_junctions(
 def _read(
     fleet: FleetSource, database: VehicleDatabase, settings: CalibrationSettings, workers: Workers
 ) -> tuple[Equipment, list[VehicleSummary], dict[str, str], list[Sequence[Drive]]]:
-    """Return branches, summaries of usable vehicles, why others cannot be used, and the drives if there are few."""
+    """Return equipment, summaries of usable vehicles, why others are not, and each one's drives if they are few."""
     branches, limit_s = settings.branches, settings.time_limit_s
     if len(fleet.vehicles) > MOST_READ_HERE:
         equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False)
@@ -316,7 +317,7 @@ def _known_readings(
 def _charges(
     drives: Sequence[Sequence[Drive]], settings: CalibrationSettings, fleet: FleetSource
 ) -> dict[str, tuple[float, float, float]]:
-    """Return by branch the mean current over all drives: as measured, by its charge, and the latter's deviation. [A]"""
+    """Return :attr:`JunctionKnowledge.charge_a`, empty if no charge is given; FleetError if it cannot be used. [A]"""
     if not settings.charge_ah:
         return {}
     if len(drives) != 1:

@@ -34,7 +34,7 @@ __all__ = ["calibrate_fleet_published", "read_vehicle_model"]
 EXPECTED = FaultSettings(sparsity=80.0, magnitude=(0.05, 0.25), balanced=True)
 """Faults of the artificial fleet that the trees learn from: one of five parameters is not zero, as in the paper."""
 MISFIT = 5.0
-"""Simulation error over the fleet's median from which on a model is not one of the fleet. [1]"""
+"""Vehicles whose simulation error is more than this multiple of the fleet's median are left out. [1]"""
 SLOPE_SPREAD = 0.093
 """Standard deviation of the vehicles' slopes where one of five sensor and hardware drifts is not zero, with 5 to 25 %
 (S = 80, the default). [1]"""
@@ -69,9 +69,10 @@ def calibrate_fleet_published(
     Returns
     -------
     equipment : Equipment
-        Its branches and inputs.
+        Branches and inputs of the fleet.
     part : bytes
-        Parameters of every vehicle that could be used, and why the others could not.
+        Content of a part file of the result (Parquet): parameters of every vehicle that could be used, and why the
+        others could not.
     details : dict of str to JSON values
         For the record of the run.
     notices : tuple of str
@@ -154,7 +155,7 @@ def _parameters(
     identity: RunIdentity,
     fleet_size: int,
 ) -> VehicleParameters:
-    """Write down what was found for vehicle j."""
+    """Return the parameters of vehicle j: its faults, the junction sum with and without them, and the verdict."""
     faults, classes = recovery.faults.take(j), recovery.classification
     residual = junction_residual(
         current_moments(vehicle.mean_a, vehicle.moment_a2),

@@ -61,7 +61,7 @@ MOST_NAMED = 1000
 """Largest number of vehicles that a report names one by one; all of them are in ``results.parquet``."""
 PARTS, FILES, ROWS = "buckets", "params", "results.parquet"
 LEFT_OUT = "left out"
-"""In place of the verdict of a vehicle without parameters, or of a file whose vehicle is unclear."""
+"""What the rows have as verdict of a vehicle without parameters, or of a file whose vehicle is unclear."""
 REMEDY = "name a folder that 'calibrator calibrate --out' wrote"
 Rows = list[dict[str, Any]]
 
@@ -118,7 +118,7 @@ PART_SCHEMA = pa.schema(
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """How a result was made."""
+    """How a result was made, the content of its ``run.json``."""
 
     tool: str
     method: str
@@ -163,7 +163,7 @@ def encode_chunk(
     drives: Mapping[str, str] = {},
     evidence: Mapping[str, Array] = {},
 ) -> bytes:
-    """Encode the result of some vehicles, sorted by name, as a part of the result.
+    """Encode the parameters of some vehicles, sorted by name, as the content of a part file of the result.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def encode_chunk(
     Returns
     -------
     bytes
-        Content of a part of the result.
+        Parquet, with the columns of :data:`PART_SCHEMA`.
     """
     rows: Rows = []
     reasons = dict(left_out)
@@ -202,7 +202,7 @@ def encode_chunk(
 
 
 def _rows_of(item: VehicleParameters) -> Rows:
-    """Make the rows of a vehicle, one per branch; keys that are no columns are not written later."""
+    """Return the rows of a vehicle, one per branch; a row may have keys that are no columns, which are not written."""
     hardware, residual = item.hardware_fault, item.junction_residual
     measured_a, corrected_a = residual.measured_a, residual.corrected_a
     if item.provenance.fleet_size == 1:  # the user declared the expected sum; in a fleet it is estimated
@@ -290,7 +290,7 @@ def parts_of(result: Path) -> dict[int, Path]:
 
 
 def part_file(result: Path, number: int) -> Path:
-    """Return the path of the part file that holds the vehicles of a bucket."""
+    """Return the path of the part file that holds the vehicles of bucket ``number``, whether it exists or not."""
     return result / PARTS / f"{number:05d}.parquet"
 
 
@@ -354,7 +354,7 @@ def _first_line(error: Exception) -> str:
 
 
 def write_run(folder: Path, run: RunRecord) -> None:
-    """Write ``run.json``."""
+    """Write ``run.json`` into a result folder."""
     write_atomically(folder / "run.json", msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
 
 
@@ -392,6 +392,7 @@ class CalibrationReport:
     """Where in the result the parameter files are."""
     run: RunRecord
     verdicts: Mapping[str, int]
+    """Number of vehicles with each verdict."""
     undecided: Mapping[str, str]
     """Vehicles with the verdict "cannot tell", and what would decide."""
     corrected: Mapping[str, str]
@@ -452,7 +453,7 @@ class CalibrationReport:
 
 
 def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> CalibrationReport:
-    """Summarise a result folder for the user.
+    """Make the report on a result from its folder.
 
     Parameters
     ----------
@@ -468,7 +469,7 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
     Returns
     -------
     CalibrationReport
-        Of all its vehicles.
+        Of all vehicles of the result.
     """
     rows = pd.read_parquet(result / ROWS, use_threads=False)
     rows = rows[rows["branch"].notna()].astype({"applied": bool, "hardware_fault": bool})

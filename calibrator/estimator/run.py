@@ -66,7 +66,7 @@ WORTH_PROCESSES = 200
 """Number of vehicles from which on `workers` are used. Other processes take 3 s to start; with 600 vehicles of two
 branches two of them are no faster yet, but with more branches each vehicle takes longer. [1]"""
 Calibrate: TypeAlias = Callable[..., tuple[Equipment, bytes, dict[str, object], Sequence[str]]]
-"""Function that calibrates a fleet in one piece; returns branches, part of the result, details and notices."""
+"""Function that calibrates all vehicles in one go; returns equipment, content of a part file, details and notices."""
 
 
 def calibrate_fleet(
@@ -179,9 +179,9 @@ def _require_summaries_enough(storage: Storage, settings: CalibrationSettings, l
 
 
 def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) -> Calibrate | None:
-    """Return the function that calibrates all in one piece: published method, or single junctions; None: neither.
+    """Return the function of the published method or of single junctions; None if the fleet is compared with itself.
 
-    Each vehicle is calibrated by itself if there is only one, or if what is known is about branches.
+    Each vehicle is calibrated by itself if there is only one, if what is known is about branches, or if the user asks.
     """
     if settings.method is Method.PUBLISHED:
         from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second)
@@ -210,7 +210,7 @@ def _require_named(settings: CalibrationSettings, usable: Set[str], problems: Ma
 
 @dataclass(frozen=True, kw_only=True)
 class Census:
-    """Which vehicles are in a store: counts and hardly any names, as a fleet may have millions of vehicles.
+    """Numbers of vehicles in a store, and hardly any of their names, as a fleet may have millions.
 
     Attributes
     ----------
@@ -296,7 +296,7 @@ def read_sample(
 
 @dataclass(frozen=True, kw_only=True)
 class _Run:
-    """One run: of which fleet, how and where it is computed, and the folder of its result."""
+    """One run: settings, where it is computed, and the result: ``result`` is its folder now, ``shown`` the user's."""
 
     result: Path
     shown: Path
@@ -305,7 +305,7 @@ class _Run:
     workers: Workers
 
     def workers_if(self, many: bool) -> Workers:
-        """Return the workers if there are many vehicles, or if they are a cluster, which was asked for; else none."""
+        """Return the user's workers if there are many vehicles, or if they are a cluster; else one process."""
         return self.workers if many or self.workers.scheduler else Workers()
 
     def bench_table(self, store: SummaryStore) -> BenchTable:
@@ -319,7 +319,7 @@ class _Run:
         check_bench_table(bench, vehicles, left_out=left_out, trusted=self.settings.trusted, full_scale_a=scale_a)
 
     def summaries(self, store: SummaryStore, others: Mapping[str, str], since: Path | None) -> CalibrationReport:
-        """Calibrate every vehicle of a store; ``others`` says which vehicles are not in it, and why."""
+        """Calibrate every vehicle of a store, complete the result; ``others``: why vehicles are not in the store."""
         previous = None if since is None else since.absolute()
         if since is not None:
             _require_previous(since, self.identity.database, store.identity)
@@ -367,7 +367,7 @@ class _Run:
         notices: Sequence[str],
         buckets: int = 0,
     ) -> CalibrationReport:
-        """Join the parts to the result; ``others`` says which vehicles are in none of them, and why."""
+        """Complete the result folder from its parts, and report; ``others``: why vehicles are in none of the parts."""
         identity, layout, folder = self.identity, self.identity.database.layout, self.result
         vehicles, left_out = join_rows(folder, others), left_out_of(folder)
         if not vehicles:
@@ -399,7 +399,7 @@ class _Run:
 
 
 def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:
-    """Refuse an earlier result that a run cannot go on from."""
+    """Raise FleetError if an earlier result was made otherwise than this run, so that the run cannot go on from it."""
     run, layout = read_run(folder), database.layout
     for what, was, now in (
         ("method", run.method, Method.POSTERIOR.value),

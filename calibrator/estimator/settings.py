@@ -1,4 +1,4 @@
-"""How a fleet is calibrated: the user's choices."""
+"""The user's choices of how a fleet, or single junctions, are calibrated."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -39,12 +39,12 @@ class Method(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationSettings:
-    """How a fleet is calibrated.
+    """The user's choices for one calibration.
 
     Attributes
     ----------
     method : Method
-        Estimator.
+        How sensor faults are estimated.
     branches : tuple of str or None
         Branches to use; None: those that the fleet has.
     hold_out : frozenset of str

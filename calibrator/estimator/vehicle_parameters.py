@@ -1,4 +1,4 @@
-"""The parameters of a vehicle as written for the node: what was found, the sum before and after, and by whom."""
+"""Parameters of a vehicle as written for the node: faults, junction sum before and after, and which run found them."""
 
 import math
 import os
@@ -43,7 +43,7 @@ __all__ = [
 MOST_REPORTED, LEAST_REPORTED = 3, 0.02
 """Largest number of explanations that are reported, and least probability of one after the first. [1]"""
 QUIET_SHARE = 0.25
-"""Share of the blocks, those with the least throughput, that show how far sums at rest are from what is expected."""
+"""Share of the blocks, those with the least throughput (current through the junction), that count as at rest. [1]"""
 STABILITY = 0.01
 """Least change of gains with temperature between drives that is assumed: the node must not take it for a fault. [1]"""
 TINY_A2 = 1e-12
@@ -61,7 +61,7 @@ class RunIdentity:
     method : Method
         Method by which they are found.
     fleet, created : str
-        Name of the fleet; time, ISO 8601.
+        Name of the fleet; time of the run, ISO 8601.
     """
 
     database: VehicleDatabase
@@ -118,7 +118,7 @@ def by_branch(branches: Sequence[str], values: Array) -> dict[str, float]:
 
 
 def current_moments(mean_a: Array, product_a2: Array) -> Array:
-    """Arrange the moments of the measured currents and of 1 as one block.
+    """Return moments of the measured currents and of 1 as those of one block, for :func:`junction_residual`.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def current_moments(mean_a: Array, product_a2: Array) -> Array:
 
 
 def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_a: float) -> JunctionResidual:
-    """Compute the Kirchhoff sum before and after the correction of given sensor faults.
+    """Compute the RMS and mean of the Kirchhoff sum before and after the correction of given sensor faults.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_
     offset_a : ndarray of shape (K,)
         Offset that is subtracted before that. [A]
     expected_a : float
-        Mean sum that faultless sensors would show: the load that none of them sees. [A]
+        Mean sum that faultless sensors would show: the load that none of them sees, positive if it takes current. [A]
 
     Returns
     -------
@@ -180,10 +180,11 @@ def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_
 
 
 def _spread(moments: Array, sums: Array) -> tuple[float, float]:
-    """Return the deviation of single sums at rest [A] and per ampere of throughput [1], from moments (B, K + 1, K + 1).
+    """Return the RMS of the sums at rest [A], and what it grows by per ampere of current through the junction [1].
 
-    The quarter of the blocks with the least throughput gives that at rest; the excess of all blocks over it is taken to
-    grow with the throughput. Half the sum of the squared currents stands for the squared throughput and is not more.
+    ``moments`` (B, K + 1, K + 1) and ``sums``, the factors (B, K + 1) that make the sum of (i_m,1 ... i_m,K, 1), are by
+    block. The blocks with the least throughput give the RMS at rest; the excess of all blocks over it is taken to grow
+    with the throughput. Half the sum of the squared currents stands for the squared throughput and is not more.
     """
     share, weight = moments[:, -1, -1], sums[:, :-1]
     square_a2 = np.maximum(np.einsum("bk,bkl,bl->b", sums, moments, sums), 0.0)
@@ -229,9 +230,9 @@ def parameters_of(
     branches : sequence of str
         Names of the K branches.
     expected_a : float
-        Mean junction sum that faultless sensors show. [A]
+        Mean junction sum that faultless sensors show, see :func:`junction_residual`. [A]
     fleet_size : int
-        Number of vehicles that can be used.
+        Number of usable vehicles of the fleet; 1: the vehicle was calibrated by itself.
     decisive : str or None
         Evidence that would decide what is in doubt; None: it is found from the explanations.
 

@@ -43,7 +43,7 @@ def explained_faults(explanation: Explanation, branches: Sequence[str]) -> Array
 def deciding_evidence(
     estimate: "FleetEstimate", j: int, branches: Sequence[str], *, layout: str
 ) -> tuple[str, Explanation | None]:
-    """Say what evidence would decide which sensor is faulty, or would allow a correction that is held back.
+    """Return a sentence on what evidence would decide which sensor is faulty, or allow a correction that is held back.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def deciding_evidence(
     Returns
     -------
     text : str
-        One sentence.
+        The sentence.
     rival : Explanation or None
         The explanation that this evidence would tell from the most probable one, if the text is about one.
     """
@@ -101,7 +101,10 @@ def deciding_evidence(
 def _rival(
     found: Sequence[Explanation], branches: Sequence[str], held: Mask, full_scale_a: float
 ) -> tuple[str, Explanation | None]:
-    """Say what would tell the most probable explanation from its strongest rival; empty if there is none."""
+    """Return what would tell the most probable explanation from its strongest rival ("": nothing), and that rival.
+
+    Only differences in sensors whose correction is held back (``held``, shape (K,)) count; if none is, all count.
+    """
     least = LEAST_IN_THE_WAY if held.any() else LEAST_RIVAL
     others = [each for each in found[1:] if each.probability >= least]
     best, *rivals = (explained_faults(each, branches) / [[1.0], [full_scale_a]] for each in (found[0], *others))
@@ -123,7 +126,7 @@ def _rival(
 
 
 def explained(parameters: VehicleParameters) -> str:
-    """Describe in a few lines for people what was found for a vehicle, why, and what would decide what is open."""
+    """Return some lines for people: what was found for a vehicle, why, and what would decide what is open."""
     confidence, hardware, residual = parameters.confidence, parameters.hardware_fault, parameters.junction_residual
     sure = "" if confidence is None else f" (confidence {confidence:.2f})"
     lines = [f"{parameters.vehicle}: {parameters.verdict}{sure}"]
@@ -147,7 +150,7 @@ def explained(parameters: VehicleParameters) -> str:
 
 
 def held_back_lines(parameters: VehicleParameters) -> list[str]:
-    """Say which faults that were found are not corrected, and why: a line per reason."""
+    """Return a line per reason: which faults that were found are not corrected, and why."""
     lines = []
     for reason, why in REASONS.items():
         held_back = {name: branch for name, branch in parameters.branches.items() if branch.held_back == reason}
@@ -169,7 +172,7 @@ def sensor_texts(parameters: VehicleParameters) -> dict[str, str]:
 
 
 def _sensor_text(branch: BranchParameters, offsets: Sequence[tuple[float, float]]) -> str:
-    """Describe the faults of one sensor; ``offsets`` has probability [1] and offset [A] by each explanation."""
+    """Describe the faults of one sensor; ``offsets`` has the probability [1] and offset [A] of each explanation."""
     chance = branch.fault_probability
     probability = "" if chance is None else f" (probability of a fault {chance:.2f})"
     if not branch.drift and not branch.offset_a:
