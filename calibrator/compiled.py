@@ -61,7 +61,7 @@ def compiled(function: _Function) -> _Function:
     """Compile a function that Python calls, at its first call; division by zero gives infinity, as in NumPy arrays."""
     if _FOLDER is None:
         return cast("_Function", _dispatcher(function))
-    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_FOLDER)  # for this function, not for those of users
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_FOLDER)  # only while this function is compiled
     try:
         return cast("_Function", _dispatcher(function, cache=True))
     finally:
@@ -74,7 +74,7 @@ def inner(function: _Function) -> _Function:
 
 
 def is_compiled(module: str) -> bool:
-    """Check whether compiled functions of a module of this name are in the cache."""
+    """Check whether the cache has compiled functions of a module, given by the last part of its name: "posterior"."""
     return _FOLDER is not None and any(_FOLDER.rglob(f"{module}.*.nbi"))
 
 

@@ -18,7 +18,10 @@ _REMEDY = "name the truth.json that 'calibrator simulate' wrote beside the logs"
 
 
 class VehicleTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Faults and load of one vehicle, and moments of its currents; currents are positive into the junction."""
+    """Faults and load of one vehicle, and moments of its currents.
+
+    Mappings are by branch, currents positive into the junction; faults are those of :class:`calibrator.faults.Faults`.
+    """
 
     hardware_drift: float
     hardware_offset_a: dict[str, float]
@@ -27,7 +30,7 @@ class VehicleTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     delay_s: dict[str, float]
     """Delay of each measured current behind the true one. [s]"""
     unmeasured_a: float
-    """Load that no branch measures. [A]"""
+    """Load that no branch measures, positive if it takes current out of the junction. [A]"""
     unseen_mean_a: dict[str, float]
     """Mean of the true currents on a drive that is not in the logs. [A]"""
     unseen_mean_square_a2: dict[str, float]
@@ -43,18 +46,22 @@ class FleetTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     full_scale_a: float
     seed: int
     sparsity: float
+    """Share of the fault parameters that are zero. [%]"""
     magnitude: tuple[float, float]
     """Range of fault magnitudes: drifts [1], offsets in fractions of full scale."""
     balanced: bool
+    """Whether half of the vehicles cannot have a hardware fault."""
     symmetric: bool
+    """Whether vehicles come in groups of four whose measured currents have the ideal current as their mean."""
     common_drive: bool
+    """Whether all vehicles drive the same trip."""
     noise: float
     """Standard deviation of the sensor noise in fractions of full scale."""
     vehicles: dict[str, VehicleTruth]
 
 
 def write_truth(path: Path, truth: FleetTruth) -> None:
-    """Write ``truth.json``, whole or not at all."""
+    """Write ``truth.json`` whole, or not at all if writing fails."""
     write_atomically(path, msgspec.json.format(msgspec.json.encode(truth), indent=1) + b"\n")
 
 
@@ -69,7 +76,7 @@ def read_truth(path: Path) -> FleetTruth:
 
 
 def faults_of(truth: FleetTruth, vehicles: list[str]) -> Faults:
-    """Fault parameters of some vehicles as arrays.
+    """Return the true fault parameters of some vehicles as arrays.
 
     Parameters
     ----------
@@ -81,7 +88,7 @@ def faults_of(truth: FleetTruth, vehicles: list[str]) -> Faults:
     Returns
     -------
     Faults
-        In the order of ``vehicles`` and of ``truth.branches``.
+        Of these vehicles in this order, branches in the order of ``truth.branches``.
 
     Raises
     ------

@@ -3,9 +3,8 @@
     recovered   drift vector and offset vector (offsets / full scale) each within a tolerance of the truth in the
                 Euclidean norm, the truth's norm counted as at least the fleet's smallest fault
     f2          weighted harmonic mean of precision and recall of the hardware classification, footnote 7 of the paper
-    harmed      some branch current corrected by (25) is farther (RMSE) from the true one than as measured
-
-Equation (25) is that of [1]_.
+    harmed      some branch current corrected by (i_m - o) / (1 + d), (25) of [1]_, is farther (RMSE) from the true
+                current than the measured one
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -75,7 +74,7 @@ class UnseenDrive:
     Attributes
     ----------
     mean_a, mean_square_a2 : ndarray of shape (N, K)
-        Of i. [A], [A^2]
+        E[i] and E[i^2]. [A], [A^2]
     error_mean_a, error_mean_square_a2, error_product_a2 : ndarray of shape (N, K)
         E[e], E[e^2] and E[e i]. [A], [A^2], [A^2]
     """
@@ -88,18 +87,18 @@ class UnseenDrive:
 
     @classmethod
     def of_samples(cls, drives: Sequence[tuple[Array, Array]]) -> "UnseenDrive":
-        """Compute the moments from pairs of true and measured currents, each of shape (T, K), of N vehicles. [A]"""
+        """Compute the moments from N pairs, one per vehicle: true and measured currents, each of shape (T, K). [A]"""
         moments = [(i, i**2, i_m - i, (i_m - i) ** 2, (i_m - i) * i) for i, i_m in drives]
         return cls(*np.array([[values.mean(axis=0) for values in own] for own in moments]).swapaxes(0, 1))
 
     @classmethod
     def of_linear_sensors(cls, mean_a: Array, mean_square_a2: Array, truth: Faults) -> "UnseenDrive":
-        """Compute the moments for linear sensors (13) from those of the true currents, shape (K,) or (N, K)."""
+        """Compute the moments for sensors that show i_m = (1 + d) i + o, from E[i] and E[i^2], shape (K,) or (N, K)."""
         d, o, i, i2 = truth.drift, truth.offset_a, mean_a, mean_square_a2
         return cls(i, i2, d * i + o, d**2 * i2 + 2.0 * d * o * i + o**2, d * i2 + o * i)
 
     def rms_a(self, drift: Array, offset_a: Array) -> Array:
-        """Root mean square error of the currents corrected with these parameters (25), shape (N, K). [A]
+        """Root mean square error of the currents corrected with drifts and offsets, all of shape (N, K). [A]
 
         (i_m - o) / (1 + d) - i = (e - o - d i) / (1 + d); parameters of 0 give the error as measured.
         """
@@ -120,7 +119,7 @@ def harmed(estimate: Faults, truth: Faults, *, mean_a: Array, mean_square_a2: Ar
     estimate, truth : Faults
         Of the same N vehicles.
     mean_a, mean_square_a2 : ndarray of shape (K,) or (N, K)
-        Moments of the true currents on a drive that was not used for the calibration. [A], [A^2]
+        Mean and mean square of the true currents on a drive that was not used for the calibration. [A], [A^2]
 
     Returns
     -------
