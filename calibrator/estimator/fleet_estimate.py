@@ -72,7 +72,7 @@ class FleetReference:
     models : tuple of FaultModel
         Fault models that explain the fleet, by falling probability.
     usual : ndarray of shape (2, K)
-        Mean and mean square of the measured currents on the fleet's usual drive, over full scale.
+        Mean over full scale, and mean square over its square, of the measured currents: medians over the vehicles.
     misfits : UsualMisfits or None
         How far sensors of the fleet usually are from having one gain and one offset; None: not known.
     full_scale_a : float

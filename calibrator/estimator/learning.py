@@ -112,7 +112,7 @@ COARSE_LOW, COARSE_HIGH = np.geomspace(0.003, 0.4, 14), np.geomspace(0.015, 1.2,
 FINE = 1.06 ** np.arange(-8, 9)
 """Bounds that are tried about the best ones so far, relative to them. [1]"""
 TAILS = (0.001, 0.003, 0.01, 0.03, 0.1)
-"""Shares of faults beyond the bounds that are tried. [1]"""
+"""Shares of faults in the log-uniform tail that are tried. [1]"""
 LEAST_RANGE = (2.0, 1.2)
 """Least ratio of the upper to the lower bound of drifts and of offsets. Vehicles that all have the same drift would be
 the reference; all sensors of a branch may have the same offset, where the load is declared. [1]"""

@@ -37,7 +37,7 @@ GUESS_WEIGHT = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Slab:
-    """Probability density of the size of a fault: uniform between two bounds, with a tail beyond them.
+    """Probability density of the size of a fault: uniform between two bounds, plus a log-uniform tail of any size.
 
     Attributes
     ----------
