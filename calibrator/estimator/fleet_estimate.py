@@ -34,6 +34,7 @@ from calibrator.estimator.prior import Prior
 from calibrator.estimator.readings import FEWEST_TRUSTED, untrusted_vehicles, with_knowledge
 from calibrator.estimator.settings import CONFIDENT, FEWEST_VEHICLES, HARM_LIMIT, SUSPECTED
 from calibrator.summaries.moments import DriveSummary
+from calibrator.terminal.text import counted
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.parameters import Explanation, SensorFinding
 
@@ -88,7 +89,9 @@ class FleetReference:
     variants : tuple of float
         Logarithms of the factors on all currents of two variants of the vehicle; empty if there is only one. [1]
     distrusted : mapping of int to str
-        How vehicles that the user trusts contradict that trust, by position among those learnt from.
+        How vehicles that the user trusts contradict that trust, by position among those given to learn from.
+    unbalanced : int
+        Number of vehicles given in which a sign or unit is wrong, and from which nothing was learnt.
     """
 
     branches: tuple[str, ...]
@@ -106,6 +109,7 @@ class FleetReference:
     agreeing: tuple[float, ...]
     variants: tuple[float, ...]
     distrusted: Mapping[int, str]
+    unbalanced: int = 0
 
     @property
     def ordered(self) -> list[str]:
@@ -154,6 +158,11 @@ class FleetReference:
             notices.append(
                 f"{self.vehicles} vehicles are few for a fleet that is compared with itself: nothing is corrected; at "
                 f"least {FEWEST_VEHICLES} are needed, or {FEWEST_TRUSTED} bench-checked vehicles (--trusted)"
+            )
+        if self.unbalanced:
+            notices.append(
+                f"in {counted(self.unbalanced, 'vehicle')} the currents do not balance, as a sign or unit is wrong: "
+                f"nothing is learnt from them"
             )
         best = self.models[0]
         constant = best.spread.mean[RowPlaces(K).junction]
@@ -248,7 +257,7 @@ def learn_fleet(
         distrusted = {used[j]: why for j, why in found.distrusted.items()}
         if trusted is not None:
             distrusted |= dict.fromkeys(np.flatnonzero(trusted & ~balanced).tolist(), "its currents do not balance")
-        return replace(found, distrusted=distrusted)
+        return replace(found, distrusted=distrusted, unbalanced=found.unbalanced + int((~balanced).sum()))
     feed = int(np.argmax(np.median(fleet.mean_a, axis=0)))
     read_out = fit_fleet_model(fleet)
     measured, usual_correlation = collect_rows(fleet, read_out, full_scale_a=full_scale_a)

@@ -177,7 +177,7 @@ def _sensor_text(branch: BranchParameters, offsets: Sequence[tuple[float, float]
     probability = "" if chance is None else f" (probability of a fault {chance:.2f})"
     if not branch.drift and not branch.offset_a:
         return f"no fault found{probability}"
-    drift_sd = "" if branch.drift_sd is None else f" +- {100.0 * branch.drift_sd:.2f} %"
+    drift_sd = f" +- {100.0 * branch.drift_sd:.2f} %" if branch.drift_sd else ""
     drift = f"{100.0 * branch.drift:+z.2f} %{drift_sd}" if branch.identifiable else f"not known{drift_sd}"
     offset = f"{branch.offset_a:+.2f} A" + ("" if branch.offset_sd_a is None else f" +- {branch.offset_sd_a:.2f} A")
     peaks = dict.fromkeys(f"{offset_a:+.1f}" if offset_a else "0" for p, offset_a in offsets if p >= LEAST_RIVAL)

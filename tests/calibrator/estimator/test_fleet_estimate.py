@@ -77,6 +77,7 @@ def test_wrong_sign_or_unit_in_most_vehicles_is_refused_and_nothing_is_learnt_fr
         learned(most)
     found = learned(few)
     assert found.vehicles == VEHICLES - 4
+    assert "in 4 vehicles the currents do not balance" in found.notices[0]
     np.testing.assert_array_equal(found.read_out, learned(few[4:]).read_out)
 
 
