@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from calibrator.compiled import compiled, inner
 from calibrator.drive import Array, Channel, Drive, Mask, Samples
 from calibrator.errors import DriveError
-from ecu_node.core.signals import VOLT, WATT, unit_factor
-from ecu_node.database import VehicleDatabase
 from ecu_node.formulas import FUNCTIONS, formula_value, parse_formula
 from ecu_node.layout import Layout
 from ecu_node.summary import INSTANT_SLACK, TIME_RESOLUTION_S
@@ -31,7 +29,7 @@ __all__ = [
     "at_pace",
     "choose_inputs",
     "evaluate_formula",
-    "step_of",
+    "step_seen",
 ]
 
 MAX_SAMPLES = 20_000_000
@@ -306,20 +304,16 @@ def _next_good(known_s: Array, good: Mask, at: int) -> int:
     return at
 
 
-def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
-    """Return the step in which the current of a branch was measured; 0 if it is not known. [A]
+def step_seen(channel: Channel, otherwise_a: float) -> float:
+    """Return the step in which a current was measured, the least distance of two of its values. [A]
 
-    It is the least distance of two values in the drive or, if these are few, the scale of the branch's signal. For a
-    power it is the scale of the power over the median voltage, if the voltage is recorded.
+    Parameters
+    ----------
+    channel : Channel
+        Samples of the current. [A]
+    otherwise_a : float
+        What is returned if there are too few values to show a step, such as the scale of its signal. [A]
     """
-    branch, channel = database.layout.find_branch(name), drive.branches[name]
-    if branch.power is not None and branch.voltage is not None:
-        signal, voltage = database.signal(branch.power)[1], drive.inputs.get(f"_voltage_{name}")
-        if signal.is_float or voltage is None:
-            return 0.0
-        volts = np.median(np.abs(voltage.value[voltage.good]))
-        per_volt = unit_factor(signal, WATT, name) / unit_factor(database.signal(branch.voltage)[1], VOLT, name)
-        return float(abs(float(signal.scale)) * per_volt / volts)
     value_a = channel.value[channel.good]
     levels_a = np.unique(np.round(value_a[:: max(len(value_a) // LOOKED_AT, 1)], 9))
     if len(levels_a) >= FEW_LEVELS:
@@ -327,4 +321,4 @@ def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
         steps = (levels_a - levels_a[0]) / step_a
         if len(levels_a) >= LEVELS or np.allclose(steps, np.rint(steps), atol=1e-3):
             return step_a
-    return database.current_step_a(name)
+    return otherwise_a

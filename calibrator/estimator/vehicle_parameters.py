@@ -9,12 +9,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
 from calibrator.estimator.decision import FleetEstimate
 from calibrator.estimator.settings import CONFIDENT, SUSPECTED, Method
-from calibrator.estimator.vehicle_report import deciding_evidence
+from calibrator.estimator.vehicle_report import LEAST_RIVAL, REASONS, explained_faults
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
@@ -34,6 +34,7 @@ __all__ = [
     "RunIdentity",
     "by_branch",
     "current_moments",
+    "deciding_evidence",
     "impossible",
     "junction_residual",
     "parameters_of",
@@ -42,6 +43,10 @@ __all__ = [
 
 MOST_REPORTED, LEAST_REPORTED = 3, 0.02
 """Largest number of explanations that are reported, and least probability of one after the first. [1]"""
+LEAST_IN_THE_WAY = 1e-4
+"""Probability from which on another explanation can hold a correction back. [1]"""
+RESOLVED = 0.002
+"""Smallest difference that a zero-current window or a bench check shows: drifts, offsets over full scale. [1]"""
 QUIET_SHARE = 0.25
 """Share of the blocks, those with the least throughput (current through the junction), that count as at rest. [1]"""
 STABILITY = 0.01
@@ -299,3 +304,88 @@ def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int
 def _probability(value: float) -> float | None:
     """Clip a probability to its range, which rounding may exceed; None where it is not known (NaN)."""
     return None if np.isnan(value) else float(np.clip(value, 0.0, 1.0))
+
+
+def deciding_evidence(
+    estimate: FleetEstimate, j: int, branches: Sequence[str], *, layout: str
+) -> tuple[str, Explanation | None]:
+    """Return a sentence on what evidence would decide which sensor is faulty, or allow a correction that is held back.
+
+    Parameters
+    ----------
+    estimate, j : FleetEstimate, int
+        Estimate of N vehicles, and position of the vehicle in it.
+    branches : sequence of str
+        Names of the K branches.
+    layout : str
+        Name of the layout file, which contains the limits.
+
+    Returns
+    -------
+    text : str
+        The sentence.
+    rival : Explanation or None
+        The explanation that this evidence would tell from the most probable one, if the text is about one.
+    """
+    held_back, drift, offset_a = estimate.held_back[j], estimate.drift[j], estimate.offset_a[j]
+    full_scale_a = estimate.full_scale_a
+
+    def those(reason: HeldBack) -> list[str]:
+        return [branches[k] for k in np.flatnonzero(held_back == reason).tolist()]
+
+    if beyond := those("beyond the limits"):
+        k = branches.index(beyond[0])
+        return (
+            f"the {branches[k]} sensor is off by {100.0 * drift[k]:+z.1f} % and {offset_a[k]:+.1f} A, beyond the "
+            f"limits of {layout}: replace the sensor"
+        ), None
+    if unfit := those("does not fit"):  # a finding of such a branch, else of no branch, else of another one
+        found = sorted(estimate.findings[j], key=lambda each: (each.branch not in unfit, each.branch is not None))
+        check = f"a check of the {unfit[0]} sensor would decide: {REASONS['does not fit']}"
+        return found[0].text if found else check, None
+    doubtful = those("reference in doubt")
+    if doubtful and not those("harm limit"):
+        return (
+            f"bench-checked vehicles would decide: the fleet's reference is in doubt for branch {', '.join(doubtful)}; "
+            f"name at least three with --trusted"
+        ), None
+    text, rival = _rival(estimate.explanations[j], branches, held_back != "", full_scale_a)
+    if text:
+        return text, rival
+    # One explanation is left, and not known well enough: which sensor is known least, relative to the faults found?
+    sd = np.array([estimate.drift_sd[j], estimate.offset_sd_a[j] / full_scale_a])
+    size = np.linalg.norm([drift, offset_a / full_scale_a], axis=1, keepdims=True)
+    unsure = (sd / np.where(size > 0.0, size, 1.0)).max(axis=0)
+    k = int(np.argmax(np.where((held_back != "") | ~(held_back != "").any(), unsure, -np.inf)))
+    return (
+        f"more drives would decide: the {branches[k]} sensor's drift is known to "
+        f"+-{100.0 * estimate.drift_sd[j, k]:.2f} % and its offset to "
+        f"+-{estimate.offset_sd_a[j, k]:.2f} A only; record drives in which that current varies"
+    ), None
+
+
+def _rival(
+    found: Sequence[Explanation], branches: Sequence[str], held: Mask, full_scale_a: float
+) -> tuple[str, Explanation | None]:
+    """Return what would tell the most probable explanation from its strongest rival ("": nothing), and that rival.
+
+    Only differences in sensors whose correction is held back (``held``, shape (K,)) count; if none is, all count.
+    """
+    least = LEAST_IN_THE_WAY if held.any() else LEAST_RIVAL
+    others = [each for each in found[1:] if each.probability >= least]
+    best, *rivals = (explained_faults(each, branches) / [[1.0], [full_scale_a]] for each in (found[0], *others))
+    apart = [np.hypot(*(rival - best))[held | ~held.any()] for rival in rivals]
+    in_the_way = [each.probability * a[a > RESOLVED].sum() for each, a in zip(others, apart, strict=True)]
+    if not any(in_the_way):
+        same = "the explanations differ in the vehicle, not in its sensors: inspect the hardware"
+        return same if rivals and not held.any() else "", None
+    most = int(np.argmax(in_the_way))
+    rival, explanation = rivals[most], others[most]
+    drift, offset = np.abs(rival - best)
+    k = int(np.argmax(offset))
+    if offset[k] > RESOLVED:
+        what = f"a zero-current window (contactors open) would decide: the {branches[k]} sensor then shows"
+        return f"{what} {best[1, k] * full_scale_a:+.1f} A or {rival[1, k] * full_scale_a:+.1f} A", explanation
+    k = int(np.argmax(drift))
+    what = f"a check of the {branches[k]} sensor against a reference would decide: its gain is off by"
+    return f"{what} {100.0 * best[0, k]:+z.1f} % or {100.0 * rival[0, k]:+z.1f} %", explanation

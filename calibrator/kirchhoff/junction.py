@@ -12,11 +12,11 @@ from functools import cached_property
 import numpy as np
 
 from calibrator.drive import Array, Drive, good_values
-from calibrator.drives.align import at_pace, step_of
+from calibrator.drives.align import at_pace
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 from calibrator.kirchhoff.signs import WELL_CORRELATED, Bands, bands_of, likely_multipliers, sag
-from calibrator.kirchhoff.sums import VOLTAGE, Comparison, compare_kirchhoff
+from calibrator.kirchhoff.sums import VOLTAGE, Comparison, compare_kirchhoff, step_of
 from calibrator.words import is_battery
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout

@@ -28,16 +28,17 @@ import numpy as np
 import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.align import align_channels, at_pace, step_of
+from calibrator.drives.align import align_channels, at_pace, step_seen
 from calibrator.drives.delays import MAX_DELAY_S
 from calibrator.errors import DriveError
+from ecu_node.core.signals import VOLT, WATT, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
 from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
 from ecu_node.summary import DIFFERENCE_GAIN, MAD_TO_SD
 
-__all__ = ["BAND", "SUM", "VOLTAGE", "Comparison", "compare_kirchhoff", "with_voltages"]
+__all__ = ["BAND", "SUM", "VOLTAGE", "Comparison", "compare_kirchhoff", "step_of", "with_voltages"]
 
 VOLTAGE = "_junction_voltage"
 """Input that is the battery's voltage; drives may lack it."""
@@ -173,7 +174,7 @@ def _noise(value: Array) -> float:
 def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
     """Return the database with more inputs: :data:`VOLTAGE`, and the voltages of branches that are powers.
 
-    The latter are for :func:`.step_of`. :data:`VOLTAGE` is the first signal by which powers are divided, or else the
+    The latter are for :func:`step_of`. :data:`VOLTAGE` is the first signal by which powers are divided, or else the
     first input in volts.
     """
     layout = database.layout
@@ -183,6 +184,23 @@ def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
         divisors[VOLTAGE] = signal
     more = [Input(name=name, signal=signal) for name, signal in divisors.items()]
     return replace(database, layout=msgspec.structs.replace(layout, input=[*layout.input, *more]))
+
+
+def step_of(database: VehicleDatabase, name: str, drive: Drive) -> float:
+    """Return the step in which the current of a branch was measured; 0 if it is not known. [A]
+
+    It is the least distance of two values seen; where few values were seen, the scale of its signal. For a power it is
+    the scale of the power over the median voltage, if the voltage is recorded.
+    """
+    branch, channel = database.layout.find_branch(name), drive.branches[name]
+    if branch.power is not None and branch.voltage is not None:
+        signal, voltage = database.signal(branch.power)[1], drive.inputs.get(f"_voltage_{name}")
+        if signal.is_float or voltage is None:
+            return 0.0
+        volts = np.median(np.abs(voltage.value[voltage.good]))
+        per_volt = unit_factor(signal, WATT, name) / unit_factor(database.signal(branch.voltage)[1], VOLT, name)
+        return float(abs(float(signal.scale)) * per_volt / volts)
+    return step_seen(channel, database.current_step_a(name))
 
 
 def compare_kirchhoff(

@@ -9,7 +9,7 @@ from operator import add
 import numpy as np
 
 from calibrator.drive import Array, Channel, Drive, Equipment, Samples
-from calibrator.drives.align import align, at_pace, step_of
+from calibrator.drives.align import align, at_pace, step_seen
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank
@@ -181,7 +181,9 @@ def with_noise_of_steps(
 
     Differences between samples do not show the noise of rounding while the current changes by less than a step.
     """
-    step_a = np.array([max(step_of(database, name, drive) for drive in drives) for name in branches])
+    step_a = np.array(
+        [max(step_seen(drive.branches[name], database.current_step_a(name)) for drive in drives) for name in branches]
+    )
     return replace(summary, noise_a2=np.maximum(summary.noise_a2, step_a**2 / 12.0))
 
 

@@ -9,8 +9,8 @@ from msgspec.structs import replace as changed
 from calibrator.drive import Array
 from calibrator.estimator.evidence import evidence_names, reported_evidence
 from calibrator.estimator.fleet_estimate import FleetEstimate
-from calibrator.estimator.vehicle_parameters import impossible
-from calibrator.estimator.vehicle_report import deciding_evidence, explained, held_back_lines
+from calibrator.estimator.vehicle_parameters import deciding_evidence, impossible
+from calibrator.estimator.vehicle_report import explained, held_back_lines
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, SensorFinding
 from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
