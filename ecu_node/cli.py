@@ -57,7 +57,10 @@ def _main(arguments: list[str]) -> int:
 
 
 def _option(read: Callable[[str], Any], is_right: Callable[[Any], Any], refusal: str) -> Callable[[str], Any]:
-    """Make a type for argparse: it returns `read(text)` if `is_right` accepts that, and else refuses the text."""
+    """Make a type for argparse: it returns `read(text)` if `is_right` accepts that, else it refuses the text.
+
+    `refusal` is the message, in which ``{}`` stands for the text.
+    """
 
     def value_of(text: str) -> Any:
         with suppress(ValueError):
@@ -80,7 +83,7 @@ _VEHICLE = _option(
 
 
 def _read_target(text: str) -> Path | tuple[str, int] | None:
-    """Return the file, or host and port, of ``--telemetry``; None if the text is neither."""
+    """Return the target of ``--telemetry``: a file, or host and UDP port; None if the text is neither."""
     if "://" not in text:
         return Path(text) if text.strip() else None
     found = urlsplit(text)

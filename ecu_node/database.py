@@ -45,7 +45,7 @@ class VehicleDatabase:
     """SHA-256 of the DBC file; see :attr:`.Layout.dbc_digest`."""
 
     def message(self, name: str, place: str = "") -> Message:
-        """Return the message of this name, or raise DatabaseError; ``place`` is where the layout names it."""
+        """Return the message of this name, or raise DatabaseError, which says where the layout names it: ``place``."""
         return self._found(name, place)[1]
 
     def channel_of(self, name: str) -> str | None:

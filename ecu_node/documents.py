@@ -1,4 +1,4 @@
-"""Files that a user names: they are read if regular and not too large, written whole, and their errors located.
+"""Reads files that a user names, if they are regular and not too large; writes files whole; locates their errors.
 
 msgspec decides whether a document has the right structure; :func:`field_error` says where it has not.
 """
@@ -19,7 +19,7 @@ import msgspec
 
 
 class UnsuitableFileError(OSError):
-    """A path leads to something that is no regular file, or too large; the text is made to follow the path."""
+    """A path leads to no regular file, or to one too large; its text follows the path, as in "PATH: it is a folder"."""
 
     def __str__(self) -> str:
         return str(self.strerror)
@@ -65,7 +65,10 @@ def _require_regular(found: os.stat_result) -> None:
 
 
 def signature(path: Path) -> tuple[int, int, int, int] | None:
-    """Return times of change, size and inode of a file, which tell whether it was changed; None if there is none."""
+    """Return times of change [ns], size [byte] and inode of a file: another result means that it was changed.
+
+    None if there is no such file.
+    """
     try:
         found = path.stat()
     except OSError:
@@ -126,7 +129,7 @@ def _problem(value: Any, kind: Any) -> tuple[list[str], str] | None:
     is_table = isinstance(value, dict)
     kinds, limits = _alternatives(kind)
     structs = [one for one in kinds if is_table and isinstance(one, type) and issubclass(one, msgspec.Struct)]
-    if len(structs) > 1:  # told apart by the value of a key
+    if len(structs) > 1:  # the value of one key says which of them is meant
         key = str(structs[0].__struct_config__.tag_field)
         by_tag = {str(one.__struct_config__.tag): one for one in structs}
         if not isinstance(value.get(key), str) or value[key] not in by_tag:
@@ -180,7 +183,7 @@ def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 _LONGEST_VALUE = 40
-"""Characters of a value that are shown."""
+"""Most characters of a value that are shown."""
 
 
 def _shown(value: Any) -> str:

@@ -6,7 +6,7 @@ The command line turns every :class:`UserError` into that line and an exit code;
 __all__ = ["BusError", "DatabaseError", "LayoutError", "ParameterError", "UserError", "printable", "shown_name"]
 
 _LONGEST_NAME = 64
-"""Characters of a name that are shown."""
+"""Most characters of a name that are shown."""
 
 
 class UserError(Exception):

@@ -114,7 +114,9 @@ class Branch(_Table, frozen=True, kw_only=True):
     balance: bool = False
     """In ground truth made from recordings, this branch is set to minus the sum of the others, (19) of the paper."""
     corrected: SignalName | None = None
+    """Signal into which an overlay node writes the corrected current or power."""
     quality: SignalName | None = None
+    """Signal of the same message that says what kind of value that is, such as corrected or passed through."""
     vss: _VssName | None = None
     """Its name in the COVESA Vehicle Signal Specification, used in telemetry."""
     no_value: list[int] = []
@@ -198,9 +200,10 @@ class Watch(_Table, frozen=True, kw_only=True):
     """When the node takes its own corrections to be wrong."""
 
     window_s: Annotated[float, msgspec.Meta(ge=1.0, le=3600.0)] = 10.0
-    """Over this long the sums are compared. [s]"""
+    """Measured and corrected sums are compared over this long. [s]"""
     margin_a: _Positive | None = None
-    """By how much the corrected sum must be worse (RMS) [A]; 0.25 % of full scale where not given."""
+    """The correction is wrong if the corrected sum (RMS) exceeds the measured one by this [A]; where not given, 0.25 %
+    of full scale."""
     start_s: Annotated[float, msgspec.Meta(ge=0.0, le=60.0)] = 3.0
     """Time that the first frame of a branch may take after the bus has woken up, if its timeout is shorter. [s]"""
     sleep_s: Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)] = 5.0
@@ -217,11 +220,11 @@ class Activation(_Table, frozen=True, kw_only=True):
     trial_s: Annotated[float, msgspec.Meta(ge=1.0, le=86400.0)] = 300.0
     """Length of the trial: time for which the Kirchhoff sum is watched while currents flow. [s]"""
     tolerance: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
-    """How far the share of the correction that removes an error may fall below what the calibrator saw. [1]"""
+    """How far the share in :mod:`ecu_node.update.trial` may fall below that which the calibrator saw. [1]"""
     step_drift: Annotated[float, msgspec.Meta(gt=0.0, le=2.0)] = 0.2
-    """Largest difference from the drift that is in force. [1]"""
+    """Largest difference of a new drift from that in force. [1]"""
     step_offset_a: _Positive | None = None
-    """Largest difference from the offset that is in force [A]; 20 % of full scale where not given."""
+    """Largest difference of a new offset from that in force [A]; 20 % of full scale where not given."""
 
 
 _DataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]
@@ -249,7 +252,7 @@ class _Protected(_Table, frozen=True, kw_only=True):
     invalid: E2EWindow = E2EWindow(window=10, min_ok=3, max_error=1)
     """Condition to become VALID again, also after a silence."""
     max_delta_counter: Annotated[int, msgspec.Meta(ge=1, le=255)] = 3
-    """Largest step of the counter between two frames that is used: one more than the frames that may be lost."""
+    """Largest step of the counter after which a frame is still used: 3 allows for two lost frames before it."""
 
     @property
     def profile(self) -> str:
@@ -273,7 +276,8 @@ class ProfileP01(_WithHeader, frozen=True, kw_only=True, tag_field="profile", ta
     """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
 
     data_id_mode: Literal["both", "alternating", "low", "nibble"] = "both"
-    """Which bytes of the data identifier the CRC covers, in this order: profile 1A, 1B, the low byte only, 1C."""
+    """Which bytes of the data identifier the CRC covers: "both" as in profile 1A, "alternating" as in 1B, "nibble" as
+    in 1C, "low" the low byte only."""
 
 
 class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P02"):
@@ -328,7 +332,7 @@ class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", ta
 AutosarProfile = ProfileP01 | ProfileP02 | ProfileP04 | ProfileP05 | ProfileP06 | ProfileP07 | ProfileP11
 """A profile of AUTOSAR for some messages."""
 EndToEnd = AutosarProfile | CounterCrc8
-"""How some messages are protected."""
+"""One way to protect messages: a profile of AUTOSAR, or a counter with a CRC-8."""
 
 
 class LayoutKeys(_Table, frozen=True, kw_only=True):
@@ -341,8 +345,10 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
     bus: list[Bus] = []
     """Buses, each with its DBC, in place of ``dbc`` if logs hold several buses."""
     full_scale_a: _Positive
+    """Nominal maximum current of the junction. [A]"""
     branch: Annotated[list[Branch], msgspec.Meta(min_length=2, max_length=16)]
     period_s: Annotated[float, msgspec.Meta(gt=0.0, le=LONGEST_PERIOD_S)] = 0.1
+    """Period of the time base on which the calibrator compares all currents and inputs. [s]"""
     max_age_s: _Positive = 1.0
     """An input without a frame for this long is stale. [s]"""
     input: list[Input] = []
@@ -367,12 +373,12 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
 
     @property
     def dbc_files(self) -> dict[str, str]:
-        """DBC files as written, by bus; ``""`` where the layout names none."""
+        """DBC files as written, by name of the bus (``""`` if the layout names no buses); empty if it has no DBC."""
         return {bus.name: bus.dbc for bus in self.bus} or ({} if self.dbc is None else {"": self.dbc})
 
     @property
     def watch_signal(self) -> SignalName | None:
-        """The signal of the watch's input."""
+        """The signal of the watch's input; None if the watch has no input."""
         return next((item.signal for item in self.input if item.name == self.watch.input), None)
 
     @property
@@ -387,7 +393,7 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
 
     @property
     def step_offset_a(self) -> float:
-        """Largest difference of an offset from the one that is in force. [A]"""
+        """Largest difference of a new offset from that in force. [A]"""
         return self.activation.step_offset_a or 0.2 * self.full_scale_a
 
     @property
@@ -397,13 +403,13 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
 
     @property
     def protections(self) -> list[tuple[str, EndToEnd]]:
-        """All entries of ``e2e``, each with its place in the file."""
+        """All entries of ``e2e``, each after its place in the file, such as ``[[e2e]] entry number 2``."""
         if not isinstance(self.e2e, list):
             return [("[e2e]", self.e2e)]
         return [(f"[[e2e]] entry number {number}", entry) for number, entry in enumerate(self.e2e, start=1)]
 
     def protection(self, message: str) -> EndToEnd | None:
-        """How a message is protected; None if it is not."""
+        """How the message of this name is protected; None if it is not."""
         return next((entry for _, entry in self.protections if message in entry.messages), None)
 
     def base_inputs(self, names: Collection[str]) -> set[str]:
@@ -431,7 +437,7 @@ class Layout(LayoutKeys, frozen=True, kw_only=True):
 
     @property
     def dbc_paths(self) -> dict[str, Path]:
-        """Paths of the DBC files by bus, ``""`` where the layout names none."""
+        """Paths of the DBC files, by the keys of :attr:`dbc_files`."""
         return {bus: self.path.parent / file for bus, file in self.dbc_files.items()}
 
     @property
@@ -480,7 +486,7 @@ def read_layout(path: Path) -> Layout:
 
 
 def layout_of(document: dict[str, Any], path: Path, digest: str | None = None) -> Layout:
-    """Check a layout.
+    """Return the layout that the content of a layout file describes, checked.
 
     Parameters
     ----------
@@ -530,7 +536,7 @@ def file_digest(path: Path) -> str:
 
 
 def joint_digest(digests: Sequence[str]) -> str:
-    """Return one digest for several files, or none: that of their joined digests; for one file it is its own."""
+    """Return the digest of any number of files: the SHA-256 of their digests in a row; of one file, its own digest."""
     return digests[0] if len(digests) == 1 else text_digest("".join(digests).encode())
 
 

@@ -56,7 +56,7 @@ class _HeardMessage:
         """Frames that this message has not answered yet: when each came [s], and its message."""
 
     def take(self, payload: bytearray, time_s: float) -> bool:
-        """Take a frame; like the node, use it only if it is intact, new, and not after a jump of its counter."""
+        """Take a frame; return whether it is used: only if it is intact, new, and its counter did not jump."""
         self._count += 1
         found = self._check(payload)
         if found in _FAULTS:
@@ -67,7 +67,7 @@ class _HeardMessage:
         return True
 
     def rate_hz(self, now_s: float) -> float:
-        """Return the mean rate of its frames, intact or not, since the last call two seconds ago or more. [1/s]"""
+        """Return the mean rate of its frames, intact or not, since the latest call at least two seconds ago. [1/s]"""
         counts = self._counts
         while len(counts) > 1 and counts[1][0] <= now_s - _RATE_WINDOW_S:
             counts.popleft()
@@ -163,7 +163,7 @@ class BusMonitor:
 
 
 class _BranchOnBus:
-    """One branch: its measured current, and the corrected one, which stays without frames if the layout has none."""
+    """One branch: its measured current, and the corrected one, without frames if the layout has no signal for it."""
 
     def __init__(self, database: VehicleDatabase, branch: Branch, heard: _Heard) -> None:
 
@@ -218,7 +218,7 @@ class _BranchOnBus:
 
 
 def _current_at(branch: LiveBranch, time_s: float) -> float | None:
-    """Return the current of a signal at a time [A], without a correction; None if it is not known for that time."""
+    """Return the current that a signal shows at a time [A]; None if it is not known for that time."""
     return (branch.currents_at(time_s) or (None,))[0]
 
 
@@ -231,7 +231,10 @@ def _name(names: type[Quality | Reason | State], code: int | None) -> str | int 
 
 
 def _sums(branches: Sequence[_BranchOnBus], now_s: float, *, publishes: bool) -> View:
-    """Return sums at the newest instant that all branches have reached; None while one is stale or has no value. [A]"""
+    """Return ``measured_a`` and ``corrected_a``: the sums at the newest instant that all branches have reached. [A]
+
+    They are None while a branch is stale or has no value.
+    """
     measured, shown = [branch.measured for branch in branches], [branch.shown for branch in branches]
     is_published = publishes and all(branch.seen for branch in shown)
     after = aligned_currents(shown, {}, now_s) if is_published else None
@@ -284,7 +287,8 @@ _COLUMNS = {
     "age": "[s]",
     "faults": "",
 }
-"""Names and units: "rate" is that of measured frames, "answers" of corrected ones. Words stand at the left."""
+"""Columns of the table and their units; one without a unit holds words, set to the left. "rate" is that of measured
+frames, "answers" that of corrected ones."""
 
 
 def view_lines(view: View, where: str, counters: Counters) -> list[str]:
@@ -456,7 +460,7 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
 
 
 def _listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[], bool]) -> None:
-    """Take frames until a time of the steady clock [s], or until told to stop."""
+    """Take frames until a time of the steady clock [s], or until `stop` returns True."""
     while (now_s := time.monotonic()) < until_s and not stop():
         ahead_s = time.time() - now_s
         turn_end_s = min(until_s, now_s + _LONGEST_WAIT_S)

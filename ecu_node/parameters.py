@@ -105,9 +105,9 @@ class SensorFinding(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class JunctionResidual(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Kirchhoff sum on the drives used.
+    """Kirchhoff sum on the drives that were used for the calibration.
 
-    Single corrected sums, as the node takes them, have about expected_a the variance corrected_sd_a^2 +
+    A single corrected sum, as the node takes it, scatters around expected_a with the variance corrected_sd_a^2 +
     (corrected_sd_per_a * throughput)^2, where throughput is half the sum of the magnitudes of all currents.
     """
 
@@ -121,7 +121,7 @@ class JunctionResidual(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     corrected_sd_per_a: Annotated[_Share | None, Meta(description="how much of it grows with the current [1]")] = None
 
     def about_expected(self) -> tuple[float, float]:
-        """Return the RMS of measured and corrected sum about the expected one; about 0 if their means are not known."""
+        """Return the RMS of measured and corrected sum about expected_a; about 0 if a mean is not known. [A]"""
         if self.measured_mean_a is None or self.corrected_mean_a is None:
             return self.measured_a, self.corrected_a
 

@@ -110,7 +110,8 @@ def end_of(program: str, error: Exception, *, debug: bool, packages: Sequence[st
     debug : bool
         Whether the traceback is shown before the line.
     packages : sequence of str
-        The program's own packages, beside this one: a fault is reported with the last place in their code.
+        The program's own packages, in the folder that holds ``ecu_node``: a fault is reported with the last place in
+        their code.
 
     Returns
     -------

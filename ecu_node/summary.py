@@ -1,9 +1,9 @@
-"""What is kept of a drive: blocks, as the calibrator and a node that sums on board form them, and the node's file.
+"""Rules by which the calibrator, and a node on board, sum up drives in blocks; and the file that the node writes.
 
 Branches and inputs are taken at whole multiples of the layout's period since the start of the drive, each interpolated
 between its good samples. Of every block of :data:`BLOCK_S` the sums of the products of (inputs, measured currents, 1)
-are kept, without spikes, which are looked for in :data:`BATCH_SAMPLES` at a time. A block of which less than
-:data:`LEAST_SHARE` is valid does not count. :mod:`calibrator.summaries` computes this with arrays, and
+are kept. Spikes are left out; they are looked for in :data:`BATCH_SAMPLES` samples at a time. A block of which less
+than :data:`LEAST_SHARE` is valid does not count. :mod:`calibrator.summaries` computes this with arrays, and
 :mod:`ecu_node.bus.on_board_summary` in plain Python; a test compares them.
 """
 
@@ -22,7 +22,7 @@ BATCH_SAMPLES = 1500
 LEAST_SHARE = 0.2
 """Least share of valid samples of a block that is used. [1]"""
 TIME_RESOLUTION_S = 1e-3
-"""Rounding of time stamps in logs, added to limits so that samples exactly one limit apart pass. [s]"""
+"""Rounding of time stamps in logs; added to limits of time, so that samples exactly one limit apart pass. [s]"""
 INSTANT_SLACK = 1e-3
 """An instant within this share of a period or limit from a sample, or from the grid, coincides with it. [1]"""
 RANGE_SLACK = 1e-6
@@ -35,7 +35,8 @@ DIFFERENCE_GAIN = 20.0
 NORMAL_MEDIAN = 0.6745
 """Median magnitude of a standard normal variable."""
 MEDIAN_EXCESS = 3.8
-"""The squared median of n third differences of white noise is too large by this / n (simulated, n = 9 to 300)."""
+"""The squared median of n third differences of white noise is 1 + this / n times too large (simulated, n = 9 to
+300)."""
 
 SPIKE_SDS = 8.0
 """Distance from the running median, in robust standard deviations, from which a sample may be a spike. [1]"""
@@ -60,7 +61,7 @@ ZERO_SETTLING_S = 2.0
 FEWEST_ZERO_SAMPLES = 10
 """Least number of samples of a branch in windows with open contactors for its offset reading to count."""
 ZERO_RESOLUTION_A = 0.02
-"""Least standard deviation of such a reading: sensors drift by about this much within a window. [A]"""
+"""Least standard deviation of an offset reading: sensors drift by about this much within a window. [A]"""
 ZERO_PIECE_S = 5.0
 """Length of the pieces of a window: an offset that wanders within it shows in their medians. [s]"""
 
@@ -93,24 +94,26 @@ class SummaryFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """Standard deviations of the delays, by branch; null: not known. [s]"""
     zero_offset_a: list[float | None]
     zero_sd_a: list[float | None]
+    """Offset of each branch in windows with open contactors, and its standard deviation; null: no reading. [A]"""
     starts: list[bool]
     """Whether a drive starts with each batch."""
     count: list[int]
     """Number of samples of each batch."""
     mean: bytes
-    """(B, p - 1)"""
+    """Means of inputs and currents (B, p - 1)."""
     covariance: bytes
-    """Lower triangles, row by row (B, (p - 1) p / 2)."""
+    """Covariances of inputs and currents: lower triangles, row by row (B, (p - 1) p / 2)."""
     noise_a2: bytes
-    """(B, K)"""
+    """Variance of the white noise of each current (B, K). [A^2]"""
     fast_a2: bytes
-    """Lower triangles (B, K (K + 1) / 2)."""
+    """Sums of products of fast changes of each two currents, a fast change being the distance of a sample from the mean
+    of its neighbours: lower triangles, row by row (B, K (K + 1) / 2). [A^2]"""
     spikes: bytes
-    """(B, K, 2)"""
+    """Numbers of positive and of negative spikes of each current (B, K, 2)."""
     temperature_c: bytes
-    """(B,)"""
+    """Mean temperature of the sensors (B,); NaN: not known. [degC]"""
     levels: list[list[int]]
-    """Levels of its current that each branch visited, see ``level_sums``."""
+    """Levels between the edges :data:`LEVELS_A` that the current of each branch visited; 0 is the most negative one."""
     level_sums: bytes
     """For each of these levels p + 1 numbers: sums of (inputs, currents, 1) and of the branch's own current squared."""
 

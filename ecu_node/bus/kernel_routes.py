@@ -61,7 +61,9 @@ class _Route(NamedTuple):
 
 
 class KernelRoutes:
-    """The kernel's rules between two buses, both ways; leaving the context removes them, unless the program crashed.
+    """The kernel's rules between two buses, both ways.
+
+    Leaving the context removes them, except by an exception that is no :class:`UserError`.
 
     Parameters
     ----------
@@ -214,7 +216,10 @@ def _route(payload: bytes) -> _Route | None:
 def kernel_routes(
     channels: tuple[str, str], ours: Collection[tuple[int, bool]], *, fd: bool, say: Callable[[str], None]
 ) -> KernelRoutes | None:
-    """Return rules for all identifiers but ours; None, and a line in the log, if the node carries all frames itself."""
+    """Return rules for all identifiers but ours; None if the kernel takes none, so that the node carries all frames.
+
+    The log then says why, except for an interface that is missing.
+    """
     if set(channels) - {name for _, name in socket.if_nameindex()}:
         return None  # opening the bus says so
     try:

@@ -79,7 +79,7 @@ class TimeOfDay:
 
 
 _REMEMBERED = 256
-"""Most frames of one identifier that may be on their way back."""
+"""Most frames of one identifier that the node has sent and may still receive itself."""
 _Key = tuple[int, bool]
 """An identifier, and whether it has 29 bits."""
 
@@ -92,7 +92,7 @@ class OwnFrames:
     keys : iterable of tuple
         Identifiers, each with whether it has 29 bits.
     remembered : int
-        Number of frames of each identifier that may be on their way back.
+        Number of frames of each identifier that the node has sent and may still receive itself.
     """
 
     def __init__(self, keys: Iterable[_Key], remembered: int = _REMEMBERED) -> None:
@@ -161,7 +161,7 @@ class Node:
     period_s : float
         Time between status messages. [s]
     on_tick : callable
-        Called after each look at the junction, with the time of the steady clock [s], and whether all threads work.
+        Called after each look at the junction, with the steady clock [s], and True if all threads work.
     latency : Latency
         Histogram to which the latencies of answers are added.
     routed : bool

@@ -55,6 +55,7 @@ _Column = list[float]
 _Samples = list[tuple[float, float]]
 """Times [s] and values."""
 _Take = Callable[[float, float], None]
+"""Takes the time [s] and the value of a sample."""
 
 
 def _reader(placed: PlacedSignal, codes: Codes) -> Callable[[bytearray], float | None]:
@@ -71,7 +72,7 @@ def _reader(placed: PlacedSignal, codes: Codes) -> Callable[[bytearray], float |
 
 
 class _Channel:
-    """Good samples of a branch or input since the last batch, with their times at the junction. [s], [base unit]"""
+    """Good samples of a branch or input since the last batch, with their times [s] at the junction."""
 
     def __init__(self, limit_s: float, delay_s: float = 0.0) -> None:
         self.limit_s, self._delay_s = limit_s + rule.TIME_RESOLUTION_S, delay_s
@@ -94,7 +95,7 @@ class _Channel:
 
 
 def _aligned(samples: _Samples, instants_s: Sequence[float], limit_s: float) -> _Column:
-    """Interpolate samples at instants; NaN where neighbouring samples are too far apart, and after the last one."""
+    """Interpolate samples at instants from the first sample on; NaN in gaps above `limit_s`, and after the last one."""
     times_s, found = [time_s for time_s, _ in samples], []
     for instant_s in instants_s:
         following = bisect_right(times_s, instant_s)
@@ -138,7 +139,7 @@ class _ZeroCurrent:
         self._windows: dict[str, list[_Window]] = {name: [] for name in layout.branch_names}
 
     def state(self, time_s: float, value: float) -> None:
-        """Take a state of the contactors, and begin or end a window."""
+        """Take the value of the contactors' input at a time [s], and begin or end a window."""
         is_open = any(math.isclose(value, other, rel_tol=1e-9, abs_tol=1e-9) for other in self._open)
         if self._samples is not None and (not is_open or time_s - self._last_s > self._max_age_s):
             self.end_window()
@@ -517,7 +518,10 @@ class OnBoardSummary:
 
 
 def _power_over_voltage(limit_s: float, take: _Take) -> tuple[_Take, _Take]:
-    """Return functions that take a voltage, and a power, which is passed on as a current if a voltage is recent."""
+    """Return a function that takes a voltage, and one that takes a power and passes power / voltage on to `take`.
+
+    A power without a voltage within `limit_s` is dropped.
+    """
     latest = -math.inf, 0.0
 
     def put_voltage(time_s: float, value: float) -> None:
@@ -587,7 +591,7 @@ def _products(columns: Sequence[Sequence[float]]) -> _Column:
 
 
 def _white_noise_a2(current_a: Sequence[float]) -> float:
-    """Estimate the variance of white noise in a block from its median third difference, without gaps (NaN). [A^2]"""
+    """Estimate the variance of white noise in a block from its median third difference; NaN is a gap. [A^2]"""
     x = current_a
     third = [abs(late - early - 3.0 * (c - b)) for early, b, c, late in zip(x, x[1:], x[2:], x[3:], strict=False)]
     known = [value for value in third if not math.isnan(value)]
@@ -597,7 +601,7 @@ def _white_noise_a2(current_a: Sequence[float]) -> float:
 
 
 def _add_levels(columns: Sequence[_Column], own: _Column, sums: dict[int, _Column]) -> None:
-    """Add samples to the sums of the levels that a branch's own current is in."""
+    """Add each sample to the sums of the level in which the branch's own current is then."""
     sorted_rows: dict[int, list[int]] = {}
     for t, x in enumerate(own):
         away = bisect_right(rule.LEVELS_A, int(abs(x)))
@@ -618,7 +622,10 @@ def _second_differences(blocks: Sequence[_Column], used: Sequence[Sequence[bool]
 
 
 def _find_spikes(currents: list[_Column], used: Sequence[bool]) -> dict[int, list[int]]:
-    """Find spikes as :func:`calibrator.summaries.summariser.find_spikes`; return signs per branch, by sample."""
+    """Find spikes as :func:`calibrator.summaries.summariser.find_spikes` does.
+
+    Returns, by number of the sample, the sign of the spike of each branch: 1, -1, or 0 for none.
+    """
     K, count, found, half = len(currents), len(used), dict[int, list[int]](), rule.SPIKE_WINDOW // 2
     kept, suspects, weights = list(used), list[int](), list[float]()
     for _ in range(2):  # the second time with gains that the spikes did not distort

@@ -276,7 +276,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
     vehicle : str or None
         Identity of the vehicle; None: not checked.
     is_gateway : bool
-        Whether corrected values are written in place, or under identifiers of their own.
+        Whether corrected values are written in place; else under identifiers of their own.
 
     Returns
     -------

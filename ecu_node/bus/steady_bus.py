@@ -37,7 +37,7 @@ _BUS_OFF = 0x40
 _GONE = frozenset((errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF))
 """Errors of sending after which only opening the bus again helps."""
 _OF_FRAME = frozenset((errno.EINVAL, errno.EMSGSIZE))
-"""Errors of a frame that the bus never takes, whatever its state, such as one that is too long for it."""
+"""Errors of sending a frame that the bus never takes, such as one that is too long for it."""
 _ERRORS = (can.CanError, OSError, ValueError)
 """Exceptions of a bus in use; ValueError: the other thread has just closed it."""
 
@@ -90,8 +90,8 @@ class SteadyBus:
         self.send: Callable[[can.Message], None] = (lambda _: None) if listen_only else self._queue.append
         """Takes a frame to be sent at the next :meth:`flush`."""
         self.asked_s = self.read_s = time.monotonic()
-        """When the bus was asked last (if it had no more frames, all that came before were received), and when the last
-        frame was read, which came before that. [s]"""
+        """When the bus was last asked for frames, and when it last had one, on the steady clock [s]. If it had none
+        when asked, all frames that came before have been received."""
 
     @property
     def at_hand(self) -> bool:
@@ -260,7 +260,7 @@ class _FrameByFrame:
         except (ValueError, TypeError, struct.error) as error:  # python-can's serial driver, on a disturbed line
             raise can.CanOperationError(f"the adapter sends what is no frame: {error}") from None
         now_s = time.monotonic()
-        self.asked_s = min(now_s, asked_s + timeout_s)  # in a pause of the process after it nothing was heard
+        self.asked_s = min(now_s, asked_s + timeout_s)  # in a pause after the timeout nothing is heard
         if message is not None:
             self.read_s = now_s
             if not self._has_time_of_day:
@@ -368,7 +368,7 @@ class SocketCanLink:
         if timeout_s > 0.0:
             waiting_s = time.monotonic()
             is_asked = bool(self._waiting.poll(1e3 * timeout_s))
-            self.asked_s = min(time.monotonic(), waiting_s + timeout_s)  # nothing was heard in a pause after it
+            self.asked_s = min(time.monotonic(), waiting_s + timeout_s)  # in a pause after the timeout nothing is heard
         else:
             is_asked, self._had_no_more = not self._had_no_more, False
             if is_asked:

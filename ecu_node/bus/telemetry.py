@@ -103,7 +103,7 @@ class Telemetry:
 
 
 def _branch(branch: LiveBranch, now_s: float) -> dict[str, Any]:
-    """Return the measured and the published current of a branch, positive into the junction. [A]"""
+    """Return the measured and the published current of a branch, positive into the junction [A], and their quality."""
     quality = branch.published(now_s)[1]
     currents_a = None if quality in _WITHOUT_VALUE else branch.currents_at(branch.time_s)
     if currents_a is None:

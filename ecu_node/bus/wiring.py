@@ -173,7 +173,10 @@ def signal_codes(
     what: str,
     no_value: tuple[int, ...] = (),
 ) -> Codes:
-    """Return the codes of a signal in a base unit (None: its own); `no_value` are further codes that are no values.
+    """Return the codes of a signal; `no_value` are further codes that are no values.
+
+    Values are in the base unit of `units`, such as :data:`.AMPERE`, or in the signal's own if that is None. `what`
+    names the signal's use in errors.
 
     Raises
     ------
@@ -210,7 +213,7 @@ def branch_signals(database: VehicleDatabase, branch: Branch, mode: Mode) -> Sig
 
 
 def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, mode: Mode) -> IntegerPlan:
-    """Return the plan of one branch, from measured to written codes; errors are those of ``branch_signals``."""
+    """Return the plan of one branch, from measured to written codes; errors are those of :func:`branch_signals`."""
     return correction_plan(branch_signals(database, branch, mode), fault)
 
 

@@ -126,7 +126,7 @@ AS_IT_IS = IntegerPlan(gain=2, bias=0, shift=1, lowest=-_EVERYTHING, highest=_EV
 
 
 def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
-    """Build the plan of one branch, once at start.
+    """Return the plan by which one branch is corrected; built once, when parameters are put in force.
 
     Parameters
     ----------

@@ -60,8 +60,9 @@ def _in_one_word(
 ) -> _Rewrite:
     """Return a function that writes all branches at once, or `otherwise` if payloads of this length may lack a branch.
 
-    It falls back to `otherwise` for a frame with a code that is not ordinary. Two's complements are handled as unsigned
-    numbers: their sign bits are inverted, in the payload and in the outgoing one.
+    It falls back to `otherwise` for a frame with a code that is not ordinary, see :meth:`.LiveBranch.ordinary_codes`.
+    Two's complements are handled as unsigned numbers: their sign bits are inverted, in the payload and in the outgoing
+    one.
     """
     orders = {(branch.signal.place.order, written.place.order) for branch, written in branches.items()}
     if len(orders) != 1 or any(branch.signal.above or branch not in inside for branch in branches):
@@ -137,7 +138,9 @@ class _Ways(NamedTuple):
     missing: list[LiveBranch]
     """Branches that such a payload is too short for."""
     in_place: _Rewrite
+    """Writes corrected currents into the payload itself."""
     answers: list[tuple[OwnMessage, _Rewrite]]
+    """Messages that answer such a payload, each with the function that fills it."""
 
 
 class Source:
@@ -251,7 +254,7 @@ class Source:
         return made
 
     def _take(self, payload: bytearray, now_s: float, ways: _Ways) -> Check:
-        """Check a frame, and remember it if it is usable."""
+        """Check a frame, remember it if it is usable, and return the outcome of the check."""
         counters, check = self._counters, _OK
         counters.frames_in += 1
         if self._receiver is not None:
@@ -359,7 +362,7 @@ class Corrector:
             self.own_keys.add(status_fields.message.key)
 
     def begin(self, *, reason: Reason, parameter_set: int, expected: JunctionResidual | None = None) -> None:
-        """Begin to work with the parameters that the branches were just given; release what was latched.
+        """Work from now on with the parameters that the branches took over last, and release what is latched.
 
         Parameters
         ----------
@@ -375,7 +378,10 @@ class Corrector:
         self.latch(Reason.NONE)
 
     def look(self, now_s: float) -> None:
-        """Look at the whole junction; must be called every 20 ms for a jump to be seen within 0.1 s."""
+        """Judge the whole junction, and fall back to passing through if a branch is stale or a sum is wrong.
+
+        Must be called every 20 ms for a jump to be seen within 0.1 s.
+        """
         self._looked_s = now_s
         if self.counters.foreign != self._foreign:
             self._foreign, self._foreign_until_s = self.counters.foreign, now_s + _FOREIGN_S
@@ -431,7 +437,7 @@ class Corrector:
         return fields.message
 
     def _see_whether_asleep(self, now_s: float) -> None:
-        """See whether all branches are silent: then the vehicle goes to sleep, which is not a fault.
+        """Note whether all branches are silent: then the vehicle goes to sleep, which is not a fault.
 
         Once it sleeps, a branch that was latched as silent or stuck is tried again; what the sums showed stays latched.
         """
@@ -456,7 +462,7 @@ class Corrector:
         self.latch(Reason.NONE)
 
     def _is_missed(self, branch: LiveBranch, now_s: float) -> bool:
-        """Whether a branch is stale, and another sent after its deadline; if none did, the vehicle goes to sleep."""
+        """Whether a branch is stale, and another sent after its deadline; else the vehicle may be going to sleep."""
         return branch.is_stale(now_s) and any(other.time_s > branch.deadline_s for other in self.branches)
 
     def latch(self, reason: Reason, branches: Sequence[str] = ()) -> None:

@@ -59,7 +59,7 @@ class Protection:
     modulus : int
         Number of codes of the counter, which runs from 0.
     max_step : int
-        Largest step of the counter from one frame to the next with which that one is still used.
+        Largest step of the counter from one frame to the next with which the next one is still used.
     counter : BitPlace
         Where the counter stands: within one byte, or in whole bytes, the most significant one first.
     check, protect : callable
@@ -197,7 +197,7 @@ class Receiver:
 
 
 class _Profile(NamedTuple):
-    """A profile of AUTOSAR: its functions in autosar-e2e, and its header, counted from the offset."""
+    """A profile of AUTOSAR: its functions in autosar-e2e, and its header, whose bytes count from its start."""
 
     check: Callable[..., bool]
     protect: Callable[..., None]
@@ -223,7 +223,7 @@ _DATA_ID_MODES = {
     "low": p01.E2E_P01_DATAID_LOW,
     "nibble": p01.E2E_P01_DATAID_NIBBLE,
 }
-"""Constants of autosar-e2e for ``data_id_mode`` of a layout; P11 has two of them, with the same numbers."""
+"""Constants of autosar-e2e for ``data_id_mode`` of a layout; the two that P11 has are the same numbers."""
 _LONGEST_CLASSIC, _FD_LENGTHS = 8, (12, 16, 20, 24, 32, 48, 64)
 """Longest payload of classic CAN, and the longer ones that CAN FD has. [byte]"""
 

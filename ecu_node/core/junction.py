@@ -26,7 +26,7 @@ REMEMBERED_FRAMES = 1024
 Frames = deque[tuple[float, bytearray]]
 """Times [s] and payloads of the last intact frames of a message."""
 Currents = Mapping[str, tuple[float, float]]
-"""Measured and corrected current of each branch. [A]"""
+"""Measured and corrected current, by branch. [A]"""
 
 
 class HeardSignal:
@@ -55,7 +55,7 @@ class HeardSignal:
         self.signal, self._frames = signal, frames
 
     def newest_first(self) -> Iterator[tuple[float, int]]:
-        """Return times [s] and codes, backwards from the last frame that has the signal; each frame is read once."""
+        """Return pairs of time [s] and code, backwards from the last frame with the signal; each frame is read once."""
         if self._frames and self._frames[-1] is not self._read:
             new = list(takewhile(lambda frame: frame is not self._read, reversed(self._frames)))
             self._read = new[0]
@@ -76,7 +76,7 @@ class HeardSignal:
 _LEAST_VOLTAGE_V = 10.0
 """Below this the HV net is switched off, and power / voltage says nothing of the current. [V]"""
 _FLICKER_STEPS = 4
-"""A current that makes this many steps of a size in its last frames flickers; a load that is switched does not."""
+"""A current that makes this many large steps in its last frames flickers; a load that is switched makes fewer."""
 
 
 class Movement(NamedTuple):
@@ -87,7 +87,7 @@ class Movement(NamedTuple):
     step_a: float
     """Largest step between two frames."""
     flicker_a: float
-    """Size of the steps that it makes to and fro, as when frames of another sender are among those of the sensor."""
+    """Its fourth largest step: large if it goes to and fro, as when another sender's frames are among the sensor's."""
 
 
 class Written(NamedTuple):
@@ -170,7 +170,7 @@ class LiveBranch(HeardSignal):
         delay_s : float
             How much later its values are seen than they were at the junction. [s]
         expected_since_s : float or None
-            Time from which its frames are waited for [s]; None: only once one has come (a vehicle may lack the branch).
+            Time from which its frames are waited for [s]; None: from its first frame on (a vehicle may lack it).
         """
         self.fault, self.delay_s = fault, delay_s
         self._passing, self._correcting = passing, correcting
@@ -179,7 +179,7 @@ class LiveBranch(HeardSignal):
             self._waited_s = max(self._waited_s, expected_since_s)
 
     def activate(self, *, active: bool, doubted: bool) -> None:
-        """Correct, or pass through; what is passed through from a doubted sensor is published as implausible."""
+        """Correct if `active`, else pass through, with the quality "implausible" if the sensor is `doubted`."""
         corrects = active and self.fault.applied
         self.plan = self._correcting if corrects else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.IMPLAUSIBLE if doubted else Quality.PASSED_THROUGH
@@ -221,7 +221,7 @@ class LiveBranch(HeardSignal):
         return now_s > self.deadline_s
 
     def is_old(self, now_s: float) -> bool:
-        """Whether its last frame is older than the timeout, even if none is waited for."""
+        """Whether its last frame is older than the timeout; also true for a branch that never sent."""
         return now_s - self.time_s > self.timeout_s
 
     def expect(self, now_s: float) -> None:
@@ -229,7 +229,7 @@ class LiveBranch(HeardSignal):
         self._awake_s = self._waited_s = now_s
 
     def lacks_input(self, now_s: float) -> bool:
-        """Whether a branch with a fault to correct is not corrected now, as something that this needs is missing."""
+        """Whether the branch is not corrected now: it is passed through, or its value or its voltage is missing."""
         no_value = self.seen and self.latest() is None
         return self.quality is not Quality.CORRECTED or no_value or self._voltage_code(now_s) is None
 
@@ -257,7 +257,7 @@ class LiveBranch(HeardSignal):
         return max(first, -((bias - least) // plan.gain)), min(last, (beyond - 1 - bias) // plan.gain)
 
     def convert(self, code: int, time_s: float, counters: Counters) -> tuple[int | None, Quality]:
-        """Return what to write for a code that came at a time (None: no value) and its quality; count saturation."""
+        """Return code (None: no value) and quality to write for a code that came at a time; count a clamped result."""
         if not self.codes.is_value(code):
             return None, Quality.NOT_AVAILABLE if code in self.codes.named else Quality.INVALID
         voltage_code = self._voltage_code(time_s)
@@ -268,7 +268,7 @@ class LiveBranch(HeardSignal):
         return out, self.quality
 
     def published(self, now_s: float) -> tuple[int | None, Quality]:
-        """Return code and quality to write for its last value, when the current frame does not carry the branch."""
+        """Return code (None: no value) and quality to write for its last value, when a frame lacks the branch."""
         found = next(self.newest_first(), None)
         if found is None or now_s - found[0] > self.timeout_s:
             return None, Quality.NOT_AVAILABLE
@@ -277,12 +277,13 @@ class LiveBranch(HeardSignal):
         return self.convert(found[1], found[0], Counters())
 
     def currents_at(self, time_s: float) -> tuple[float, float] | None:
-        """Return the measured current, and as the parameters correct it, even while the node passes it through.
+        """Return its current as measured and as the parameters correct it, even while the node passes it through.
 
         Parameters
         ----------
         time_s : float
-            Time on the scale of its frames, between which the current is interpolated linearly. [s]
+            Time as its frames have it, later than at the junction by its delay; between frames the current is
+            interpolated linearly. [s]
 
         Returns
         -------
@@ -371,7 +372,7 @@ def aligned_currents(
     instant_s : float
         The instant, in time of the junction. [s]
     currents : dict of str to (float, float)
-        Measured current, and as the parameters in force correct it; positive into the junction. [A]
+        Each branch's current as measured and as the parameters in force correct it; positive into the junction. [A]
         None, instead of both, while a fitted branch is stale or has no value.
     """
     fitted = [(branch, delays_s.get(branch.name, 0.0)) for branch in branches if branch.is_fitted]
@@ -456,7 +457,7 @@ class _Window:
             self._sums = [total - term for total, term in zip(self._sums, old, strict=True)]
 
     def means(self, share: float) -> list[float] | None:
-        """Return the means of the terms; None until this share of the window is filled."""
+        """Return the means of the moments' ``terms``; None until this share of the window is filled."""
         moments = self.moments
         if len(moments) < _LEAST_LOOKS or moments[-1].time_s - moments[0].time_s < share * self._length_s:
             return None
@@ -535,7 +536,7 @@ class JunctionWatch:
         self.forget()
 
     def forget(self) -> None:
-        """Begin new windows, without a jump or a verdict."""
+        """Begin new windows, and forget jump and verdict."""
         self._window, self._recent = _Window(self._window_s), _Window(_PLAUSIBILITY_WINDOW_S)
         self._jump: tuple[float, int, _Verdict] | None = None
         """Instant at which a jump began [s], number of instants since, and the verdict as it was then."""
@@ -610,7 +611,7 @@ class JunctionWatch:
         return verdict if looks + 1 >= _JUMP_LOOKS and instant_s - since_s >= _JUMP_S else None
 
     def _frozen(self, still: Sequence[str], residual_a: float = 0.0) -> tuple[str, ...]:
-        """Return which of these unchanging branches carry more than at rest, and enough to account for the residual."""
+        """Return which of these unchanging branches carry more than at rest, and more than half of the residual."""
         least_a = max(_REST_SHARE * self._full_scale_a, 0.5 * abs(residual_a))
         return tuple(name for name in still if abs(self.currents_a[name][1]) > least_a)
 
@@ -626,7 +627,10 @@ class JunctionWatch:
         return self._frozen(still)
 
     def _explaining(self) -> _Verdict:
-        """Name the branches whose gain error best explains the sums since they went wrong; all if an offset does."""
+        """Return the verdict on wrong sums: which branches are stuck, else whose gain error explains the sums best.
+
+        The sums count since they went wrong. If an offset explains them, all branches are named: it may be any one's.
+        """
         moments = list(self._recent.moments)
         good = (number for number, moment in enumerate(moments) if abs(moment.deviations) < 1.0)
         since = moments[max(good, default=-1) + 1 :]
@@ -651,7 +655,7 @@ def _is_step(current: Sequence[float]) -> bool:
 
 
 def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
-    """Return what is left of the sum of squares of the residual after the best gain error of a branch."""
+    """Return the sum of squares of the residual that the best gain error of a branch leaves. [A^2]"""
     own, both = math.fsum(map(mul, current, current)), math.fsum(map(mul, current, residual))
     return math.fsum(map(mul, residual, residual)) - (both * both / own if own else 0.0)
 
@@ -662,7 +666,7 @@ def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, bool]:
-    """Return the slope of a line through points, and whether it explains them: little of y is left around it."""
+    """Return the slope of the line through points, and whether it explains them: y hardly scatters around it."""
     xx, xy, yy = _covariance(x, x), _covariance(x, y), _covariance(y, y)
     slope = xy / xx if xx else 0.0
     return slope, slope * xy >= _EXPLAINS * yy

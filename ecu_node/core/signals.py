@@ -73,7 +73,7 @@ def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float
 
 
 def factor_of(unit: str, known: Mapping[str, float], what: str) -> float:
-    """Return the factor from a unit to the base unit, 1 if it is empty; the error says that `what` is in it."""
+    """Return the factor from a unit to the base unit, 1 for an empty text; DatabaseError says that `what` is in it."""
     if not unit:
         return 1.0
     try:
@@ -427,7 +427,7 @@ def writable_range(codes: Codes, where: str) -> tuple[int, int]:
 
 
 _NEARLY = Fraction(98, 100)
-"""A range that reaches this share of the outermost value is long enough: named codes may cost a few codes. [1]"""
+"""Results must reach this share of the signal's outermost value: named codes may take a few codes away. [1]"""
 
 
 def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
@@ -463,7 +463,7 @@ def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
 
 
 def exact_code(signal: Signal, value: float) -> Fraction:
-    """Return the code that stands for a value in the unit of the DBC; it is no whole number if no code does."""
+    """Return the code that stands for a value in the unit of the DBC; a fraction if no code stands for it."""
     return (as_written(float(value)) - as_written(signal.offset)) / as_written(signal.scale)
 
 

@@ -139,7 +139,7 @@ class Counters:
     clock_steps: int = 0
     """Times that the time of day jumped against the steady clock; time stamps of frames are ignored for a while."""
     telemetry_lost: int = 0
-    """Lines of telemetry that could not be written in time."""
+    """Lines of telemetry that could not be written, or not in time."""
     reloads: int = 0
     """Times that other parameters were put in force, or those in force ended."""
 

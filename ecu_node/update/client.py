@@ -72,7 +72,7 @@ tuf_json.encode_canonical = _canonical_json  # type: ignore[assignment]  # calle
 
 
 class TargetFacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Custom fields of a target: what is signed about a parameter file besides its digest."""
+    """What is signed about a parameter file besides its digest: the custom fields of its entry in TUF's metadata."""
 
     vehicle: str
     layout: _Digest

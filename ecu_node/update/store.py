@@ -47,7 +47,7 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
     tried : ParameterSet
         The set that was on trial.
     passed : bool
-        Whether the set kept what it promised; even so it is not used if it has expired meanwhile.
+        Whether the set passed its trial; even then it is not used if it has expired meanwhile.
     text : str
         What was seen, for the log.
     now : datetime
@@ -56,7 +56,7 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
     Returns
     -------
     VehicleState
-        State after that; unchanged if another set is on trial by now.
+        The new state; unchanged if another set is on trial by now.
 
     Raises
     ------
@@ -149,7 +149,9 @@ class ParameterStore:
             self.in_force = self._in_force(self._state)
 
     def look(self, corrector: Corrector, now_s: float) -> bool:
-        """See whether a trial has ended, the state was changed, or a set has expired; call it at each look.
+        """See whether a trial has ended, the state was changed, or a set has expired.
+
+        Call it at each look at the junction.
 
         Parameters
         ----------

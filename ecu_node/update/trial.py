@@ -9,7 +9,7 @@ sum about e by exactly that of s:
 The share does not depend on how hard the vehicle is driven. The parameter file says e, and which share the calibrator
 saw on the drives that it used; where that is below 1, as where one of two offsets that cancel is corrected, so is the
 share on the vehicle. A set whose s stays below the layout's margin changes too little for this sum to judge, and must
-only not make it worse. In either case the rest, the mean square of c - e, must be about what the calibrator saw: a set
+only not make it worse. In either case the rest, the RMS of c - e, must not much exceed what the calibrator saw: a set
 that removes one error and leaves others is not for this vehicle, or not any more.
 """
 
@@ -26,7 +26,7 @@ __all__ = ["ParameterTrial", "TrialResult"]
 _LEAST_CURRENT_SHARE = 0.02
 """Trial time counts only while a branch carries this share of full scale. [1]"""
 _MOST_LEFT = 2.0
-"""Residual sum that is allowed, as a multiple of what the calibrator saw. [1]"""
+"""Corrected sum (RMS) that is allowed, as a multiple of what the calibrator saw. [1]"""
 _LONGEST_STEP_S = 0.5
 """Of the time between two looks at most this counts as watched. [s]"""
 
@@ -121,7 +121,7 @@ class ParameterTrial:
         )
 
     def _most_left(self, step_a: float) -> float:
-        """Return the allowed residual sum (RMS), larger if the set changes more here than the calibrator saw. [A]"""
+        """Return the allowed corrected sum (RMS); it grows with the change that the set makes here, `step_a`. [A]"""
         if self._step_a is None:
             return math.inf
         harder = step_a / self._step_a if self._step_a > self._margin_a else 1.0
