@@ -40,7 +40,8 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = "dbc/hv_powertrain.toml"
 VEHICLES, BRANCHES = 24, 3
 HELD_OUT = 3
-"""Vehicles with most faults, from which the fleet learns nothing; the first that is corrected drives at the end."""
+"""Number of vehicles, those with most faults, that are held out of the learning; the first that may be corrected drives
+at the end."""
 MINUTES = 4
 """Length of the trip that each vehicle is calibrated on. [min]"""
 SECONDS = 12.0
@@ -165,7 +166,7 @@ def record_live_drive(parameters: Path, vehicle: str, *, log: Path, recording: P
 
 @contextmanager
 def running_node(parameters: Path, vehicle: str) -> Iterator[None]:
-    """Run the node's own loop in a thread."""
+    """Run the node's own loop in a thread, on the virtual bus, until the block ends."""
     database = read_database(read_layout(ROOT / LAYOUT))
     in_force = choose_parameters(parameters, database, vehicle)
     if in_force.why_not is not None:
@@ -187,7 +188,7 @@ def running_node(parameters: Path, vehicle: str) -> Iterator[None]:
 
 
 def put_in(truth: FleetTruth, vehicle: str) -> str:
-    """List the faults that were put into the sensors of a vehicle."""
+    """Return in words the faults that were put into the sensors of a vehicle."""
     faults = truth.vehicles[vehicle]
     gains = [f"{name} gain error {100.0 * value:+.2f}%" for name, value in faults.drift.items() if value]
     return ", ".join(gains + [f"{name} offset {value:+.2f} A" for name, value in faults.offset_a.items() if value])

@@ -70,12 +70,13 @@ LEAST_DCDC_W = 200.0
 IMPOSSIBLE_JUMP_KW = 3.0
 """No heater does this within one sample."""
 NEAR_DEFAULT_KW = 0.6
-"""Reaches one sample of an interpolation over one second, from the default to zero."""
+"""A sample beside a jump, at most this far from the default, counts as the default: a line that falls from there to 0
+within 1 s changes by less from sample to sample."""
 _HEATER_CHANNELS = "auxiliary, motor and heater_demand"
 _MADE_OF = {"auxiliary": ("voltage", "heater_demand", "aircon_demand"), "motor": ("battery", "auxiliary")}
 """Branches that are computed, in this order, and the channels that they are made of: good where all of these are."""
 _JUDGED_SAMPLES = 100
-"""10 s with the inverter idle suffice to judge the heater signal."""
+"""Least number of samples with the inverter idle, 10 s, from which the heater signal is judged."""
 _SUFFIXES = (".csv", ".csv.gz")
 
 
@@ -145,7 +146,7 @@ class ImportedTrip:
 
 
 def _trips(arguments: Iterable[Path]) -> dict[str, list[Path]]:
-    """Return the files by the name of their trip; more than one file is an error of that trip."""
+    """Return the files by the name of their trip; more than one file of a trip is refused later."""
     trips: dict[str, list[Path]] = {}
     for argument in arguments:
         found = sorted(p for p in argument.iterdir() if p.name.endswith(_SUFFIXES)) if argument.is_dir() else [argument]
@@ -159,7 +160,7 @@ def _trips(arguments: Iterable[Path]) -> dict[str, list[Path]]:
 
 
 def _import_trip(name: str, paths: list[Path], database: VehicleDatabase, out: Path) -> ImportedTrip | None:
-    """Import a trip; None if it is there already."""
+    """Import a trip into the store `out` and return it; None if it is there already."""
     if len(paths) > 1:
         raise LogError(f"two files for one trip: {' and '.join(map(str, paths))}; remove or rename one")
     require_plain_name(name, f"{paths[0]}: the file's name, which names the trip,")

@@ -12,7 +12,7 @@ READ = {"docutils": "BSD-2-Clause AND public domain", "fastsim": "Apache-2.0"}
 
 
 def licence_of(one: Distribution) -> str:
-    """Return the licence stated in the metadata, in one line; empty if they state none."""
+    """Return the licence that the metadata state, in one line, rather one that is good; empty if they state none."""
     name, found = one.metadata["Name"], one.metadata.get_all("License-Expression") or []
     classifiers = [text.rpartition(" :: ")[2] for text in one.metadata.get_all("Classifier") or [] if "License" in text]
     stated = [text for text in one.metadata.get_all("License") or [] if "\n" not in text and len(text) < 60]
@@ -21,12 +21,12 @@ def licence_of(one: Distribution) -> str:
 
 
 def is_good(licence: str) -> bool:
-    """Check whether a licence goes with Apache-2.0."""
+    """Check whether a licence allows its software as a dependency of Apache-2.0 software."""
     return any(word in licence.lower() for word in GOOD)
 
 
 def main() -> int:
-    """Print the list."""
+    """Print a line for each package, and return the exit code."""
     bad = 0
     for one in sorted(distributions(), key=lambda one: one.metadata["Name"].lower()):
         licence = licence_of(one)

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""The table of docs/layout_init.md: what 'calibrator layout init' finds in a folder of databases of others.
+"""Print the table of docs/layout_init.md: what 'calibrator layout init' finds in the CAN databases of a folder.
 
     tools/tried_databases.py FOLDER [--right right.csv]
 
-Prints one line of Markdown per database, and how many are right, none and wrong. The table --right has the columns
-``database`` (file without suffix) and ``battery`` (``Message.Signal``, empty where its authors name none); for a
-database that is not in it, only what was found is shown. A file NAME.log, .csv, ... beside NAME.dbc is its log.
+Prints one line of Markdown per database, and how often the battery current found was right, wrong or none. The table
+--right has the columns ``database`` (file without suffix) and ``battery`` (``Message.Signal``, empty where its authors
+name none); for a database that is not in it, only what was found is shown. A file NAME.log, .csv, ... beside NAME.dbc
+is its log.
 """
 
 import argparse
@@ -20,7 +21,10 @@ DATABASES = (".dbc", ".kcd", ".sym", ".arxml")
 
 
 def found_in(database: Path) -> tuple[str, str]:
-    """Return the battery current that is proposed, and the problem or the other branches."""
+    """Return the signal proposed as battery current, and the problem or the other branches, as texts.
+
+    The signal is "" if none is proposed, and "refused" if the database cannot be used.
+    """
     logs = [path for path in sorted(database.parent.glob(f"{database.stem}.*")) if path.suffix not in DATABASES]
     try:
         proposal = look_at(database, logs[0] if logs else None, "tried")
@@ -32,7 +36,7 @@ def found_in(database: Path) -> tuple[str, str]:
 
 
 def main() -> None:
-    """Try every database of a folder."""
+    """Print the table for the folder on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--right", type=Path)

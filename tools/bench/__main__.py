@@ -19,7 +19,7 @@ OUT = Path("build") / "bench.json"
 
 
 def main(group: Annotated[Group | None, typer.Argument()] = None, *, quick: bool = False, out: Path = OUT) -> None:
-    """Measure one group, or all of them; --quick with small sizes, within five minutes: shows that all works."""
+    """Measure one group, or all of them; --quick takes small sizes and five minutes, to show that all works."""
     found: list[Row] = []
     out.parent.mkdir(parents=True, exist_ok=True)
     for name in [group] if group is not None else get_args(Group):

@@ -40,7 +40,7 @@ SILENCE = 255
 
 
 def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
-    """Make a vehicle with faults in all sensors but one; the default layout uses everything that the core can do."""
+    """Make a vehicle with faults in all sensors but that of branch "passed"; the default layout uses the whole core."""
     database, rng = read_database(read_layout(layout)), Random(1)
     limit, offset_a = database.layout.limits.drift, 0.1 * database.layout.full_scale_a
     faults = {
@@ -54,7 +54,10 @@ def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
 
 
 def frames(database: VehicleDatabase, rng: Random, count: int) -> Iterator[tuple[int, bytes | None]]:
-    """Yield frames as on a bus, and worse: jumps of counters, changed bits, cut payloads, silences (None)."""
+    """Yield identifier and payload of frames as on a bus, and worse.
+
+    Counters jump, bits are changed, payloads are cut; a payload of None is a silence. Bit 31 marks 29-bit identifiers.
+    """
     messages = []
     for key, message in received(database).items():
         protection = protection_of(database, message)
@@ -89,6 +92,7 @@ def _put_edge(place: BitPlace, payload: bytearray, rng: Random) -> None:
 
 
 def record(identifier: int, payload: bytes | None) -> bytes:
+    """Return the bytes of :data:`RECORD` for a frame, or for a silence (None)."""
     return RECORD.pack(identifier, SILENCE if payload is None else len(payload), 0, payload or b"")
 
 

@@ -1,4 +1,5 @@
-/* Between the C core and whoever compares it with the node: frames or codes come in, what became of them goes out. */
+/* Runs the C core, to be compared with the node: corrects the codes on its command line, or else the records of frames
+ * on standard input, and writes the results to standard output. */
 #include "hv_correction.h"
 #include <stdio.h>
 #include <stdlib.h>
@@ -9,7 +10,7 @@ int main(int count, char **words)
     uint8_t record[70]; /* identifier, little-endian; length, or 255: silence; result; payload */
     hv_state_t state;
 
-    if (count == 5) { /* branch, first and last code, voltage code or "-" */
+    if (count == 5) { /* arguments: number of the branch, first and last code, voltage code or "-" */
         const size_t k = strtoul(words[1], NULL, 10);
         const int64_t last = strtoll(words[3], NULL, 10), voltage = strtoll(words[4], NULL, 10);
         for (int64_t code = strtoll(words[2], NULL, 10); code <= last; code++) {

@@ -67,7 +67,7 @@ def resident_bytes(process: int) -> float:
 
 
 def main(*, vehicles: int = 1_000_000, drives: int = 0) -> None:
-    """Calibrate a fleet from summaries; or from so many drives of ten minutes, ten of each vehicle."""
+    """Calibrate so many vehicles from summaries; or, if `drives` is not 0, from so many drives, ten of each vehicle."""
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         place, store = Path(name), Path(name) / "store"
         if drives:

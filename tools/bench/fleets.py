@@ -37,9 +37,10 @@ __all__ = ["WORKERS", "calibrator", "make_store", "simulated_fleet", "write_driv
 WORKERS = 2
 """Processes that make fleets and calibrate them."""
 SUMMARISED, SUMMARISED_MINUTES = 16, 6.0
-"""Vehicles whose summaries stand for those of a large fleet, and the least length of their trips. [min]"""
+"""Number of simulated vehicles whose summaries a large fleet is made of, and the least length of their trips. [min]"""
 DRIVES, DRIVE_MINUTES, STEP_A = 20, 10.0, 0.1
-"""Different drives of a large fleet, their length [min], and the step of the noise that makes copies differ [A]."""
+"""Number of different drives that a large fleet is made of, their length [min], and the step of the noise by which
+copies differ [A]."""
 
 
 def calibrator(*words: object) -> list[str]:
@@ -69,7 +70,7 @@ def _summaries(branches: int) -> tuple[Equipment, list[VehicleSummary]]:
 
 
 def make_store(folder: Path, *, vehicles: int, branches: int = 2) -> None:
-    """Write a store of summaries of vehicles with the paper's faults, half of them without hardware faults."""
+    """Write a new store of summaries of vehicles with the paper's faults, half of them without hardware faults."""
     database, (equipment, summaries) = read_database(read_layout(LAYOUT)), _summaries(branches)
     identity = store_identity(equipment, database, vehicles=vehicles, fleet="synthetic")
     store = SummaryStore(storage=open_storage(folder), identity=identity)
@@ -111,7 +112,7 @@ def _with_faults(found: VehicleSummary, faults: Faults) -> VehicleSummary:
 
 
 def write_drives(folder: Path, drives: int, *, per_vehicle: int = 10) -> float:
-    """Write drives of ten minutes with frames at 10 and 20 Hz into a store, and return their total length. [h]"""
+    """Write so many drives of ten minutes, with frames at 10 and 20 Hz, into a store; return their total length. [h]"""
     database, rng, seconds = read_database(read_layout(LAYOUT)), np.random.default_rng(0), 0.0
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         fleet = simulated_fleet(Path(name) / "fleet", vehicles=DRIVES, minutes=DRIVE_MINUTES, currents=2)

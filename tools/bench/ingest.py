@@ -43,7 +43,7 @@ STORE_PERIOD_S = 0.1
 
 
 def rows(*, quick: bool) -> list[Row]:
-    """Measure.
+    """Measure how fast logs and drives are read.
 
     Parameters
     ----------
@@ -86,13 +86,13 @@ def _as(log: Path, suffix: str) -> Path:
 
 
 def _thinned(channel: Channel) -> Channel:
-    """Keep ten samples a second."""
+    """Return the channel with ten samples a second."""
     step = max(round(STORE_PERIOD_S / float(np.median(np.diff(channel.time_s)))), 1)
     return Channel(time_s=channel.time_s[::step], value=channel.value[::step], good=channel.good[::step])
 
 
 def _log_row(name: str, path: Path, database: VehicleDatabase) -> Row:
-    """Measure frames per second of a log file; raises if both ways give different results."""
+    """Measure frames per second of a log file, ours and the peer's; raise if the results differ."""
     recording, seconds = _best(lambda: read_recording(path, database, vehicle="V", name="d"), READINGS)
     others, peer_seconds = _best(lambda: _message_by_message(path, database), 1)
     for channel_name, channel in {**recording.drive.branches, **recording.drive.inputs}.items():
@@ -107,7 +107,7 @@ def _log_row(name: str, path: Path, database: VehicleDatabase) -> Row:
 
 
 def _message_by_message(path: Path, database: VehicleDatabase) -> dict[str, tuple[Any, Any]]:
-    """Read times [s] and values of the same channels as most programs do."""
+    """Return times [s] and values of the same channels, read as most programs do it."""
     layout = database.layout
     signals: dict[str, tuple[str, int]] = {branch.name: (branch.source, branch.sign) for branch in layout.branch}
     signals |= {item.name: (item.signal, 1) for item in layout.input}

@@ -31,7 +31,7 @@ PATIENCE_S = 60.0
 STARTS = 5
 """Number of starts, of which the median counts."""
 SHORT, ROUND = 15, 150
-"""Number of frames that is enough to measure a start, and of different frames that a process is sent in a cycle."""
+"""Number of frames sent where only the start is measured; number of different frames sent, after which they repeat."""
 
 
 def rows(*, quick: bool) -> list[Row]:
@@ -89,7 +89,7 @@ def core_rows(repeats: int) -> list[Row]:
 
 
 def _require_equal(vehicle: BenchVehicle, mode: Mode) -> None:
-    """Refuse to compare ways that give different results."""
+    """Raise RuntimeError if the node and its peer make different payloads of the frames."""
     message = vehicle.database.message("Pair" if mode is Mode.GATEWAY else "PairOut")
     others = [bytes(payload) for payload in map(plain_job(vehicle, mode), vehicle.frames) if payload is not None]
     for ours, other in zip(vehicle.corrected(mode), others, strict=True):

@@ -46,7 +46,7 @@ FIGURES = {"rate": "frames/s", "latency, median": "us", "latency, 99.9 %": "us"}
 QUIET_S = 0.5
 """If no frame comes for this long, none is on its way. [s]"""
 LATENCY_SHARE = 10
-"""Frames that measure the rate for each one that is then sent alone, to measure its latency."""
+"""The latency is measured with one frame, sent alone, for each so many frames that measure the rate."""
 
 
 def rows(frames: int) -> list[Row]:
@@ -76,7 +76,7 @@ def rows(frames: int) -> list[Row]:
 
 
 def _measured(command: list[str], expected: list[bytes], vehicle: BenchVehicle, frames: int) -> dict[str, float]:
-    """Measure rate and latencies of a process between the two buses; all frames must arrive, and in order."""
+    """Return :data:`FIGURES` of a process between the two buses; all frames must arrive, and in order."""
     kind, quiet = (socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW), subprocess.DEVNULL
     with socket.socket(*kind) as near, socket.socket(*kind) as far:
         near.bind((IN,))
@@ -134,7 +134,7 @@ class _Line:
                 raise RuntimeError("nothing passes the frames on")
 
     def measured(self, frames: int) -> dict[str, float]:
-        """Measure rate and latencies; all frames must arrive, and in order."""
+        """Return :data:`FIGURES`; all frames must arrive, and in order."""
         received = first = self._sent
         start_s, latencies_s = time.monotonic(), []
         while received < first + frames:

@@ -32,9 +32,9 @@ SPARSITIES = (80.0, 60.0)
 SLOPE_SD, RATIO_SD, INTERCEPT_SD, JUNCTION_SD = 0.002, 0.0005, 0.001, 0.0005
 """Standard deviations of the simulated rows; those of good drives. [1]"""
 MEAN, MEAN_SQUARE = 0.05, 0.02
-"""Moments of the currents, in fractions of full scale and their squares. [1]"""
+"""Mean of each current, in fractions of full scale, and mean of its square. [1]"""
 RESIDUAL = 0.25
-"""Share of the expected squared residual that basis pursuit is allowed: it then finds most. [1]"""
+"""Squared residual that basis pursuit is allowed, as a share of what noise alone leaves. [1]"""
 RUNS = 3
 
 
@@ -65,7 +65,7 @@ def _best_s(measured: Callable[[], object]) -> float:
 
 
 def _basis_pursuit_s(fleet: EvidenceRows, vehicles: int) -> float:
-    """Return the time that basis pursuit takes per vehicle. [s]"""
+    """Return the processor time that basis pursuit takes per vehicle. [s]"""
     K = fleet.branches
     slopes, intercepts = np.exp(fleet.values[:, fleet.places.slopes]), fleet.values[:, fleet.places.intercepts]
     pairs = list(zip(slopes, intercepts, strict=True))[:vehicles]

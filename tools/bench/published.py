@@ -11,7 +11,7 @@ __all__ = ["Publisher"]
 
 
 class Publisher:
-    """People who all sign, each with a key for every role, and their repository in a folder that is new or empty."""
+    """A new repository in a new or empty folder, and the people who all sign it, each with a key for every role."""
 
     def __init__(self, folder: Path, people: int = 1) -> None:
         self.folder, self.root = folder, folder / "metadata" / "1.root.json"

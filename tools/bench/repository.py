@@ -34,7 +34,10 @@ UPDATES = 20
 
 
 def one_bin(vehicles: int) -> list[int]:
-    """Return the vehicles of one bin and one of each other; bundle and snapshot are then as for the whole fleet."""
+    """Return the numbers of all vehicles of one bin of the metadata, and of one vehicle of each other bin.
+
+    Bundle and snapshot are then as large as for the whole fleet.
+    """
     bins, found = SuccinctRoles([], 1, BIN_BITS, "bins"), dict[str, list[int]]()
     for number in range(vehicles):
         found.setdefault(bins.get_role_for_target(f"V{number:07d}.json"), []).append(number)
@@ -56,7 +59,7 @@ def write_parameters(database: VehicleDatabase, folder: Path, vehicles: Iterable
 
 
 def measured(folder: Path, vehicles: Iterable[int]) -> list[Row]:
-    """Publish twice, and verify one bundle."""
+    """Measure two publications, and the update of a vehicle from a bundle of the second one."""
     database, now, found = read_database(read_layout(LAYOUT)), datetime.now(UTC), list[Row]()
     publisher, params, state = Publisher(folder / "repository"), folder / "params", folder / "state"
     for name, drift in (("first", 0.05), ("all changed", 0.06)):

@@ -38,6 +38,6 @@ class Row:
 
 
 def show(rows: Sequence[Row]) -> None:
-    """Print a table."""
+    """Print rows as a table."""
     table = pd.DataFrame(map(vars, rows)).astype({"ratio": float}).fillna({"peer": ""})
     print(table.to_string(index=False, na_rep="", float_format="{:.4g}".format))

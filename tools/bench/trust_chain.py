@@ -62,8 +62,8 @@ def main(
 ) -> None:
     """Drive a fleet through the whole chain, and count what became of its vehicles.
 
-    Options are those of calibrator simulate: load without a sensor [A], least length of the trips to learn from, and of
-    the unseen trips, on which the trial is made. [min]
+    Options are those of calibrator simulate: mean and standard deviation of the load without a sensor [A], least length
+    [min] of the trips to learn from and of the unseen trips, on which the trial is made.
     """
     trial_s = read_layout(layout).activation.trial_s
     if 60.0 * unseen_minutes <= trial_s:
@@ -223,7 +223,7 @@ def _is_worse(errors_a: Mapping[str, float]) -> bool:
 
 
 def _makes_worse(parameters: VehicleParameters, traces: Mapping[str, pd.DataFrame]) -> bool:
-    """Check whether a set would make any branch worse."""
+    """Check whether a set would bring any branch that it corrects farther from its true current."""
     for name, trace in traces.items():
         fault = parameters.fault(name)
         published = (trace["measured"] - fault.offset_a) / (1.0 + fault.drift)
