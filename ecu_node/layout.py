@@ -244,6 +244,8 @@ class E2EWindow(_Table, frozen=True, kw_only=True):
 
 
 class _Protected(_Table, frozen=True, kw_only=True):
+    """Keys that all kinds of protection share."""
+
     messages: Annotated[list[Name], msgspec.Meta(min_length=1)]
     init: E2EWindow = E2EWindow(window=1, min_ok=1, max_error=0)
     """Condition to become VALID at the start."""
@@ -261,6 +263,8 @@ class _Protected(_Table, frozen=True, kw_only=True):
 
 
 class _WithHeader(_Protected, frozen=True, kw_only=True):
+    """Keys of the AUTOSAR profiles with one data identifier and a header that can be moved."""
+
     data_id: dict[str, _DataId] = {}
     """Data identifier per message; the message's own identifier where not given."""
     offset: _Offset = 0

@@ -227,6 +227,7 @@ def _difference(later_a: float | None, earlier_a: float | None) -> float | None:
 
 
 def _name(names: type[Quality | Reason | State], code: int | None) -> str | int | None:
+    """Return the name of a code; the code itself if it has no name."""
     return names(code).name if code in set(names) else code
 
 
@@ -355,6 +356,7 @@ def _node_text(view: View) -> str:
 
 
 def _words(names: type[Reason | State], shown: str | int | None) -> str:
+    """Return the description of a named code, or say that the code is not known."""
     known = names.__members__.get(str(shown))
     return known.words if known is not None else f"{names.__name__.lower()} {shown}, which this version does not know"
 

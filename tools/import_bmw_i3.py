@@ -283,6 +283,7 @@ def _with_ramps(default: Mask, heater_kw: Array) -> Mask:
 
 
 def _runs(mask: Mask) -> int:
+    """Count the runs of samples that are True."""
     return int(np.sum(np.diff(mask.astype(np.int8), prepend=0) == 1))
 
 

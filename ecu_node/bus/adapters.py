@@ -191,6 +191,7 @@ def _wrong_timing(config: Mapping[str, Any], rates: Mapping[str, int]) -> Iterat
 
 
 def _timing_keys(*, fd: Any) -> str:
+    """Return the names of the settings that make up a bit timing, for messages."""
     return ", ".join((BitTimingFdDict if fd else BitTimingDict).__annotations__)
 
 

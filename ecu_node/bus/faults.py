@@ -50,6 +50,7 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 def _file(folder: Path) -> Path:
+    """Return the path of the fault memory; raise UserError if there is no such folder."""
     if not folder.is_dir():
         raise UserError(f"{folder}: no such state folder; name the one of 'ecu-node run --state'")
     return folder / _NAME
@@ -141,17 +142,20 @@ class FaultMemory:
         self._keep(now_s)
 
     def _is_cleared(self) -> bool:
+        """Whether the file of the fault memory is gone."""
         try:
             return all(path.name != _NAME for path in self._folder.iterdir())
         except OSError:  # a folder that is gone, or on a broken disk, says nothing
             return False
 
     def _keep(self, now_s: float) -> None:
+        """Have the entries written in the background."""
         self._tried_s = now_s
         content = msgspec.json.format(msgspec.json.encode(self._faults), indent=2) + b"\n"
         self._written = self._background.submit(self._write, content)
 
     def _add(self, reason: str, branches: list[str]) -> None:
+        """Enter a fault that occurs now, or count it if it is there, as the first entry."""
         corrector, now = self._corrector, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         found = [item for item in self._faults if (item.reason, item.branches) == (reason, branches)]
         fault = found[0] if found else Fault(reason=reason, branches=branches, parameter_set=0, first=now, last=now)
@@ -162,6 +166,7 @@ class FaultMemory:
         self._faults = [fault, *(item for item in self._faults if item is not fault)][:_MOST_FAULTS]
 
     def _write(self, content: bytes) -> bool:
+        """Write the file; return whether it is written."""
         try:
             write_atomically(self._folder / _NAME, content)
         except OSError as error:

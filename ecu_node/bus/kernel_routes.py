@@ -53,6 +53,8 @@ def complement(taken: Collection[int], bits: int) -> Iterator[tuple[int, int]]:
 
 
 class _Route(NamedTuple):
+    """One rule of can-gw: flags, indices of the two interfaces, and the filter for identifiers."""
+
     flags: int
     source: int
     target: int
@@ -158,6 +160,7 @@ class KernelRoutes:
         self._socket.close()
 
     def _wanted(self) -> Counter[_Route]:
+        """Return the rules that must be set, both ways."""
         one, other = map(socket.if_nametoindex, self._channels)
         ways = (one, other), (other, one)
         return Counter(_Route(flags, *way, *pair) for way in ways for flags, *pair in self._kinds)
@@ -178,6 +181,7 @@ class KernelRoutes:
         return surplus.total() + missing.total()
 
     def _change(self, kind: int, route: _Route) -> None:
+        """Set or delete one rule; raise OSError if the kernel refuses."""
         flags, source, target, *pair = route
         attributes = _ATTRIBUTES.pack(8, _FROM, source, 8, _TO, target, 12, _FILTER, *pair, 5, _LIMIT, 1)
         self._ask(kind, _ACKNOWLEDGE, _RULE.pack(socket.AF_CAN, _CAN_TO_CAN, flags) + attributes)

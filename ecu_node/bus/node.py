@@ -238,6 +238,7 @@ class Node:
                     raise _another_node(message, self._vehicle)
 
     def _work(self, stop: Callable[[], bool]) -> None:
+        """Take frames, and do the jobs when they are due, until `stop` returns True."""
         self._heard_s = time.monotonic()
         while not stop():
             now_s = self._sensors.asked_s
@@ -248,10 +249,12 @@ class Node:
             self._hear()
 
     def _look(self, now_s: float) -> None:
+        """Look at the junction at the time up to which the bus was heard, then call `on_tick` with the time [s]."""
         self._corrector.look(self._heard_s)  # frames that wait to be read make no branch stale
         self._on_tick(now_s, not self._is_gateway or time.monotonic() - self._back_s < _LONGEST_TURN_S)
 
     def _tell(self, _: float) -> None:
+        """Send the status message, if the layout has one."""
         status = self._corrector.status()
         if status is not None:
             self._own.sent(status.key, status.data)

@@ -355,12 +355,14 @@ class OnBoardSummary:
             self._read(branch.source, signals.source, take)
 
     def _read_input(self, item: Input, take: _Take) -> None:
+        """Have an input read in its own unit; codes whose names mean "not available" are no values."""
         codes = signal_codes(self._database, item.signal, None, f"input {item.name}")
         no_value = codes_of_no_value(self._database, item.signal)
         named = {code: name for code, name in codes.named.items() if code in no_value}
         self._read(item.signal, replace(codes, named=named), take)
 
     def _read(self, name: str, codes: Codes, take: _Take) -> None:
+        """Have a signal read from its message, and each value given to `take`."""
         message, signal = self._database.signal(name)
         protection = protection_of(self._database, message)
         _, readers = self.messages.setdefault(
@@ -369,6 +371,7 @@ class OnBoardSummary:
         readers.append((_reader(placed_signal(message, signal), codes), take))
 
     def _take_current(self, branch: str, channel: _Channel, sign: int, time_s: float, value: float) -> None:
+        """Take a current with the sign of its signal, as a sample positive into the junction; NaN is left out."""
         if not math.isnan(value):
             channel.put(time_s, sign * value)
             self._zero.current(branch, time_s, sign * value)
@@ -396,6 +399,7 @@ class OnBoardSummary:
         return True
 
     def _begin_file(self) -> None:
+        """Forget the batches of the last file; the next batch begins a new one."""
         self._path: Path | None = None
         self._starts: list[bool] = []
         self._count: list[int] = []
@@ -582,6 +586,7 @@ def on_board_summary(
 
 
 def _product(one: Sequence[float], other: Sequence[float]) -> float:
+    """Return the sum of the products of two columns."""
     return math.fsum(map(mul, one, other))
 
 

@@ -43,6 +43,7 @@ _ERRORS = (can.CanError, OSError, ValueError)
 
 
 def _number(error: Exception) -> int | None:
+    """Return the errno of an error of a bus; None if it has none."""
     code = getattr(error, "error_code", None)
     return code if code is not None else getattr(error, "errno", None)
 
@@ -184,6 +185,7 @@ class SteadyBus:
         return taken
 
     def _stays_full(self, error: Exception) -> None:
+        """Note that the send queue is full, and log it once if it stays so."""
         now_s = time.monotonic()
         if self._full_since_s is None:
             self._full_since_s = now_s
@@ -210,6 +212,7 @@ class SteadyBus:
         self._counters.bus_off += bool(message.arbitration_id & _BUS_OFF)
 
     def _gone(self, error: Exception) -> None:
+        """Log an error, close the bus, and plan to open it again."""
         self.say(f"{self.channel}: the bus failed: {error_text(error)}; trying to open it again")
         self._retry_s, self._pause_s = time.monotonic() + _FIRST_PAUSE_S, _FIRST_PAUSE_S
         with contextlib.suppress(can.CanError, OSError):
@@ -388,6 +391,7 @@ class SocketCanLink:
         return True
 
     def _message(self, number: int) -> can.Message:
+        """Return the frame of this number in the batch that was received."""
         batch = self._in
         word, length, flags, dlc, data = _FRAME.unpack_from(batch.frames, number * _FD_BYTES)
         control_bytes, _, came_bytes = _CAME.unpack_from(batch.headers, number * _HEADER.size + _CAME_AT)
@@ -478,5 +482,6 @@ _Link = SocketCanLink | _FrameByFrame
 
 
 def _link(bus: can.BusABC) -> _Link:
+    """Return how to use a bus: many frames at a time on SocketCAN, else frame by frame."""
     opened = socketcan_socket(bus)
     return _FrameByFrame(bus) if opened is None else SocketCanLink(opened, bus.shutdown)

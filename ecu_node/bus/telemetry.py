@@ -68,6 +68,7 @@ class Telemetry:
             self.corrector.counters.telemetry_lost += 1
 
     def _record(self, now_s: float) -> dict[str, Any]:
+        """Return the content of one line."""
         corrector, sums = self.corrector, self.corrector.watch.sums
         state, reason = corrector.state()
         return {

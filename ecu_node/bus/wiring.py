@@ -424,6 +424,7 @@ def _answers(database: VehicleDatabase, branches: Mapping[str, LiveBranch]) -> d
 
 
 def _status_fields(database: VehicleDatabase) -> StatusFields | None:
+    """Return the status message and the places of its fields; None if the layout has no status."""
     status, where = database.layout.status, f"{database.layout.path}: status"
     if status is None:
         return None

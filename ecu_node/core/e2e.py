@@ -172,6 +172,7 @@ class Receiver:
             self.state = E2EState.INVALID
 
     def _checked(self, payload: bytearray) -> Check:
+        """Check a frame, and expect the counter after its own."""
         if not self._protection.is_intact(payload):
             return Check.CORRUPT
         counter, before = self._protection.counter_of(payload), self._expected
@@ -182,6 +183,7 @@ class Receiver:
         return Check.LOST if step <= self._protection.max_step else Check.JUMPED
 
     def _judge(self, check: Check) -> None:
+        """Update the state of the message after the check of one more frame."""
         if check is Check.CORRUPT and not self._past and self.state is E2EState.INIT:
             return  # nothing was received yet
         self._past.append(check)
@@ -274,6 +276,7 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
 
 
 def _data_id(given: dict[str, int], message: Message, highest: int = 0xFFFF) -> int:
+    """Return the data identifier that is given for a message, else the message's own identifier, cut to `highest`."""
     return given.get(message.name, message.frame_id & highest)
 
 

@@ -577,6 +577,7 @@ class JunctionWatch:
         return math.hypot(self._sd_a, self._sd_per_a * throughput_a)
 
     def _judge(self) -> _Verdict | None:
+        """Return the verdict on the windows as they are; None while the parameters may be used."""
         if (jump := self._jumped()) is not None:
             return jump
         if recent := self._recent.means(0.5):
@@ -661,6 +662,7 @@ def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
 
 
 def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
+    """Return the covariance of two columns, over their length."""
     mean_x, mean_y = math.fsum(x) / len(x), math.fsum(y) / len(y)
     return math.fsum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / len(x)
 

@@ -87,6 +87,8 @@ class _Signed(msgspec.Struct):
 
 
 class _Metadata(msgspec.Struct):
+    """As much of TUF's metadata as :func:`expiry_of` needs."""
+
     signed: _Signed
 
 

@@ -72,6 +72,7 @@ def bundle_bytes(files: Mapping[str, bytes]) -> bytes:
 
 
 def _bundle_files(path: Path) -> dict[str, str]:
+    """Return the files of a bundle, as texts by name; raise TrustError if it is not whole."""
     try:
         content = read_user_file(path, largest_bytes=_LARGEST_BUNDLE_BYTES)
     except UnsuitableFileError as error:
@@ -93,6 +94,8 @@ def _bundle_files(path: Path) -> dict[str, str]:
 
 
 class _BundleFetcher(FetcherInterface):
+    """Fetches from the files of a bundle."""
+
     def __init__(self, files: Mapping[str, str]) -> None:
         self._files = files
 
@@ -104,6 +107,8 @@ class _BundleFetcher(FetcherInterface):
 
 
 class _FolderFetcher(FetcherInterface):
+    """Fetches from the folder of a repository."""
+
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 

@@ -283,6 +283,7 @@ class ParameterStore:
 
 
 def _why_nothing(state: VehicleState) -> TrustError:
+    """Return the error that says why no set is in force."""
     if state.on_trial is not None:
         return TrustError(Reason.ON_TRIAL, f"{state.on_trial} is on trial, and nothing is in force yet")
     if state.ended == "revoked":

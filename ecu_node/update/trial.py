@@ -99,6 +99,7 @@ class ParameterTrial:
         return self._result() if self._time_s >= self._activation.trial_s else None
 
     def _result(self) -> TrialResult:
+        """Judge the sums of the whole trial."""
         measured, corrected, step = (
             (total / self._looks) ** 0.5 for total in (self._measured2, self._corrected2, self._step2)
         )

@@ -81,6 +81,8 @@ def core_seconds(workers: int) -> tuple[float, float]:
 
 
 def _serve(workers: int | None, port: int) -> None:
+    """Run so many Dask workers in this process; None: the scheduler, on this port."""
+
     async def serve() -> None:
         if workers is None:
             await Scheduler(port=port, host="127.0.0.1", dashboard_address=":0")

@@ -1,6 +1,6 @@
 """How fast logs become drives and summaries, beside python-can and cantools message by message.
 
-The log is that of an artificial vehicle with three branches, 250 frames a second. Both ways read the same file in one
+The log is that of an artificial vehicle with three branches, 230 frames a second. Both ways read the same file in one
 thread and make the same channels (compared value by value). The best of several readings counts, in processor time that
 includes helping processes, so that other work of the machine does not change the ratio.
 """

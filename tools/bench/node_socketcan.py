@@ -153,6 +153,7 @@ class _Line:
         return dict(zip(FIGURES, (1.0 / per_frame_s, 1e6 * median(latencies_s), slow_us), strict=True))
 
     def _require(self, number: int) -> None:
+        """Receive the next frame; raise RuntimeError if it is not the frame of this number."""
         found = self.receive(PATIENCE_S)
         if found != number % len(self._frames):
             raise RuntimeError(f"frame {found} arrived, expected {number % len(self._frames)}")

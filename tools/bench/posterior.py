@@ -74,6 +74,7 @@ def _basis_pursuit_s(fleet: EvidenceRows, vehicles: int) -> float:
 
 
 def _estimate(fleet: EvidenceRows, models: Sequence[FaultModel]) -> None:
+    """Do the work that is timed: explanations, estimate and probability of harm of each vehicle."""
     mean, square = (np.full((len(fleet), fleet.branches), value) for value in (MEAN, MEAN_SQUARE))
     estimate_rows(fleet, models, feed=0, mean=mean, mean_square=square, usual=np.stack([mean[0], square[0]]))
 
