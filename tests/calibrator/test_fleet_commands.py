@@ -122,7 +122,7 @@ def test_unusable_vehicles_are_left_out_and_named(broken_fleet: Path, tmp_path: 
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
 
 
-def test_since_works_for_a_single_vehicle_with_new_drives(fleet: Path, tmp_path: Path) -> None:
+def test_option_since_recalibrates_a_single_vehicle_with_new_drives(fleet: Path, tmp_path: Path) -> None:
     layout, store, one = ("--layout", LAYOUT), tmp_path / "store", ("--workers", 1)
     assert calibrator("summarise", fleet / "logs", *layout, "--out", store, *one).returncode == 0
     first = calibrator("calibrate", store, *layout, "--out", tmp_path / "first", *one)

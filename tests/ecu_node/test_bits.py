@@ -91,7 +91,7 @@ def test_multiplexer_name_cut_to_32_characters_refers_to_the_full_name(tmp_path:
 @pytest.mark.parametrize(
     ("above", "words"), [("Page", "has no signal 'Page'"), ("S", "multiplexes in a circle by 'S'")]
 )
-def test_missing_or_circular_multiplexer_is_refused_by_name(above: str, words: str) -> None:
+def test_missing_or_circular_multiplexer_is_refused_and_named(above: str, words: str) -> None:
     signal = Signal("S", start=8, length=8, multiplexer_ids=[1], multiplexer_signal=above)
     message = Message(frame_id=1, name="M", length=8, signals=[signal], strict=False)
     with pytest.raises(DatabaseError, match=f"message M {words}, the multiplexer of its signal S"):

@@ -194,7 +194,7 @@ def test_named_code_within_the_measuring_range_is_refused(scale: float, code: in
         require_reach(codes, Fraction(400), "test")
 
 
-def test_named_codes_at_an_end_of_the_range_keep_no_value_out() -> None:
+def test_named_codes_at_an_end_of_the_range_are_accepted_and_never_written() -> None:
     codes = current(length=8, names=dict.fromkeys([-128, *range(120, 128)], "Reserved"))
     require_reach(codes, Fraction(400), "test")
     assert writable_range(codes, "test") == (-127, 119)
@@ -203,7 +203,7 @@ def test_named_codes_at_an_end_of_the_range_keep_no_value_out() -> None:
 TEMPERATURE = Signal("T", start=0, length=8, unit="degC", conversion=BaseConversion.factory(scale=0.5, offset=-40.0))
 
 
-def test_signal_of_no_wanted_unit_keeps_its_own() -> None:
+def test_signal_keeps_its_unit_if_no_unit_is_wanted() -> None:
     codes = read_codes(TEMPERATURE, None, "test")
     assert (codes.scale, codes.offset) == (HALF, Fraction(-40))
 

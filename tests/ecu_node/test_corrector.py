@@ -412,7 +412,7 @@ def test_junction_sum_is_not_interpolated_across_a_frame_without_value(database:
     assert sums_at(corrector, 0.07) == pytest.approx((-20.0, -20.0))
 
 
-def test_value_is_used_though_its_timestamp_precedes_that_of_a_missing_one(database: VehicleDatabase) -> None:
+def test_value_is_used_though_stamped_earlier_than_the_frame_without_value_before_it(database: VehicleDatabase) -> None:
     """As after a clock step: the first frame has the time of its reading, the next one that of its arrival."""
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
     answers(corrector, battery(database, 0, -655.36), 0.02)
@@ -452,7 +452,9 @@ def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDa
 
 
 @pytest.mark.parametrize(("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")])
-def test_scale_in_unit_and_in_factor_is_applied_once(make_database: MakeDatabase, scale: str, unit: str) -> None:
+def test_scale_given_both_in_the_unit_and_as_factor_is_applied_once(
+    make_database: MakeDatabase, scale: str, unit: str
+) -> None:
     dbc = SMALL_DBC.replace('(1,0) [0|60000] "W"', f'({scale},0) [0|60000] "{unit}"')
     corrector = corrector_for(make_database(SMALL_LAYOUT, dbc), heater=(0.0, 0.0))
     answers(corrector, Frame(HEATER, (80).to_bytes(4, "little")), 0.0)

@@ -153,7 +153,7 @@ def test_none_of_many_revocations_is_forgotten(repo: Repo, state: Path) -> None:
     assert "nothing is in force now" in repo.updated(state)
 
 
-def test_later_expiry_needs_no_trial(
+def test_same_set_with_a_later_expiry_needs_no_trial(
     repo: Repo, state: Path, parameters: VehicleParameters, other: VehicleParameters
 ) -> None:
     assert repo.updated(state).startswith("nothing new: parameter set 300 (")

@@ -147,7 +147,9 @@ def test_previous_set_stays_in_force_during_and_after_a_failed_trial(vehicle: Pa
     assert drive.has_said(FAILED)
 
 
-def test_set_that_predicts_a_smaller_change_passes_with_a_smaller_one(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_that_promises_to_remove_less_error_passes_if_it_removes_less(
+    vehicle: Path, database: VehicleDatabase
+) -> None:
     """A load that no sensor sees is half of the change: the share is about 0."""
     residual = JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0)
     promising_half = replace(right(database), junction_residual=residual)

@@ -99,7 +99,7 @@ def test_builtin_trip_obeys_the_junction_law_and_has_all_channels(database: Vehi
     assert set(trip.inputs) == {item.name for item in database.layout.input} - NOT_MODELLED
 
 
-def test_common_trip_is_the_same_for_all_vehicles_but_not_for_judging() -> None:
+def test_common_trip_is_the_same_for_all_vehicles_and_not_the_unseen_trip() -> None:
     trips = BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0, common=True)
     first, second = trips.trip(0, "calibration"), trips.trip(5, "calibration")
     np.testing.assert_array_equal(first.currents_a["battery"], second.currents_a["battery"])
@@ -117,7 +117,7 @@ def chosen(drives: str, layout: Layout) -> TripSource:
     return choose_trips(drives, layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
 
 
-def test_drives_without_good_samples_are_left_out_by_name(database: VehicleDatabase, tmp_path: Path) -> None:
+def test_drives_without_good_samples_are_left_out_and_named(database: VehicleDatabase, tmp_path: Path) -> None:
     for name, good in (("fine", True), ("stuck", False)):
         branches = {
             branch: Channel(time_s=np.arange(100) * 0.1, value=np.ones(100), good=np.full(100, usable))

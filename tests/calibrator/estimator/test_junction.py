@@ -60,7 +60,9 @@ MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift":
     ),
     ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
 ])  # fmt: skip
-def test_well_known_faults_are_corrected(fault: dict[str, Any], known: dict[str, Any], corrected: set[str]) -> None:
+def test_faults_are_estimated_within_their_deviations_and_corrected(
+    fault: dict[str, Any], known: dict[str, Any], corrected: set[str]
+) -> None:
     rows = found(recording(**fault), **known).loc["vehicle"]
     gain, offset_a = (np.array(fault.get(name, (0.0, 0.0, 0.0))) for name in ("gain", "offset_a"))
     assert (np.abs(rows.gain_error - gain) < 3.0 * rows.gain_error_sd).all()
@@ -192,7 +194,7 @@ BATTERY_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "dri
 
 
 @pytest.mark.parametrize("known", [{"trusted": ["battery"]}, {"readings": BATTERY_READ}])
-def test_equal_gain_error_of_all_others_is_reported_against_the_only_known_sensor(known: dict[str, Any]) -> None:
+def test_only_known_sensor_is_reported_if_its_gain_error_would_explain_all_others(known: dict[str, Any]) -> None:
     wrong = JunctionCalibrator(**known).fit(recording(gain=(0.05, 0.0, 0.0), seconds=1200.0), JUNCTION)
     assert any("against battery: a gain error of its own of +5." in notice for notice in wrong.notices_)
     right = JunctionCalibrator(**known).fit(recording(gain=(0.0, 0.05, 0.0), seconds=1200.0), JUNCTION)

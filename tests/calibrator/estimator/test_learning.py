@@ -92,7 +92,7 @@ def test_uncertain_gain_ratios_are_not_taken_for_a_shared_gain_error(bias: float
 
 
 @pytest.mark.parametrize("vague", [0.0005, 0.04])
-def test_gain_error_shared_in_one_branch_is_not_given_to_the_others_even_if_one_of_these_is_vague(vague: float) -> None:
+def test_gain_error_shared_in_one_branch_is_not_given_to_a_branch_of_uncertain_gain_ratio(vague: float) -> None:
     faults = no_faults(16, 4)
     faults.drift[:, 0] = 0.05
     faults.drift[3, 1], faults.offset_a[5, 2] = -0.12, 0.1
@@ -103,7 +103,7 @@ def test_gain_error_shared_in_one_branch_is_not_given_to_the_others_even_if_one_
     assert shared_by(learn_fault_models(rows, feed=0)).keys() == {(4,)}
 
 
-def test_ratios_that_are_off_but_not_alike_are_no_shared_gain_error() -> None:
+def test_gain_ratios_that_deviate_unequally_are_no_shared_gain_error() -> None:
     """As where the signal of one branch is a mean over a second: how far a ratio is off depends on the drive."""
     rows = rows_of(no_faults(16, 3), seed=8)
     by = np.zeros((16, 15))
@@ -111,7 +111,7 @@ def test_ratios_that_are_off_but_not_alike_are_no_shared_gain_error() -> None:
     assert shared_by(learn_fault_models(moved(rows, by), feed=0)).keys() == {()}
 
 
-def test_ratios_in_doubt_are_compared_within_the_fleet_alone() -> None:
+def test_doubtful_gain_ratios_reveal_no_shared_gain_error() -> None:
     faults = no_faults(16, 3)
     faults.drift[4, 1] = 0.1
     rows, by = rows_of(faults, seed=9), np.zeros(15)
@@ -129,7 +129,7 @@ def test_gain_errors_of_a_tenth_of_the_gain_can_be_learnt_from() -> None:
     assert learned(rows_of(faults, seed=10)).prior.gain.high > 0.8
 
 
-def test_load_of_one_vehicle_does_not_confirm_itself() -> None:
+def test_load_in_a_single_vehicle_does_not_make_loads_probable() -> None:
     """It may be an offset of the feeding branch as well, of which the other vehicles have none either."""
     faults = no_faults(8, 2)
     faults.offset_a[0, 0] = 0.03

@@ -328,7 +328,7 @@ def test_slab_is_uniform_between_its_bounds_and_has_its_tail_beyond(low: float, 
 
 
 @BRANCHES
-def test_supports_of_every_prior_sum_to_one(K: int) -> None:
+def test_prior_probabilities_of_all_supports_sum_to_one(K: int) -> None:
     for prior in (first_prior(K), known_prior(counted(K, 70.0) / 4000.0, (0.05, 0.25))):
         ways = [[comb(K, h) * comb(2 * K, s) for s in range(2 * K + 1)] for h in range(K + 1)]
         assert prior.counts.sum() == pytest.approx(1.0, abs=1e-6)

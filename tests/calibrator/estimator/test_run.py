@@ -273,7 +273,7 @@ def test_internal_error_exits_with_70(store: SummaryStore, tmp_path: Path, monke
 @pytest.mark.parametrize(
     ("drift", "offset_a", "moved"), [(0.0, 0.0, None), (0.08, 0.0, "battery drift"), (0.0, 30.0, "battery")]
 )
-def test_since_recalibrates_changed_vehicles_and_detects_moved_sensors(
+def test_option_since_recalibrates_changed_vehicles_and_detects_moved_sensors(
     store: SummaryStore, result: Path, tmp_path: Path, drift: float, offset_a: float, moved: str | None
 ) -> None:
     faults = random_faults(VEHICLES).take(slice(9, 10))
@@ -315,7 +315,7 @@ def test_vehicle_removed_from_the_store_is_named(store: SummaryStore, result: Pa
     ("layout_sha256", "0", "its version of "),
     ("buckets", 32, "its number of buckets is 32, that of this run 16"),
 ])  # fmt: skip
-def test_since_with_an_incompatible_result_is_refused(
+def test_option_since_refuses_an_incompatible_result(
     store: SummaryStore, result: Path, tmp_path: Path, key: str, value: object, message: str
 ) -> None:
     shutil.copytree(result, tmp_path / "earlier")

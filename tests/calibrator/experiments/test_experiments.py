@@ -142,7 +142,7 @@ def test_damaged_experiment_record_is_named(tmp_path: Path) -> None:
         read_records(tmp_path, ["real", "snr"])
 
 
-def test_calibration_pools_confidences_and_counts_shared_trials_once(snr: ExperimentResult) -> None:
+def test_pooled_confidences_count_shared_trials_once(snr: ExperimentResult) -> None:
     shared = replace(only(snr, "x", 20.0), experiment=EXPERIMENTS["classifier"])
     other = replace(snr, experiment=EXPERIMENTS["sparsity"], settings={**snr.settings, "seed": 100})
     result = pool_confidences([shared, snr, other])
@@ -196,7 +196,7 @@ def test_settings_are_chosen_by_a_text_in_their_name() -> None:
     assert "asymmetry: no setting has '0.3' in its name; there are 0, 0.2, 0.4, 0.5" in str(ran.exception)
 
 
-def test_settings_that_quick_keeps_must_exist() -> None:
+def test_settings_kept_by_option_quick_must_exist() -> None:
     with pytest.raises(FleetError, match="small: --quick keeps K=9, which no setting is called"):
         replace(EXPERIMENTS["small"], quick={"K=9": (6.0,)})
 

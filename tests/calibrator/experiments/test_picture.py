@@ -75,6 +75,6 @@ def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult
     assert [text.get_text() for text in drawn(equal).legends[0].get_texts()] == [f"sign bias {b}" for b in BIASES]
 
 
-def test_map_shows_every_rate(equal: ExperimentResult) -> None:
+def test_every_cell_of_a_map_shows_its_rate(equal: ExperimentResult) -> None:
     texts = [text.get_text() for text in drawn(shown_as(equal, "phase")).axes[0].texts]
     assert sorted(texts) == ["0.00"] * len(BIASES) + ["1.00"] * len(BIASES)

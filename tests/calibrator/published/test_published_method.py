@@ -106,7 +106,7 @@ def test_threshold_is_a_third_of_the_fleets_spread() -> None:
     assert found.sensor.all()
 
 
-def test_expected_features_hold_for_an_asymmetric_fleet() -> None:
+def test_expected_features_equal_those_without_noise_in_an_asymmetric_fleet() -> None:
     faults = fleet(40, symmetric=False)
     expected = classify.expected_features(faults, ideal_currents(), np.zeros(3), reference_vehicles=40)
     np.testing.assert_allclose(evidence_of_noisy(faults, 0.0)[0].features, expected, rtol=1e-9, atol=1e-9)

@@ -96,7 +96,7 @@ def test_bank_is_read_back_unchanged_from_its_file(tmp_path: Path) -> None:
     ('{"input_names": ["u"], "period_s": 0.0}', "period 0.0 s; expected a positive number"),
     ('{"input_names": ["u", "u"], "period_s": 0.1}', "expected distinct names"),
 ])  # fmt: skip
-def test_file_that_is_not_a_filter_bank_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+def test_file_that_is_not_a_filter_bank_is_refused_and_named(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "bank.json"
     if text:
         path.write_text(text)

@@ -127,7 +127,7 @@ def test_a_drive_without_enough_valid_samples_is_refused_with_the_reason() -> No
         summarise_samples([drive], period_s=PERIOD_S, bank=a_bank(100.0))
 
 
-def test_levels_are_sums_of_the_samples_at_each_level() -> None:
+def test_samples_are_summed_by_the_level_of_their_current() -> None:
     drive = coloured_drive()
     levels = fit_of(drive).levels
     columns = np.column_stack([drive.inputs, drive.currents_a, np.ones(SAMPLES)])

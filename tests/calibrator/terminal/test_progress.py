@@ -85,7 +85,7 @@ def test_numbers_are_formatted_with_significant_digits_and_separators(value: flo
     assert figure(value, digits) == text
 
 
-def test_five_reasons_are_reported_and_the_number_of_others() -> None:
+def test_first_five_reasons_are_listed_and_the_rest_counted() -> None:
     reasons = {f"V{j}": "cut" for j in range(7)}
     five = "; V0: cut; V1: cut; V2: cut; V3: cut; V4: cut"
     assert few_reasons({}) == ""
