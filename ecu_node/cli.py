@@ -1,4 +1,4 @@
-"""Command line of the node: ``ecu-node run``, ``ecu-node monitor``, ``ecu-node check``, ``ecu-node template``.
+"""Command line of the node, ``ecu-node``: run, monitor, check, template, faults, and the commands of updates.
 
 Results go to standard output, events to standard error. Exit code 0: done, 1: failed, 2: wrong use,
 70: a fault of the program itself, 130: interrupted by Ctrl-C before the node was at work (at work, Ctrl-C and SIGTERM
@@ -31,7 +31,7 @@ _AT_WORK = "done (also when ended by a signal at work)"
 
 
 def run_ecu_node(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run a command of ``ecu-node``.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ def _template(options: argparse.Namespace) -> None:
 
 
 def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> str:
-    """Make a parameter file that corrects nothing yet.
+    """Return the content of a parameter file that corrects nothing yet.
 
     Parameters
     ----------

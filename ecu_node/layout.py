@@ -290,7 +290,7 @@ class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag
     data_id_list: dict[
         str, Annotated[list[Annotated[int, msgspec.Meta(ge=0, le=255)]], msgspec.Meta(min_length=16, max_length=16)]
     ]
-    """Data identifiers per message."""
+    """Data identifiers of each message: 16 numbers, one for each code of the counter."""
 
 
 class ProfileP04(_WithLongDataId, frozen=True, kw_only=True, tag_field="profile", tag="P04"):
@@ -436,7 +436,7 @@ class Layout(LayoutKeys, frozen=True, kw_only=True):
 
     @property
     def dbc_path(self) -> Path:
-        """Path of the DBC file, the first if there are several; a path that is no file if there is none."""
+        """Path of the DBC file, the first if there are several; ``Path("no DBC")`` if there is none."""
         return next(iter(self.dbc_paths.values()), Path("no DBC"))
 
     @property

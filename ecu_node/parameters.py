@@ -323,7 +323,7 @@ def check_fit(parameters: VehicleParameters, database: "VehicleDatabase", vehicl
     Raises
     ------
     UnfitError
-        With the reason that the node then publishes; the message gives both values.
+        With the reason that the node then publishes; the message gives the value found and the one expected.
     """
     layout, verdict = database.layout, parameters.verdict
     if vehicle is not None and parameters.vehicle != vehicle:

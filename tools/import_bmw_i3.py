@@ -64,11 +64,11 @@ HEATER_DEFAULT_KW = 5.52
 HEATER_RESOLUTION_KW = 0.005
 """Half a step of the heater signal, which the file gives to 0.01 kW."""
 IDLE_TORQUE_NM = 1.0
-"""Below this the inverter takes next to nothing."""
+"""Below this torque the inverter takes next to nothing."""
 LEAST_DCDC_W = 200.0
 """The control units of a running car take more than this; sound trips have 330 W or more."""
 IMPOSSIBLE_JUMP_KW = 3.0
-"""No heater does this within one sample."""
+"""No heater's power changes by this much from one sample to the next."""
 NEAR_DEFAULT_KW = 0.6
 """A sample beside a jump, at most this far from the default, counts as the default: a line that falls from there to 0
 within 1 s changes by less from sample to sample."""

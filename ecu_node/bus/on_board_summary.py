@@ -126,7 +126,7 @@ _Reading: TypeAlias = tuple[float, float] | tuple[None, None]
 
 
 class _ZeroCurrent:
-    """Offsets that the sensors show while the contactors are open."""
+    """Collects the offsets that the sensors show while the contactors are open."""
 
     def __init__(self, database: VehicleDatabase) -> None:
         layout = database.layout
@@ -290,7 +290,7 @@ class OnBoardSummary:
         payload : bytearray
             Its data.
         stamp_s : float
-            Time of day at which it came [s]; a large step of it, forwards or backwards, begins another drive.
+            Time of day at which it came [s]; a step by more than :data:`DRIVE_GAP_S`, either way, begins another drive.
         """
         if self._zero_s is not None and abs(stamp_s - self._zero_s - self._last_s) > DRIVE_GAP_S:
             self.end_drive()
@@ -308,7 +308,7 @@ class OnBoardSummary:
             self._sum_batch()
 
     def end_drive(self) -> None:
-        """End the drive: sum and write its last block, however short."""
+        """End the drive: sum and write its last block, if at least :data:`.LEAST_SHARE` of it is there."""
         self._zero.end_window()
         if self._zero_s is not None and (self._next is not None or self._start()):
             end_s = min(self._channels[name].samples[-1][0] for name in (*self._recorded, *self._branches))
@@ -407,7 +407,7 @@ class OnBoardSummary:
         self._levels: dict[str, dict[int, _Column]] = {name: {} for name in self._branches}
 
     def _sum_batch(self, end: int | None = None) -> None:
-        """Have the next batch summed in the background, up to an instant; wait for the batch before it."""
+        """Have the next batch summed in the background, up to instant number `end`; wait for the batch before it."""
         if self._next is None and not self._start():
             self._restart()
             return

@@ -43,7 +43,7 @@ class Log:
         self._said: dict[str, tuple[float, int]] = {}
 
     def say(self, text: str) -> None:
-        """Write a line."""
+        """Write a line, unless it repeats too often."""
         now_s = time.monotonic()
         since_s, times = self._said.pop(text, (now_s, 0))
         held_back = 0

@@ -1,4 +1,4 @@
-"""Builds the node's core from layout, DBC and parameters: everything is looked up once, at start.
+"""Builds the node's core from layout, DBC and parameters; signals are looked up here, and never for each frame.
 
 Loop guard: no message that the layout reads may be sent on the same bus, else the node would correct its own output, or
 speak in the name of another control unit. By the DBC, all messages that the node sends must come from one control unit,
@@ -259,7 +259,7 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
 
 
 def unpublished(database: VehicleDatabase, in_force: InForce, mode: Mode) -> dict[str, str]:
-    """Return branches whose fault stays uncorrected, as an overlay has no signal for them, each with a line to log."""
+    """Return, by branch, a line for the log on each fault that an overlay cannot correct, for lack of a signal."""
     hidden = [branch.name for branch in database.layout.branch if mode is Mode.OVERLAY and branch.corrected is None]
     why = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
     return {name: f"branch {name} is not published: {why}" for name in hidden if in_force.fault(name).applied}
@@ -308,7 +308,7 @@ def put_in_force(
 def wire(
     database: VehicleDatabase, in_force: InForce, start_s: float, *, mode: Mode = Mode.OVERLAY, shadow: bool = False
 ) -> Corrector:
-    """Build the node's core.
+    """Build the node's core, with these parameters in force.
 
     Parameters
     ----------

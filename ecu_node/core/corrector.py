@@ -184,7 +184,7 @@ class Source:
         self._silent_from_s = float("inf")
         self._frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
         self.ways: dict[int, _Ways] = {}
-        """By length of the payload; must be cleared when the correction of a branch changes."""
+        """What is done with payloads, by their length; must be cleared when the correction of a branch changes."""
         for part, signal in readers:
             part.follow(signal, self._frames)
 
@@ -325,7 +325,7 @@ class Corrector:
     shadow : bool
         Compute and report, change nothing.
     sleep_s : float
-        The bus sleeps once all branches have been silent for this long. [s]
+        Silence of all branches after which one that was latched as silent or stuck is tried again. [s]
     """
 
     def __init__(

@@ -187,7 +187,7 @@ class BitPlace:
 
 
 def bit_place(signal: Signal) -> BitPlace:
-    """Find the place of a signal of the DBC.
+    """Return the place of a signal of the DBC.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ class PlacedSignal:
 
 
 def placed_signal(message: Message, signal: Signal) -> PlacedSignal:
-    """Find out where a signal of the DBC stands, and in which frames.
+    """Return where a signal of the DBC stands, and in which frames.
 
     Parameters
     ----------
@@ -348,7 +348,7 @@ def as_written(number: float) -> Fraction:
 
 
 def read_codes(signal: Signal, units: Mapping[str, float] | None, where: str) -> Codes:
-    """Collect what the DBC says of a signal's codes.
+    """Return the codes of a signal and their values, as the DBC defines them.
 
     Parameters
     ----------
@@ -431,7 +431,7 @@ _NEARLY = Fraction(98, 100)
 
 
 def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
-    """Refuse a signal in which a named code amid its values keeps results up to full scale from being written.
+    """Raise DatabaseError if a named code amid a signal's values keeps results up to full scale from being written.
 
     Parameters
     ----------

@@ -184,7 +184,7 @@ def add_decision(folder: Path, event: str, text: str, now: datetime, *, reason: 
 
 @contextmanager
 def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
-    """Keep other processes from changing a state folder.
+    """Within the block, keep other processes from changing a state folder.
 
     Parameters
     ----------

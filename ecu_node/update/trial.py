@@ -130,7 +130,7 @@ class ParameterTrial:
 
 
 def _share(measured2: float, corrected2: float, step2: float) -> float:
-    """Return the share of the change that was an error; if no change is known 1, or 0 if the sum is worse. [1]"""
+    """Return the share of the change that was an error; without a change it is 1, or 0 if the sum is worse. [1]"""
     if step2 <= 0.0:
         return 1.0 if corrected2 <= measured2 else 0.0
     return min(1.0, (measured2 - corrected2) / step2)

@@ -109,7 +109,7 @@ def build(checked: Checked, folder: Path, *, compiler: str = "gcc", flags: tuple
 
 
 def run(program: Path, given: bytes, *words: str) -> bytes:
-    """Run the driver, and return what it writes."""
+    """Run the driver on these records, or with these arguments, and return what it writes."""
     return subprocess.run([program, *words], input=given, stdout=subprocess.PIPE, check=True).stdout
 
 
@@ -147,7 +147,7 @@ def fuzz(folder: Path, seconds: int) -> None:
 
 
 def main(what: Literal["measure", "fuzz"], *, seconds: int = 60) -> None:
-    """Measure the C core, or fuzz it for so long."""
+    """Measure the C core, or fuzz it for so many seconds."""
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         if what == "fuzz":
             fuzz(Path(name), seconds)

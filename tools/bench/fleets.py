@@ -44,7 +44,7 @@ copies differ [A]."""
 
 
 def calibrator(*words: object) -> list[str]:
-    """Return a command line of the calibrator."""
+    """Return the command line that runs the calibrator with these arguments."""
     return [sys.executable, "-m", "calibrator", *map(str, words)]
 
 

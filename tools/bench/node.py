@@ -26,7 +26,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"
 NO_KERNEL = 2
 """Exit code of tools/with_vcan where there is no SocketCAN."""
 ONE_CODE_A = 0.1
-"""cantools rounds halves to even codes, the node upwards. [A]"""
+"""Difference allowed between node and cantools: the latter rounds halves to even codes, the node upwards. [A]"""
 PATIENCE_S = 60.0
 STARTS = 5
 """Number of starts, of which the median counts."""

@@ -1,4 +1,4 @@
-"""Cost of a node's own summaries: the drives of an artificial fleet, 230 frames a second, are replayed to them."""
+"""Cost of summaries made on board: drives of an artificial fleet, 230 frames a second, are replayed to their code."""
 
 import tempfile
 import time

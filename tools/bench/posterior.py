@@ -24,9 +24,9 @@ from calibrator.published.recovery import BasisPursuit
 __all__ = ["rows"]
 
 VEHICLES, QUICK_VEHICLES = {2: 300, 3: 300, 4: 150, 6: 16, 8: 8}, 4
-"""Vehicles of a fleet, by number of branches."""
+"""Number of vehicles of a fleet, by number of branches; and of any fleet in quick runs."""
 SOLVED, QUICK_SOLVED = 40, 2
-"""Vehicles that the peer solves."""
+"""Number of vehicles that the peer solves; and in quick runs."""
 SPARSITIES = (80.0, 60.0)
 """Typical and worst sparsity of faults. [%]"""
 SLOPE_SD, RATIO_SD, INTERCEPT_SD, JUNCTION_SD = 0.002, 0.0005, 0.001, 0.0005

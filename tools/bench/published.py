@@ -21,7 +21,7 @@ class Publisher:
         Repository.create(folder, keys)
 
     def add(self, files: Iterable[Path]) -> None:
-        """Stage parameter files."""
+        """Stage parameter files, to be signed and published later."""
         Repository(self.folder).add(files, days=365, allow_large_step=False)
 
     def publish(self) -> None:

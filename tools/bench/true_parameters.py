@@ -1,4 +1,4 @@
-"""True parameters of the made-up vehicles of the benchmarks."""
+"""Makes the true parameters of the made-up vehicles of the benchmarks."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime

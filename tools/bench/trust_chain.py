@@ -125,7 +125,9 @@ def drive(folder: Path, layout: Path, names: tuple[str, str]) -> dict[str, Any]:
     Returns
     -------
     dict of str
-        What became of it; errors are the largest over its branches on the drive after the trial. [A]
+        Name of the ``vehicle``; whether it is ``corrected``, its set was ``refused`` or ``passed`` its trial, the node
+        ``fell_back``, and a branch got ``worse``; of each wrong set ``KIND: passed`` and ``KIND: worse``. Of a set that
+        passed ``measured_a`` and ``published_a``: largest error over the corrected branches after the trial. [A]
     """
     name, database, now = names[0], read_database(read_layout(layout)), datetime.now(UTC)
     own, others = (read_parameters(folder / "result" / "params" / f"{each}.json") for each in names)
