@@ -51,7 +51,7 @@ def read_user_file(path: Path, *, largest_bytes: int) -> bytes:
     """
     _require_regular(path.stat())
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
-        _require_regular(os.fstat(file.fileno()))  # the folder's owner may have put another one there
+        _require_regular(os.fstat(file.fileno()))  # another one may have been put there meanwhile
         content = file.read(largest_bytes + 1)
     if len(content) > largest_bytes:
         raise UnsuitableFileError(errno.EFBIG, f"it is larger than {largest_bytes} bytes, which no such file is")
@@ -65,7 +65,7 @@ def _require_regular(found: os.stat_result) -> None:
 
 
 def signature(path: Path) -> tuple[int, int, int, int] | None:
-    """Return times of change [ns], size [byte] and inode of a file: another result means that it was changed.
+    """Return modification and change time [ns], size [byte] and inode of a file; they tell whether it was changed.
 
     None if there is no such file.
     """

@@ -63,7 +63,7 @@ def parse_formula(text: str) -> ast.expr:
     """
     try:
         tree = ast.parse(text, mode="eval").body
-        formula_value(tree, dict.fromkeys(formula_names(tree), 1.0))  # refuses all else
+        formula_value(tree, dict.fromkeys(formula_names(tree), 1.0))  # raises if anything else is in it
     except LayoutError as error:
         raise LayoutError(f"formula {text!r}: {error}") from None
     except (SyntaxError, ValueError, OverflowError, MemoryError):

@@ -441,7 +441,7 @@ class Layout(LayoutKeys, frozen=True, kw_only=True):
 
     @property
     def dbc_paths(self) -> dict[str, Path]:
-        """Paths of the DBC files, by the keys of :attr:`dbc_files`."""
+        """Paths of the DBC files, by the keys of ``dbc_files``."""
         return {bus: self.path.parent / file for bus, file in self.dbc_files.items()}
 
     @property

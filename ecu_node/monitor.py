@@ -429,7 +429,7 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
         If layout, DBC or bus cannot be used.
     """
     database = node_database(layout)
-    stop = stopped_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal was closed
+    stop = stopped_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # SIGHUP: the terminal was closed
     counters, say, where = Counters(), Log().say, f"{bus['interface']} {bus['channel']}"
     if bus["listen_only"]:
         say(acknowledgement(bus["interface"], bus["channel"]))

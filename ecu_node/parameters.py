@@ -229,7 +229,7 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
     except UnicodeDecodeError:
         raise _malformed(where, "it is no text in UTF-8") from None
     except msgspec.DecodeError as error:
-        raise _malformed(where, str(error).partition(" - at `")[0]) from None  # its path names no key
+        raise _malformed(where, str(error).partition(" - at `")[0]) from None  # the rest names no key
     try:
         return msgspec.json.decode(content, type=VehicleParameters)
     except msgspec.ValidationError as error:

@@ -113,7 +113,7 @@ class SummaryFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     temperature_c: bytes
     """Mean temperature of the sensors (B,); NaN: not known. [degC]"""
     levels: list[list[int]]
-    """Levels between the edges :data:`LEVELS_A` that the current of each branch visited; 0 is the most negative one."""
+    """Numbers of the levels that each branch's current visited; 0: the most negative one. See :data:`LEVELS_A`."""
     level_sums: bytes
     """For each of these levels p + 1 numbers: sums of (inputs, currents, 1) and of the branch's own current squared."""
 

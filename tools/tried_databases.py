@@ -3,10 +3,10 @@
 
     tools/tried_databases.py FOLDER [--right right.csv]
 
-Prints one line of Markdown per database, and how often the battery current found was right, wrong or none. The table
---right has the columns ``database`` (file without suffix) and ``battery`` (``Message.Signal``, empty where its authors
-name none); for a database that is not in it, only what was found is shown. A file NAME.log, .csv, ... beside NAME.dbc
-is its log.
+Prints one line of Markdown per database, and how often each result came: right, wrong, none, refused, not known. The
+table --right has the columns ``database`` (file without suffix) and ``battery`` (``Message.Signal``, empty where its
+authors name none); for a database that is not in it, only what was found is shown. A file NAME.log, .csv, ... beside
+NAME.dbc is its log.
 """
 
 import argparse

@@ -213,7 +213,7 @@ class Node:
             ready()
             self._work(stop)
             return
-        end_s = time.monotonic() + _LONGEST_WAIT_S  # a busy bus never runs empty
+        end_s = time.monotonic() + _LONGEST_WAIT_S  # a limit, as a busy bus never runs empty
         while time.monotonic() < end_s and self._sensors.receive(0.0) is not None:
             pass  # too old by now
         ready()

@@ -308,7 +308,7 @@ class OnBoardSummary:
             self._sum_batch()
 
     def end_drive(self) -> None:
-        """End the drive: sum and write its last block, if at least :data:`.LEAST_SHARE` of it is there."""
+        """End the drive: sum and write its last block, if at least the share ``LEAST_SHARE`` of it is there."""
         self._zero.end_window()
         if self._zero_s is not None and (self._next is not None or self._start()):
             end_s = min(self._channels[name].samples[-1][0] for name in (*self._recorded, *self._branches))

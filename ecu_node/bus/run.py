@@ -211,7 +211,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             latency=latency,
             routed=routes is not None,
         )
-        gc.collect()  # freeze: later collections leave out what was made at the start
+        gc.collect()  # then freeze: later collections leave out what was made at the start
         gc.freeze()
         gc.set_threshold(_GARBAGE)
         node.run(stop, ready)

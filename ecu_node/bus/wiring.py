@@ -213,7 +213,7 @@ def branch_signals(database: VehicleDatabase, branch: Branch, mode: Mode) -> Sig
 
 
 def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, mode: Mode) -> IntegerPlan:
-    """Return the plan of one branch, from measured to written codes; errors are those of :func:`branch_signals`."""
+    """Return the plan of one branch, from measured to written codes; errors are those of ``branch_signals``."""
     return correction_plan(branch_signals(database, branch, mode), fault)
 
 
@@ -248,7 +248,7 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
     InForce
         The parameters, or the reason why measured values are passed through.
     """
-    where = ""  # errors of reading name the file themselves
+    where = ""  # errors of read_parameters name the file themselves
     try:
         parameters = read_parameters(path)
         where = f"{path}: "

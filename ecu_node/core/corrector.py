@@ -60,7 +60,7 @@ def _in_one_word(
 ) -> _Rewrite:
     """Return a function that writes all branches at once, or `otherwise` if payloads of this length may lack a branch.
 
-    It falls back to `otherwise` for a frame with a code that is not ordinary, see :meth:`.LiveBranch.ordinary_codes`.
+    It falls back to `otherwise` for a frame with a code that is not ordinary, see ``LiveBranch.ordinary_codes``.
     Two's complements are handled as unsigned numbers: their sign bits are inverted, in the payload and in the outgoing
     one.
     """
@@ -214,7 +214,7 @@ class Source:
         if self.is_invalid:
             for branch in self.branches:
                 branch.spoil(now_s)
-            ways = self._find(0)  # nothing is read from it
+            ways = self._find(0)  # as for an empty payload: nothing is read from it
         for target, rewrite in ways.answers:
             made = rewrite(payload, target.data, now_s)
             if target.protection is not None:
@@ -462,7 +462,7 @@ class Corrector:
         self.latch(Reason.NONE)
 
     def _is_missed(self, branch: LiveBranch, now_s: float) -> bool:
-        """Whether a branch is stale, and another sent after its deadline; else the vehicle may be going to sleep."""
+        """Whether a branch is stale, and another sent after its deadline; if none did, the vehicle goes to sleep."""
         return branch.is_stale(now_s) and any(other.time_s > branch.deadline_s for other in self.branches)
 
     def latch(self, reason: Reason, branches: Sequence[str] = ()) -> None:

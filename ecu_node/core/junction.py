@@ -179,7 +179,7 @@ class LiveBranch(HeardSignal):
             self._waited_s = max(self._waited_s, expected_since_s)
 
     def activate(self, *, active: bool, doubted: bool) -> None:
-        """Correct if `active`, else pass through, with the quality "implausible" if the sensor is `doubted`."""
+        """Correct the fault, if any, while `active`; else pass through, with quality IMPLAUSIBLE if `doubted`."""
         corrects = active and self.fault.applied
         self.plan = self._correcting if corrects else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.IMPLAUSIBLE if doubted else Quality.PASSED_THROUGH
@@ -639,7 +639,7 @@ class JunctionWatch:
         residual = [moment.corrected_a for moment in moments]
         rows = {name: [moment.currents_a.get(name, (0.0, 0.0))[1] for moment in moments] for name in self.currents_a}
         still = [name for name, row in rows.items() if min(row) == max(row)]
-        if frozen := self._frozen(still):  # a single step of another branch may be a jump of that one's sensor
+        if frozen := self._frozen(still):  # a branch that moved in one step is left out: its own sensor may have jumped
             lines = [_line(row, residual) for name, row in rows.items() if name not in still and not _is_step(row)]
             if any(explains and abs(slope) >= _LARGEST_SLOPE for slope, explains in lines):
                 return Reason.BRANCH_STUCK, frozen
@@ -662,7 +662,7 @@ def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
 
 
 def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
-    """Return the covariance of two columns, over their length."""
+    """Return the covariance of two columns: the mean product of their distances from their means."""
     mean_x, mean_y = math.fsum(x) / len(x), math.fsum(y) / len(y)
     return math.fsum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / len(x)
 

@@ -450,7 +450,7 @@ def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
     ends = writable_range(codes, where)
     for end, extreme, inwards in zip(ends, (codes.lowest, codes.highest), (1, -1), strict=True):
         outermost = extreme
-        while outermost in codes.named:  # names at the ends of the range keep no value out
+        while outermost in codes.named:  # named codes at the ends of the range exclude no value
             outermost += inwards
         if abs(codes.worth(end)) >= min(largest, _NEARLY * abs(codes.worth(outermost))):
             continue

@@ -1,8 +1,8 @@
 """How many workers of a cluster the process that the user starts and the Dask scheduler can keep busy.
 
 The workers are those of Dask, all in one process, and only wait: each item brings back a record of the usual size.
-Measured is the time on a core that user's process and scheduler each take per item: the slower one limits a fleet, and
-both have a core of their own in a real cluster.
+Measured is the time on a core that the user's process and the scheduler take per item: the slower one limits a fleet,
+and both have a core of their own in a real cluster.
 """
 
 import asyncio
@@ -46,7 +46,7 @@ def read(_: bytes, seconds: float) -> bytes:
 
 
 def rows(*, quick: bool) -> list[Row]:
-    """Measure the time on a core per item of user's process and scheduler, and the rate that the slower one allows."""
+    """Measure the time on a core per item of both processes, and the rate that the slower one allows."""
     workers = QUICK_WORKERS if quick else WORKERS
     own_s, scheduler_s = core_seconds(workers)
     return [

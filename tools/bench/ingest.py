@@ -80,7 +80,7 @@ def _as(log: Path, suffix: str) -> Path:
     path = log.with_suffix(suffix)
     with can.LogReader(log) as messages, can.Logger(path) as writer:
         for message in messages:
-            message.channel, message.is_rx = 0, True  # these formats number channels
+            message.channel, message.is_rx = 0, True  # in these formats channels are numbers
             writer.on_message_received(message)
     return path
 
