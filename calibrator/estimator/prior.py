@@ -1,6 +1,6 @@
 """Prior of the faults of a fleet: how many a vehicle has, how large they are, and what several vehicles share.
 
-Sizes are uniform between two bounds (a slab), with a log-uniform tail far below and above them, so that no size is
+Sizes are uniform between two bounds (a slab), with a log-uniform part over a far wider range, so that no size is
 impossible. The number n of the 3K parameters that are not zero follows (20) of [1]_; in some vehicles all hardware
 parameters are zero, (M13) of docs/method.md. Bounds, tail and numbers are learned from the fleet:
 :mod:`calibrator.estimator.learning`. The feeding branch is the one with the largest mean current, mostly the battery.
