@@ -75,7 +75,7 @@ class GroundTruth:
         return self.period_s * np.arange(float(len(self)))
 
     def matrix_a(self) -> Array:
-        """Currents as an array of shape (T, K). [A]"""
+        """Return the currents as an array of shape (T, K), branches in the order of ``currents_a``. [A]"""
         return np.stack(list(self.currents_a.values()), axis=1)
 
     @classmethod
@@ -101,7 +101,7 @@ class GroundTruth:
 
 
 def builtin_trip(rng: np.random.Generator, *, duration_s: float, name: str) -> GroundTruth:
-    """Drive one random trip with the built-in vehicle.
+    """Return one random trip of the built-in vehicle, sampled at :data:`PERIOD_S`.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def builtin_trip(rng: np.random.Generator, *, duration_s: float, name: str) -> G
 
 
 def _speed_trace(rng: np.random.Generator, duration_s: float) -> Array:
-    """Random micro-trips of the cycles at 1 Hz, each driven in its own style. [m/s]"""
+    """Join random parts of the cycles, each driven in a style of its own, into speeds at 1 Hz. [m/s]"""
     pieces = _microtrips()
     parts: list[Array] = [np.zeros(3)]
     while sum(map(len, parts)) < duration_s:
@@ -169,7 +169,7 @@ def _speed_trace(rng: np.random.Generator, duration_s: float) -> Array:
 
 
 def _microtrips() -> list[Array]:
-    """Parts of the cycles between two standstills, at 1 Hz. [m/s]"""
+    """Return the parts of the cycles between two standstills, each as speeds at 1 Hz. [m/s]"""
     fastsim = _fastsim()
     pieces: list[Array] = []
     for name in CYCLES:
@@ -180,7 +180,7 @@ def _microtrips() -> list[Array]:
 
 
 def _drive(speed_ms: Array) -> tuple[Array, Array, Array, Array]:
-    """Let fastsim drive a speed trace of 1 Hz: speed [m/s], mechanical and electrical motor power [W], charge [1]."""
+    """Drive speeds at 1 Hz; return speed [m/s], mechanical and electrical motor power [W], charge [1] at 10 Hz."""
     fastsim = _fastsim()
     seconds = np.arange(float(len(speed_ms)))
     vehicle = fastsim.Vehicle.from_resource(VEHICLE)
@@ -204,20 +204,20 @@ def _drive(speed_ms: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _battery(power_w: Array, charge: Array) -> tuple[Array, Array]:
-    """Current [A] and terminal voltage [V] of a battery with a series resistance that gives this power."""
+    """Return current [A], positive on discharge, and terminal voltage [V] of a battery that gives this power."""
     open_v = OPEN_CIRCUIT_V[0] + (OPEN_CIRCUIT_V[1] - OPEN_CIRCUIT_V[0]) * charge
     current = (open_v - np.sqrt(open_v**2 - 4.0 * RESISTANCE_OHM * power_w)) / (2.0 * RESISTANCE_OHM)
     return current, open_v - RESISTANCE_OHM * current
 
 
 def _random_steps(rng: np.random.Generator, samples: int, *, mean_s: float, levels: tuple[float, ...]) -> Array:
-    """Demand that jumps between levels at random instants, mean_s apart. [W]"""
+    """Return a demand that jumps between levels at random instants, on average mean_s apart. [W]"""
     jumps = rng.random(samples) < PERIOD_S / mean_s
     return np.asarray(rng.choice(levels, size=int(jumps.sum()) + 1)[np.cumsum(jumps)])
 
 
 def _lag(demand: Array, time_constant_s: float) -> Array:
-    """First-order lag, at rest in the first demand."""
+    """Filter a demand by a first-order lag that starts at rest in its first value."""
     pole = np.exp(-PERIOD_S / time_constant_s)
     return np.asarray(lfilter([1.0 - pole], [1.0, -pole], demand, zi=[pole * demand[0]])[0])
 

@@ -27,11 +27,11 @@ from ecu_node.program import write_output
 __all__ = ["MAX_MINUTES", "UnmeasuredOption", "simulate"]
 
 MAX_MINUTES = 240.0
-"""A trip's log is made in memory, at some 250 frames per second. [min]"""
+"""Longest trip, as its log is made in memory, at some 250 frames per second. [min]"""
 MAX_DELAY_MS = 1000.0
-"""The branch signals of a real car lag each other by tens to hundreds of milliseconds. [ms]"""
+"""Largest delay: the branch signals of real cars lag each other by tens to hundreds of milliseconds. [ms]"""
 MAX_UNMEASURED_A = 1000.0
-"""More than the full scale of any car's junction. [A]"""
+"""Largest load without a sensor: more than the full scale of any car's junction. [A]"""
 
 
 def _unmeasured(value: tuple[float, float]) -> tuple[float, float]:

@@ -18,8 +18,8 @@ __all__ = ["FaultSettings", "Purpose", "nonzero_count", "random_stream"]
 class Purpose(IntEnum):
     """What a random stream is used for.
 
-    numpy pads seeds with zeros, so [7], [7, 0] and [7, 0, 0] give the same numbers. In :func:`random_stream` purpose
-    and count stand in front, so that no two purposes ever share a stream.
+    numpy pads seeds with zeros, so [7], [7, 0] and [7, 0, 0] give the same numbers. :func:`random_stream` puts purpose
+    and length in front, so that different purposes or numbers never share a stream.
     """
 
     FAULTS = 1
@@ -35,7 +35,7 @@ class Purpose(IntEnum):
 
 
 def random_stream(purpose: Purpose, *numbers: int) -> np.random.Generator:
-    """Return the generator of one purpose.
+    """Return the random generator of one purpose, seed and, for example, vehicle.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class FaultSettings:
 def _sparse_values(
     rng: np.random.Generator, vehicles: int, parameters: int, nonzero: int, magnitude: tuple[float, float]
 ) -> Array:
-    """Rows with a random support of the given size and values (2B - 1) U(a, b), (20) in [1]_."""
+    """Return rows in which ``nonzero`` random entries are U(a, b) with random sign, (20) in [1]_, and the others 0."""
     rank = np.argsort(np.argsort(rng.random((vehicles, parameters)), axis=1), axis=1)
     sign = rng.choice([-1.0, 1.0], size=(vehicles, parameters))
     return np.where(rank < nonzero, sign * rng.uniform(*magnitude, size=(vehicles, parameters)), 0.0)

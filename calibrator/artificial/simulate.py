@@ -46,7 +46,7 @@ LOG_NAME = "drive.log.gz"
 
 @dataclass(frozen=True, kw_only=True)
 class Vehicle:
-    """One artificial vehicle, and what lies between its currents and its frames.
+    """One artificial vehicle: its faults, and what else makes its frames differ from ideal currents.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Vehicle:
     noise_a : float
         Standard deviation of each sensor sample. [A]
     delay_s : ndarray of shape (K,)
-        Delay with which each current is seen. [s]
+        By how much later than it flows each current is measured. [s]
     unmeasured_a : float
         Load that no branch measures; the first branch (the source) carries it. [A]
     """
@@ -180,14 +180,14 @@ def _write_vehicle(
 
 
 def _true_currents(vehicle: Vehicle, trip: GroundTruth) -> Array:
-    """True currents of the vehicle's branches; the first also supplies the unmeasured load. [A]"""
+    """Return the true currents of the vehicle's branches, (T, K); the first also gives the unmeasured load. [A]"""
     i = true_currents(trip.matrix_a(), vehicle.faults)
     i[:, 0] += vehicle.unmeasured_a
     return i
 
 
 def _frame_times(rng: np.random.Generator, database: VehicleDatabase, message_name: str, trip: GroundTruth) -> Array:
-    """Instants of one message: its cycle time from a random phase, with jitter. [s]"""
+    """Return the instants of one message: a random first one, then one per cycle time, each with jitter. [s]"""
     cycle_s = (database.message(message_name).cycle_time or DEFAULT_CYCLE_MS) / 1e3
     nominal = np.arange(rng.uniform(0.0, cycle_s), trip.time_s[-1], cycle_s)
     jitter = np.clip(rng.normal(0.0, JITTER, size=len(nominal)), -0.4, 0.4) * cycle_s
@@ -211,15 +211,15 @@ class FleetPlan(FaultSettings):
     vehicles, currents : int
         Fleet size N and number of branches K.
     common_drive : bool
-        Whether all vehicles drive the same trip. Only written down here; the trip source decides.
+        Whether all vehicles drive the same trip. It is only written into the truth; the trip source decides.
     noise : float
-        Standard deviation of the sensor noise in fractions of full scale.
+        Standard deviation of the sensor noise in fractions of full scale. [1]
     delay_max_s : float
         Largest delay of a branch. [s]
     unmeasured_a : tuple of float
         Mean and standard deviation over vehicles of the load that no branch measures. [A]
     seed : int
-        Seed of everything.
+        Seed of everything that is random.
     """
 
     vehicles: int
@@ -302,6 +302,6 @@ def _draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -
 
 
 def _trip_of(trips: TripSource, vehicle: Vehicle, number: int, purpose: TripPurpose, layout: Layout) -> GroundTruth:
-    """Return the trip of vehicle ``number`` with only its branches; the layout says which of them takes the balance."""
+    """Return the trip of vehicle ``number`` with its branches; one of them is minus the sum of the others (19)."""
     branches = vehicle.branches
     return with_branches(trips.trip(number, purpose), branches, balance_branch(layout, branches))

@@ -32,12 +32,12 @@ STANDSTILL_KMH = 0.5
 
 
 def choose_branches(layout: Layout, available: Sequence[str], count: int) -> tuple[str, ...]:
-    """Choose which branches a fleet of K currents has: the first K of the layout that the recordings have.
+    """Return the first ``count`` branches of a layout that the recordings have.
 
     Parameters
     ----------
     layout : Layout
-        Names the branches in order, and the one that takes the balance (19).
+        Names the branches in order.
     available : sequence of str
         Branches that the recordings have.
     count : int
@@ -46,12 +46,12 @@ def choose_branches(layout: Layout, available: Sequence[str], count: int) -> tup
     Returns
     -------
     tuple of str
-        K names, in the order of the layout, with the balancing branch among them.
+        K names, in the order of the layout.
 
     Raises
     ------
     FleetError
-        If the recordings have fewer branches.
+        If the recordings have fewer branches, or the count is below 2.
     """
     names = [name for name in layout.branch_names if name in available]
     if len(names) < 2:
@@ -68,14 +68,14 @@ def choose_branches(layout: Layout, available: Sequence[str], count: int) -> tup
 
 
 def with_branches(trip: GroundTruth, branches: Sequence[str], balance: str) -> GroundTruth:
-    """Keep some branches and let one of them take minus the sum of the others, (19) in [1]_."""
+    """Return the trip with some of its branches; one of them, ``balance``, is minus the sum of the others (19)."""
     kept = {name: trip.currents_a[name] for name in branches}
     kept[balance] = -np.sum([kept[name] for name in branches if name != balance], axis=0)
     return GroundTruth(name=trip.name, period_s=trip.period_s, currents_a=kept, inputs=trip.inputs)
 
 
 def balance_branch(layout: Layout, branches: Sequence[str]) -> str:
-    """Return the branch that is minus the sum of the others: the layout's, or the last one as in (19) of the paper."""
+    """Return the branch that is minus the sum of the others: the one that the layout names, or else the last (19)."""
     return next((branch.name for branch in layout.branch if branch.balance and branch.name in branches), branches[-1])
 
 
@@ -171,7 +171,7 @@ class BuiltinTrips:
     seed : int
         Seed of the trips.
     duration_s, unseen_s : float
-        Length of each trip to learn from, and of each trip to test on. [s]
+        Least length of each trip to learn from, and of each trip to test on. [s]
     common : bool
         Whether every vehicle drives the trips of the first one, as in the experiments of the paper.
     notices : tuple of str
@@ -199,7 +199,7 @@ class BuiltinTrips:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedTrips:
-    """Recorded trips: one for each vehicle if there are enough, else joined from pieces, as unseen trips always are.
+    """Recorded trips: to learn from, one per vehicle if there are enough, else joined ones; to test on, joined ones.
 
     No piece of a recording is in both trips of a vehicle; a single recording is cut in time.
 
@@ -229,7 +229,7 @@ class RecordedTrips:
         return tuple(self.recorded[0].currents_a)
 
     def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
-        """Take or join a trip for vehicle ``number``."""
+        """Return the recorded or joined trip of vehicle ``number``, to learn from or to test on."""
         number = 0 if self.vehicles == 1 else number
         count, learnt, half = len(self.recorded), purpose == "calibration", len(self.recorded) // 2
         if learnt and count > 1 and self.vehicles <= count:
@@ -250,7 +250,7 @@ class RecordedTrips:
 
 
 TripSource = BuiltinTrips | RecordedTrips
-"""Gives every vehicle its trips."""
+"""Where the trips of the vehicles come from."""
 
 
 def read_recorded_trips(store: Path, layout: Layout) -> tuple[list[GroundTruth], list[str]]:
@@ -300,7 +300,7 @@ def read_recorded_trips(store: Path, layout: Layout) -> tuple[list[GroundTruth],
 def choose_trips(
     drives: str, layout: Layout, *, vehicles: int, seed: int, duration_s: float, unseen_s: float, common: bool
 ) -> TripSource:
-    """Choose where trips come from.
+    """Return the source of the trips: the built-in vehicle, or a drive store.
 
     Parameters
     ----------
@@ -313,9 +313,9 @@ def choose_trips(
     seed : int
         Seed of the trips.
     duration_s, unseen_s : float
-        Length of each built-in trip to learn from, and of each trip to test on. [s]
+        Least length of each built-in trip to learn from, and length of each trip to test on. [s]
     common : bool
-        One trip for all vehicles.
+        Whether all vehicles drive the same trip.
 
     Returns
     -------
@@ -337,7 +337,7 @@ def choose_trips(
 
 
 def _builtin_notices(layout: Layout) -> tuple[str, ...]:
-    """Say which model inputs the built-in vehicle lacks; FleetError if it lacks all, or has fewer than two branches."""
+    """Return a notice of model inputs that the built-in vehicle lacks; FleetError without inputs or two branches."""
     inputs, missing = choose_inputs(layout, BUILTIN_INPUTS)
     common = [name for name in layout.branch_names if name in BUILTIN_BRANCHES]
     if len(common) < 2 or not inputs:

@@ -1,1 +1,1 @@
-"""Experiments of the paper and ours: each is a row of a table, run by one runner with any methods."""
+"""Experiments of the paper and ours: each is a row of a table, and one function runs each of them with any methods."""

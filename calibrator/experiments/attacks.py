@@ -3,8 +3,8 @@
 A world is a row of :data:`WORLDS`. In the vehicles that it affects it may change the true faults (sensors stay linear),
 the true currents (loads without a sensor), or the measured current of one sensor. That is the sensor of the battery or
 the motor: the other branches of a recorded trip hardly move, so the effect would not show there. Disturbances (spikes,
-interference) appear only in the recording, not on the drive on which corrections are judged. What belongs to a sensor
-or a vehicle is on both; on the latter drive a step or a ramp is over, and the temperature is another one.
+interference) appear only in the recording, not on the unseen drive, on which corrections are judged. What belongs to a
+sensor or a vehicle is on both drives; on the unseen one a step or ramp is complete, and the temperature is another one.
 """
 
 from collections.abc import Callable
@@ -27,6 +27,7 @@ MOVING = 2
 HZ = 10.0
 """Samples per second of recorded trips; lengths of bursts and switching loads are counted in them. [1/s]"""
 REFERENCE_C = 25.0
+"""Temperature at which sensors whose gain depends on it have their usual gain. [degC]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +37,9 @@ class Scene:
     Attributes
     ----------
     size : float
-        Size of the effect; signed for effects on sensors.
+        Size of the effect, in the unit that its world needs; of either sign for effects on sensors.
     full_scale_a, peak_a : float
-        Full scale of the junction, and the sensor's largest current on the drive to learn from. [A]
+        Full scale of the junction, and the sensor's greatest magnitude in the recording. [A]
     progress, temperature_c : ndarray of shape (T,)
         Time since the start over the drive's length [1], 1 on the unseen drive; temperature of the sensors [degC].
     rng : numpy.random.Generator
@@ -55,30 +56,30 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """One effect that the estimator does not expect; each callable says how it changes a vehicle or a sensor.
+    """One effect that the estimator does not expect; its callables say how it changes a vehicle or a sensor.
 
     Attributes
     ----------
     share : float
         Share of the vehicles that it affects. [1]
     size : tuple of float
-        Range of its size over vehicles.
+        Range of its size over vehicles, in the unit that its callables need: A or [1].
     causes : tuple of str
-        Causes by which a finding names it correctly; empty: findings are not judged.
+        A finding is right if it names one of these causes; empty: findings are not judged.
     magnitude : tuple of float or None
-        Range of the fault magnitudes of all vehicles, if the world is about these.
+        Range of the fault magnitudes of all vehicles [1]; None: that of the case.
     truth : callable or None
-        Returns new drift and offset [A] of the affected sensor, from the old ones and the size; sensors stay linear.
+        From drift, offset [A] and size of n affected sensors, each (n,), to their new drift and offset, still linear.
     hardware : callable or None
-        Returns the new hardware drift, from the old one and the size.
+        From hardware drift and size of all vehicles, each (N,), to the hardware drift that affected ones have.
     load : callable or None
-        Returns what is added to the first branch (the source), shape (T,), from the true currents (T, K). [A]
+        From true currents (T, K) and scene to what the first branch (the source) gives in addition, (T,). [A]
     sensor : callable or None
-        Returns the new measured current of the affected sensor, shape (T,). [A]
+        From what the affected sensor measures (T,) and scene to what it measures in this world (T,). [A]
     disturbance : callable or None
-        Returns what is added to the affected sensor in the recording only, shape (T,). [A]
+        From scene and T to what is added to the affected sensor, in the recording only, (T,). [A]
     battery : bool
-        Whether the sensor is always the battery's.
+        Whether the affected sensor is always the battery's; else it is the battery's or the motor's.
     """
 
     share: float = 0.3
@@ -106,7 +107,7 @@ class Attack:
     branch : ndarray of int of shape (N,)
         Number of the branch whose sensor is affected.
     size : ndarray of shape (N,)
-        Size of the effect; signed for effects on sensors.
+        Size of the effect, as in :class:`Scene`.
     full_scale_a : float
         Full scale of the junction. [A]
     seed : int
@@ -121,7 +122,7 @@ class Attack:
     seed: int
 
     def truth(self, faults: Faults) -> Faults:
-        """Return the faults of the fleet in this world, as far as they are linear."""
+        """Return the linear faults of the fleet in this world, from its faults without it."""
         drift, offset_a, hardware = faults.drift.copy(), faults.offset_a.copy(), faults.hardware_drift
         j = np.flatnonzero(self.has)
         at = (j, self.branch[j])
@@ -132,14 +133,20 @@ class Attack:
         return replace(faults, drift=drift, offset_a=offset_a, hardware_drift=hardware)
 
     def true_a(self, vehicle: int, i: Array, *, unseen: bool) -> Array:
-        """Return the true currents of a vehicle in this world, shape (T, K), from those without it. [A]"""
+        """Return the true currents of a vehicle in this world, shape (T, K), from those without it, i. [A]
+
+        ``unseen``: whether it is the drive on which corrections are judged.
+        """
         if not self.has[vehicle] or self.world.load is None:
             return i
         load_a = self.world.load(i, self._scene(vehicle, len(i), unseen=unseen))
         return np.column_stack([i[:, 0] + load_a, i[:, 1:]])
 
     def measured_a(self, vehicle: int, i_m: Array, *, unseen: bool, peak_a: Array) -> Array:
-        """Return the measured currents of a vehicle in this world, shape (T, K), from those of linear sensors. [A]"""
+        """Return the measured currents of a vehicle in this world, shape (T, K), from those of linear sensors, i_m. [A]
+
+        ``unseen`` is as in :meth:`true_a`; ``peak_a`` (K,) has the greatest magnitudes in the recording.
+        """
         k, changed = int(self.branch[vehicle]), i_m.copy()
         scene = self._scene(vehicle, len(i_m), unseen=unseen, peak_a=float(peak_a[k]))
         if self.has[vehicle] and self.world.sensor is not None:
@@ -162,7 +169,7 @@ class Attack:
 
 
 def draw_attack(name: str, vehicles: int, *, full_scale_a: float, seed: int) -> Attack:
-    """Draw which vehicles of a fleet a world affects, and how much.
+    """Draw which vehicles and sensors of a fleet a world affects, and how much.
 
     Parameters
     ----------
@@ -194,7 +201,7 @@ def draw_attack(name: str, vehicles: int, *, full_scale_a: float, seed: int) -> 
 
 
 def _on_off(scene: Scene, samples: int, seconds: tuple[float, float], duty: float = 0.5) -> Array:
-    """Switch between 1 and 0, shape (T,): on for random times, off for times that make the duty cycle."""
+    """Return a signal of 1 and 0 by turns, shape (samples,): 1 for random times, and for the share ``duty`` in all."""
     lengths_s = scene.rng.uniform(*seconds, (2 * int(samples / HZ / seconds[0]) + 2,))
     state = np.arange(len(lengths_s)) % 2 == int(scene.rng.random() < duty)
     lengths_s[~state] *= (1.0 - duty) / duty
@@ -223,7 +230,7 @@ def _mean(x: Array, scene: Scene) -> Array:
 
 
 def _wander(x: Array, scene: Scene) -> Array:
-    """Let the zero of a current walk at random; the size is its standard deviation at the end of a drive. [A]"""
+    """Add a random walk to a current; the scene's size is its standard deviation at the end of the drive. [A]"""
     return np.asarray(x + scene.size * np.cumsum(scene.rng.standard_normal(len(x))) / np.sqrt(len(x)))
 
 
@@ -233,7 +240,7 @@ def _later_gain(d: Array, o: Array, size: Array) -> tuple[Array, Array]:
 
 
 def _earlier(x: Array, scene: Scene, part: Array) -> Array:
-    """Return the current measured when the gain has made only a part of its change, from that after all of it."""
+    """Return what is measured when the gain has made only ``part`` (0 to 1) of its change, from x, after all of it."""
     return x * (1.0 + scene.size * part) / (1.0 + scene.size)
 
 
@@ -251,18 +258,18 @@ def _sensor(size: tuple[float, float], sensor: Change, *causes: str, **more: Any
 
 
 def _disturbed(size: tuple[float, float], added: Callable[[Scene, int], Array], *causes: str) -> World:
-    """Make the world of a disturbance that is only in the recording, not on the drive that judges corrections."""
+    """Make the world of a disturbance that is in the recording, not on the drive on which corrections are judged."""
     return World(size=size, causes=causes, disturbance=added)
 
 
 def _batch(share: float, offset_a: float) -> World:
-    """Make the world of a batch of battery sensors that have one more offset."""
+    """Make the world of a batch of battery sensors with an offset in common, in addition to their own."""
     size = (offset_a, offset_a)
     return World(share=share, size=size, causes=("batch",), battery=True, truth=lambda d, o, s: (d, o + s))
 
 
 def _gain_batch(share: float, drift: float) -> World:
-    """Make the world of a batch of battery sensors that have one more gain error."""
+    """Make the world of a batch of battery sensors with a gain error in common, in addition to their own."""
     return World(share=share, size=(drift, drift), battery=True, truth=_one_more_gain)
 
 

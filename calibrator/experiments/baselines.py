@@ -49,7 +49,7 @@ LEAST_WEIGHT = 0.2
 
 
 def best_subset(trial: Trial) -> Faults:
-    """Take the support with the least Bayesian information criterion of all."""
+    """Return the faults of the support that has the least Bayesian information criterion of all supports."""
     linear = _Linear(trial)
     N, P = len(linear.rows), linear.design.shape[1]
     supports = np.array([bits for bits in itertools.product((False, True), repeat=P) if sum(bits) < P], bool)
@@ -58,7 +58,7 @@ def best_subset(trial: Trial) -> Faults:
 
 
 def lasso(trial: Trial) -> Faults:
-    """Take the support on the LASSO path with the least Bayesian information criterion, fitted without shrinkage."""
+    """Return the faults, without shrinkage, of the LASSO path's support of least Bayesian information criterion."""
     linear = _Linear(trial)
     y = linear.values(np.zeros((len(linear.rows), linear.design.shape[1])))
     support = np.zeros((len(y), linear.design.shape[1]), bool)
@@ -71,10 +71,9 @@ def lasso(trial: Trial) -> Faults:
 
 
 def fleet_median(trial: Trial) -> Faults:
-    """Take what is far from the fleet's median as faults of the sensors.
+    """Return as sensor faults what is farther than :data:`BEYOND` robust standard deviations from the fleet's median.
 
-    Compared are slopes and intercepts (15) of each vehicle over the fleet model. Far is beyond :data:`BEYOND` robust
-    standard deviations.
+    Compared are slopes and intercepts (15) of each vehicle over the fleet model.
     """
     rows, order = _evidence_rows(trial)
 
@@ -88,7 +87,7 @@ def fleet_median(trial: Trial) -> Faults:
 
 
 def total_least_squares(trial: Trial) -> Faults:
-    """Take the direction in which currents vary least as weights 1 / (1 + d) of the junction law, with median 1."""
+    """Return sensor faults by the direction in which currents vary least: it gives 1 / (1 + d), scaled to median 1."""
     mean_a, covariance_a2 = _measured_moments(trial)
     w = np.linalg.eigh(covariance_a2)[1][:, :, 0]
     w = w / np.median(w, axis=1, keepdims=True)
@@ -99,7 +98,10 @@ def total_least_squares(trial: Trial) -> Faults:
 
 
 def reconciliation(trial: Trial) -> Faults:
-    """Fit measured over reconciled currents: the nearest ones that sum to zero, all sensors being equally accurate."""
+    """Return sensor faults by which measured currents follow from reconciled ones, the nearest that sum to zero.
+
+    All sensors count as equally accurate; a sum that their :data:`ACCURACY` explains gives no faults.
+    """
     mean_a, covariance_a2 = _measured_moments(trial)
     K = mean_a.shape[1]
     project = np.eye(K) - 1.0 / K
@@ -119,7 +121,7 @@ SOLVERS = {
     "total least squares": total_least_squares,
     "VDI 2048": reconciliation,
 }
-"""Functions by name; each finds the faults of the vehicles of a trial."""
+"""Baselines by name; each function returns the faults that it finds in the vehicles of a trial."""
 
 
 def _sensors_alone(drift: Array, offset_a: Array) -> Faults:
@@ -129,7 +131,7 @@ def _sensors_alone(drift: Array, offset_a: Array) -> Faults:
 
 
 def _measured_moments(trial: Trial) -> tuple[Array, Array]:
-    """Mean (N, K) [A] and covariance (N, K, K) [A^2] of each vehicle's measured currents."""
+    """Return mean (N, K) [A] and covariance (N, K, K) [A^2] of each vehicle's measured currents."""
     if isinstance(trial.recorded, CommonEvidence):
         return trial.recorded.mean_a, trial.recorded.covariance_a2
     mean_a = np.stack([summary.mean_a for summary in trial.recorded])
@@ -138,7 +140,7 @@ def _measured_moments(trial: Trial) -> tuple[Array, Array]:
 
 
 def _evidence_rows(trial: Trial) -> tuple[EvidenceRows, NDArray[np.int64]]:
-    """Evidence rows, and the position of each of their branches in the vehicle's own order."""
+    """Return the evidence rows, and order (K,): branch k of the rows is branch order[k] of the vehicles."""
     if isinstance(trial.recorded, CommonEvidence):
         return trial.recorded.rows, np.arange(trial.recorded.rows.branches)
     order = np.argsort(-np.median(stack_summaries(trial.recorded).variance_a2, axis=0), kind="stable")
@@ -171,13 +173,13 @@ class _Linear:
         self.whiten = np.linalg.inv(np.linalg.cholesky(whole))
 
     def values(self, theta: Array) -> Array:
-        """Return rows minus their centre, shape (N, 3K), with constants taken at the gains of theta, shape (N, 3K)."""
+        """Return rows minus their centre, shape (N, 3K); their constants depend on the gains in theta (N, 3K)."""
         without_load = np.pad(theta, ((0, 0), (0, 1)))
         left = row_residuals(self.evidence, without_load[:, None])[:, 0, self.rows.places.measured]
         return np.asarray(left + theta @ self.design.T)
 
     def fit(self, support: Mask) -> tuple[Array, Array]:
-        """Parameters (N, 3K), 0 outside a support (N, 3K) of each vehicle, and chi2 (N,), by least squares."""
+        """Fit the parameters in a support (N, 3K) by least squares; return them (N, 3K), 0 elsewhere, and chi2 (N,)."""
         theta = np.zeros(support.shape)
         design = (self.whiten @ self.design) * support[:, None, :]
         solve = np.linalg.pinv(design, rcond=1e-9)
@@ -188,7 +190,7 @@ class _Linear:
         return theta, np.sum((y - np.einsum("nip,np->ni", design, theta)) ** 2, axis=1)
 
     def faults(self, support: Mask) -> Faults:
-        """Faults of a support (N, 3K), branches in the vehicles' own order."""
+        """Return the faults fitted with a support (N, 3K), branches in the vehicles' own order."""
         at, own, theta = ParameterPlaces(self.rows.branches), np.argsort(self.order), self.fit(support)[0]
         gain, hardware = np.exp(theta[:, at.gains]), theta[:, at.hardware_offsets]
         hardware = np.column_stack([hardware, -hardware.sum(axis=1)])

@@ -75,7 +75,7 @@ class CommonDrive:
             raise DriveError(f"drive {self.name}: ideal currents must sum to zero; the worst sum is {worst:.3g} A")
 
     def with_branches(self, count: int) -> "CommonDrive":
-        """Return the drive with its first K branches, of which the second, the motor, takes the balance (19).
+        """Return the drive with its first ``count`` branches; the second, the motor, is minus the sum of the others.
 
         Raises
         ------
@@ -94,7 +94,7 @@ class CommonDrive:
 
     @property
     def unity_start(self) -> int:
-        """First sample of the unity drive, T_1 of section IV-C."""
+        """Number of the first sample of the unity drive, T_1 of section IV-C."""
         return int(TRAIN_SHARE * len(self.i_s))
 
     @property
@@ -104,7 +104,7 @@ class CommonDrive:
 
     @property
     def record(self) -> dict[str, int | float | str]:
-        """What is needed to make the drive again."""
+        """Description, lengths and full scale of the drive, for the record of a result."""
         return {
             "drive": self.name,
             "samples": len(self.i_s),
@@ -114,7 +114,7 @@ class CommonDrive:
 
 
 def builtin_common_drive(duration_s: float) -> CommonDrive:
-    """Take the common drive from the built-in vehicle, with all branches and the inputs of ``dbc/hv_powertrain.toml``.
+    """Make the common drive with the built-in vehicle, all its branches and inputs as in ``dbc/hv_powertrain.toml``.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ class CommonCase(FaultSettings):
     snr_db : float
         Signal-to-noise ratio of the artificial simulation (26). [dB]
     state_space : bool
-        Simulate by a state-space model of each vehicle (2), trained on 80 % of the drive, instead of artificially (23).
+        Whether vehicles are simulated by state-space models (2) trained on 80 % of the drive; else artificially (23).
     """
 
     branches: int = 2
@@ -185,7 +185,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         return CommonEvidence(rows=rows, mean_a=mean_a, covariance_a2=covariance_a2)
 
     def training() -> tuple[FleetEvidence, Faults]:
-        """Return evidence and truth of another fleet, from which the trees learn."""
+        """Return evidence and true faults of another fleet, from which the trees learn."""
         other = case.draw(random_stream(Purpose.TRAINING_FAULTS, seed), vehicles=case.training_vehicles, **junction)
         simulate_other = _simulation(drive, other, case, Purpose.TRAINING_ERROR, seed)
         return collect_evidence(simulate_other(), fleet_mean(simulate_other()), _junction_a2(drive, other)), other
@@ -205,7 +205,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
 def _simulation(
     drive: CommonDrive, truth: Faults, case: CommonCase, purpose: Purpose, seed: int
 ) -> Callable[[], Iterable[Array]]:
-    """Return a function that makes the measured currents with white noise (23) anew at each call, to save memory."""
+    """Return a function that yields each vehicle's measured currents with white noise (23), the same at each call."""
     noise_a = np.sqrt(10.0 ** (-case.snr_db / 10.0) * np.mean(drive.unity[:, 0] ** 2))  # (26), with the power of i_s,1
 
     def simulate() -> Iterator[Array]:
@@ -216,7 +216,7 @@ def _simulation(
 
 
 def _state_space_simulations(drive: CommonDrive, truth: Faults) -> Iterator[Array]:
-    """Yield simulations by state-space models (2); all have the order of the first, as vehicles are identical."""
+    """Yield each vehicle's simulation on the unity drive by a state-space model (2); all models have the same order."""
     start, order = drive.unity_start, None
     for measured in _measured(drive.i_s, truth):
         if order is None:
@@ -226,18 +226,18 @@ def _state_space_simulations(drive: CommonDrive, truth: Faults) -> Iterator[Arra
 
 
 def _measured(i_s: Array, truth: Faults) -> Iterator[Array]:
-    """Yield the measured currents (21) of one vehicle after the other."""
+    """Yield the measured currents (21) of one vehicle after the other, each of shape (T, K). [A]"""
     for slope, intercept in zip(*slopes_and_intercepts(truth), strict=True):
         yield slope * i_s + intercept
 
 
 def _junction_a2(drive: CommonDrive, truth: Faults) -> Array:
-    """Mean square of the sum of each vehicle's measured currents (6), shape (N,). [A^2]"""
+    """Return the mean square of the sum of each vehicle's measured currents (6), shape (N,). [A^2]"""
     return np.array([np.mean(measured.sum(axis=1) ** 2) for measured in _measured(drive.unity, truth)])
 
 
 def _unseen(ideal_a: Array, truth: Faults) -> UnseenDrive:
-    """Moments of N vehicles with linear sensors that all make one drive of ideal currents (T, K), (11)."""
+    """Return the unseen drive of N vehicles that have the same ideal currents (T, K), and true currents by (11)."""
     gain, constant = 1.0 + truth.hardware_drift[:, None], truth.hardware_offset_a
     mean_a, mean_square_a2 = ideal_a.mean(axis=0), np.mean(ideal_a**2, axis=0)
     i2 = gain**2 * mean_square_a2 + 2.0 * gain * constant * mean_a + constant**2
@@ -245,7 +245,7 @@ def _unseen(ideal_a: Array, truth: Faults) -> UnseenDrive:
 
 
 def measured_moments(i_s: Array, truth: Faults) -> tuple[Array, Array]:
-    """Mean (N, K) [A] and covariance (N, K, K) [A^2] of what N vehicles measure of ideal currents (T, K), (14)."""
+    """Return mean (N, K) [A] and covariance (N, K, K) [A^2] of the measured currents (14) of ideal ones (T, K)."""
     slope, intercept = slopes_and_intercepts(truth)
     centred = i_s - i_s.mean(axis=0)
     covariance = centred.T @ centred / len(i_s)
@@ -262,7 +262,7 @@ def common_rows(
     evidence : FleetEvidence
         Slopes and intercepts of the simulations over the fleet mean, with white residuals.
     reference_mean_a : ndarray of shape (K,)
-        Mean of the fleet mean on the unity drive. [A]
+        Mean over time of the fleet mean on the unity drive. [A]
     mean_a, covariance_a2 : ndarray of shape (N, K) and (N, K, K)
         Moments of the measured currents of the same vehicles. [A], [A^2]
     full_scale_a : float
@@ -290,7 +290,7 @@ def common_rows(
 
 
 def _over_cluster(evidence: FleetEvidence, reference_mean_a: Array) -> tuple[Array, Array, Array]:
-    """Slopes (N, K), intercepts (N, K) [A] over the densest cluster, and the covariance of both (N, K, 2, 2)."""
+    """Return slopes a' (N, K), intercepts b' (N, K) [A], see the top, and the covariance of the two (N, K, 2, 2)."""
     slope, intercept_a = evidence.slopes, evidence.intercepts_a
     covariance = np.empty((*slope.shape, 2, 2))
     covariance[..., 0, 0] = np.maximum(evidence.slope_variances, LEAST_SD**2)

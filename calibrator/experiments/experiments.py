@@ -47,9 +47,9 @@ class Setting:
     Attributes
     ----------
     x : float
-        Value of what the experiment varies.
+        Value of what the experiment varies, such as 60.0 for a sparsity of 60 %.
     series : str
-        Value of what else it varies, as text.
+        Value of what else it varies, as text, such as ``K=2, 5-25 %``.
     case : CommonCase or RecordedCase
         How the fleets are made.
     methods : tuple of ComparedMethod
@@ -69,19 +69,19 @@ class Experiment:
     Attributes
     ----------
     name, title : str
-        Name on the command line, and what it shows.
+        Name on the command line, and heading of its page.
     x_label, series_label : str
-        What it varies, with units.
+        What x and series of its settings are, with the unit, such as ``sparsity S [%]``.
     methods : tuple of ComparedMethod
         Methods that it compares.
     settings : tuple of Setting
         All on the common drive, or all on recorded trips; none for an experiment that pools the results of others.
     quick : mapping of str to collection of float
-        Values of x by series that ``--quick`` keeps; empty: all.
+        Values of x by series that ``--quick`` keeps, such as ``{"3 of 6": (60.0,)}``; empty: all.
     drive_s : float
         Length of the common drive; an hour has 7,200 samples of unity drive at 10 Hz, the paper does not say. [s]
     paper : mapping
-        Figures of the paper by (x, method) and name; the best by x stands in the tables.
+        What the paper prints: ``{(60.0, "published/tree"): {"f2": 0.84}}`` by (x, method), then figure.
     note : str
         Remark on the settings.
     picture : str
@@ -142,9 +142,9 @@ class Experiment:
 
 
 READINGS = (("", 60.0), ("3 of 6", 50.0))
-"""S = 60 with two branches: 2 of 6 parameters that are not zero, or 3 of 6, which is S = 50 in our count."""
+"""(series, S) of the two readings of S = 60 with two branches: 2 of 6 parameters are not zero, or 3, here S = 50."""
 LEVELS = ((20.0, "", 20.0), (40.0, "", 40.0), *((60.0, *reading) for reading in READINGS), (80.0, "", 80.0))
-"""Levels of sparsity, with both readings of the one at which the paper is quoted."""
+"""(x, series, S) of the paper's levels of sparsity x, with both readings of 60."""
 TWO_READINGS = (
     "S = 60 can be read as 2 or 3 of 6 parameters that are not zero: 3 of 6 where the table says so, else 2. The "
     "paper's share of hardware faults fits 3, its recovery fits 2; its figure stands beside both."
@@ -164,7 +164,7 @@ def _sizes(magnitude: tuple[float, float]) -> str:
 
 
 def _named(case: RecordedCase) -> Setting:
-    """Make a setting over the sparsity, whose series names branches, sizes of faults and whatever is unusual."""
+    """Make a setting with the sparsity as x, and as series what else it has, such as ``K=2, 5-25 %, load 3+-1 A``."""
     load = "" if not any(case.unmeasured_a) else ", load {:g}+-{:g} A".format(*case.unmeasured_a)
     hardware = "" if case.balanced else ", any vehicle"
     named = "own prior" if case.own_prior is not None else f"{_sizes(case.magnitude)} %{hardware}{load}"
@@ -186,7 +186,7 @@ REAL = tuple(
         ),
     )
 )
-"""The four main settings, balanced and with hardware faults possible in any vehicle; sizes of faults; loads."""
+"""Settings on recorded trips: the main four, balanced and with any vehicle; other sizes of faults; with a load."""
 COVERAGE = ("gain_within_1", "gain_beyond_3", "offset_within_1", "offset_beyond_3")
 
 TABLE = (
@@ -394,7 +394,7 @@ def fleet_for(
     experiment : Experiment
         The experiment.
     quick : bool
-        Whether few and short drives are enough.
+        Whether to take only few and short drives.
     drives : Path or None
         Drive store with recorded trips; None: the built-in vehicle.
     layout : Path or None
@@ -429,12 +429,12 @@ class ExperimentResult:
     experiment : Experiment
         The row that was run.
     settings : mapping
-        Seed, repetitions, drive, and what all settings have in common.
+        By name: seed, repetitions, facts of the drives, and what the cases of all settings have in common.
     figures : DataFrame
         A row per setting (columns ``series``, ``x``), ``method`` and ``figure``, with the columns of
         :func:`~calibrator.experiments.figures.figure_rows`.
     tenths : DataFrame
-        By setting and method, from :func:`~calibrator.experiments.figures.tenths_of`.
+        Rows of :func:`~calibrator.experiments.figures.tenths_of` for each setting and method.
     made : str
         Version, machine and day, as :func:`~calibrator.experiments.runner.made_now` says; empty for an experiment that
         was called as a function.
@@ -448,7 +448,7 @@ class ExperimentResult:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Methods in the order of their first rows."""
+        """Names of the methods, in the order of their first rows."""
         return tuple(dict.fromkeys(self.figures["method"]))
 
     def value(self, figure: str, *, x: float, method: str, series: str = "") -> float:
@@ -456,7 +456,7 @@ class ExperimentResult:
         return float(self.figures.set_index([*KEYS, "figure"])["value"].to_dict()[series, x, method, figure])
 
     def to_json(self) -> str:
-        """Encode as JSON."""
+        """Return it as one JSON object: names and labels, settings, made, and both tables as lists of rows."""
         tables = {
             name: json.loads(table.to_json(orient="records", double_precision=15))
             for name, table in (("figures", self.figures), ("tenths", self.tenths))

@@ -1,4 +1,4 @@
-"""Figures of merit, which compare what a method says of a trial with the truth, and the table of their meanings.
+"""Figures of merit, which compare a method's estimate of a trial with the truth, and the table of their meanings.
 
 Every figure is one number made of many values, mostly their mean: :func:`judge` gives the values of one trial,
 :func:`figure_rows` the figures of several trials together. The expected calibration error is that of [1]_, intervals
@@ -28,7 +28,7 @@ __all__ = [
 ALL = "all together"
 """Name of the series that pools several experiments."""
 SURE = 0.95
-"""Confidence from which on a vehicle counts as sure. [1]"""
+"""A vehicle counts as sure if its confidence is above this. [1]"""
 LEAST_GAIN = 1e-9
 """Least magnitude of 1 + d, by which corrections divide; nearer to zero there is no correction. [1]"""
 TAIL = 0.025
@@ -37,11 +37,11 @@ TENTHS = np.arange(10) / 10.0
 TENTH_COLUMNS = ("low", "vehicles", "confidence", "recovered", "pit")
 
 Values = Mapping[str, NDArray[Any]]
-"""Values of one or several trials by figure; those of a share are true or false."""
+"""Values of one or several trials, an array by name of the figure; those of a share are true or false."""
 
 
 class FigureKind(NamedTuple):
-    """Meaning of a figure, how its values are merged, and whether it is rare, so that counts are shown with it."""
+    """Meaning of a figure, function that makes it of its values, and whether it is so rare that counts are shown."""
 
     meaning: str
     merged: Callable[[NDArray[Any]], Any] = np.mean
@@ -85,7 +85,7 @@ FIGURES = {
 
 
 def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
-    """Compare an estimate with the truth.
+    """Compare an estimate with the truth, and return the values of which figures are made.
 
     Parameters
     ----------
@@ -97,9 +97,9 @@ def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
     Returns
     -------
     dict of str to ndarray
-        Values of the figures of :data:`FIGURES`, one per vehicle, parameter or delay that counts in the figure; pairs
-        (held to be, is) faulty of ``f2``, and (confidence, recovered) of ``ece``. ``pit`` holds the probability
-        integral transforms of the deployed parameters. Figures that have no meaning here are left out.
+        By figure of :data:`FIGURES`, one value per vehicle, parameter or delay that counts in it. Those of ``f2`` are
+        pairs (classified as faulty, truly faulty), those of ``ece`` pairs (confidence, recovered). ``pit`` holds the
+        probability integral transforms of the deployed parameters. Figures that have no meaning here are left out.
     """
     truth, faults, N = trial.truth, estimate.faults, len(trial.truth)
     scales = {"full_scale_a": trial.full_scale_a, "smallest_fault": trial.smallest_fault}
@@ -141,7 +141,10 @@ def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
 
 
 def _worsening_a(estimate: Estimate, trial: Trial) -> Array:
-    """Return by how much corrected branches (N, K) get worse; full scale if the gain is 0, which has no inverse. [A]"""
+    """Return by how much correction raises the root mean square error of each branch on the unseen drive, (N, K). [A]
+
+    It is negative where correction helps, 0 where nothing is corrected, and full scale where 1 + d is 0.
+    """
     drift, offset_a = (np.where(estimate.corrected, x, 0.0) for x in (estimate.faults.drift, estimate.faults.offset_a))
     impossible, zero = np.abs(1.0 + drift) < LEAST_GAIN, np.zeros_like(drift)
     worsening = trial.unseen.rms_a(np.where(impossible, 0.0, drift), offset_a) - trial.unseen.rms_a(zero, zero)
@@ -149,7 +152,7 @@ def _worsening_a(estimate: Estimate, trial: Trial) -> Array:
 
 
 def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Figures of one method over the trials of one setting.
+    """Return the figures of one method over the trials of one setting.
 
     Parameters
     ----------
@@ -160,7 +163,7 @@ def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
     -------
     figures : DataFrame
         A row per figure: its name (``figure``), ``value``, standard deviation ``sd`` over the trials (0 for a single
-        one), and number of values it is made ``of``; for a share also its 95 % interval, from ``low`` to ``high``.
+        one), and ``of``, the number of its values; for a share also its 95 % interval, from ``low`` to ``high``.
     tenths : DataFrame
         Vehicles by tenths of their confidence, see :func:`tenths_of`.
     """
@@ -179,7 +182,7 @@ def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _with_intervals(figures: pd.DataFrame) -> pd.DataFrame:
-    """Add the 95 % intervals of those figures that are shares."""
+    """Add columns ``low`` and ``high``, the 95 % intervals of those figures that are shares; drop column ``share``."""
     hits, share = np.rint(figures["value"] * figures["of"]), figures["share"].astype(bool)
     misses = figures["of"] - hits
     low = np.nan_to_num(beta.ppf(TAIL, hits, misses + 1), nan=0.0)  # beta needs hits and misses above 0
@@ -188,10 +191,11 @@ def _with_intervals(figures: pd.DataFrame) -> pd.DataFrame:
 
 
 def tenths_of(values: Values) -> pd.DataFrame:
-    """Vehicles by tenths of their confidence, and deployed parameters by tenths of their integral transforms.
+    """Count vehicles by tenths of their confidence, and deployed parameters by tenths of their integral transforms.
 
-    Returns a row per tenth: its lower end ``low``, ``vehicles`` in it, their mean ``confidence`` and the share of them
-    that is ``recovered`` (NaN of none), and the number of parameters ``pit``; no row where there is neither.
+    Returns a row per tenth: its lower end ``low``; number of ``vehicles`` in it, their mean ``confidence`` and the
+    share of them that is ``recovered`` (NaN of none); number of parameters in it, ``pit``. No rows if there
+    are neither vehicles nor parameters.
     """
     pairs, pit = (values.get(name, np.zeros((0, 2))) for name in ("ece", "pit"))
     if not len(pairs) and not len(pit):
@@ -204,7 +208,7 @@ def tenths_of(values: Values) -> pd.DataFrame:
 
 
 def pool_tenths(tenths: pd.DataFrame) -> pd.DataFrame:
-    """Pool the tenths of several settings; leave out those that hold no vehicle."""
+    """Return one row per tenth for several settings together, without ``pit``, and without tenths of no vehicle."""
     means = ["confidence", "recovered"]
     weighed = tenths[["low", "vehicles", *means]].astype(float)
     weighed[means] = weighed[means].mul(weighed["vehicles"], axis=0)
@@ -214,7 +218,7 @@ def pool_tenths(tenths: pd.DataFrame) -> pd.DataFrame:
 
 
 def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
-    """Return the expected calibration error, and what it would be by chance alone; NaN without vehicles."""
+    """Return the expected calibration error [1], and what it is by chance of exact confidences; NaN of no vehicle."""
     vehicles, confidence = tenths["vehicles"].to_numpy(float), tenths["confidence"].to_numpy(float)
     if not vehicles.sum():
         return float("nan"), float("nan")
@@ -224,7 +228,7 @@ def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
 
 
 def pool_figures(figures: pd.DataFrame) -> pd.DataFrame:
-    """Pool those figures that are means over the values of several settings; standard deviations are set to 0."""
+    """Return the figures of several settings together, only those that are means of their values; ``sd`` is 0."""
     means = figures[[FIGURES[name].merged is np.mean for name in figures["figure"]]]
     weighed = means.assign(value=means["value"] * means["of"], share=means["low"].notna())
     pooled = weighed.groupby("figure", sort=False)[["value", "of", "share"]].sum().reset_index()

@@ -32,14 +32,14 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class MethodRow:
-    """A row of the methods.
+    """A method that experiments compare.
 
     Attributes
     ----------
     name : str
         Short name for tables.
     estimate : callable
-        Estimates the faults of all vehicles of a trial.
+        Function from a trial to the estimate for all its vehicles.
     """
 
     name: str
@@ -47,7 +47,7 @@ class MethodRow:
 
 
 def _posterior(trial: Trial, *, known: bool = False) -> Estimate:
-    """Run the default, which corrects branches that this hardly ever makes worse; if `known`, with the true prior."""
+    """Run the default method; if `known`, its prior is the distribution that the faults were drawn from."""
     prior = None
     if known:
         if trial.drawn_from is None:
@@ -99,7 +99,7 @@ def _estimated(found: decision.SensorEstimate, corrected: Mask, prior: Prior) ->
 
 
 def _all_corrected(faults: Faults, hardware: Mask, failed: int = 0) -> Estimate:
-    """Return the estimate of a method that corrects whatever it finds, and does not say how sure it is."""
+    """Return the estimate of a method that corrects each fault that it finds, and does not say how sure it is."""
     corrected = (faults.drift != 0.0) | (faults.offset_a != 0.0)
     return Estimate(faults=faults, hardware=hardware, corrected=corrected, confidence=None, failed=failed)
 

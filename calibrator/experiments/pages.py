@@ -47,7 +47,7 @@ def headline(result: ExperimentResult) -> pd.DataFrame:
 
 
 def figure_table(result: ExperimentResult, names: Iterable[str], *, intervals: bool = True) -> pd.DataFrame:
-    """Return figures of all methods as texts, a row per setting and method; those of the paper follow a slash."""
+    """Return figures of all methods as texts, a row per setting and method; the paper's value follows a slash."""
     figures = result.figures.assign(text=_texts(result, intervals=intervals))
     paper = (_of_paper(result.experiment, row) for row in figures.itertuples())
     figures["text"] += [f" / {value:.2f}" if np.isfinite(value) else "" for value in paper]
@@ -57,7 +57,7 @@ def figure_table(result: ExperimentResult, names: Iterable[str], *, intervals: b
 
 
 def _texts(result: ExperimentResult, *, intervals: bool = True) -> list[str]:
-    """Format the figures: a share with its interval, a rare one with its counts, too."""
+    """Format each row of figures: ``0.937 (0.921 to 0.950)``, and for a rare one its counts: ``; 2 of 140``."""
     texts = []
     for row in result.figures.itertuples():
         count = f"; {round(row.value * row.of)} of {row.of:.0f}" if FIGURES[row.figure].rare else ""
@@ -72,7 +72,7 @@ def _of_paper(experiment: Experiment, row: Any) -> float:
 
 
 def _labelled(table: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
-    """Turn the index of a table, which is what is varied, into labelled columns; drop the series if there are none."""
+    """Turn the index of a table (series, x) into columns with the experiment's labels; drop series without a label."""
     table = table.astype(object).fillna("-").reset_index()
     table["x"] = ["" if np.isnan(x) else f"{x:g}" for x in table["x"]]
     table = table if experiment.series_label else table.drop(columns="series")
@@ -87,13 +87,13 @@ def _owner(result: ExperimentResult) -> str:
 
 
 def _names(result: ExperimentResult) -> list[str]:
-    """Return the names of a result's figures, in the order of the columns; failures only if there are any."""
+    """Return the names of a result's figures, in the order of :data:`FIGURES`; ``failed`` only if it is not 0."""
     there = result.figures[(result.figures["figure"] != "failed") | (result.figures["value"] > 0.0)]["figure"]
     return [name for name in FIGURES if (there == name).any()]
 
 
 def _notes(result: ExperimentResult) -> str:
-    """Return remarks on the settings."""
+    """Return the experiment's note, and which branch is minus the sum of the others."""
     branch = result.settings.get("balance_branch")
     balance = f"In every trip the current of {branch} is minus the sum of the others, so it depends on their sensors."
     return f"{result.experiment.note} {balance if branch else ''}".strip()
@@ -124,14 +124,14 @@ def result_table(result: ExperimentResult) -> Group:
 
 
 def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
-    """Result as a page (Markdown), with what is needed to repeat it.
+    """Return a result as a page (Markdown), with the settings that repeat it.
 
     Parameters
     ----------
     result : ExperimentResult
         Result of one experiment.
     picture : str
-        File of its picture, as the page is to link it; empty: there is none.
+        Link to the file of its picture; empty: there is none.
     """
     experiment, names, owner = result.experiment, _names(result), _owner(result)
     also = f"; then figures of {owner}" if owner else ""
@@ -229,7 +229,10 @@ def _style(number: int) -> dict[str, Any]:
 def _draw_points(
     axes: Axes, experiment: Experiment, rows: pd.DataFrame, places: Sequence[float], *, label: str, number: int, of: int
 ) -> None:
-    """Draw one of several curves side by side; where settings are no numbers, draw dots from top to bottom."""
+    """Draw curve ``number`` of ``of``, shifted to stand beside the others at the places of its settings.
+
+    In a picture of dots the settings go from top to bottom and values to the right; else settings go to the right.
+    """
     across = experiment.picture == "dots"
     place = np.array(places) + (0.6 if across else 0.2) * ((number + 0.5) / of - 0.5)
     lengths = np.maximum(np.nan_to_num([rows["value"] - rows["low"], rows["high"] - rows["value"]]), 0.0)
@@ -245,7 +248,7 @@ def _draw_points(
 
 
 def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
-    """Draw a line of dots per setting and a panel per figure, for settings that are no numbers."""
+    """Draw a panel per figure, with a line per setting and a dot per method in it."""
     table, experiment = result.figures, result.experiment
     keys = list(dict.fromkeys(zip(table["series"], table["x"], strict=True)))
     figure.set_size_inches(11.0, 2.0 + max(3.0, 0.3 * len(keys)))

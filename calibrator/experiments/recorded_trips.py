@@ -84,7 +84,7 @@ class RecordedFleet:
 
     @property
     def record(self) -> dict[str, int | float | str]:
-        """What is needed to make the trips again."""
+        """Origin, number and length of the trips, full scale and noise, for the record of a result."""
         return {
             "drive": self.name,
             "trips": len(self.trips),
@@ -95,13 +95,13 @@ class RecordedFleet:
         }
 
     def take(self, trips: int, *, duration_s: float) -> "RecordedFleet":
-        """Return the first trips, each cut to its first seconds."""
+        """Return the fleet with only the first ``trips`` trips, each cut to its first ``duration_s``."""
         samples = int(duration_s / self.period_s)
         taken = tuple(trip.part(0, samples) for trip in self.trips[:trips])
         return replace(self, name=f"the first {duration_s:g} s of {len(taken)} of {self.name}", trips=taken)
 
     def with_branches(self, count: int) -> tuple[GroundTruth, ...]:
-        """Return trips with K currents that sum to zero, as one of them takes the balance (19).
+        """Return the trips with ``count`` currents, one of which is minus the sum of the others (19).
 
         Raises
         ------
@@ -118,7 +118,7 @@ class RecordedFleet:
         return choose_inputs(layout, tuple(available), names=names)[0]
 
     def inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
-        """Return these model inputs of a trip by name, each of shape (T,)."""
+        """Return the inputs :meth:`input_names` of a trip by name, computed ones included, each of shape (T,)."""
         layout, values = self.database.layout, dict(trip.inputs)
         for item in layout.derived:
             if layout.base_inputs([item.name]) <= values.keys():
@@ -178,12 +178,13 @@ class RecordedCase(FaultSettings):
     world : str
         World that affects some vehicles, of :data:`~calibrator.experiments.attacks.WORLDS`; empty: none.
     own_prior : ComparedMethod or None
-        Method from whose prior, learnt from this very fleet, the faults are drawn, so that its prior is right.
+        Method that first learns its prior from this fleet; faults are then drawn from that prior, so that it is right.
     vehicles, minutes : int or None, float or None
         Number of vehicles and length of their drives, each of which starts at a random instant of the trips and goes
         on from trip to trip. Without minutes each trip is a vehicle; without vehicles there are as many as trips.
     delay_max_s : float or None
-        Record through asynchronous frames at 100 Hz, each branch late by a uniform delay of 0 to this. [s]
+        Largest delay: each branch is late by a uniform delay of 0 to this, and comes in frames with times of their own.
+        None: all branches are sampled at the same instants, without delay. [s]
     delays_left_in : bool
         Whether these delays stay; else they are estimated and taken out.
     """
@@ -219,13 +220,13 @@ class VehicleSamples:
     truth : Faults
         Faults of N vehicles.
     unmeasured_a : ndarray of shape (N,)
-        Load that no branch measures. [A]
+        Load of each vehicle that no branch measures. [A]
     attack : Attack or None
         World that affects some of them.
     samples : sequence of N Samples
         One drive of each.
     delay_error_s : ndarray of shape (N, K - 1) or None
-        Error of the delays that were taken out, if they were. [s]
+        Estimated minus true delay of each branch but the first, to which delays are relative; None: not estimated. [s]
     """
 
     truth: Faults
@@ -242,9 +243,9 @@ class VehicleSamples:
         vehicle : int
             Its number.
         own : ndarray of shape (T', K)
-            Ideal currents of its own trip. [A]
+            Ideal currents of the trip that it records. [A]
         following : ndarray of shape (T, K) or None
-            Ideal currents of the trip on which corrections are judged; None: its own trip is wanted. [A]
+            Ideal currents of the trip on which corrections are judged; None: return those of its own trip. [A]
         """
         faults, attack = self.truth.take(vehicle), self.attack
 
@@ -294,7 +295,7 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
 
 
 def _runs(fleet: RecordedFleet, minutes: float, vehicles: int, seed: int) -> tuple[GroundTruth, ...]:
-    """Make drives of so many minutes, each from a random start; vehicles may share trips, but hardly ever a start."""
+    """Make a drive of so many minutes for each vehicle, from a random start on; several may use the same trips."""
     trips, samples, runs = fleet.trips, int(60.0 * minutes / fleet.period_s), []
     for number in range(vehicles):
         rng = random_stream(Purpose.START_OF_RUN, seed, number)
@@ -341,7 +342,7 @@ def record_vehicles(
 
 
 def _sampled(fleet: RecordedFleet, vehicles: VehicleSamples, trip: GroundTruth, seed: tuple[int, int]) -> Samples:
-    """Return what a vehicle records at the instants of its trip, with noise, in the steps of its signals."""
+    """Return what vehicle number seed[1] records at the instants of its trip: with noise, in steps of its signals."""
     _, i_m = vehicles.currents_a(seed[1], trip.matrix_a())
     seen = i_m + NOISE * fleet.full_scale_a * random_stream(Purpose.FRAMES, *seed).standard_normal(i_m.shape)
     steps_a = np.array([fleet.database.current_step_a(name) for name in trip.currents_a])  # 0: no step
@@ -359,7 +360,7 @@ def _sampled(fleet: RecordedFleet, vehicles: VehicleSamples, trip: GroundTruth, 
 def _through_frames(
     fleet: RecordedFleet, case: RecordedCase, vehicles: VehicleSamples, trip: GroundTruth, seed: tuple[int, int]
 ) -> tuple[Samples, Array]:
-    """Return aligned samples of a vehicle with late branches, and the error of the delays found, shape (K - 1,). [s]"""
+    """Return aligned samples of vehicle number seed[1] with late branches, and its ``delay_error_s``, (K - 1,). [s]"""
     assert case.delay_max_s is not None
     rng, j = random_stream(Purpose.FRAMES, *seed), seed[1]
     delay_s = rng.uniform(0.0, 1.0, size=case.branches) * case.delay_max_s

@@ -1,4 +1,4 @@
-"""Score of a result against the truth of its artificial fleet, for ``calibrator score``."""
+"""Compare a result with the truth of its artificial fleet, for ``calibrator score``."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ WORDS = {
     "deployed_rate": "with parameters to apply",
     "hardware_f2": "f2 of the hardware suspicion",
 }
-"""Meanings of the figures of a score."""
+"""Names of the figures of a score, and how people read them."""
 
 
 def score_result(result: Path, truth_file: Path) -> dict[str, float]:
@@ -39,10 +39,9 @@ def score_result(result: Path, truth_file: Path) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        Number of vehicles in the truth, and of those without parameters. Shares of all vehicles: those whose sensor
-        faults were found within 10 % and 25 % (without parameters they were not), those in which some branch is farther
-        from the truth after correction on an unseen drive, and those to which the node applies parameters. The f2 score
-        of the hardware suspicion. Names are those of :data:`WORDS`.
+        By the names of :data:`WORDS`: numbers of vehicles in the truth, and of those without parameters; shares of all
+        vehicles that are recovered within 10 % and 25 % (without parameters they are not), that are harmed, and to
+        which the node applies parameters; f2 score of the hardware suspicion, over vehicles with parameters.
 
     Raises
     ------
@@ -69,7 +68,7 @@ def score_result(result: Path, truth_file: Path) -> dict[str, float]:
         return np.asarray(rows[name].unstack("branch").loc[known, truth.branches].to_numpy(dtype=float))
 
     def moment(field: str) -> Array:
-        """Moments of the true currents, shape (N, K)."""
+        """A moment of the true currents on the unseen drive, shape (N, K)."""
         return np.array([[getattr(truth.vehicles[name], field)[b] for b in truth.branches] for name in known])
 
     drift, offset_a, applied, actual = column("drift"), column("offset_a"), column("applied"), faults_of(truth, known)

@@ -47,9 +47,9 @@ def run_experiment(
     fleet : CommonDrive or RecordedFleet
         What the vehicles drive, see :func:`~calibrator.experiments.experiments.fleet_for`.
     methods : sequence of ComparedMethod or None
-        Methods to compare; None: those of the row.
+        Methods to compare in settings that have none of their own; None: those of the experiment.
     repetitions, seed : int
-        Trials per setting, and the seed of the first; the others follow.
+        Trials per setting, and the seed of the first trial; each further one has the next seed.
     workers : int
         Processes; the figures do not depend on them.
 
@@ -107,13 +107,13 @@ def _run_trial(
 
 
 def _keyed(tables: Iterable[pd.DataFrame], series: str, x: float, method: str) -> list[pd.DataFrame]:
-    """Put columns that name setting and method in front of the tables."""
+    """Return the tables with the columns :data:`KEYS` in front, which name setting and method."""
     keys = dict(zip(KEYS, (series, float(x), method), strict=True))
     return [table.assign(**keys)[[*KEYS, *table.columns]] for table in tables]
 
 
 def _common(settings: Sequence[Setting]) -> dict[str, Any]:
-    """Return what the cases of all settings have in common, without empty values."""
+    """Return the fields that are equal in the cases of all settings, by name, without empty ones; ranges as text."""
     cases = [vars(setting.case) for setting in settings]
     common = {key: value for key, value in cases[0].items() if all(case[key] == value for case in cases)}
     mean_and_sd = {"unmeasured_a"}  # the other pairs are ranges
@@ -130,7 +130,7 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
     """Pool the confidences of the default method over experiments: is a confidence of 0.9 right in 0.9 of the cases?
 
     Experiments share settings, such as the paper's with S = 60, and with the same seed these are the same trials. "All
-    together" counts them once: trials are taken for the same if drive, seed, repetitions and tenths are.
+    together" counts them once: trials are taken for the same if drive, seed, repetitions and tenths are equal.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def pool_confidences(results: Sequence[ExperimentResult]) -> ExperimentResult:
 
 
 def _pooled(series: str, figures: pd.DataFrame, tenths: pd.DataFrame) -> list[pd.DataFrame]:
-    """Make the rows of an experiment that show whether its confidences are right."""
+    """Return pooled figures and tenths of an experiment, which show whether its confidences are right."""
     pooled, means = pool_tenths(tenths), pool_figures(figures)
     kept = means[means["figure"].isin(["recovery_rate", "confidence"]) | means["figure"].str.startswith("sure")]
     vehicles = pooled["vehicles"].sum()
@@ -193,7 +193,7 @@ def _pooled(series: str, figures: pd.DataFrame, tenths: pd.DataFrame) -> list[pd
 
 
 def made_now() -> str:
-    """Version of the calibrator, commit if it is a checkout, machine and day, in words."""
+    """Return version of the calibrator, commit (of a checkout), Python, machine and day as one text."""
     return (
         f"calibrator {__version__}{_commit()}, Python {platform.python_version()} on {platform.machine()} with "
         f"{os.cpu_count()} cores, {time_of_run()[:10]}"

@@ -29,8 +29,8 @@ class FaultDistribution:
     Attributes
     ----------
     counts : ndarray of shape (K + 1, 2K + 1)
-        Probability that a vehicle has so many hardware faults (rows) and sensor faults (columns); all supports with
-        the same numbers are equally likely.
+        ``counts[h, s]``: probability that h hardware and s sensor parameters of a vehicle are not zero; all supports
+        with these numbers are equally likely.
     gain, offset : tuple of float
         Range of the uniform magnitudes of gain errors [1], and of offsets in fractions of full scale; either sign.
     """
@@ -54,10 +54,10 @@ class FaultDistribution:
 
 
 def drawn_distribution(settings: FaultSettings, branches: int) -> FaultDistribution | None:
-    """Distribution that the faults of vehicles with K branches are drawn from; None for faults of a preferred sign.
+    """Return the distribution from which the settings draw the faults of a vehicle; None if one sign is preferred.
 
-    An estimator that knows it shows the ceiling: with the same evidence no estimator recovers more on average than its
-    mean confidence says, as far as the errors of the evidence are stated rightly.
+    An estimator that knows it shows the ceiling: its mean confidence is the most that any estimator recovers on average
+    with the same evidence, provided that the stated errors of the evidence are right.
     """
     if settings.sign_bias:
         return None
@@ -111,11 +111,11 @@ class Trial:
         Makes evidence and truth of an artificial fleet that the published method's trees learn from; None: there is
         none, and trees cannot be used.
     delay_error_s : ndarray of shape (N, K - 1) or None
-        Error of the delays that were estimated and taken out, if they were. [s]
+        Estimated minus true delay of each branch relative to the first; None: no delays were estimated. [s]
     attacked : ndarray of bool of shape (N,) or None
         Vehicles that the world of an attack affects; None: there is no attack.
     causes : tuple of str
-        Causes by which a finding names the attack correctly.
+        A finding is right if it names one of these causes for an attacked vehicle.
     """
 
     smallest_fault: float
@@ -156,12 +156,12 @@ class Estimate:
     confidence : ndarray of shape (N,) or None
         Probability of being recovered; None: the method does not say.
     failed : int
-        Vehicles whose optimisation failed.
+        Number of vehicles whose optimisation failed.
     drift_sd, offset_sd_a : ndarray of shape (N, K) or None
         Standard deviations of the sensors' parameters, if the method states them. [1], [A]
     pit : callable or None
-        Probability integral transform of true faults under the posterior, (drift, offset) each of shape (N, K); None:
-        that of a normal distribution with these standard deviations.
+        From true faults to the probability integral transforms of their drifts and offsets under the posterior, two
+        arrays (N, K); None: those of normal distributions with the standard deviations above.
     findings : sequence of N sequences of str
         Causes that the method names of each vehicle, besides faults; empty if it names none.
     learnt : FaultDistribution or None
@@ -181,7 +181,7 @@ class Estimate:
 
 
 class ComparedMethod(Protocol):
-    """Anything that estimates the faults of a fleet."""
+    """Any object with a name and a function that estimates the faults of a fleet."""
 
     @property
     def name(self) -> str:
@@ -189,4 +189,4 @@ class ComparedMethod(Protocol):
 
     @property
     def estimate(self) -> Callable[[Trial], Estimate]:
-        """Estimates the faults of all vehicles of a trial."""
+        """Function from a trial to the estimate for all its vehicles."""

@@ -26,7 +26,7 @@ TRAINING_VEHICLES = 3000
 """Size of the artificial fleet that the trees learn from, section V-B. [1]"""
 
 THRESHOLD_SHARE = 1.0 / 3.0
-"""delta_h in standard deviations of the criterion across the fleet, section V-B. [1]"""
+"""Threshold delta_h over the standard deviation of the criterion across the fleet, section V-B. [1]"""
 TREE_DEPTH = 6
 """Largest depth of a tree, against overfitting, section V-B. [1]"""
 RECALL_WEIGHT = 5.0
@@ -54,7 +54,7 @@ def decision_criterion(features: Array) -> Array:
     Parameters
     ----------
     features : ndarray of shape (N, K + 1)
-        From :class:`~calibrator.published.evidence.FleetEvidence`. [A^2]
+        (5) and (6), ``features`` of :class:`~calibrator.published.evidence.FleetEvidence`. [A^2]
 
     Returns
     -------
@@ -74,7 +74,7 @@ def classify_by_threshold(features: Array, in_reference: Mask | None = None) -> 
     Parameters
     ----------
     features : ndarray of shape (N, K + 1)
-        Of the whole fleet. [A^2]
+        Features of the whole fleet, (5) and (6). [A^2]
     in_reference : ndarray of bool of shape (N,), optional
         Vehicles whose spread sets the threshold; all by default.
 
@@ -100,11 +100,11 @@ def classify_by_trees(learnt: Array, truth: Faults, features: Array) -> Classifi
     Parameters
     ----------
     learnt : ndarray of shape (N', K + 1)
-        Features of an artificial fleet made like the fleet to be classified. [A^2]
+        Features (5) and (6) of an artificial fleet made like the fleet to be classified. [A^2]
     truth : Faults
-        Of the artificial fleet.
+        Faults of the N' vehicles of the artificial fleet.
     features : ndarray of shape (N, K + 1)
-        Of the fleet to be classified. [A^2]
+        Features of the fleet to be classified. [A^2]
     """
 
     def found(faulty: Mask) -> Mask:
@@ -123,13 +123,13 @@ def expected_features(
     Parameters
     ----------
     faults : Faults
-        Of N vehicles.
+        Faults of N vehicles.
     i_s : ndarray of shape (T, K)
         Ideal currents on the unity drive. [A]
     simulation_error_a : ndarray of shape (K,)
         Standard deviation of the simulation error. [A]
     reference_vehicles : int or None
-        Size of the groups of consecutive vehicles whose mean is their reference (3); None: it is the ideal current.
+        Each group of so many consecutive vehicles has its mean as reference (3); None: all have the ideal current.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def classify_by_expected_trees(
     Parameters
     ----------
     features : ndarray of shape (N, K + 1)
-        Of the real fleet. [A^2]
+        Features (5) and (6) of the real fleet. [A^2]
     reference : ndarray of shape (T, K)
         Fleet reference. [A]
     simulation_error_a : ndarray of shape (K,)
@@ -176,7 +176,7 @@ def classify_by_expected_trees(
     full_scale_a : float
         Full scale of the junction. [A]
     expected : FaultSettings
-        What the fleet's faults are like.
+        How the faults of the artificial fleet are drawn.
     reference_vehicles : int or None
         Number of vehicles whose mean is the reference; None: the fleet is symmetric, so its mean is the ideal vehicle.
     """

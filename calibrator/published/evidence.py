@@ -49,7 +49,7 @@ class FleetEvidence:
         return np.column_stack([self.deviation_a2, self.junction_a2])
 
     def take(self, index: Index) -> "FleetEvidence":
-        """Return the evidence of some of the vehicles."""
+        """Return the evidence of some of the vehicles; of a single one, by its number, arrays without the leading N."""
         return FleetEvidence(**{name: values[index] for name, values in vars(self).items()})
 
 
@@ -94,12 +94,12 @@ def collect_evidence(simulated: Iterable[Array], reference: Array, junction_a2: 
     Returns
     -------
     FleetEvidence
-        Of all vehicles.
+        Evidence of all vehicles.
 
     Raises
     ------
     FleetError
-        If the reference does not vary, so that nothing can be regressed on it, or the vehicles differ in number.
+        If a branch of the reference does not vary, or junction_a2 has not one value per simulated vehicle.
     """
     centred = reference - reference.mean(axis=0)
     power = np.sum(centred**2, axis=0)
@@ -120,7 +120,7 @@ def collect_evidence(simulated: Iterable[Array], reference: Array, junction_a2: 
 
 
 def _compare(currents: Array, reference: Array, centred: Array, power: Array) -> Array:
-    """Slope, intercept, their variances and the mean square deviation, (5, K)."""
+    """Return slope, intercept, variances of these, and mean square deviation of one vehicle, as an array (5, K)."""
     samples = len(reference)
     mean = reference.mean(axis=0)
     slope = np.sum(centred * currents, axis=0) / power

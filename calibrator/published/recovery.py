@@ -96,7 +96,7 @@ class BasisPursuit:
         self._problem = cp.Problem(cp.Minimize(objective), constraints)
 
     def solve(self, slopes: Array, intercepts: Array, *, epsilon: float) -> Array:
-        """Solve for one vehicle.
+        """Return the sparsest fault parameters that explain slopes and intercepts of one vehicle.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ def refit_support(x: Array, slopes: Array, intercepts: Array, deviations: Array)
     Parameters
     ----------
     x : ndarray of shape (3K,)
-        Start values. Those above :data:`SMALLEST_PARAMETER`, at most the 2K largest, are refitted, the others zeroed.
+        Start values. Those of magnitude above :data:`SMALLEST_PARAMETER`, at most the 2K largest, are refitted.
     slopes, intercepts : ndarray of shape (K,)
         a [1], and b in fractions of full scale [1].
     deviations : ndarray of shape (2K,)
@@ -144,7 +144,7 @@ def refit_support(x: Array, slopes: Array, intercepts: Array, deviations: Array)
     Returns
     -------
     ndarray of shape (3K,)
-        Refitted parameters; the start with the others zeroed if the refit diverges (a magnitude exceeds 1).
+        Refitted parameters; if the refit diverges (a magnitude exceeds 1), their start values; zeros for the others.
     """
     largest = np.argsort(np.argsort(-np.abs(x), kind="stable")) < len(deviations)  # there are 2K equations
     support = largest & (np.abs(x) > SMALLEST_PARAMETER)
@@ -161,7 +161,7 @@ def refit_support(x: Array, slopes: Array, intercepts: Array, deviations: Array)
 
 
 def _model(x: Array) -> tuple[Array, Array]:
-    """Slopes and intercepts (2K,) of (15), and their derivatives (2K, 3K)."""
+    """Return slopes and intercepts (2K,) by (15) for parameters x (3K,), and their derivatives by x (2K, 3K)."""
     K = len(x) // 3
     scale, drift, offset = 1.0 + x[0], 1.0 + x[K : 2 * K], x[2 * K :]
     hardware = np.append(x[1:K], -x[1:K].sum())
@@ -183,7 +183,7 @@ class Recovery:
     Attributes
     ----------
     faults : Faults
-        Estimate.
+        Estimated faults.
     classification : Classification
         Class that each vehicle was put in; ``classification.hardware`` tells where a hardware fault is suspected.
     failed : mapping of int to str
@@ -201,9 +201,9 @@ def recover_fleet(evidence: FleetEvidence, classification: Classification, *, fu
     Parameters
     ----------
     evidence : FleetEvidence
-        Of N vehicles.
+        Evidence of N vehicles.
     classification : Classification
-        Of the same vehicles.
+        Classes of the same vehicles, which choose the case of each.
     full_scale_a : float
         Full scale of the junction; offsets are compared with drifts in fractions of it. [A]
 
@@ -228,7 +228,7 @@ def recover_fleet(evidence: FleetEvidence, classification: Classification, *, fu
 
 
 def _pursue(pursuit: BasisPursuit, vehicle: FleetEvidence, full_scale_a: float) -> Array:
-    """Case 4 for one vehicle: parameters of shape (3K,), offsets in fractions of full scale."""
+    """Return the parameters of a vehicle of case 4, shape (3K,), offsets in fractions of full scale."""
     slopes, intercepts = vehicle.slopes, vehicle.intercepts_a / full_scale_a
     variances = np.concatenate([vehicle.slope_variances, vehicle.intercept_variances_a2 / full_scale_a**2])
     x = pursuit.solve(slopes, intercepts, epsilon=EPSILON_SHARE * float(variances.sum()))

@@ -122,7 +122,7 @@ def simulation_snr_db(measured: Array, simulated: Array) -> Array:
 
 
 def snr_from_power(signal: Array, error: Array) -> Array:
-    """Ratio of two powers in dB; NaN where there is no signal."""
+    """Return the ratio of signal power to error power in dB; NaN where there is no signal."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(signal > 0.0, 10.0 * np.log10(signal / error), np.nan))
 
@@ -202,20 +202,20 @@ def pooled_poles(drives: Sequence[tuple[Array, Array, Mask]], orders: Sequence[i
 
 
 def bridged(values: Array, valid: Mask) -> Array:
-    """Values (T, M) with linear interpolation over samples that are not valid."""
+    """Return values (T, M) in which those that are not valid (T,) are linear interpolations of their neighbours."""
     time, known = np.arange(len(valid)), np.flatnonzero(valid)
     return np.column_stack([np.interp(time, known, channel[known]) for channel in values.T])
 
 
 def _standardised(values: Array, mask: Mask) -> tuple[Array, Array, Array]:
-    """Scale values (T, M) to mean 0 and deviation 1, gaps bridged; return them, means and scales (1 if constant)."""
+    """Return values (T, M) scaled to mean 0 and standard deviation 1, gaps bridged; and means and scales, each (M,)."""
     mean, scale = values[mask].mean(axis=0), values[mask].std(axis=0)
     scale[scale <= RIDGE * np.maximum(np.abs(mean), 1.0)] = 1.0
     return (bridged(values, mask) - mean) / scale, mean, scale
 
 
 def _models(inputs: Array, currents: Array, mask: Mask, orders: Sequence[int]) -> Iterator[StateSpaceModel]:
-    """Fit a model of each order."""
+    """Yield a fitted model of each order."""
     (u, u_mean, u_scale), (y, y_mean, y_scale) = _standardised(inputs, mask), _standardised(currents, mask)
     observed = _observability([(u, y, mask)]) if any(orders) else np.zeros((y.shape[1], 0))
     for order in orders:
@@ -302,7 +302,7 @@ def _fit_output_error(poles: Complex, C: Complex, u: Array, y: Array, mask: Mask
 
 
 def solve_scaled(normal: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
-    """Solve scaled normal equations (..., Q, Q), (..., Q, R) with a relative ridge; zero columns get coefficient 0."""
+    """Solve normal equations (..., Q, Q) with right sides (..., Q, R) and a tiny ridge; columns of 0 get solution 0."""
     scale = np.sqrt(np.einsum("...ii->...i", normal).real)[..., None]
     scale = np.where(scale > 0.0, scale, 1.0)
     scaled = normal / (scale * np.swapaxes(scale, -1, -2)) + RIDGE * np.eye(normal.shape[-1])
@@ -322,7 +322,7 @@ class VehicleModel:
     duration_s : float
         Valid data of all drives. [s]
     model : StateSpaceModel
-        Inputs to measured currents (2).
+        Model (2) from inputs to measured currents.
     snr_db : ndarray of shape (K,)
         Simulation signal-to-noise ratio on held-out data. [dB]
     simulation_error_a : ndarray of shape (K,)
@@ -368,7 +368,7 @@ def identify_vehicle(
     Returns
     -------
     VehicleModel
-        The vehicle.
+        Its model, learnt on the first 80 % of each drive, with its errors on the rest.
 
     Raises
     ------
@@ -440,12 +440,12 @@ def evidence_of_models(
     vehicles : sequence of N VehicleModel
         With K branches.
     in_reference : sequence of N bool
-        Vehicles whose mean is the fleet reference (3), and whose held-out drives may be the unity drive.
+        Whether a vehicle counts in the fleet reference (3), their mean, and its held-out drive may be the unity drive.
 
     Returns
     -------
     evidence : FleetEvidence
-        Of all vehicles.
+        Evidence of all vehicles.
     reference : ndarray of shape (T, K)
         Fleet reference. [A]
     unity : VehicleModel
