@@ -36,7 +36,7 @@ class Finding(msgspec.Struct, frozen=True):
     advice : str
         What to do, for example which line of the layout to change; empty if the text says it.
     number : float or None
-        The figure of the text, in its unit: A, s, or a share or factor of 1.
+        Figure for programs: a current [A], time [s], share or factor [1], count, or value in the unit of an input.
     """
 
     severity: Severity
@@ -54,9 +54,10 @@ class Finding(msgspec.Struct, frozen=True):
 
 Findings = Iterator[Finding]
 error, warning, hint = (partial(Finding, severity) for severity in Severity)
+"""Each makes a :class:`Finding` of its severity from code, subject, text, advice and number."""
 
 
 def worst_first(findings: Iterable[Finding]) -> list[Finding]:
-    """Errors, then warnings, then hints, each in the order in which they were found."""
+    """Return the findings sorted: errors, warnings, hints; those of one severity stay in the given order."""
     order = list(Severity)
     return sorted(findings, key=lambda each: order.index(each.severity))

@@ -33,7 +33,7 @@ def word_set(text: str) -> frozenset[str]:
 
 
 VOCABULARY: dict[str, Any] = tomllib.loads((Path(__file__).parent / "vocabulary.toml").read_text(encoding="utf-8"))
-"""Content of ``vocabulary.toml``: words by meaning, each list as one text for :func:`word_set`; and replacements."""
+"""Content of ``vocabulary.toml``: words by meaning, each list one text with blanks between, as ``"volt vlt"``."""
 PLACES = {place: word_set(words) for place, words in VOCABULARY["places"].items()}
 """Places where a current may flow (battery, motor, ...), each with the words for it."""
 POSITIONS = ("front", "rear", "left", "right")
@@ -43,6 +43,7 @@ CURRENT, VOLTAGE, POWER = (word_set(VOCABULARY[quantity]) for quantity in ("curr
 _LETTERS = {"i": "i", "u": "u", "v": "u", "p": "p", "hv": "hv", "lv": "lv"}
 """Leading letters that are a word of their own if a place follows, as in ``Ibat`` and ``HVBatt``; and that word."""
 _GLUED = sorted((CURRENT | VOLTAGE | POWER) - set("iuvp") - {"cur", "amp", "volt"}, key=len, reverse=True)
+"""Words that are split off where they end another one, as in ``Batteriestrom``; the longest first."""
 
 
 def words_of(*texts: str | None) -> tuple[str, ...]:
@@ -77,7 +78,7 @@ def _parted(word: str) -> list[str]:
 
 
 def places_of(words: Iterable[str]) -> set[str]:
-    """Return the places that the words name."""
+    """Return those :data:`PLACES` that one of the words stands for, such as ``{"battery"}``."""
     known = set(words)
     return {place for place, names in PLACES.items() if names & known}
 

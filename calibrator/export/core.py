@@ -1,8 +1,8 @@
 """Data of the C core (``ecu_node/c/hv_correction.h``): the layout to be compiled and the calibration to be flashed.
 
-The calibration holds the node's own integer plans, each scaled so that all have 58 fractional bits below one code. So
-the results are the same, bit by bit, and one conversion serves all gains. The calibration is written as a C struct, or
-as the memory image of that struct, at the address of ``hv_calibration`` in a compiled program, in Intel HEX.
+The calibration holds the integers with which the node itself corrects, scaled so that all have 58 fractional bits
+below one code. So the results are the same, bit by bit, and one conversion serves all gains. It is written as a C
+struct, or as the memory image of that struct, at the address of ``hv_calibration`` in a compiled program, in Intel HEX.
 """
 
 import json
@@ -70,7 +70,7 @@ class Checked:
     name : str
         Name of the parameter file.
     digest : str
-        SHA-256 of the file as it was read, with line ends as LF.
+        SHA-256 of the file's text with LF as line ends, hexadecimal.
     parameters : VehicleParameters
         Content of the file.
     database : VehicleDatabase
@@ -162,7 +162,7 @@ def branch_values(database: VehicleDatabase, branch: Branch, fault: SensorFault)
     Returns
     -------
     BranchValues
-        The node's integer plan, scaled; it gives the same result for every code.
+        The node's own integers, scaled to :data:`FRACTION_BITS`; they give the same result for every code.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def branch_values(database: VehicleDatabase, branch: Branch, fault: SensorFault)
 
 
 def scaled_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> BranchValues:
-    """Return the numbers of :func:`branch_values` without the check that they fit into the core's integers."""
+    """Return the numbers of :func:`branch_values`, unchecked; ExportError only if they need more fractional bits."""
     if not fault.applied:
         return _PASSED
     signals = branch_signals(database, branch, Mode.GATEWAY)
@@ -226,7 +226,7 @@ def image_bytes(checked: Checked, order: Literal["little", "big"]) -> bytes:
 
 
 def _all_values(checked: Checked) -> list[BranchValues]:
-    """Return the numbers of all branches, in the order of the layout."""
+    """Return the numbers of all branches, in the order of the layout, if the node takes layout and DBC."""
     database = checked.database
     wire(database, InForce(parameters=checked.parameters), start_s=0.0, mode=Mode.GATEWAY)
     return [branch_values(database, branch, checked.parameters.fault(branch.name)) for branch in database.layout.branch]
@@ -317,7 +317,7 @@ def intel_hex(address: int, data: bytes) -> str:
 
 
 def foreign_protection(database: VehicleDatabase) -> list[str]:
-    """Return the names of the messages whose end-to-end protection the core does not support."""
+    """Return the names of the received messages whose end-to-end protection the C core does not support."""
     entries = {message.name: database.layout.protection(message.name) for message in received(database).values()}
     return [name for name, entry in entries.items() if not isinstance(entry, ProfileP01 | ProfileP02 | None)]
 
@@ -382,7 +382,7 @@ def _message(database: VehicleDatabase, message: Message, has_branches: bool) ->
 
 
 def rendered(template: str, **values: object) -> str:
-    """Render one of ``templates/``; values go where it says ``[[ name ]]``, because braces are part of C."""
+    """Return the text of a file of ``templates/`` with ``[[ name ]]`` replaced by values; braces are part of C."""
     braces = {"variable_start_string": "[[", "variable_end_string": "]]"}
     environment = templates_of("calibrator.export", autoescape=template.endswith(".cdfx"), **braces)
     environment.filters |= {"comment": _comment, "int64": _int64, "printable": printable}

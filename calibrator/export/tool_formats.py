@@ -45,7 +45,7 @@ _FIELDS = {
 
 
 def _fields(branch: Branch) -> list[str]:
-    """Return the names of the numbers that a branch has: one measured as a current has no voltage gain."""
+    """Return the names of the numbers that a branch has; ``voltage_gain`` only if a voltage divides its power."""
     return [name for name in _FIELDS if name != "voltage_gain" or branch.voltage is not None]
 
 
@@ -79,7 +79,7 @@ class Characteristic(NamedTuple):
 
 
 def characteristics(checked: Checked) -> list[Characteristic]:
-    """Return all characteristics of a parameter file, branch by branch.
+    """Return all numbers and truth values of a parameter file for calibration tools, branch by branch.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def _for_people(checked: Checked, branch: str) -> Iterator[Characteristic]:
 
 
 def _notes(checked: Checked) -> dict[str, str]:
-    """Return texts about the whole file by name, such as the vehicle."""
+    """Return texts about the whole file, such as ``{"vehicle": "V001"}``; ExportError if tools cannot hold one."""
     texts = {key: value for key, value in checked.provenance.items() if key != "parameter_set"}
     for key, value in texts.items():
         if not value.isprintable() or any(letter in value for letter in _FORBIDDEN):

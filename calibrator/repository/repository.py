@@ -1,4 +1,4 @@
-"""A TUF repository of parameter files: one target per vehicle, delegated to hashed bins.
+"""A TUF repository of parameter files: one target per vehicle; the hash of its name says in which bin it is listed.
 
     metadata/    what vehicles read: N.root.json, N.targets.json, N.bins-XXX.json, N.snapshot.json, timestamp.json
     targets/     parameter files, SHA256.VEHICLE.json
@@ -53,7 +53,7 @@ _BINS = SuccinctRoles([], 1, BIN_BITS, "bins")
 _DAYS = {"root": 730, "targets": 730, "bins": 400, "snapshot": 60, "timestamp": 30}
 """How long metadata is valid. [d]"""
 _RENEW_DAYS = 60
-"""Targets and bins that expire within this time are staged anew, to be signed again. [d]"""
+"""Root, targets and bins that expire within this time are staged anew, to be signed again. [d]"""
 
 _SHOWN = 3
 """Most roles that a message names. [1]"""
@@ -223,7 +223,7 @@ class Repository:
         return len(bins), lifted
 
     def revoke(self, vehicles: Sequence[str], digest: str | None) -> None:
-        """Stage the revocation of a file of these vehicles: the present one, or that with the given SHA-256."""
+        """Stage the revocation of one file per vehicle: its latest, or the one with this SHA-256 (hexadecimal)."""
         bins: dict[str, Targets] = {}
         for vehicle in vehicles:
             path = target_path(vehicle)
@@ -263,7 +263,7 @@ class Repository:
                     self._stage(name, self._latest(name))
 
     def renew(self) -> None:
-        """Stage root, targets and bins that expire soon; the expiry of a bin counts from its last change."""
+        """Stage anew the root, targets and bins that expire within ``_RENEW_DAYS``."""
         soon = datetime.now(UTC) + timedelta(days=_RENEW_DAYS)
         live = {"root": self._root_version, **self._versions}
         for role, version in live.items():
@@ -297,7 +297,7 @@ class Repository:
             return expiry_of(path.read_bytes())
 
     def sign(self, signers: Sequence[Signer]) -> Iterator[str]:
-        """Sign all staged metadata; roles that still lack signatures are put into :attr:`waiting`.
+        """Sign all staged metadata, role by role as one iterates; roles that lack signatures go into :attr:`waiting`.
 
         Parameters
         ----------
@@ -307,7 +307,7 @@ class Repository:
         Yields
         ------
         str
-            Name of each staged role.
+            Name of the staged role that was signed or checked.
 
         Raises
         ------
@@ -339,7 +339,7 @@ class Repository:
             yield role
 
     def publish(self, signers: Sequence[Signer]) -> None:
-        """Publish what :meth:`sign` has signed; while signatures are missing, publish only a new timestamp.
+        """Publish what :meth:`sign` has signed; if it lacks signatures, publish only a new snapshot and timestamp.
 
         Parameters
         ----------
@@ -349,7 +349,7 @@ class Repository:
         Raises
         ------
         RepositoryStateError
-            If these keys are missing; then vehicles see what they saw before.
+            If some of these keys are missing, or nothing can be published yet; vehicles then see what they saw before.
         """
         root = self._live("root") if self.waiting else self._latest("root")
         missing = dict(self.waiting)
@@ -366,7 +366,7 @@ class Repository:
         self._put_in_place(root, {} if self.waiting else self._staged_versions, signers)
 
     def _put_in_place(self, root: Root, staged: Mapping[str, int], signers: Sequence[Signer]) -> None:
-        """Publish what is staged, timestamp last; an interruption before it changes nothing, and a rerun continues."""
+        """Publish what is staged, timestamp last: until then vehicles see no change, and a rerun continues."""
         for role, version in staged.items():
             content = (self._staged / f"{role}.json").read_bytes()
             _write(self._metadata / f"{version}.{role}.json", content)
@@ -428,7 +428,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def missing_text(missing: Mapping[str, str]) -> str:
-    """Say in words which signatures are missing; of many roles only the first three are named."""
+    """Join what roles lack, ``{"root": "1 of 2 signatures ..."}``, into one text that names three roles at most."""
     words = [f"{role} has {what}" for role, what in [*missing.items()][:_SHOWN]]
     return "; ".join(words) + (f"; and {len(missing) - _SHOWN} roles more" if len(missing) > _SHOWN else "")
 
@@ -438,7 +438,7 @@ def _lacking(signed: int, threshold: int, others: Iterable[str]) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Replace a file in one step; the sync before the timestamp is replaced makes sure that it is on the disk."""
+    """Replace a file in one step; it is surely on the disk only after the sync that publishing does."""
     new = path.with_suffix(".new")
     try:
         new.write_bytes(content)
@@ -454,7 +454,7 @@ def _set_keys(root: Root, role: str, new: NewKeys) -> None:
 
 
 def _delegate(targets: Targets, new: NewKeys) -> None:
-    """Delegate the bins to the keys of targets, which then sign both."""
+    """Let the keys of targets also sign the bins."""
     keys: dict[str, Key] = {key.keyid: key for key in new.keys}
     targets.delegations = Delegations(keys, succinct_roles=SuccinctRoles(list(keys), new.threshold, BIN_BITS, "bins"))
 

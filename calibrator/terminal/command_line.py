@@ -17,7 +17,7 @@ from ecu_node.program import DEBUG_HINT, FAILED, drop_output, end_of, flush_outp
 __all__ = ["EXIT_CODES", "command_app", "example", "run_app", "run_tool"]
 
 _PACKAGES = ("calibrator", "ecu_node", "tools")
-"""Packages of the program: a fault of the program itself is reported with the last place in them."""
+"""Packages of this program: an internal error is reported with the last place of its traceback in one of them."""
 EXIT_CODES = (
     f"Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted, 143 ended by SIGTERM. {DEBUG_HINT}"
 )
@@ -28,17 +28,17 @@ _UsageError: Any = typer.BadParameter.__base__
 
 
 def command_app(**settings: Any) -> typer.Typer:
-    """Make a command line.
+    """Return a command line without commands, set up as all command lines here are.
 
     Parameters
     ----------
     **settings
-        Arguments of ``typer.Typer``, beside those that all command lines share.
+        More arguments of ``typer.Typer``; they replace shared ones of the same name.
 
     Returns
     -------
     typer.Typer
-        Without commands; to be run by :func:`run_app`.
+        To be run by :func:`run_app`.
     """
     shared = {
         "add_completion": False,
@@ -50,17 +50,17 @@ def command_app(**settings: Any) -> typer.Typer:
 
 
 def example(*commands: str) -> str:
-    """Return the text below the options in the help of a command, which shows how it is called.
+    """Return the text "Example: ..." that the help of a command shows below its options.
 
     Parameters
     ----------
     *commands : str
-        Whole command lines; long ones are broken as a shell allows.
+        Whole command lines; long ones are broken with a backslash.
 
     Returns
     -------
     str
-        For typer's ``epilog``.
+        To be given to typer as ``epilog``.
     """
     kept = [re.sub(r"(--\S+) (?!-)", "\\1\0", line) for line in commands]  # an option stays with its value
     lines = [textwrap.wrap(line, 72, break_long_words=False, break_on_hyphens=False) for line in kept]
@@ -68,14 +68,14 @@ def example(*commands: str) -> str:
 
 
 def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
-    """Run a command line.
+    """Run a command line and return its exit code; errors are printed on standard error.
 
     Parameters
     ----------
     app : typer.Typer
         Made by :func:`command_app`.
     program : str
-        Its name.
+        Name with which messages begin, such as ``calibrator``.
     arguments : sequence of str
         Without the program's name; ``--debug`` may stand anywhere.
 
@@ -130,7 +130,7 @@ def _in_words(parameter: Any) -> None:
 
 
 def run_tool(app: typer.Typer, program: str) -> None:
-    """Run a command line that is a program of its own, and end it with its exit code."""
+    """Run a command line with the arguments of this process, and end the process with the exit code."""
     try:
         code = run_app(app, program, sys.argv[1:])
         flush_output()
@@ -147,7 +147,7 @@ def run_tool(app: typer.Typer, program: str) -> None:
 
 
 def _all_commands(command: Any) -> Iterator[Any]:
-    """Yield a command, and the commands in it."""
+    """Yield a command, its subcommands, and theirs."""
     yield command
     for each in getattr(command, "commands", {}).values():
         yield from _all_commands(each)

@@ -38,17 +38,17 @@ MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
 MAX_WORKERS = 256
 FAR = 1e9
-"""Upper bounds from here on are of no use to a reader, and are left out of the help."""
+"""The help leaves out upper bounds from here on: they are of no use to a reader."""
 TIME_LIMIT_S = 600.0
-"""A day's log is read in seconds; a log that takes so long never ends, or would hold up a fleet. [s]"""
+"""Default of ``--time-limit``: a day's log is read in seconds; one that takes longer than this may never end. [s]"""
 SCHEDULER = re.compile(r"(tcp|tls)://([^\s/?#@:\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
 MAX_PORT = 65_535
 MAX_TIME_LIMIT_S = 86_400.0
-"""A day. [s]"""
+"""Largest ``--time-limit``: a day. [s]"""
 
 
 def _bounded(kind: type[float], name: str, low: float, high: float, meaning: str) -> Any:
-    """Make an option that is a finite number between bounds; other input is refused with what is expected.
+    """Make an option that takes a finite number between bounds; other input is refused, with these bounds.
 
     Parameters
     ----------

@@ -27,13 +27,14 @@ _Item = TypeVar("_Item")
 _active: ContextVar[Progress | None] = ContextVar("active", default=None)
 """The bars on the terminal; a step within a step adds its own to them."""
 _number: ContextVar[Callable[[], str]] = ContextVar("number", default=str)
-"""Gives the text before the label of the next pass; an empty one outside of numbered passes."""
+"""Function that gives the text before the label of the next bar, such as ``2/3``; empty outside of numbered passes."""
 _silent: ContextVar[bool] = ContextVar("silent", default=False)
 """Whether nothing is shown."""
 
 
 @contextmanager
 def _within(variable: ContextVar[_Item], value: _Item) -> Iterator[None]:
+    """Give a variable a value within the block."""
     before = variable.set(value)
     try:
         yield
@@ -53,18 +54,18 @@ def numbered_passes(total: int) -> AbstractContextManager[None]:
 
 
 def one_pass(number: int, total: int) -> AbstractContextManager[None]:
-    """Within the block every bar belongs to the same pass; a single one has no number."""
+    """Within the block every bar shows this number of its pass: ``2/3 calibrate``; none if total is 1."""
     return _within(_number, lambda: f"{number}/{total} " if total > 1 else "")
 
 
 @contextmanager
 def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Callable[[float], None]]:
-    """Show how far a long step is.
+    """Show how much of a long step is done.
 
     Parameters
     ----------
     label : str
-        What is being done.
+        What the step does, such as ``calibrate``.
     total : int or None
         Number of units; None for a step of unknown length.
     unit : str
@@ -73,7 +74,7 @@ def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Call
     Yields
     ------
     callable
-        Function to be called with the number of units done.
+        Function to be called with the number of units done so far.
     """
     if sys.stderr is None or _silent.get():  # None: closed by whoever started the program
         yield lambda _: None
@@ -91,7 +92,7 @@ def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Call
 
 @contextmanager
 def _bars(console: Console) -> Iterator[Progress]:
-    """Yield the bars that are on the terminal, or new ones."""
+    """Yield the group of bars that is on the terminal, or else a new one."""
     if (bars := _active.get()) is not None:
         yield bars
         return

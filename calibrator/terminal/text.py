@@ -39,12 +39,12 @@ def print_report(report: Any, *, json: bool) -> None:
 
 
 def dumps(value: Any) -> str:
-    """JSON text, indented; not-a-number and infinity become null."""
+    """Return a value as indented JSON text; not-a-number and infinity become null."""
     return msgspec.json.format(msgspec.json.encode(value), indent=2).decode()
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format columns of text: the first flush left, the others flush right."""
+    """Format a header and rows of cells as lines with aligned columns: the first flush left, the others flush right."""
     lines = [header, *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
@@ -72,7 +72,10 @@ def told_once(texts: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def reasons_text(title: str, reasons: Mapping[str, str], most: int = 10) -> str:
-    """Format the reasons of vehicles below a title, one line per reason with its vehicles; empty if there are none."""
+    """Format the reasons of vehicles below a title: one line per reason, with the vehicles that have it.
+
+    Beyond ``most`` lines it only says how many more there are; the text is empty without reasons.
+    """
     lines = told_once((name, reason or "no more is known") for name, reason in reasons.items())
     more = [f"and {len(lines) - most} other lines, see the parameter files"] if len(lines) > most else []
     return "\n  ".join([f"{title}:", *lines[:most], *more]) if lines else ""
@@ -84,7 +87,7 @@ def left_out_text(left_out: Mapping[str, str]) -> str:
 
 
 def end_if_internal(left_out: Mapping[str, str]) -> None:
-    """End a command with the exit code of internal errors if some of the reasons are such; name the first few."""
+    """If internal errors made some be left out, name the first few and end the command with exit code 70."""
     failed = {name: why.removeprefix(INTERNAL) for name, why in left_out.items() if why.startswith(INTERNAL)}
     if failed:
         lines = "; ".join(told_once(failed.items())[:MOST_REASONS])
@@ -93,7 +96,7 @@ def end_if_internal(left_out: Mapping[str, str]) -> None:
 
 
 def few(names: Sequence[str]) -> str:
-    """Names with commas: the first few of many, and how many more there are."""
+    """Return names with commas between; of many only the first few, and how many more there are."""
     if len(names) <= MOST_NAMES:
         return ", ".join(names)
     return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
@@ -120,7 +123,7 @@ def few_reasons(reasons: Mapping[str, str], *, count: int | None = None) -> str:
 
 
 def figure(value: float, digits: int = 3) -> str:
-    """A number as people write it: ``50``, ``2.4``, ``0.035``, ``4,096``; a dash for NaN and infinity.
+    """Format a number as people write it: ``50``, ``2.4``, ``0.035``, ``4,096``; a dash for NaN and infinity.
 
     Parameters
     ----------
@@ -143,7 +146,7 @@ def figure(value: float, digits: int = 3) -> str:
 
 
 def counted(number: int, what: str) -> str:
-    """A number of things: ``1 drive``, ``2 drives``."""
+    """Return a number with what it counts, in the plural if needed: ``1 drive``, ``2 drives``."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
@@ -154,7 +157,7 @@ class Notice:
     Attributes
     ----------
     text : str
-        Text with ``{}`` for every count; notices with the same text are merged.
+        Text with ``{}`` for every count, such as ``{} frames are damaged``; notices with the same text are merged.
     counts : tuple of int
         Numbers of frames, lines, ...; they add up over several drives.
     """
@@ -163,12 +166,12 @@ class Notice:
     counts: tuple[int, ...] = ()
 
     def __str__(self) -> str:
-        """The notice of this drive."""
+        """Return the text with the counts of this drive."""
         return self.text.format(*self.counts)
 
 
 def merged_notices(notices: Mapping[tuple[str, str], Sequence[Notice]]) -> list[str]:
-    """Merge notices with the same text.
+    """Return one line for all notices with the same text, with the sums of their counts.
 
     Parameters
     ----------
@@ -178,7 +181,7 @@ def merged_notices(notices: Mapping[tuple[str, str], Sequence[Notice]]) -> list[
     Returns
     -------
     list of str
-        One line per notice, with the drive or the number of vehicles it is about.
+        One line per text, after the drive, or the number of drives or vehicles, that it is about.
     """
     found: dict[str, dict[tuple[str, str], tuple[int, ...]]] = {}
     for drive, items in notices.items():
