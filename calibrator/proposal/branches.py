@@ -15,34 +15,34 @@ from calibrator.words import CURRENT, PLACES, POSITIONS, POWER, VOCABULARY, plac
 __all__ = ["ONLY_CHARGING", "TAKEN", "close_sum", "closure", "find_signs", "judge_all"]
 
 TAKEN = 50.0
-"""Score from which on a candidate is a branch: names, comments or sender say where it flows."""
+"""Score from which on a candidate can be a branch: names, comments or sender say where it flows."""
 NOT_MEASURED, LIMITS, ELSEWHERE, DCDC_ELSEWHERE, HIGH_VOLTAGE = (
     word_set(VOCABULARY[name]) for name in ("not_measured", "limits", "elsewhere", "dcdc_elsewhere", "high_voltage")
 )
 MAIN = ("battery", "motor")
 NAMED, NAMED_AROUND, HV, MEASURED, BESIDE = 35.0, 40.0, 15.0, 10.0, 20.0
 AGAINST, WEAK, STEADY, NEVER = -65.0, -30.0, -40.0, -150.0
-"""Points for a place in the name or comment, one in these or in message or sender, a word for high voltage, a word or
-unit of a current, and a voltage in its message; points against a word or range that excludes it, one that makes it
-unlikely, a value that never changes, and what excludes it by itself."""
+"""Points of a candidate. NAMED: name or comment has a word of the place; NAMED_AROUND: these, message or sender have
+one; HV: a word for high voltage; MEASURED: a word, and again the unit, of a current; BESIDE: a voltage in its message.
+AGAINST: a word or range excludes it, WEAK: makes it unlikely; STEADY: its value never changes; NEVER: it is none."""
 UNITS, LEAST_OF_LOADS = {"current": "A", "power": "W"}, {"current": 3.0, "power": 500.0}
-"""Units, and least ranges of heaters, converters and chargers in a database; valves and clutches have less. [A, W]"""
+"""Units by quantity, and least range of heaters, converters and chargers in a database; valves have less. [A, W]"""
 CELL_V, LOW_V, HIGH_V = 6.0, 40.0, 60.0
 """Bounds of a voltage in the message of a current: below the first it is of a cell, below the second of a network of 12
 or 24 V, and from the third on of a junction. [V]"""
 STEADY_SHARE = 0.1
 """A current that varies by less than this share of its peak is steady; how the sum varies then says little. [1]"""
 ROUGH, ROUGH_POINTS = 0.5, -50.0
-"""Root mean square of the steps, over that of white noise of the same spread, beyond which it is no current; and the
-points for that. [1]"""
+"""A candidate jumps about as no current does if its steps exceed the first times those of white noise of the same
+spread (root mean squares); it then gets the second as points. [1]"""
 CLEAR = 2.0
 """A sign, or one more branch, is clear if the sum varies this many times more without it. [1]"""
 OWN_GAIN, FEWEST_BINS = 1.3, 20
 """A current closes the sum if all gains are within this factor of 1; fewer instants than the second cannot tell. [1]"""
 MOST_TOGETHER, MOST_TRIED = 2, 12
-"""Currents without a place that are tried together, and that are tried at all, the best first. [1]"""
+"""Most currents without a place that are tried together, and that are tried at all, the best first. [1]"""
 MEANS = 50
-"""Instants for which one row of means is added; no more, as loads that no branch measures are in the means."""
+"""One row of means is added per so many instants; not more rows, as the means contain loads without a sensor."""
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
 """Reason why a charger is not taken as a branch where there is a motor, but no log."""
 
@@ -50,7 +50,10 @@ ONLY_CHARGING = "carries nothing while the car drives, which a log of charging w
 def _score(
     item: Candidate, place: str, everything: Sequence[Candidate], volts: Sequence[Candidate]
 ) -> tuple[float, str]:
-    """Return the score of a current or power as the branch at a place, and the main reason for it or against it."""
+    """Return the score of a current or power as branch at a place, such as ``motor``, and the main reason for it.
+
+    ``everything`` has all candidates, ``volts`` those that are voltages.
+    """
     own, near, named = set(item.own), set(item.words), PLACES.get(place, frozenset())
     # "Iheat" of a table is a heater's current; in a database, or beside a motor, heat is a loss.
     allowed = named if item.message is None and places_of(near) == {place} else set()
@@ -76,6 +79,7 @@ def _score(
 
 
 def _of_range(item: Candidate, place: str) -> tuple[float, str]:
+    """Return points and a reason for them by the range in the database."""
     if place not in MAIN and item.reach < LEAST_OF_LOADS[item.quantity]:
         return AGAINST, f"its range ends at {item.reach:g} {UNITS[item.quantity]}: no load of a junction"
     if place in MAIN and item.low >= 0.0:
@@ -85,6 +89,7 @@ def _of_range(item: Candidate, place: str) -> tuple[float, str]:
 
 
 def _of_recording(item: Candidate, channel: Channel) -> tuple[float, str]:
+    """Return points and a reason for them by the candidate's values in a recording."""
     value, unit = item.good, UNITS[item.quantity]
     if len(value) < 0.5 * len(channel.value):
         unusable = f"{100.0 * (1.0 - len(value) / len(channel.value)):.0f} % of its values are not usable"
@@ -100,7 +105,7 @@ def _of_recording(item: Candidate, channel: Channel) -> tuple[float, str]:
 def _of_voltage(
     item: Candidate, place: str, everything: Sequence[Candidate], volts: Sequence[Candidate]
 ) -> tuple[float, str]:
-    """Return points and a reason by the greatest voltage in the same message."""
+    """Return points and a reason for them by the greatest voltage in the candidate's message."""
     beside = [v for v in volts if v.message is item.message and not {"cell", "brick", "ref"} & set(v.own)]
     rated = [(float(np.median(v.good)) if len(v.good) else v.reach, v.name) for v in beside]
     greatest_v, name = max(rated, default=(np.nan, ""))
@@ -120,7 +125,7 @@ def _of_voltage(
 
 
 def _names(item: Candidate) -> set[str]:
-    """Return the names of its message and senders, without placeholders."""
+    """Return the names of the candidate's message and of its senders, without placeholders such as ``XXX``."""
     return {item.message.name, *item.message.senders} - {"XXX", "Vector__XXX"} if item.message is not None else set()
 
 
@@ -129,19 +134,19 @@ def _quoted(words: set[str]) -> str:
 
 
 def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> list[Candidate]:
-    """Judge all currents and powers, and choose branches among them.
+    """Return all currents and powers with scores and reasons, and names for those that are branches.
 
     Parameters
     ----------
     found : sequence of Candidate
-        Candidates of a database, those of them that a log holds, or those of a table.
+        All candidates of a database or table; with a log, only those of the database that it holds.
     everything : sequence of Candidate
-        All candidates, also those that the log does not hold: their words may tell what a message or sender is of.
+        All candidates, also those that the log does not hold: their words may tell what a message or sender is about.
 
     Returns
     -------
     list of Candidate
-        The branches first, in the order of a layout; then the rest, the best first. Signs are not looked at.
+        The branches first, in the order of a layout; then the rest, the best first. Their signs are not set yet.
     """
     volts = [item for item in found if item.quantity == "voltage"]
     judged = []
@@ -163,7 +168,7 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
 
 
 def _named_branches(judged: Sequence[Candidate]) -> dict[int, str]:
-    """Return the names of the branches by number of the candidate: the best one for each position at each place."""
+    """Return branch names by position in ``judged``, as ``{3: "motor_rear"}``: the best one per place and position."""
     taken: dict[int, str] = {}
     for place in PLACES:
         good = [k for k, item in enumerate(judged) if item.place == place and item.score >= TAKEN]
@@ -178,7 +183,7 @@ def _named_branches(judged: Sequence[Candidate]) -> dict[int, str]:
 
 
 def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
-    """Return front, rear, left, right or a number if name, comment or message say so; else an empty text."""
+    """Return where a motor or the like is, ``rear`` or a number, if name, comment or message say so; else no text."""
     for words in (item.own, item.words):
         if found := [position for position in POSITIONS if position in words]:
             return found[0]
@@ -190,7 +195,7 @@ def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
 
 
 def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
-    """Take measured currents of unknown place as branches, alone or in pairs, if they close the sum of the others.
+    """Make currents of unknown place branches, alone or in pairs, if the others sum to 0 A far better with them.
 
     The battery's current is fitted by the other branches, each with a gain. With the added current all gains must be
     near 1, which excludes copies of a branch, and the residual must be less than half of that without it.
@@ -234,7 +239,7 @@ def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Ca
 
 
 def _with_usual_sign(item: Candidate) -> Candidate:
-    """Return the candidate with the sign that its comment states, or the usual one: discharge, consumption positive."""
+    """Return the candidate with the sign that its comment states, else as if discharge or consumption were positive."""
     gives, words = item.place in {"battery", "charger"}, set(words_of(item.comment))
     out, into = ("discharge", "charge") if gives else ("recuperation", "consumption")
     if "positive" in words and (out in words) != (into in words):
@@ -246,7 +251,7 @@ def _with_usual_sign(item: Candidate) -> Candidate:
 
 
 def _channels(branches: Sequence[Candidate], voltage: Candidate | None) -> list[Channel]:
-    """Return the currents of the candidates, powers over voltage [A]; empty if the recording does not have all."""
+    """Return the currents of the candidates, powers divided by the voltage [A]; empty if the recording lacks one."""
     channels = []
     for item in branches:
         if (channel := item.channel) is None:
@@ -261,7 +266,7 @@ def _channels(branches: Sequence[Candidate], voltage: Candidate | None) -> list[
 
 
 def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
-    """Give branches the signs for which the sum varies least and the battery's voltage falls under load.
+    """Return the branches with signs for which the sum varies least and the battery's voltage falls under load.
 
     Parameters
     ----------
@@ -308,7 +313,7 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
 
 
 def closure(chosen: Sequence[Candidate], voltage: Candidate | None) -> float:
-    """Return how much the sum varies, as a share of the greatest current's variation [1]; NaN without a recording."""
+    """Return the variation of the sum over that of the current that varies most [1]; NaN without a recording."""
     if not (known := _channels(chosen, voltage)):
         return float("nan")
     current = bands_of([known]).current_a * np.array([item.sign for item in chosen])

@@ -49,11 +49,11 @@ class Candidate:
     name : str
         ``Message.Signal``, or the header of a column.
     quantity : str
-        Such as ``current``, by its unit or else by its name; empty for quantities that are of no use here.
+        ``current``, ``voltage``, ``torque`` ..., by its unit or else by its name; empty if it is of no use here.
     unit, comment : str
-        As written in the file.
+        As written in the file; of a column without numbers the comment says so.
     own, words : tuple of str
-        Words of its name and comment; the same with those of its message and senders.
+        Words of its name and comment; these and the words of its message and senders.
     factor : float
         Turns values as written into A, V or W; 1 for other quantities.
     low, high : float
@@ -69,11 +69,11 @@ class Candidate:
     place : str
         Where it probably flows, one of :data:`calibrator.words.PLACES`; empty if no word tells.
     score : float
-        From 0 on it is worth looking at; from :data:`.TAKEN` on it can be a branch.
+        How well it fits as a branch; from :data:`.TAKEN` on it can be one.
     why : str
-        What speaks for it if it is taken, else why it is not.
+        Main reason why it is a branch, or why it is none.
     branch : str
-        Name of the branch that it is; empty if it is not taken.
+        Name of the branch that it is, such as ``motor_rear``; empty if it is none.
     sign : int
         Of a branch: 1 if it is positive into the junction, -1 if out of it.
     sign_reason : str
@@ -103,13 +103,13 @@ class Candidate:
 
     @property
     def about(self) -> str:
-        """Unit and comment, for a remark."""
+        """Unit and comment as one text, for a remark in the layout."""
         comment = " ".join(self.comment.split())
         return (self.unit or "no unit") + (f', "{comment}"' if comment else "")
 
     @property
     def points(self) -> float:
-        """Score as people see it, 0 to 100."""
+        """Score cut off to 0 to 100, as people see it."""
         return min(max(self.score, 0.0), 100.0)
 
     @property
@@ -128,14 +128,14 @@ class Candidate:
         return peak_of(self.good)
 
     def at(self, time_s: Array) -> Array:
-        """Good values of the recording at some instants, interpolated; NaN without any."""
+        """Return the recording at given instants, interpolated between good values; NaN if it has none."""
         if self.channel is None or not len(self.good):
             return np.full(len(time_s), np.nan)
         return np.interp(time_s, self.channel.time_s[self.channel.good], self.good)
 
 
 def of_database(database: Database) -> list[Candidate]:
-    """Return all signals of a database that a layout can name, in its order.
+    """Return all signals of a database that a layout can name, in the order of the database.
 
     Signals that no control unit sends (``VECTOR__INDEPENDENT_SIG_MSG``) are left out.
     """
@@ -171,7 +171,7 @@ def _of_signal(message: Message, signal: Signal) -> Candidate:
 
 
 def of_table(table: Table) -> list[Candidate]:
-    """Return the columns of a table, in its order."""
+    """Return all columns of a table with their values; columns without numbers come last, without good values."""
     found = []
     unknown = {name: np.full(len(table.time_s), np.nan) for name in table.texts}
     for name, value in (table.columns | unknown).items():
@@ -184,7 +184,7 @@ def of_table(table: Table) -> list[Candidate]:
 
 
 def _quantity(name: str, unit: str, factor_in: Callable[[Mapping[str, float], str], float]) -> tuple[str, float]:
-    """Quantity, and the factor that turns its values into A, V or W, by the unit, or else by the name."""
+    """Return the quantity, by unit or else by name, and the factor from its values to A, V or W; else ("", 1.0)."""
     if not unit:
         letters = [word for word in words_of(name) if not word.isdigit()] or [""]
         for quantity, words in _MEASURED.items():
@@ -239,7 +239,7 @@ def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
 
 
 def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
-    """Return the candidate with its values; those outside the range are good if they show the range to be wrong."""
+    """Return the candidate with its recorded values; if many are outside its range, that is wrong and they are good."""
     outside = channel.good & ~inside
     wrong = (
         outside.sum() > WRONG_RANGE * channel.good.sum() and len(np.unique(channel.value[outside])) >= FEWEST_OUTSIDE
@@ -249,7 +249,7 @@ def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
 
 
 def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
-    """Return those of the given signals that are columns of a table, ``Message.Signal`` or ``Signal``, with values.
+    """Return, with values, those signals that are columns of a table, headed ``Message.Signal`` or ``Signal``.
 
     Raises
     ------
@@ -273,7 +273,7 @@ def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
 
 
 def _signed(signal: Signal, frames: Frames, good: Mask) -> Array | None:
-    """Return the values with the highest bit read as sign, if they jump between both ends without it; else None."""
+    """Return the values with the highest bit read as a sign, if they then vary far less; else None."""
     if signal.is_signed or signal.is_float or signal.length < _FEWEST_BITS or not good.any():
         return None
     raw = raw_values(signal, frames.data, frames.length)[0].astype(np.float64)

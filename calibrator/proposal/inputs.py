@@ -28,9 +28,9 @@ class Role(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     quantity : str
         Quantity of the candidate, see :class:`.Candidate`.
     wanted, also : str
-        Two lists of words; its own name or comment must have a word of each. Without `also`, one of `wanted` is enough.
+        Words with blanks between; name or comment must have one of `wanted` and, unless that is empty, one of `also`.
     likely, against : str
-        Words that speak for it and against it, also in its message and sender.
+        Words with blanks between, in name, comment, message or sender, that speak for a candidate, and against it.
     """
 
     quantity: str
@@ -41,7 +41,7 @@ class Role(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _ROLES = msgspec.convert(VOCABULARY["roles"], dict[str, Role])
-"""In the order in which a layout lists inputs."""
+"""Roles by the name of the input, in the order in which a layout lists inputs."""
 _OF_TORQUE = {
     "driving_current": "positive({torque} * speed) / voltage",
     "recuperation_current": "negative({torque} * speed) / voltage",
@@ -49,10 +49,10 @@ _OF_TORQUE = {
     "stray_loss": "{torque} * {torque} * speed / voltage",
     "torque_current": "{torque} / voltage",
 }
-"""Mechanical power, losses of the motor, and the torque alone, for a torque sensor at rest."""
+"""Formulas made of a torque, by name: mechanical power, losses, and the torque alone, for its error at standstill."""
 _OF_SPEED = {"rotation_loss": "speed / voltage", "churning_loss": "speed * speed / voltage"}
 FOR_FLEETS = ("stray_loss", "torque_current", *_OF_SPEED)
-"""Beginnings of the names of formulas that only the model of a fleet uses; that of one vehicle cannot bear them."""
+"""Formulas whose names begin so are inputs of the fleet model alone: one vehicle has too little data for them."""
 
 
 def find_inputs(
@@ -62,7 +62,7 @@ def find_inputs(
     taken: Collection[str] = (),
     roles: Collection[str] = tuple(_ROLES),
 ) -> dict[str, Candidate]:
-    """Choose inputs by name: at most one per role, and one torque per position of an axle (``torque_front``).
+    """Return the chosen inputs by name: at most one per role, but a torque per axle: ``torque``, ``torque_rear``.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def find_inputs(
     taken : collection of str
         Names of candidates that are branches, and hence no inputs.
     roles : collection of str
-        Which inputs are looked for: ``voltage``, ``torque``, ``speed``, ...
+        Inputs that are looked for: ``voltage``, ``torque``, ``speed``, ...
     """
     chosen: dict[str, Candidate] = {}
     for role in roles:
@@ -91,6 +91,7 @@ def find_inputs(
 
 
 def _points(item: Candidate, role: str, battery: Candidate | None) -> float:
+    """Return how well a candidate fits as the input of a role; negative if it does not."""
     known, own, near, value = _ROLES[role], set(item.own), set(item.words), item.good
     wanted, also = word_set(known.wanted), word_set(known.also or known.wanted)
     if item.quantity != known.quantity or not own & wanted or not own & also:
@@ -140,7 +141,7 @@ def computed_motor(
 
 
 def derive(inputs: Mapping[str, Candidate]) -> dict[str, str]:
-    """Return formulas of the currents that inputs cause by physics: power, losses and demands over voltage."""
+    """Return by name the formulas of the currents that inputs cause: powers, losses and demands over the voltage."""
     if "voltage" not in inputs:
         return {}
     formulas = dict[str, str]()

@@ -38,11 +38,11 @@ LARGEST_A = 2000.0
 COMPUTED = 0.1
 """Relative standard deviation of a current computed from torque and speed, which leaves out the losses. [1]"""
 OPEN = 0.6
-"""A branch must be missing if the sum varies by more than this share of the greatest current. [1]"""
+"""A branch is missing or wrong if the sum varies by more than this share of the greatest current's variation. [1]"""
 OTHER_UNIT = 100.0
-"""No branch in the same unit reaches this many times the battery's current. [1]"""
+"""A branch that reaches this many times the battery's current is probably in another unit. [1]"""
 TIMEOUT_PERIODS, GAP_TIMES = 5.0, 1.5
-"""A time-out is at least so many periods, to bridge four lost frames, and so many times the longest gap seen. [1]"""
+"""A time-out is at least so many periods, to bridge four lost frames, and so many times the longest gap. [1]"""
 LEAST_TIMEOUT_S, USUAL_TIMEOUT_S, LONGEST_TIMEOUT_S = 0.1, 0.5, 2.0
 """Shortest time-out, as the time base is 0.1 s; the one for an unknown rate; and the longest, as longer gaps are lost
 frames unless all frames are that rare. [s]"""
@@ -50,7 +50,7 @@ TIMEOUT_STEP_S = 0.05
 STATED = "as --branches says"
 """Reason given for a sign that the user has stated."""
 SHOWN = 12
-"""Candidates in a list that fits on a screen."""
+"""Most candidates that are listed, so that they fit on a screen."""
 CHECKS = frozenset({"crc", "checksum", "crc8", "chk"})
 """Words in the name of a signal that protects its message."""
 
@@ -72,7 +72,7 @@ class Proposal:
     everything : tuple of Candidate
         All signals or columns, of a database also those that are not in the log.
     found : tuple of Candidate
-        Those from which branches and inputs were chosen; with a log, those in it.
+        Signals or columns from which branches and inputs are chosen: everything, or what the log has of it.
     voltage : Candidate or None
         Voltage by which powers are divided.
     """
@@ -131,15 +131,15 @@ class Proposal:
 
 
 def look_at(source: Path, log: Path | None, name: str) -> Proposal:
-    """Judge the signals of a database, with or without a log, or the columns of a table.
+    """Guess branches among the signals of a database, with or without a log, or the columns of a table.
 
     Parameters
     ----------
     source : Path
         A database (DBC, KCD, SYM, ARXML), or a table.
     log : Path or None
-        Beside a database, one of the vehicle's logs or a table of its signals: only signals in it are then judged, and
-        by their values in it.
+        Beside a database, a log of the vehicle or a table of its signals: only signals in it are then candidates, and
+        their values in it count.
     name : str
         Name of the layout.
 
@@ -198,7 +198,7 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
 
 
 def candidate_lines(proposal: Proposal) -> list[str]:
-    """Return lines of candidates with score and reason: all branches first, then others up to :data:`SHOWN` in all."""
+    """Return two lines per candidate, with score and reason: all branches, then others, up to :data:`SHOWN` in all."""
     shown, lines = proposal.candidates[: max(SHOWN, len(proposal.branches))], list[str]()
     for item in shown:
         taken = f"{item.branch} ({item.sign:+d})" if item.branch else "not taken"
@@ -237,6 +237,7 @@ def parsed_branches(text: str, proposal: Proposal) -> Proposal:
 
 
 def _named(wanted: str, proposal: Proposal) -> Candidate:
+    """Return the only candidate with this name, or with this last part of its name; ProposalError if there is none."""
     items = (*proposal.everything, *proposal.found)
     known = {item.name: item for item in items if item.quantity in {"current", "power", ""}}
     same = [name for name in known if wanted in {name.rpartition(".")[2], bare_name(name)}]
@@ -251,7 +252,7 @@ def _named(wanted: str, proposal: Proposal) -> Candidate:
 
 
 def layout_text(proposal: Proposal, out: Path | None) -> str:
-    """Write the text of a layout.
+    """Return the text of a layout (TOML).
 
     Parameters
     ----------
@@ -295,6 +296,7 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
 
 
 def _full_scale(proposal: Proposal) -> tuple[float, str]:
+    """Return a likely full scale of the junction [A], and where it comes from."""
     peak_a, battery = max(item.peak * (item.quantity == "current") for item in proposal.branches), proposal.battery
     if proposal.recording is not None and peak_a > 0.0:
         return likely_full_scale_a(peak_a), f"the recording reaches {peak_a:.0f} A; give the nominal maximum"

@@ -14,7 +14,7 @@ from ecu_node.program import write_output
 __all__ = ["report"]
 
 MAX_LIMIT_A, MAX_VOLTAGE_V = 10_000.0, 2000.0
-"""Beyond any battery of a road vehicle. [A], [V]"""
+"""Largest values that are accepted, beyond any battery of a road vehicle. [A], [V]"""
 
 
 def report(

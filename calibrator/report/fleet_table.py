@@ -48,7 +48,7 @@ class FleetTable:
         gives none), flags, texts (empty where there is none). What belongs to the vehicle as a whole is the same in all
         K places. Added are: whether a sensor is ``faulty``, that is corrected, held back, or found without a
         probability; its error at full scale, ``error_a`` [A]; and whether its gain (``open_gain``) or its offset
-        (``open_offset``) is as open as before the recordings.
+        (``open_offset``) is not known, as its standard deviation is too large.
     left_out : mapping of str to str
         Vehicles without parameters, or files whose vehicle is unclear, with the reason.
     """
@@ -75,7 +75,7 @@ class FleetTable:
         return self.columns[column][:, 0]
 
     def only(self, vehicle: str) -> "FleetTable":
-        """Return the result of one of the vehicles alone."""
+        """Return the table of one vehicle alone."""
         chosen = self.vehicle == vehicle
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return replace(self, columns=columns, left_out={})
@@ -87,12 +87,12 @@ class FleetTable:
 
     @property
     def corrected(self) -> Mask:
-        """Whether the node corrects a branch of the vehicle, shape (N,); a fault of size 0 corrects nothing."""
+        """Whether the node corrects some branch of each vehicle, shape (N,); a fault of size 0 is no correction."""
         return np.asarray((self["applied"] & self["faulty"]).any(axis=1))
 
     @property
     def deployed_a(self) -> Array:
-        """Root mean square of the Kirchhoff sum with what the node applies, shape (N,). [A]"""
+        """Root mean square of each vehicle's Kirchhoff sum with what the node applies, shape (N,). [A]"""
         measured_a, corrected_a = (self.of_vehicles(f"junction_rms_{name}_a") for name in ("measured", "corrected"))
         return deployed_rms_a(self["applied"], measured_a=measured_a, corrected_a=corrected_a)
 
@@ -132,7 +132,7 @@ class ParameterDetails(msgspec.Struct, frozen=True):
     """Contents of a parameter file that the columns do not have."""
 
     branches: dict[str, _Identifiable]
-    """Whether the gain of each could be estimated."""
+    """By branch, whether its gain could be estimated."""
     explanations: list[Explanation] = []
     """Competing explanations, the most probable first; empty where only one was left."""
     findings: list[SensorFinding] = []
@@ -140,7 +140,7 @@ class ParameterDetails(msgspec.Struct, frozen=True):
 
 
 def read_details(table: FleetTable, listed: NDArray[np.int64]) -> tuple[dict[int, ParameterDetails], list[str], Array]:
-    """Read what the parameter files of n vehicles, given by their places in the table, add to the table.
+    """Read what the parameter files of n vehicles add to the table; ``listed`` has their places in it, shape (n,).
 
     Returns
     -------

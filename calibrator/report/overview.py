@@ -33,9 +33,9 @@ _NOT_KNOWN = "not known"
 NO_DBC = hashlib.sha256(b"").hexdigest()
 """Digest of the databases of a layout for tables, which names none."""
 IN_WORKSHOP = ("beyond the limits", "does not fit")
-"""Reasons for not correcting a fault with which it is on the workshop list."""
+"""A fault that is not corrected for one of these reasons is on the workshop list."""
 UNDECIDED = ("cannot tell", "not enough data")
-"""Verdicts that leave a question."""
+"""Verdicts after which more data would decide."""
 NO_REASON = "more recordings, a reading at zero current or a bench check would decide"
 MOST_QUESTIONS = 3
 """Most questions of one kind that are asked one by one."""
@@ -49,19 +49,20 @@ FLEET_CAUSES = ("load", "batch", "variant")
 
 
 def overview_of(table: FleetTable) -> dict[str, Any]:
-    """Count and summarise a result.
+    """Return the numbers that sum up a result.
 
     Returns
     -------
     dict
-        Numbers of vehicles: with parameters and without (``vehicles``, ``left_out``), by verdict, corrected, and with a
-        suspected hardware fault (None if the method cannot see one). Numbers of sensors: with a fault, with a fault
-        that is corrected, not corrected by reason (``held_back``), and changed since the earlier result of ``calibrate
-        --since``. Median, and values between which the middle 90 % lie, of the Kirchhoff sum of a vehicle before and
-        after what is applied [A], of the length of its drives [h], and of the delay of each branch [ms]. The load that
-        no branch measures [A]: as a fleet shows it (``unmeasured_a``), or as the user declared it for vehicles that are
-        calibrated by themselves (``declared_load_a``), whose sums are about it. ``reference``: by branch the share of
-        the vehicles that agree, and the spread of their slopes [1]. The most frequent reasons for leaving out vehicles.
+        Numbers of vehicles: with parameters (``vehicles``), without (``left_out``; by frequent reason in
+        ``left_out_reasons``), by verdict (``verdicts``), ``corrected``, and ``hardware_suspected`` (None if the method
+        cannot see hardware faults). Numbers of sensors: ``faulty_sensors``; ``applied_sensors``, faulty and corrected;
+        ``held_back``, not corrected, by reason; ``moved_sensors``, changed since the result of ``calibrate --since``.
+        ``median``, ``p05`` and ``p95`` over vehicles: of the root mean square Kirchhoff sum as measured and with what
+        is applied (``junction_measured_a``, ``junction_deployed_a``) [A], of the length of the drives (``duration_h``)
+        [h] and of each branch's delay (``delay_ms``) [ms]. Load that no branch measures [A]: as a fleet shows it
+        (``unmeasured_a``), or as declared for vehicles calibrated by themselves (``declared_load_a``); sums are then
+        about it. ``reference``: by branch the share of the vehicles that agree, and the spread of their slopes [1].
     """
     reference = table.run.details.get("reference", {})
     spread = table.run.details.get("hyperparameters", {}).get("model_spread", {})
@@ -97,14 +98,14 @@ def overview_of(table: FleetTable) -> dict[str, Any]:
 
 
 def _spread(values: Array) -> dict[str, float]:
-    """Return the median and the values between which the middle 90 % lie; NaN if nothing is known."""
+    """Return ``median``, ``p05`` and ``p95``, between which the middle 90 % lie; NaN if no value is known."""
     known = values[np.isfinite(values)]
     found = np.quantile(known, [0.5, 0.05, 0.95]).tolist() if len(known) else (np.nan,) * 3
     return dict(zip(("median", "p05", "p95"), found, strict=True))
 
 
 def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> list[dict[str, Any]]:
-    """List what parameters cannot mend: hardware, then sensors, then what many vehicles share; most probable first.
+    """Return what parameters cannot mend, hardware first, what many vehicles share last; the more probable come first.
 
     Parameters
     ----------
@@ -116,8 +117,8 @@ def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> l
     Returns
     -------
     list of dict
-        What a workshop should look at: ``vehicle``, ``branch`` (empty: the vehicle), ``cause``, ``probability`` (1;
-        None if it is not known) and ``text``.
+        What a workshop should look at: ``vehicle``, ``branch`` (empty: the vehicle), ``cause``, ``probability`` [1]
+        (None if it is not known) and ``text``.
     """
     columns = ["vehicle", "branch", "cause", "probability", "text"]
     rows, hardware = list[tuple[Any, ...]](), table.of_vehicles("hardware_probability")
@@ -142,7 +143,7 @@ def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> l
 
 
 def _changes(table: FleetTable, j: int) -> str:
-    """Say by how much a hardware fault changes the currents of a vehicle."""
+    """Say by how much its hardware fault changes the currents of vehicle j: ``: all +1.20 %, motor +0.50 A``."""
     drift = table.of_vehicles("hardware_drift")[j]
     parts = [f"all {percent(drift, 2, sign=True)}"] if abs(drift) >= 5e-5 else []
     offset_a = zip(table.branches, table["hardware_offset_a"][j].tolist(), strict=True)
@@ -151,7 +152,7 @@ def _changes(table: FleetTable, j: int) -> str:
 
 
 def steps_to_take(table: FleetTable, workshop: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say what to do with a result, one sentence each, the first step first."""
+    """Return what to do with a result, a sentence or two per step; ``workshop`` is from :func:`workshop_list`."""
     steps = []
     if corrected := table.vehicle[table.corrected].tolist():
         steps.append(
@@ -190,7 +191,7 @@ def steps_to_take(table: FleetTable, workshop: Sequence[Mapping[str, Any]]) -> l
 def battery_margin(
     table: FleetTable, branch: str, *, limit_a: float | None = None, voltage_v: float | None = None
 ) -> dict[str, Any] | None:
-    """Find by how much a controller must stay below the battery's limit, as the sensor can be wrong (paper, figure 1).
+    """Return how far a controller must stay below the battery's limit, as the sensor can be wrong (paper, figure 1).
 
     docs/report.md derives it.
 
@@ -201,17 +202,17 @@ def battery_margin(
     branch : str
         Branch of the battery.
     limit_a, voltage_v : float or None
-        Current limit, full scale if None, and the voltage with which A become kW. [A], [V]
+        Current limit; None: full scale. Voltage, only to be returned: with it A become kW. [A], [V]
 
     Returns
     -------
     dict or None
-        Number of ``vehicles`` whose sensor is known, of others, which do not count further (``not_known``), and of the
-        known ones that are corrected; one margin for all as measured (``common_before_a``) and after correction
-        (``common_after_a``), and the difference (``common_gain_a``); what a margin per vehicle gives back
-        (``own_gain_a``), as the median over those corrected (None if there is none); ``largest``: vehicles that keep
-        the common margin large, as they are not corrected, and the margin that each needs [A]. None if the sensor is
-        known in no vehicle.
+        The arguments, and numbers of ``vehicles`` whose sensor is known, of the others (``not_known``), which do not
+        count further, and of known ones that are ``corrected``. Margins [A]: one for all vehicles as measured
+        (``common_before_a``) and after correction (``common_after_a``), and the difference (``common_gain_a``); what
+        correction saves if each vehicle has its own margin, in the median of those corrected (``own_gain_a``, None
+        without any); ``largest``: up to 5 vehicles not corrected that need the largest margins, with these. None if
+        the sensor is known in no vehicle.
     """
     k, limit_a = table.branches.index(branch), limit_a or table.run.full_scale_a
     known = np.flatnonzero(~(table["open_gain"] | table["open_offset"])[:, k])
@@ -239,23 +240,23 @@ def battery_margin(
 
 
 def amperes(value: float | None, *, digits: int = 2, sign: bool = False) -> str:
-    """A current [A] with its unit."""
+    """Return a current [A] as text: ``1.25 A``; ``not known`` for None and NaN."""
     return _number(value, digits, sign=sign, unit=" A")
 
 
 def percent(value: float | None, digits: int, *, sign: bool = False) -> str:
-    """A share or a relative change [1] in percent."""
+    """Return a share or relative change [1] as text in percent: ``12.5 %``; ``not known`` for None and NaN."""
     return _number(None if value is None else 100.0 * value, digits, sign=sign, unit=" %")
 
 
 def share(part: int, whole: int) -> str:
-    """A share of vehicles in whole percent; never 0 % or 100 % if a single vehicle is an exception."""
+    """Return a share as text in whole percent; ``< 1 %`` and ``> 99 %`` where 0 % or 100 % would not be exact."""
     percents = 100.0 * part / whole
     return "< 1 %" if 0.0 < percents < 0.5 else "> 99 %" if 99.5 <= percents < 100.0 else f"{percents:.0f} %"
 
 
 def probability(value: float | None) -> str:
-    """A probability [1] in percent, never as certainty."""
+    """Return a probability [1] as text in percent, never as certainty: ``97.3 %``, ``> 99.9 %``, ``not known``."""
     if value is None or not math.isfinite(value):
         return _NOT_KNOWN
     return "> 99.9 %" if value >= 0.9995 else "< 0.1 %" if value < 0.0005 else percent(value, 1)

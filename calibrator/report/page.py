@@ -77,23 +77,24 @@ def report_page(
     result : Path
         Folder that ``calibrator calibrate`` wrote.
     vehicle : str or None
-        Name of the vehicle; None: all. A result of one vehicle gives the page of this vehicle.
+        Name of the vehicle; None: all. A result with one vehicle always gives the page of this vehicle.
     battery : str or None
         Branch of the battery; None: the first one whose name is that of a battery.
     limit_a, voltage_v : float or None
-        Its current limit, and its voltage; None: full scale, and the margin in A alone. [A], [V]
+        Current limit of the battery, None: full scale; its voltage, None: the margin is shown in A alone. [A], [V]
 
     Returns
     -------
     page : str
         HTML.
     numbers : dict
-        ``overview``, ``next_steps``, ``workshop`` and ``protection`` of the page; of one vehicle its ``parameters``.
+        ``overview``, ``next_steps``, ``workshop``, ``protection`` (see overview.py); if a vehicle is named, its
+        ``parameters`` instead.
 
     Raises
     ------
     FleetError
-        If the folder is no result, no branch has this name, or the vehicle is not in it, or left out.
+        If the folder is no result, ``battery`` is none of its branches, or the vehicle is not in it or left out.
     """
     parameters = None
     if vehicle is not None:
@@ -160,7 +161,7 @@ def report_page(
 def _columns(
     table: FleetTable, listed: NDArray[np.int64], files: Mapping[int, ParameterDetails], reasons: Mapping[str, str]
 ) -> dict[str, list[Any]]:
-    """Return the columns of the listed vehicles, those of sensors with K values per vehicle; null where not known."""
+    """Return the columns of the listed vehicles as lists; those of sensors have K values for each vehicle in turn."""
     gain = np.array([[not files[j].branches[name].identifiable for name in table.branches] for j in listed])
     unknown = 1 * gain
     if table.run.method != METHOD_WITHOUT_SD:
@@ -198,7 +199,7 @@ def _plotly() -> str:
 
 @cache
 def _template() -> Any:
-    """Return the template of the page, which escapes all values but files of this package and base64."""
+    """Return the template of the page; it escapes all values but base64 and the files of this package."""
     environment = templates_of("calibrator.report", "assets", autoescape=True)
     environment.policies["json.dumps_function"] = lambda value, **_: msgspec.json.encode(value).decode()
     environment.globals |= {each.__name__: each for each in (amperes, counted, few, percent, probability, share)}
@@ -207,7 +208,7 @@ def _template() -> Any:
 
 
 def _junction_bins(before_a: Array, after_a: Array, *, expected_a: float | None) -> dict[str, Any]:
-    """Distributions of the Kirchhoff sum's root mean square over vehicles: B + 1 edges [A], and counts in the B bins.
+    """Return histograms of the vehicles' root mean square Kirchhoff sums: B + 1 edges [A], and counts in the B bins.
 
     With these a page holds no more for a million vehicles than for a hundred. The load without a sensor [A] lies
     between the edges; None if it is too small for a line.
