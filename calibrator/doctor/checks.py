@@ -32,7 +32,7 @@ LEAST_V, GREATEST_V, USUAL_V = 30.0, 1500.0, 400.0
 """Range of voltages from 48 V systems to the highest of road vehicles, and a usual one: a unit error is taken for the
 power of ten that brings the voltage nearest to it. [V]"""
 LEAST_OF_SCALE = 0.02
-"""Greatest current seen, as a share of full scale, below which one of the two is probably wrong. [1]"""
+"""If no current exceeds this share of full scale, units or full scale are probably wrong. [1]"""
 
 
 def findings_of(facts: Facts) -> list[Finding]:
@@ -43,7 +43,7 @@ def findings_of(facts: Facts) -> list[Finding]:
 
 
 def logs_as_a_whole(facts: Facts) -> Findings:
-    """Report logs without a branch of the layout, and what 'import' says of a log (times, damage, other buses)."""
+    """Report logs without a branch of the layout, and the notices that 'import' gives on a log, such as damage."""
     for log in facts.logs:
         if not isinstance(log.drive, Drive):
             what = log.drive.what.removeprefix(f"{log.name}: ")
@@ -118,7 +118,7 @@ def bad_frames(facts: Facts) -> Findings:
 
 
 def values(facts: Facts) -> Findings:
-    """Report branches with values at an end of the signal's range, and branches and inputs that never change."""
+    """Report branches with values at an end of the signal's range, and branches and needed inputs that never change."""
     for row in facts.channels[facts.channels.is_branch & (facts.channels.clipped > 0)].itertuples():
         stand = f"{row.clipped:,} of {row.frames:,} frames stand at the end of what {row.signal} can show"
         text = f"{stand}; it goes from {figure(row.low)} to {figure(row.high)} A"
@@ -174,7 +174,7 @@ CHECKS: Sequence[Callable[[Facts], Findings]] = (
 
 
 def readiness(facts: Facts, findings: Sequence[Finding]) -> dict[str, str]:
-    """Return what each command still lacks, in the order of their use; an empty text if it is ready."""
+    """Return for each command, in the order of use, why it is not ready; an empty text if it is."""
     errors, junction = [finding.subject for finding in findings if finding.severity == "error"], facts.junction
     wrong = f"of the errors above ({', '.join(dict.fromkeys(errors))})" if errors else ""
     single = () if junction.comparisons else facts.drives  # no drive has all branches, but one may have enough
@@ -192,7 +192,7 @@ def readiness(facts: Facts, findings: Sequence[Finding]) -> dict[str, str]:
 
 
 def _refusal(command: Callable[[], object]) -> str:
-    """Return the message with which a command refuses these drives; empty if it takes them."""
+    """Return the message of the error that a command ends with; empty if it succeeds."""
     try:
         command()
     except UserError as error_:

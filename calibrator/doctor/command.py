@@ -47,7 +47,7 @@ def doctor(
 
 
 def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
-    """Return tables of branches and inputs, findings, and next steps; the terminal is to wrap long lines."""
+    """Return the report as text: tables of branches and inputs, findings, next steps; lines may be long."""
     seconds, frames = sum(log.duration_s for log in facts.logs), sum(log.report.frames for log in facts.logs)
     reasons: dict[str, list[str]] = {}
     for name, why in steps.items():
@@ -85,7 +85,7 @@ def _next_commands(facts: "Facts", ready: Sequence[str]) -> list[str]:
 
 
 def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
-    """The report for programs: facts by branch and input, findings with their figures, next steps."""
+    """Return the report as JSON: facts by branch and input, findings with their figures, next steps."""
     sum_a, channels = facts.junction.sum_a, facts.channels
     rows = channels.drop(columns=["is_branch", "needed", "good"]).set_index("name", drop=False)
     total = None

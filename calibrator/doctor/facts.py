@@ -36,7 +36,7 @@ class ExaminedLog:
     name : str
         Path of the file.
     source : SignalSource
-        Finds signals in it.
+        Gives the samples of its signals.
     report : RecordingReport
         Counts of its frames, and what could not be used.
     drive : Drive or LogError
@@ -71,13 +71,13 @@ class Facts:
           whether it is an input that is ``needed`` for the model;
         - ``frames``: frames, or rows of a table, that carry it; ``in_logs``: how many of all ``logs`` have any;
         - ``period_s``, ``jitter_s``, ``gap_s``: median distance of frames, the 95th percentile of how far distances are
-          from it, and the longest distance; NaN with fewer than two frames [s]; ``late``: distances longer than its
-          time-out;
-        - ``bad``: frames that cannot be used, by reason; ``good``: how many can be used;
+          from it, and the longest distance; NaN with fewer than two frames [s]; ``late``: number of distances longer
+          than its time-out;
+        - ``bad``: numbers of frames that cannot be used, by reason; ``good``: number that can be used;
         - ``low``, ``high``: least and greatest good value, of branches positive into the junction; NaN without any;
-        - ``clipped``: good values at an end of the signal's range, several in a row.
+        - ``clipped``: number of good values at an end of the signal's range, several in a row.
     junction : RecordedJunction
-        The sum of the branches; its database has the layout at the pace of the logs, with hidden inputs for voltages.
+        What the sum of the branches shows; its layout has the logs' sample period, and voltages as further inputs.
     """
 
     database: VehicleDatabase

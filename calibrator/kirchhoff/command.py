@@ -100,7 +100,7 @@ def kirchhoff(
 
 
 def _next_step(log: Path, layout: Path | None, branches: str | None, database: "VehicleDatabase") -> str:
-    """Return the command that leads to a correction of this log; empty if one command does not, as with formulas."""
+    """Return the command that leads to a correction of this log; empty if no single one does, as with formulas."""
     if layout is not None:
         return f"calibrate {quote(str(log))} --layout {quote(str(layout))} --trusted BRANCH --out result"
     if any(branch.computed for branch in database.layout.branch):

@@ -28,36 +28,36 @@ LEAST_DELAY_S, LONG_DELAY_S = 0.02, 0.1
 """Delays from the first on are a hint: shorter ones, two frames of a fast message, change no result. From the second on
 they are a warning: 300 ms bend the gains of the junction law by 3 %, and this is a third of that. [s]"""
 LEAST_GAIN, LARGEST_GAIN, LEAST_SHARE = 0.02, 0.25, 0.5
-"""Least gain error that is reported; largest one that sensors drift by; least share of the sum about its mean that gain
-errors must explain, relative to the unexplained rest. [1]"""
+"""Least gain error that is reported; largest one that sensors drift by; and least ratio of what gain errors explain of
+the sum's variation to what remains unexplained, below which none is reported. [1]"""
 LEAST_MEAN_A, LEAST_MEAN, LARGE_MEAN = 0.5, 0.001, 0.05
-"""A mean of the sum below half an ampere, or below the first share of full scale, is not reported; beyond the second
-share it is more than loads without a sensor usually draw. [A], [1]"""
+"""A mean of the sum is reported if it is beyond the first and beyond the second times full scale. Beyond the third
+times full scale it is a warning, as loads without a sensor usually draw less. [A], [1]"""
 LEAST_SUM_A, NO_SUM = 0.5, 0.3
-"""A sum that varies by less than the first is right. Branches do not belong together if the sum keeps more than the
-second as a share of their mean squares. [A], [1]"""
+"""A sum that varies by less than the first is right. Branches do not belong together if the mean square of their sum is
+more than the second times the sum of their mean squares. [A], [1]"""
 SAME, CLEAR = 1.2, 2.0
 """The sign of a branch is unknown if with the other sign the sum varies less than the first times as much. Two branches
-are surely exchanged if the sum varies more than the second times less with each in the other's place. [1]"""
+are surely exchanged if the sum varies more than the second times as much as with each in the other's place. [1]"""
 STUCK_S, STUCK_RANGE = 10.0, (0.1, 0.9)
 """A current other than zero is stuck if it holds its exact value for so long; how much the others' sum varies meanwhile
 is taken between these quantiles. [s], [1]"""
 STUCK_MOVE, STUCK_VALUE, STUCK_ROUNDING = 0.02, 0.002, 1e-9
-"""Shares of full scale: the others' sum must vary by more than the first meanwhile; a current below the second may well
-stand still; interpolation makes equal values differ by up to the third. [1]"""
+"""Shares of full scale: a current is stuck only if it exceeds the second while the others' sum varies by more than the
+first; interpolation makes equal values differ by up to the third. [1]"""
 
 UNITS = {factor_a: unit for unit, factor_a in AMPERE.items()}
 """Units of currents by the factor that turns their values into A."""
 
 
 def sum_findings(junction: RecordedJunction) -> list[Finding]:
-    """Return all findings of the sum, errors first."""
+    """Return all findings about the sum of the currents, errors first."""
     checks = [*CHECKS, *(CHECKS_OF_MOVING if junction.moves else ())]
     return worst_first(each for check in checks for each in check(junction))
 
 
 def enough(junction: RecordedJunction) -> Findings:
-    """Check whether there is a sum, whether it is long enough, and whether currents move."""
+    """Report that there are too few branches for a sum, that the recording is too short, or that no current moves."""
     names, record, valid_s = junction.branches, "record a minute of driving or more", junction.valid_s
     if len(names) < 2:
         text = f"usable frames of {', '.join(names) or 'no branch'} only, so there is no sum to look at"
@@ -84,7 +84,7 @@ def enough(junction: RecordedJunction) -> Findings:
 
 
 def times(factor: float) -> str:
-    """Say how wrong a value is that must be multiplied by this power of ten."""
+    """Say how wrong a value is that must be multiplied by a power of ten: ``1000 times too large`` for 0.001."""
     return f"{1.0 / factor:g} times too large" if factor < 1.0 else f"{factor:g} times too small"
 
 
@@ -153,7 +153,7 @@ def _exchanged(junction: RecordedJunction) -> list[tuple[str, str]]:
 
 
 def sum_cancels(junction: RecordedJunction) -> Findings:
-    """Report branches that do not belong to one junction."""
+    """Report that the currents do not cancel, so that the branches do not belong to one junction."""
     rest_a = junction.bands.rms_a(junction.multipliers)
     all_a, least_a = (float(np.linalg.norm(junction.multipliers * a)) for a in (junction.rms_a, junction.steps_a))
     if rest_a > max(LEAST_SUM_A, least_a) and (rest_a / all_a) ** 2 > NO_SUM:
@@ -185,8 +185,8 @@ def delays(junction: RecordedJunction) -> Findings:
     found = junction.delays
     if found is None:
         return
-    apart = np.abs(found.delay_s[:, None] - found.delay_s[None, :]) < LEAST_DELAY_S
-    usual = int(np.argmax(np.where(found.known, (apart & found.known).sum(axis=1), 0)))
+    together = np.abs(found.delay_s[:, None] - found.delay_s[None, :]) < LEAST_DELAY_S
+    usual = int(np.argmax(np.where(found.known, (together & found.known).sum(axis=1), 0)))
     advice = (
         f"'calibrate' estimates delays up to {1e3 * MAX_DELAY_S:.0f} ms and takes them out by itself; 'kirchhoff' and "
         f"the node's watch do not, so correct the time stamps if the logger made the delay"
@@ -240,7 +240,7 @@ def mean_of_sum(junction: RecordedJunction) -> Findings:
 
 
 def stuck(junction: RecordedJunction) -> Findings:
-    """Report the longest stretch in which a branch holds its value though the others move."""
+    """Report for each branch the longest stretch, if any, in which it holds its value though the others move."""
     scale_a, longest = junction.database.layout.full_scale_a, dict[str, Finding]()
     for currents_a in (comparison.stages["before"] for comparison in junction.comparisons):
         for name in junction.branches:
@@ -264,4 +264,4 @@ def stuck(junction: RecordedJunction) -> Findings:
 
 CHECKS: Sequence[Callable[[RecordedJunction], Findings]] = (enough, exchanged, mean_of_sum, stuck)
 CHECKS_OF_MOVING = (signs_and_units, sum_cancels, cannot_tell, delays, gains)
-"""Checks that are of use only if currents move long enough."""
+"""Checks that need currents that move for long enough, beside :data:`CHECKS`, which are always made."""

@@ -24,8 +24,8 @@ from ecu_node.layout import Layout
 __all__ = ["RecordedJunction", "look_at_junction"]
 
 CHANGE_PRICE, UNIT_PRICE = 0.7, 0.3
-"""Price of each changed branch: it must halve V / N, so the branch must vary more than what is left of the sum. The
-second is the price of a wrong unit beyond that of a wrong sign: where both explain the same, the sign is wrong. [1]"""
+"""Prices are added to log (V / N), see :mod:`calibrator.kirchhoff.signs`. Price of each changed branch: the change must
+halve V / N. The second is added for a wrong unit: where sign or unit explain the same, the sign is wrong. [1]"""
 PLAUSIBLE_PRICE = 2.0
 """Price of each branch whose current would be beyond full scale, and of currents that would all be near zero. [1]"""
 ORIENTATION_PRICE = 1.5
@@ -64,13 +64,13 @@ class RecordedJunction:
     drives : tuple of Drive
         Drives with all of these branches.
     comparisons : tuple of Comparison
-        Currents of each of these drives on one time base; none with fewer than two branches.
+        Currents of each of these drives on one time base; empty with fewer than two branches.
     steps_a : ndarray of shape (K,)
         Step of the signal of each branch, at most the share :data:`COARSEST` of full scale. [A]
     bands : Bands
-        Comparable currents with signs and units of the layout, without delays; no instant if too little was recorded.
+        Filtered currents with signs and units of the layout, delays taken out; no instant if too little was recorded.
     multipliers : ndarray of shape (K,)
-        Factors +-10^n of the branches with which the sum varies least; 1 where nothing is wrong. [1]
+        Likely factors +-10^n by which the branches must be multiplied; 1 where sign and unit are right. [1]
     delays : BranchDelays or None
         Delays found with these signs and units; None if too little was recorded.
     """
@@ -86,12 +86,12 @@ class RecordedJunction:
 
     @property
     def rms_a(self) -> Array:
-        """Root mean square variation of each branch with the layout's sign and unit, shape (K,). [A]"""
+        """Root mean square of each branch's filtered current, with the layout's sign and unit, shape (K,). [A]"""
         return np.asarray(np.sqrt(np.mean(self.bands.current_a**2, axis=0)))
 
     @property
     def changed(self) -> list[int]:
-        """Numbers of the branches whose sign or unit in the layout is wrong."""
+        """Positions in ``branches`` of those whose sign or unit in the layout is wrong."""
         return [int(k) for k in np.flatnonzero(self.multipliers != 1.0)]
 
     def is_small(self, name: str) -> bool:
@@ -101,12 +101,12 @@ class RecordedJunction:
 
     @cached_property
     def currents_a(self) -> list[Array]:
-        """Branches and their sum at the valid instants, shape (T, K + 1) for each drive. [A]"""
+        """For each drive the currents of the branches, then their sum, at the valid instants, shape (T, K + 1). [A]"""
         return [comparison.stages["before"].dropna().to_numpy() for comparison in self.comparisons]
 
     @property
     def sum_a(self) -> Array:
-        """Sum of the branches at all valid instants. [A]"""
+        """Sum of the branches at all valid instants of all drives, one after the other, shape (T,). [A]"""
         return np.concatenate([np.zeros(0), *(part[:, -1] for part in self.currents_a)])
 
     @property
@@ -121,7 +121,7 @@ class RecordedJunction:
 
     @cached_property
     def moves_a(self) -> Array:
-        """Standard deviation of each branch, noise averaged out; empty where too little was recorded to tell. [A]"""
+        """Standard deviation of each branch's 2 s averages, shape (K,); empty if too little was recorded. [A]"""
         length = max(round(AVERAGED_S / self.database.layout.period_s), 1)
         whole = [part[: len(part) // length * length, :-1] for part in self.currents_a]
         means = [part.reshape(-1, length, part.shape[1]).mean(axis=1) for part in whole]
@@ -129,12 +129,12 @@ class RecordedJunction:
 
     @property
     def mean_a(self) -> float:
-        """Mean current of each branch in each drive: the greatest magnitude of them all. [A]"""
+        """Greatest magnitude that the mean current of any branch has in any drive. [A]"""
         return float(max((np.abs(part[:, :-1].mean(axis=0)).max() for part in self.currents_a), default=0.0))
 
     @cached_property
     def speed(self) -> float | None:
-        """Greatest speed [in its unit], 0 for none; None where it is not recorded."""
+        """Greatest recorded speed, in its own unit; 0 if below :data:`STILL_SPEED`; None if no speed is recorded."""
         inputs = [
             item.name
             for item in self.database.layout.input
@@ -146,7 +146,7 @@ class RecordedJunction:
 
     @cached_property
     def stands_still(self) -> bool:
-        """Whether no current varies by more than its sensor resolves; False if the car moves or the data are few."""
+        """Whether no current moves by more than the ``STILL_`` limits; False if the car moves or the data are few."""
         if self.speed or not len(self.moves_a):
             return False
         least_a = min(STILL_A, STILL_SHARE * self.database.layout.full_scale_a)
@@ -161,12 +161,12 @@ class RecordedJunction:
 def look_at_junction(
     drives: Sequence[Drive], database: VehicleDatabase, *, full_scale_a: float | None = None
 ) -> RecordedJunction:
-    """Look at the sum of the branches that have usable values in some drives of one vehicle.
+    """Find out what the sum of a vehicle's currents shows: signs, units and delays of its branches.
 
     Parameters
     ----------
     drives : sequence of Drive
-        Drives of one vehicle; a drive that lacks a branch of the others does not count.
+        Drives of one vehicle; a drive that lacks a branch that another one has does not count.
     database : VehicleDatabase
         DBC and layout with the voltages, see :func:`.with_voltages`.
     full_scale_a : float, optional
@@ -219,7 +219,7 @@ def _multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
 
 
 def _multipliers(bands: Bands, price: Callable[[Array], float], least_a: float) -> Array:
-    """Return likely multipliers of the branches; all are 1 if the sum varies by no more than quantisation explains."""
+    """Return likely multipliers, shape (K,); all 1 if the sum varies by no more than least_a, by quantisation."""
     ones = np.ones(bands.current_a.shape[1])
     return ones if bands.rms_a(ones) <= least_a else likely_multipliers(bands, price)
 
@@ -227,7 +227,7 @@ def _multipliers(bands: Bands, price: Callable[[Array], float], least_a: float) 
 def _price(
     drives: Sequence[Drive], names: Sequence[str], layout: Layout, full_scale_a: float
 ) -> Callable[[Array], float]:
-    """Return the function that gives multipliers a price for changes, implausible currents and the battery's sign."""
+    """Return the function from multipliers (K,) to their price: for changes, implausible currents, battery's sign."""
     peak_share = (
         np.array([np.quantile(np.abs(good_values(drives, name)), PEAK_QUANTILE) for name in names]) / full_scale_a
     )

@@ -44,19 +44,19 @@ WELL_CORRELATED = 0.5
 
 
 class Bands(NamedTuple):
-    """Comparable currents of K branches [A], shape (T, K), positive into the junction, and each instant's block."""
+    """Filtered currents of K branches [A], (T, K), positive into the junction; number of each instant's block, (T,)."""
 
     current_a: Array
     block: NDArray[np.intp]
 
     @property
     def moments(self) -> Array:
-        """Second moments of each of B >= 1 blocks, shape (B, K, K). [A^2]"""
+        """Sums of the products of the currents in each of B >= 1 blocks, shape (B, K, K). [A^2]"""
         parts = [self.current_a[self.block == b] for b in range(int(self.block.max(initial=0)) + 1)]
         return np.stack([part.T @ part for part in parts])
 
     def rms_a(self, multipliers: Array) -> float:
-        """Root mean square of the sum with each branch multiplied by a number. [A]"""
+        """Return the root mean square of the sum of the branches times multipliers (K,); 0 without instants. [A]"""
         total = self.current_a @ multipliers
         return float(np.sqrt(np.mean(total**2))) if len(total) else 0.0
 
@@ -84,14 +84,14 @@ def bands_of(recordings: Sequence[Sequence[Channel]]) -> Bands:
 def likely_multipliers(
     bands: Bands, price_besides: Callable[[Array], float], *, factors: Sequence[float] = FACTORS, sure: bool = True
 ) -> Array:
-    """Return the multipliers, shape (K,), of the least price, which is log (V / N) and the price of other objections.
+    """Return the multipliers, shape (K,), of the least price: log (V / N) plus the price of other objections.
 
     Parameters
     ----------
     bands : Bands
         Bands of the K currents.
     price_besides : callable
-        Returns the price of all other objections to multipliers of shape (K,). [1]
+        From multipliers (K,) to the price of all other objections to them. [1]
     factors : sequence of float
         Magnitudes that are tried, for one branch or two at a time. [1]
     sure : bool
@@ -119,7 +119,7 @@ def likely_multipliers(
 
 
 def _ratios(moments: Array, multipliers: Array) -> Array:
-    """Return V / N of each block, at least :data:`LEAST_RATIO`."""
+    """Return V / N of each block for multipliers (K,), at least :data:`LEAST_RATIO`, shape (B,)."""
     power = np.einsum("bkk,k->b", moments, multipliers**2)
     values = np.einsum("bij,i,j->b", moments, multipliers, multipliers)
     return np.asarray(np.maximum(np.divide(values, power, out=np.ones(len(moments)), where=power > 0.0), LEAST_RATIO))
@@ -137,6 +137,6 @@ def _neighbours(multipliers: Array, factors: Sequence[float]) -> Iterator[Array]
 
 
 def sag(pairs: Sequence[tuple[Channel, Channel]]) -> float:
-    """Return the correlation of a battery's currents and voltages [1]: -1 if these fall under load; 0 if unknown."""
+    """Return the correlation of a battery's currents and voltages: -1 if these fall under load, 0 if unknown. [1]"""
     band = bands_of(pairs).current_a
     return float(np.corrcoef(band[:, 0], band[:, 1])[0, 1]) if len(band) and np.all(band.std(axis=0) > 0.0) else 0.0

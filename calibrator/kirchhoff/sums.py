@@ -67,7 +67,7 @@ class Comparison:
     uncorrected : tuple of str
         Branches that are not corrected, and enter the corrected sum with measured values; empty without such a sum.
     masked : mapping of str to int
-        Number of instants that are not valid, by reason.
+        Number of instants that are not valid, by reason; one may have several.
     stages : mapping of str to DataFrame of shape (T, K + 1)
         ``before`` and, if something is corrected, ``after``: a column per branch and :data:`SUM`, positive into the
         junction, by the instant [s]; NaN where not valid. [A]
@@ -124,7 +124,7 @@ class Comparison:
 
     @property
     def in_band(self) -> dict[str, float]:
-        """Share of the valid instants at which the sum lies within :data:`BAND` of what is expected. [1]"""
+        """By stage, the share of the valid instants at which the sum is within :data:`BAND` of what is expected. [1]"""
         far_a = (BAND * self.expected_sd_a + 1e-9 * self.full_scale_a)[self.valid]  # rounding
         sums_a = {stage: frame[SUM].to_numpy()[self.valid] for stage, frame in self.stages.items()}
         return {stage: float(np.mean(np.abs(sum_a - self.expected_a) <= far_a)) for stage, sum_a in sums_a.items()}
@@ -141,7 +141,7 @@ class Comparison:
         return [text for text, is_said in texts.items() if is_said]
 
     def as_json(self) -> dict[str, object]:
-        """Everything but the samples, with figures in A and in percent of full scale."""
+        """Return everything but the samples, with figures in A and in percent of full scale."""
         found: dict[str, Any] = dict.fromkeys(("before", "after", "change"))
         for stage, table in self.figures.items():
             percent = (table * (100.0 / self.full_scale_a)).rename(columns=lambda key: f"{key[:-2]}_percent")
@@ -209,7 +209,7 @@ def compare_kirchhoff(
     corrected: Mapping[str, Channel] | None = None,
     parameters: VehicleParameters | None = None,
 ) -> Comparison:
-    """Put measured and corrected currents of a recording on one time base, no finer than its frames.
+    """Return measured and corrected currents of a recording on one time base, no finer than its frames.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def compare_kirchhoff(
     database : VehicleDatabase
         DBC and layout: period, limits, full scale, declared load, steps of the signals.
     corrected : mapping of str to Channel or None
-        Corrected currents that were found beside the measured ones, positive into the junction. [A]
+        Corrected currents in the same recording, by branch, positive into the junction. [A]
     parameters : VehicleParameters or None
         Corrections to apply here instead, i = (i_m - offset) / (1 + drift), as the node would.
 
@@ -279,7 +279,7 @@ def compare_kirchhoff(
 def _explained(
     frames: Mapping[str, pd.DataFrame], valid: Mask, database: VehicleDatabase, drive: Drive, expected_a: float
 ) -> tuple[Array, dict[str, float], dict[str, dict[str, Any] | None]]:
-    """Return the expected standard deviation of the sum (formula at the top), its parts, and the shares in the sum."""
+    """Return ``expected_sd_a``, ``parts_a`` and ``residual`` of a :class:`Comparison`."""
     time_s, measured_a = frames["before"].index.to_numpy(), frames["before"].to_numpy()
     channels = {name: drive.branches[name] for name in frames["before"]}
     good_s = [channel.time_s[channel.good] for channel in channels.values()]
@@ -323,7 +323,7 @@ def _together(good_s: Sequence[Array], time_s: Array) -> Mask:
 def _shares(
     currents_a: pd.DataFrame, slope: Array, noise_a: Array, mean_a: float
 ) -> tuple[dict[str, Any] | None, Array, Array]:
-    """Return shares in the sum, delays relative to the branch that moves most, shape (K,) [s], and the residual [A].
+    """Return shares in the sum, delays relative to the branch that moves most (K,) [s], and the unexplained rest [A].
 
     The sum holds the noise of each branch, too: its variance is taken out of both sides of the regression on the gains.
     The branch that moves most is left out of the regressions, since an error of its gain cannot be told from the same
@@ -357,6 +357,6 @@ def _shares(
 
 
 def _gone(before: Array, after: Array) -> float:
-    """Return the share of a signal's power that was removed."""
+    """Return the share of a signal's power that is gone after a part of it was subtracted. [1]"""
     power = float(before @ before)
     return max(1.0 - float(after @ after) / power, 0.0) if power > 0.0 else 0.0
