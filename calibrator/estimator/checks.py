@@ -662,7 +662,10 @@ class _Vehicle(NamedTuple):
         return _finding(name, cause, probability, f"{_who(name)}: {text}; {this_makes}")
 
     def of_spikes(self) -> list[SensorFinding]:
-        """Report sensors with many spikes."""
+        """Report sensors with more spikes than is usual in the fleet: samples at which one alone leaps and returns.
+
+        The cause is ``spikes`` if nearly all go to one side, else ``outliers``, or ``noise`` if there are very many.
+        """
         found, n, usual = [], self.misfits.samples[self.j], self.usual.spike_rate
         for name, (up, down) in zip(self.branches, self.misfits.spikes[self.j], strict=True):
             if (rate := float(up + down)) <= usual:

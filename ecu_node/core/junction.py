@@ -234,7 +234,10 @@ class LiveBranch(HeardSignal):
         return self.quality is not Quality.CORRECTED or no_value or self._voltage_code(now_s) is None
 
     def _voltage_code(self, time_s: float) -> int | None:
-        """Return the code of its voltage at a time, None if that is not known; 0 if the plan needs no voltage."""
+        """Return the raw code of the branch's voltage in its last frame up to a time of frames, not interpolated.
+
+        None if there is no such frame, it is too old, or its code is no value; 0 if the plan needs no voltage.
+        """
         return self.voltage.code_at(time_s) if self.voltage is not None and self.plan.needs_voltage else 0
 
     def ordinary_codes(self) -> tuple[int, int]:

@@ -203,7 +203,7 @@ def test_named_codes_at_an_end_of_the_range_are_accepted_and_never_written() -> 
 TEMPERATURE = Signal("T", start=0, length=8, unit="degC", conversion=BaseConversion.factory(scale=0.5, offset=-40.0))
 
 
-def test_signal_keeps_its_unit_if_no_unit_is_wanted() -> None:
+def test_codes_are_read_in_the_unit_of_the_dbc_if_no_conversion_is_asked_for() -> None:
     codes = read_codes(TEMPERATURE, None, "test")
     assert (codes.scale, codes.offset) == (HALF, Fraction(-40))
 

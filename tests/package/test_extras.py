@@ -115,7 +115,7 @@ def test_mf4_logs_are_read(installed: Installed, car: Path, drive: Path, tmp_pat
     assert json.loads(json_output)["branches"] == ["battery", "motor"]
 
 
-def test_bench_compares_with_its_peer(installed: Installed, unpacked: Path) -> None:
+def test_extra_bench_suffices_to_compare_the_posterior_with_basis_pursuit(installed: Installed, unpacked: Path) -> None:
     command = ("-m", "bench", "posterior", "--quick")
     done = installed("bench").run("python", *command, folder=unpacked / "tools")
     assert done.returncode == 0, done.stderr

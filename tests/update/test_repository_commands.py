@@ -224,7 +224,7 @@ def test_full_disk_does_not_change_what_vehicles_receive(repo: Repo, new: Path, 
     assert repo.updated(new).startswith("nothing new: ")
 
 
-def test_root_that_expires_before_the_timestamp_is_reported(repo: Repo) -> None:
+def test_status_gives_the_expiry_of_a_root_that_expires_before_the_timestamp_role(repo: Repo) -> None:
     def expire_soon(root: Root) -> None:
         root.expires = datetime.now(UTC).replace(microsecond=0) + timedelta(days=3)
 

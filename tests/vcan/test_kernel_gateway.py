@@ -238,7 +238,7 @@ def test_foreign_branch_frames_are_reported_and_dropped(
     )
 
 
-def test_gateway_with_a_blocked_log_forwards_frames_and_can_be_ended(
+def test_gateway_whose_standard_error_nobody_reads_forwards_frames_and_can_be_ended(
     database: VehicleDatabase, params: Path, drive: Path, recording: Recording, other_recording: Recording
 ) -> None:
     read, write = os.pipe()

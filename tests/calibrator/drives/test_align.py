@@ -1,3 +1,5 @@
+"""Alignment of channels to one time base, labels of bad samples, and the choice of inputs."""
+
 import msgspec
 import numpy as np
 import pytest

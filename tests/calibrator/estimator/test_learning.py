@@ -103,7 +103,7 @@ def test_gain_error_shared_in_one_branch_is_not_given_to_a_branch_of_uncertain_g
     assert shared_by(learn_fault_models(rows, feed=0)).keys() == {(4,)}
 
 
-def test_gain_ratios_that_deviate_unequally_are_no_shared_gain_error() -> None:
+def test_gain_ratios_off_by_another_amount_in_each_vehicle_are_no_shared_gain_error() -> None:
     """As where the signal of one branch is a mean over a second: how far a ratio is off depends on the drive."""
     rows = rows_of(no_faults(16, 3), seed=8)
     by = np.zeros((16, 15))

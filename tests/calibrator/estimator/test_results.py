@@ -50,7 +50,7 @@ def test_parameters_are_found_in_results_of_few_and_of_many_vehicles(result: Pat
 
 
 @pytest.mark.parametrize("name", ["v3", "../params/v1", ""])
-def test_unknown_vehicle_is_named(result: Path, name: str) -> None:
+def test_error_for_a_vehicle_that_the_result_lacks_gives_its_name(result: Path, name: str) -> None:
     with pytest.raises(FleetError, match=rf"no vehicle '{name}' in it; results\.parquet names all that are"):
         results.written_of(result, name)
 

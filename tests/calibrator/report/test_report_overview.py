@@ -155,7 +155,7 @@ def test_common_margin_is_set_by_the_worst_uncorrected_sensor(margin: Margin) ->
     assert f"Not corrected, these keep it large: V2 ({9.0 + DOUBT_A:.1f} A)." in text
 
 
-def test_unknown_sensor_is_excluded_from_the_margin_and_reported(margin: Margin) -> None:
+def test_sensor_of_undetermined_error_is_left_out_of_the_protection_margin_and_counted(margin: Margin) -> None:
     lost = sensor(0.3, 50.0, sd=0.2)
     found, text = margin(lost, sensor(0.1, 4.0), sensor())
     assert (found["vehicles"], found["not_known"]) == (2, 1)
