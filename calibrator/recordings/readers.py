@@ -61,7 +61,7 @@ class RecordingReport:
     ignored : mapping of str to int
         Number of frames from buses that the layout does not mean, by channel.
     found : str
-        What was detected about a table, see :attr:`.Table.found`; empty for logs.
+        What was detected about a table, ``found`` of :class:`.Table`; empty for logs.
     unfit : tuple of str
         (What the recording lacks, what to do about it), each a text: it lacks the channel of a ``[[bus]]``, or numbers
         in the column of a branch. Empty if nothing is lacking.

@@ -1,7 +1,7 @@
 """Read tables of measured values: CSV and other text, Parquet, Feather, decoded MF4. One column is the time.
 
 The user need not describe a file: delimiter, decimal sign, encoding, header, units and the time column are detected,
-and :attr:`Table.found` says what was detected. Rows need not have a value in every column.
+and ``Table.found`` says what was detected. Rows need not have a value in every column.
 """
 
 import csv
