@@ -1,6 +1,6 @@
 """Put the channels of a drive on one time base.
 
-The rule: The instants are whole multiples of the layout's period, over the span that every needed channel covers with
+The rule: the instants are whole multiples of the layout's period, over the span that every needed channel covers with
 good samples. At each instant a channel's value is interpolated linearly between its last good sample at or before and
 its next good sample at or after the instant; nothing is extrapolated. The value is valid if those two samples are not
 farther apart than the channel's limit (time-out of a branch, ``max_age_s`` of an input), or if one lies at the instant
@@ -38,8 +38,8 @@ MAX_SAMPLES = 20_000_000
 SLOWER = 1.5
 """If even the fastest branch's frames are this many periods or more apart, the period becomes their distance. [1]"""
 LEVELS, FEW_LEVELS, LOOKED_AT = 10, 4, 2000
-"""In :func:`step_of`: fewest different values whose least distance is taken for the step; fewest if all are whole steps
-apart, as a heater may only be on or off; most samples that are looked at. [1]"""
+"""In :func:`step_seen`: fewest different values whose least distance is taken for the step; fewest if all are whole
+steps apart, as a heater may only be on or off; most samples that are looked at. [1]"""
 _STALE, _NOT_GOOD = "stale", "not good"
 
 
