@@ -90,7 +90,8 @@ fuzz: setup              ## 10^7 random frames through node and C core, 10^6 cha
 		tests/ecu_node/test_random_vehicles.py tests/calibrator/export/test_c_core.py
 	PYTHONPATH=tools $(BIN)/python -m bench.c_core fuzz --seconds 3600
 
-release-check: coverage bench experiments fuzz mutants package ## all that is measured for a release, on one commit (hours)
+release-check: coverage check-long experiments bench package ## the bars of a release on one commit, met or not (two hours)
+	PYTHONPATH=tools $(BIN)/python -m bench.bars
 
 mutants: setup           ## change the code in small ways and see that tests notice (an hour; goes on where it stopped)
 	unshare --map-current-user --pid --fork --kill-child --mount-proc $(BIN)/mutmut run --max-children 2

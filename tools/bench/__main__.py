@@ -13,7 +13,9 @@ import typer
 
 from bench.row import Row, show
 
-Group = Literal["posterior", "ingest", "fleet_run", "node", "fleet_report", "on_board", "cluster"]
+Group = Literal[
+    "posterior", "ingest", "fleet_run", "node", "fleet_report", "on_board", "repository", "trust_chain", "cluster"
+]
 """Modules of this folder with a function ``rows``."""
 OUT = Path("build") / "bench.json"
 

@@ -10,13 +10,14 @@ import resource
 import tempfile
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import typer
-from msgspec.structs import replace
+from msgspec import structs
 from securesystemslib.signer import SSlibKey
 from tuf.api.metadata import SuccinctRoles
 
@@ -51,8 +52,8 @@ def write_parameters(database: VehicleDatabase, folder: Path, vehicles: Iterable
         drift=drift, offset_a=1.5, drift_sd=0.001, offset_sd_a=0.1, apply=True, delay_s=0.01, delay_sd_s=0.001
     )
     found = true_parameters(database, dict.fromkeys(database.layout.branch_names, branch))
-    drives = replace(found.provenance, drives=[f"drive-{number:04d}.blf" for number in range(20)])
-    content = encode_parameters(replace(found, vehicle="VEHICLE", provenance=drives), "bench")
+    drives = structs.replace(found.provenance, drives=[f"drive-{number:04d}.blf" for number in range(20)])
+    content = encode_parameters(structs.replace(found, vehicle="VEHICLE", provenance=drives), "bench")
     folder.mkdir(exist_ok=True)
     for number in vehicles:
         (folder / f"{number:07d}.json").write_bytes(content.replace(b"VEHICLE", b"V%07d" % number))
@@ -103,6 +104,14 @@ def verify_times_s(state: Path, bundle: Path, database: VehicleDatabase) -> tupl
             update(state, str(bundle), database, datetime.now(UTC), dry_run=True)
             times_s.append((time.process_time() - start_s, sum(signatures_s)))
     return min(times_s)
+
+
+def rows(*, quick: bool) -> list[Row]:
+    """Measure the update of one of 10^6 vehicles, or of 10^4 in a quick run."""
+    vehicles = 10_000 if quick else 1_000_000
+    with tempfile.TemporaryDirectory(prefix="repository-") as folder:
+        found = measured(Path(folder), one_bin(vehicles))
+    return [replace(row, name=f"update of one of {vehicles:,}: {row.name}") for row in found[-3:]]
 
 
 def main(*, vehicles: int = 10_000, sampled: bool = False) -> None:

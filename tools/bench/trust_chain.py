@@ -25,7 +25,7 @@ from msgspec.structs import replace
 
 from bench.fleets import calibrator
 from bench.published import Publisher
-from bench.row import LAYOUT
+from bench.row import LAYOUT, Row
 from calibrator.fleet_truth import VehicleTruth, read_truth
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.recordings.log_formats import read_frames
@@ -59,8 +59,8 @@ def main(
     unseen_minutes: float = 10.0,
     seed: int = 0,
     workers: int = 2,
-) -> None:
-    """Drive a fleet through the whole chain, and count what became of its vehicles.
+) -> dict[str, float]:
+    """Drive a fleet through the whole chain, and count what became of its vehicles; the counts are printed, too.
 
     Options are those of calibrator simulate: mean and standard deviation of the load without a sensor [A], least length
     [min] of the trips to learn from and of the unseen trips, on which the trial is made.
@@ -85,7 +85,19 @@ def main(
         pairs = zip(names, [*names[1:], names[0]], strict=True)
         driven = run_many(partial(drive, folder, layout), pairs, Workers(processes=workers))
         outcomes = pd.DataFrame(shown(driven, "drive, corrected", len(names), "vehicles"))
-    print(json.dumps(score(outcomes), indent=2))
+    found = score(outcomes)
+    print(json.dumps(found, indent=2))
+    return found
+
+
+def rows(*, quick: bool) -> list[Row]:
+    """Drive 100 vehicles through the chain, or few in a quick run."""
+    found = main(vehicles=12 if quick else 100)
+    share = found["deployed"] / max(found["with_corrections"], 1)
+    return [
+        Row(name="trial: share of corrections in force", value=share, unit="1"),
+        Row(name="trial: corrected vehicles made worse", value=found["made_worse"], unit="1"),
+    ]
 
 
 def score(outcomes: pd.DataFrame) -> dict[str, float]:

@@ -1,0 +1,50 @@
+"""The bars of a release are compared with what experiments and benchmarks have left."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bench import bars
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def bench_rows(folder: Path, **ratios: float) -> Path:
+    """Write the rows of benchmarks, each with a ratio."""
+    path = folder / "bench.json"
+    rows = [{"name": f"{name} log to drive", "value": 1.0, "ratio": ratio} for name, ratio in ratios.items()]
+    path.write_text(json.dumps(rows))
+    return path
+
+
+def test_bars_of_the_recorded_experiments_are_met_or_known_to_be_missed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):  # nothing was measured but one reader
+        bars.main(bench=bench_rows(tmp_path, BLF=30.0), results=DOCS / "results")
+    lines = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("bench")]
+    assert len(lines) > 30
+    assert not [line for line in lines if "nan" in line or ("MISSED" in line and "MISSED (" not in line)]
+
+
+@pytest.mark.parametrize(("ratio", "verdict"), [(25.0, "met"), (24.9, "MISSED")])
+def test_benchmark_that_misses_its_bar_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], ratio: float, verdict: str
+) -> None:
+    with pytest.raises(SystemExit, match="bars are missed"):
+        bars.main(bench=bench_rows(tmp_path, BLF=ratio), results=DOCS / "results")
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "BLF log" in line)
+    assert line.split()[-1] == verdict
+
+
+def test_shares_of_several_rows_are_pooled_by_their_cases(tmp_path: Path) -> None:
+    rows = [("K=2", 0.5, 10), ("K=3", 0.0, 30), ("other", 1.0, 99)]
+    figures = [
+        {"series": series, "x": 80.0, "method": "posterior", "figure": "harmed", "value": value, "of": of}
+        for series, value, of in rows
+    ]
+    (tmp_path / "real.json").write_text(json.dumps({"figures": figures}))
+    value, behind = bars.Bars(tmp_path / "bench.json", tmp_path).figure("real", "K=.*", "harmed")
+    assert value == 5 / 40
+    assert behind.startswith("5 of 40, ")

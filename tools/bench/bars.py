@@ -1,0 +1,82 @@
+"""The bars of a release (``bars.toml``) beside the figures that experiments and benchmarks left.
+
+    python -m bench.bars        (in tools/, after experiments and benchmarks)
+
+Fails if a bar is missed that is not known to be, or has no figure.
+"""
+
+import json
+import operator
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import typer
+from scipy.stats import binomtest
+
+__all__ = ["Bars", "main"]
+
+ROOT = Path(__file__).parents[2]
+COMPARISONS = {"<=": operator.le, ">=": operator.ge}
+
+
+class Bars:
+    """Looks up the figures that bars are about.
+
+    Parameters
+    ----------
+    bench : Path
+        Rows of the benchmarks, ``build/bench.json``.
+    results : Path
+        Folder of the results of experiments, ``docs/results``.
+    """
+
+    def __init__(self, bench: Path, results: Path) -> None:
+        self.bench, self.results = bench, results
+
+    def figure(self, where: str, rows: str, figure: str) -> tuple[float, str]:
+        """Return a figure, NaN if nothing was measured, and what is behind it: number of cases and 95 % interval."""
+        if where == "bench":
+            measured = pd.DataFrame(json.loads(self.bench.read_text()))
+            found = measured.loc[measured["name"].str.fullmatch(rows), figure]
+            return (float(found.iloc[-1]) if len(found) else np.nan), ""
+        table = pd.DataFrame(json.loads((self.results / f"{where}.json").read_text())["figures"])
+        table["row"] = table["series"] + ", " + table["x"].map("{:g}".format)
+        table = table[table["row"].str.fullmatch(rows)]
+        values, cases = (
+            table.pivot_table(index="row", columns=["method", "figure"], values=of) for of in ("value", "of")
+        )
+        if values.empty:
+            return np.nan, ""
+        value, of = values["posterior"], cases["posterior"]
+        if figure == "below_prior_known":
+            return float((values["posterior/prior known"] - value)["recovery_rate"].max()), ""
+        if figure == "ece_beyond_chance":
+            return float((value["ece"] - value["ece_by_chance"]).max()), ""
+        if figure == "of_expected":
+            wrong, expected = (
+                float((share * of["sure_wrong"]).sum()) for share in (value["sure_wrong"], 1 - value["sure_confidence"])
+            )
+            return wrong / expected, f"{wrong:.0f}, {expected:.1f} expected"
+        count, number = round(float((value[figure] * of[figure]).sum())), int(of[figure].sum())
+        interval = binomtest(count, number).proportion_ci()
+        return count / number, f"{count} of {number}, {interval.low:.4f} to {interval.high:.4f}"
+
+
+def main(*, bench: Path = ROOT / "build/bench.json", results: Path = ROOT / "docs/results") -> None:
+    """Print each bar with its figure, and whether it is met."""
+    bars, missed = Bars(bench, results), 0
+    for where, rows, figure, bar, *reason in tomllib.loads((Path(__file__).parent / "bars.toml").read_text())["bars"]:
+        value, behind = bars.figure(where, rows, figure)
+        sign, limit = bar.split()
+        met = COMPARISONS[sign](value, float(limit))
+        missed += not met and (not reason or np.isnan(value))
+        verdict = "met" if met else f"MISSED ({reason[0]})" if reason else "MISSED"
+        print(f"{where:9} {rows[:48]:48} {figure:17} {bar:8} {value:8.4g}  {verdict:6} {behind}")
+    if missed:
+        raise SystemExit(f"{missed} bars are missed that were met before, or have no figure")
+
+
+if __name__ == "__main__":
+    typer.run(main)
