@@ -50,7 +50,22 @@ MISTAKES = [
     ("ecu-node check", 2, "; see 'ecu-node check --help'"),
     ("ecu-node run --nonsense", 2, "; see 'ecu-node run --help'"),
     ("ecu-node run LAYOUT", 2, "required: --channel; see 'ecu-node run --help'"),
-    ("ecu-node run LAYOUT --channel c --params v1.json", 2, "--params names a file that nobody signed"),
+    ("ecu-node run LAYOUT --channel c --params v1.json", 2, "--params names a file that nobody signed: give --state"),
+    (
+        "ecu-node run LAYOUT --channel c --state s --unsigned",
+        2,
+        "--state holds signed parameters; leave --unsigned",
+    ),
+    ("ecu-node run LAYOUT --channel c UNSIGNED --gateway c", 2, "c is the bus of the sensors itself; two"),
+    ("ecu-node run LAYOUT --channel c UNSIGNED --gateway d --listen-only", 2, "a gateway must pass frames on"),
+    ("ecu-node run LAYOUT --channel c UNSIGNED --telemetry udp://h", 2, "is expected, found 'udp://h'"),
+    ("ecu-node run LAYOUT --channel c UNSIGNED --telemetry udp://:5000", 2, "is expected, found 'udp://:5000"),
+    ("ecu-node run LAYOUT --channel c UNSIGNED --telemetry mqtt://h:1", 2, "is expected, found 'mqtt://h:1'"),
+    ("ecu-node run LAYOUT --channel c UNSIGNED --telemetry=", 2, "is expected, found none"),
+    ("ecu-node monitor LAYOUT --channel c --json", 2, "--json needs --once SECONDS"),
+    (f"ecu-node template LAYOUT --vehicle {'v' * 65}", 2, "of at most 64 characters, found 65 characters"),
+    ("ecu-node template LAYOUT --vehicle \a", 2, r"printable and of at most 64 characters, found '\x07'"),
+    ("ecu-node template LAYOUT --vehicle=", 2, "--vehicle: the identity of the vehicle is expected"),
     # places for results
     ("calibrator simulate --vehicles 2 LAYOUT --out empty/x", 1, "/empty is a file; choose another folder"),
     ("calibrator calibrate none LAYOUT --out empty/x", 1, "/empty is a file; choose another folder"),
@@ -125,9 +140,9 @@ MISTAKES = [
     ("ecu-node provision --vehicle v1 --root cut.json --state s", 1, "cut.json: 1.root.json of 'calibrator repository"),
     ("ecu-node update v1.json --state none LAYOUT", 1, "none: cannot be used as state: No such file or"),
     ("ecu-node inspect --state none", 1, "none: no state of a vehicle there; make one with 'ecu-node provision'"),
-    ("ecu-node run LAYOUT --channel c --interface pigeon --params v1.json --unsigned", 1, "pigeon c: cannot open"),
-    ("ecu-node run LAYOUT --channel nobus0 --params v1.json --unsigned", 1, "socketcan nobus0: cannot open the bus: "),
-    ("ecu-node run NONE --channel nobus0 --params v1.json --unsigned", 1, "none.toml: cannot read the layout: No such"),
+    ("ecu-node run LAYOUT --channel c --interface pigeon UNSIGNED", 1, "pigeon c: cannot open"),
+    ("ecu-node run LAYOUT --channel nobus0 UNSIGNED", 1, "socketcan nobus0: cannot open the bus: "),
+    ("ecu-node run NONE --channel nobus0 UNSIGNED", 1, "none.toml: cannot read the layout: No such"),
 ]
 """Command, exit code, and some of the words."""
 
@@ -160,6 +175,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def run(command: str) -> int:
     command = command.replace("CURRENTS", "--branches battery=Ibat,-motor=Imot").replace("CAR", "--layout car.toml")
     command = command.replace("NONE", "--layout none.toml").replace("PUBLISHED", "--method published")
+    command = command.replace("UNSIGNED", "--params v1.json --unsigned")
     words = command.replace("LAYOUT", f"--layout {LAYOUT}").replace("DBC", str(LAYOUT.with_suffix(".dbc"))).split()
     if words[0] == "calibrator":
         return run_app(app, "calibrator", words[1:])

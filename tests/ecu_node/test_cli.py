@@ -1,18 +1,25 @@
-"""The command line: exit codes, one-line messages, and light imports."""
+"""The command line: exit codes, one line for every error, and light imports."""
 
 import json
 import os
+import pickle
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 
-import msgspec
 import pytest
+from msgspec.structs import replace
 
-from ecu_node.cli import run_ecu_node
+from ecu_node import cli
+from ecu_node.cli import run_ecu_node, template_text
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError, UserError
 from ecu_node.parameters import write_parameters
+from ecu_node.program import FAILED, INTERNAL_ERROR, end_of, split_debug
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
 
 
@@ -25,6 +32,9 @@ def params(database: VehicleDatabase, tmp_path: Path) -> Path:
 
 def check(params: Path, *more: str, layout: Path = LAYOUT) -> list[str]:
     return ["check", "--params", str(params), "--layout", str(layout), *more]
+
+
+# ---- what 'check' and 'template' print
 
 
 def test_check_shows_parameters_that_fit_with_their_integer_plan(
@@ -50,74 +60,6 @@ def test_check_shows_parameters_that_fit_with_their_integer_plan(
     assert max(map(len, lines)) <= 80
 
 
-RUN = "run --unsigned --params p --layout l --channel c0"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (f"{RUN} --gateway c0", "c0 is the bus of the sensors itself; two"),
-        (f"{RUN} --gateway c1 --listen-only", "a gateway must pass frames on"),
-        ("run --unsigned --state s --layout l --channel c0", "--state holds signed parameters; leave --unsigned out"),
-        ("run --params p --layout l --channel c0", "--params names a file that nobody signed: give --state"),
-        (f"{RUN} --telemetry udp://h", "is expected, found 'udp://h'"),
-        (f"{RUN} --telemetry udp://:5000", "is expected, found 'udp://:5000"),
-        (f"{RUN} --telemetry mqtt://h:1", "is expected, found 'mqtt://h:1'"),
-        (f"{RUN} --telemetry=", "is expected, found none"),
-        ("monitor --layout l --channel c --json", "--json needs --once SECONDS"),
-        ("monitor --layout l --channel c --once 0", "'0': expected a number of seconds above 0, at most 86400"),
-        (f"template --layout l --vehicle {'v' * 65}", "of at most 64 characters, found 65 characters"),
-        ("template --layout l --vehicle \x07", r"printable and of at most 64 characters, found '\x07'"),
-        ("template --layout l --vehicle=", "--vehicle: the identity of the vehicle is expected"),
-    ],
-)
-def test_wrong_use_prints_one_line_and_exits_with_2(
-    arguments: str, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        run_ecu_node(arguments.split(" "))
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("ecu-node")
-    assert words in line
-
-
-def test_layout_without_signals_for_corrected_currents_needs_a_gateway(
-    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The options of run are those of check."""
-    bare = re.sub(r', (corrected|quality) = "[\w.]+"', "", SMALL_LAYOUT)
-    database = make_database(bare)
-    write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
-    options = check(tmp_path / "v1.json", layout=database.layout.path)
-    assert run_ecu_node(options) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "page 'Layout'" in line
-    assert line.endswith("--gateway CHANNEL")
-    assert run_ecu_node([*options, "--gateway", "can1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
-
-
-def test_check_shows_which_fault_is_not_applied_and_why(
-    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    parameters = msgspec.structs.replace(parameters_for(database, battery=(0.25, 5.0)), vehicle="v\x1b[2J")
-    held = msgspec.structs.replace(parameters.branches["battery"], apply=False)
-    write_parameters(msgspec.structs.replace(parameters, branches={"battery": held}), tmp_path / "v1.json")
-    assert run_ecu_node(check(tmp_path / "v1.json")) == 0
-    text = capsys.readouterr().out
-    assert '+5.000 A  passed through, "apply" is false' in text
-    assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
-
-
-def test_check_warns_that_can_fd_messages_need_the_fd_option(
-    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
-    write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
-    assert run_ecu_node(check(tmp_path / "v1.json", layout=database.layout.path)) == 0
-    assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
-
-
 def test_check_of_unfit_parameters_exits_with_1_and_gives_the_reason(
     params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,15 +72,168 @@ def test_check_of_unfit_parameters_exits_with_1_and_gives_the_reason(
     assert capsys.readouterr().out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
 
 
-@pytest.mark.parametrize("command", ["check", "schema", "--help"])
-def test_closed_output_pipe_causes_no_traceback(params: Path, command: str) -> None:
-    arguments = check(params) if command == "check" else [command]
+def test_layout_without_signals_for_corrected_currents_needs_a_gateway(
+    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The options of run are those of check."""
+    database = make_database(re.sub(r', (corrected|quality) = "[\w.]+"', "", SMALL_LAYOUT))
+    write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
+    options = check(tmp_path / "v1.json", layout=database.layout.path)
+    assert run_ecu_node(options) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "page 'Layout'" in line
+    assert line.endswith("--gateway CHANNEL")
+    assert run_ecu_node([*options, "--gateway", "can1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
+
+
+def test_check_shows_a_fault_that_is_not_applied_and_warns_that_can_fd_needs_its_option(
+    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
+    parameters = parameters_for(database, battery=(0.25, 5.0))
+    held = {"battery": replace(parameters.branches["battery"], apply=False)}
+    write_parameters(replace(parameters, vehicle="v\x1b[2J", branches=held), tmp_path / "v1.json")
+    assert run_ecu_node(check(tmp_path / "v1.json", layout=database.layout.path)) == 0
+    text = capsys.readouterr().out
+    assert '+5.000 A  passed through, "apply" is false' in text
+    assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
+    assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in text
+
+
+@pytest.mark.parametrize(("load", "expected_a"), [("[unmeasured_load]\nmean_a = 6.1\nsd_a = 1.0\n", 6.1), ("", 0.0)])
+def test_template_expects_the_load_that_the_layout_declares(
+    make_database: MakeDatabase, load: str, expected_a: float
+) -> None:
+    database = make_database(f"{SMALL_LAYOUT}{load}")
+    document = json.loads(template_text(database, "v1", datetime(2026, 6, 1, 12, 0, tzinfo=UTC)))
+    assert document["junction_residual"]["expected_a"] == expected_a
+
+
+# ---- errors: one line each, the traceback only with --debug
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (LayoutError("my.toml: a field is wrong"), FAILED, "prog: my.toml: a field is wrong"),
+        (UserError("a name\nwith a line end\x1b[31m"), FAILED, "prog: a name with a line end\\x1b[31m"),
+        (PermissionError(13, "Permission denied", "out/x"), FAILED, "prog: out/x: Permission denied; see that it is "),
+        (MemoryError(), FAILED, "prog: there is not enough memory; give it less at a time"),
+        (TypeError("a\nb"), INTERNAL_ERROR, "prog: internal error: TypeError: a b; run again with --debug and report "),
+    ],
+)
+def test_every_error_is_reported_in_one_line(
+    error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert end_of("prog", error, debug=False) == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(text)
+
+
+def test_trust_error_keeps_its_reason_when_pickled() -> None:
+    found = pickle.loads(pickle.dumps(TrustError(Reason.REVOKED, "number 5 was revoked")))
+    assert (type(found), found.reason, str(found)) == (TrustError, Reason.REVOKED, "number 5 was revoked")
+
+
+def test_internal_error_names_file_and_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("nobody thought of that")
+
+    monkeypatch.setattr(cli, "load_python_can", broken)
+    assert run_ecu_node(["schema"]) == INTERNAL_ERROR
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("ecu-node: internal error: ZeroDivisionError: nobody thought of that (cli.py, line ")
+    assert run_ecu_node(["schema", "--debug"]) == INTERNAL_ERROR
+    assert "in broken" in capsys.readouterr().err
+
+
+def test_debug_option_works_anywhere_before_a_double_dash() -> None:
+    assert split_debug(["run", "--debug", "x"]) == (["run", "x"], True)
+    assert split_debug(["--debug", "run", "--", "--debug"]) == (["run", "--", "--debug"], True)
+    assert split_debug(["run", "--", "--debug"]) == (["run", "--", "--debug"], False)
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def huge(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 40)  # sparse: no disk is filled
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (pipe, "it is a pipe; a file is expected"),
+        (endless, "it is a device; a file is expected"),
+        (Path.mkdir, "it is a folder; a file is expected"),
+        (huge, "it is larger than [0-9]+ bytes"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("role", "said"),
+    [
+        ("small.dbc", "ecu-node: .*small.dbc: cannot read the DBC: "),
+        ("other.toml", "ecu-node: .*other.toml: cannot read the layout: "),
+        ("p.json", r"NOT FIT \(MALFORMED_PARAMETERS\): .*p\.json: not a parameter file: "),
+    ],
+)
+def test_input_that_is_not_a_regular_file_is_reported_in_one_line(
+    tmp_path: Path, make: Callable[[Path], None], words: str, role: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nobody waits for its end."""
+    make(tmp_path / role)
+    (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
+    layout = {"small.dbc": tmp_path / "small.toml", "other.toml": tmp_path / role}.get(role, LAYOUT)
+    assert run_ecu_node(check(tmp_path / "p.json", layout=layout)) == 1
+    printed = "".join(capsys.readouterr())
+    assert re.match(said + words, printed)
+    assert role == "p.json" or printed.count("\n") == 1
+
+
+# ---- as a program
+
+
+def ecu_node(*arguments: str, stdout: int = subprocess.PIPE, **environment: str) -> "subprocess.CompletedProcess[str]":
+    command, settings = [sys.executable, "-m", "ecu_node", *arguments], {**os.environ, **environment}
+    return subprocess.run(
+        command, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=60, check=False, env=settings
+    )
+
+
+MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--channel", "full", "--once", "0.1"]
+COMMANDS = [(check(Path("p")), ""), (["--help"], ""), (["--version"], "1"), (MONITOR, "1")]
+
+
+@pytest.mark.parametrize(("arguments", "unbuffered"), COMMANDS)
+def test_unwritable_output_prints_one_line_and_exits_with_1(arguments: list[str], unbuffered: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = ecu_node(*arguments, stdout=full.fileno(), PYTHONUNBUFFERED=unbuffered)
+    line = "ecu-node: standard output: cannot write the result: No space left on device; give it somewhere else to go\n"
+    assert (done.returncode, done.stderr) == (1, line)
+
+
+@pytest.mark.parametrize("arguments", [check(Path("p")), ["--help"]])
+def test_closed_output_pipe_causes_no_traceback(arguments: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    program = [sys.executable, "-m", "ecu_node", *arguments]
-    with os.fdopen(writing, "w") as closed:
-        done = subprocess.run(program, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    done = ecu_node(*arguments, stdout=writing)
+    os.close(writing)
     assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_names_that_the_terminal_cannot_show_are_escaped() -> None:
+    done = ecu_node(*check(Path("\N{SUN}.json")), PYTHONIOENCODING="ascii")
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.startswith("NOT FIT (NO_PARAMETERS): \\u2609.json: no such parameter file")
 
 
 def test_node_does_not_import_numpy_pandas_or_asammdf(params: Path) -> None:

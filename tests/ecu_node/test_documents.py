@@ -59,5 +59,7 @@ def test_overlay_signals_shown_in_the_layout_document_are_sufficient(
     assert run_ecu_node(["template", *files]) == 0
     (tmp_path / "V1.json").write_text(capsys.readouterr().out)
     assert run_ecu_node(["check", "--params", str(tmp_path / "V1.json"), *files, "--json"]) == 0
-    targets = {name: item["target"] for name, item in json.loads(capsys.readouterr().out)["branches"].items()}
-    assert targets == {"battery": "BMS_1_Corrected.PackCurrentCorrected", "motor": None}
+    report = json.loads(capsys.readouterr().out)
+    shown = {name: (branch["target"], branch["applied"]) for name, branch in report["branches"].items()}
+    assert shown == {"battery": ("BMS_1_Corrected.PackCurrentCorrected", False), "motor": (None, False)}
+    assert (report["vehicle"], report["warnings"]) == ("V1", [])
