@@ -8,15 +8,10 @@ import os
 import pty
 import re
 import select
-import signal
-import socket
 import struct
-import subprocess
-import sys
 import time
 import tty
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +24,7 @@ from ecu_node.bus.adapters import bus_config, carries_fd, connect
 from ecu_node.cli import run_ecu_node
 from ecu_node.errors import BusError
 from ecu_node.parameters import write_parameters
+from tests.ecu_node.processes import ServiceManagerHere, running
 from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
 
 _FD_VALUES = (80_000_000, 2, 63, 16, 16, 2, 15, 4, 4)
@@ -200,28 +196,6 @@ def test_listen_only_reports_whether_the_adapter_acknowledges_frames(
     assert re.search(words, last)
 
 
-@contextmanager
-def running(
-    *options: str, program: Sequence[str] = ("-m", "ecu_node"), until: str = "running on"
-) -> Iterator[list[str]]:
-    """A node in a process of its own, once it reports that it runs; the lines of its log, complete after the block."""
-    command = [sys.executable, *program, *options]
-    environment = {**os.environ, "CAN_CONFIG": os.environ.get("CAN_CONFIG", '{"sleep_after_open": 0}')}
-    log: list[str] = []
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
-        assert process.stderr is not None
-        try:
-            for line in process.stderr:
-                log.append(line)
-                if until in line:
-                    break
-            yield log
-        finally:
-            process.send_signal(signal.SIGTERM)
-            log += process.stderr.readlines()
-            assert process.wait(timeout=30) == 0, log
-
-
 class SerialLine:
     """The far end of a serial line, to which the node's adapter is connected."""
 
@@ -288,15 +262,11 @@ def test_unpublished_and_silent_branches_are_reported(
     node: list[str], line: SerialLine, make_database: MakeDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In its log, and the second one also to the service manager."""
+    manager = ServiceManagerHere(tmp_path / "notify", monkeypatch)
     write_parameters(parameters_for(make_database(), battery=(0.1, 1.0), heater=(0.1, 0.0)), tmp_path / "v1.json")
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        manager.settimeout(60.0)
-        with running(*node, "--interface", "slcan", "--channel", line.path, "--bitrate", "250000") as log:
-            line.put(SLCAN_FRAME)
-            while manager.recv(4096) != b"STATUS=no branch sends":
-                pass
+    with manager.socket, running(*node, "--interface", "slcan", "--channel", line.path, "--bitrate", "250000") as log:
+        line.put(SLCAN_FRAME)
+        manager.wait_for("STATUS=no branch sends")
     assert any("branch heater is not published: the parameters apply a fault to it" in text for text in log)
     assert "ecu-node: no branch sends\n" in log
 

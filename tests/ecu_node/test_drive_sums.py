@@ -16,7 +16,7 @@ from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.summary import SummaryFile, decode_summary, encode_summary, unpacked
-from tests.ecu_node.test_adapters import running
+from tests.ecu_node.processes import running
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, MakeDatabase
 
 OPEN_S, OFFSET_A, HEATER_W, NET_V = 8.0, 5.0, 2000, 400.0

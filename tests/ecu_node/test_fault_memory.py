@@ -12,7 +12,7 @@ from ecu_node.bus.faults import FaultMemory
 from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Reason
 from tests.ecu_node.junctions import Junction, driving, three_branches
-from tests.ecu_node.test_adapters import running
+from tests.ecu_node.processes import running
 from tests.ecu_node.vehicles import LAYOUT, AtOnce
 
 

@@ -20,7 +20,8 @@ from ecu_node.bus.wiring import Mode
 from ecu_node.core.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from tests.ecu_node.test_node import LONGEST_WAIT_S, at_work, battery_frame, receive, wait_until
+from tests.ecu_node.processes import LONGEST_WAIT_S, wait_until
+from tests.ecu_node.test_node import at_work, battery_frame, receive
 from tests.ecu_node.test_socketcan import fields, random_frame
 from tests.ecu_node.vehicles import corrector_for, decoded
 

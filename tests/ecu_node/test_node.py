@@ -21,10 +21,8 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
+from tests.ecu_node.processes import LONGEST_WAIT_S, wait_until
 from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, corrector_for, decoded, protected
-
-LONGEST_WAIT_S = 60.0
-"""A busy machine is slow; nothing here takes this long unless it is broken. [s]"""
 
 
 @contextmanager
@@ -287,13 +285,6 @@ def test_frame_after_a_clock_step_is_not_taken_for_an_old_one(
         age_s = time.monotonic() - corrector.branches[0].time_s
     assert age_s < 0.4
     assert corrector.counters.clock_steps >= 8
-
-
-def wait_until(done: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + LONGEST_WAIT_S
-    while not done():
-        assert time.monotonic() < give_up, "waited in vain"
-        time.sleep(0.002)
 
 
 def test_failed_bus_is_reported_as_open_only_when_it_works_again(peer: can.BusABC, channel: str) -> None:

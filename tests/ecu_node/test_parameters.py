@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import ecu_node
+from ecu_node.bus.wiring import InForce, Mode, choose_parameters, put_in_force, wire
 from ecu_node.core.status import Reason, UnfitError
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError
@@ -32,7 +33,7 @@ from ecu_node.parameters import (
     write_parameters,
 )
 from tests.disk import full_disk
-from tests.ecu_node.vehicles import as_document, parameters_for
+from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, as_document, corrector_for, parameters_for
 
 SCHEMA_FILE = Path(ecu_node.__file__).parent / "parameters.schema.json"
 VALIDATOR = jsonschema.Draft202012Validator(parameter_schema())
@@ -291,3 +292,40 @@ def test_full_disk_keeps_the_previous_parameter_file(database: VehicleDatabase, 
         write_parameters(parameters_for(database, battery=(0.5, 5.0)), path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+# ---- parameters of a node, at its start and while it runs
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason", "words"),
+    [
+        (lambda whole: whole[:300], Reason.MALFORMED_PARAMETERS, "not a parameter file"),
+        (instead(b'"v1"', b'"v2"'), Reason.WRONG_VEHICLE, "parameters are for vehicle 'v2', this is"),
+        (None, Reason.NO_PARAMETERS, "no such parameter file; name one that is there"),
+    ],
+    ids=["half written", "of another vehicle", "missing"],
+)
+def test_unfit_parameter_file_is_not_used(
+    database: VehicleDatabase, tmp_path: Path, spoil: Callable[[bytes], bytes] | None, reason: Reason, words: str
+) -> None:
+    """The node passes measured values through, and publishes why."""
+    path = tmp_path / "v1.json"
+    if spoil is not None:
+        write_parameters(parameters_for(database, battery=(0.25, 5.0)), path)
+        path.write_bytes(spoil(path.read_bytes()))
+    in_force = choose_parameters(path, database, "v1")
+    corrector = wire(database, in_force, 0.0)
+    assert (corrector.branches[0].fault.drift, corrector.reason) == (0.0, reason)
+    assert (in_force.why_not or "").startswith(f"{path}: {words}")
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_changing_parameters_has_the_same_effect_as_starting_with_them(make_database: MakeDatabase, mode: Mode) -> None:
+    """Measured and corrected signal have different scales here."""
+    database = make_database(dbc=SMALL_DBC.replace("SG_ Battery : 0|16@1- (0.1,0)", "SG_ Battery : 0|16@1- (0.2,0)"))
+    after = InForce(parameters=parameters_for(database, battery=(0.125, 5.0)))
+    corrector, fresh = corrector_for(database, mode, motor=(0.0, 1.0)), wire(database, after, 2.0, mode=mode)
+    put_in_force(corrector, database, after, 2.0, mode=mode)
+    for live, new in zip(corrector.branches, fresh.branches, strict=True):
+        assert (live.plan, live.fault, live.deadline_s) == (new.plan, new.fault, new.deadline_s)

@@ -1,17 +1,17 @@
 """Messages to the service manager over a real socket, and the log's rate limit."""
 
+import errno
 import os
-import socket
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from ecu_node.bus.service import Log, ServiceManager
-
-WATCHDOG_S = 4.0
+from ecu_node.bus.service import Log, ServiceManager, be_real_time
+from tests.ecu_node.processes import ServiceManagerHere
 
 
 def test_log_that_nobody_reads_does_not_block_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -31,36 +31,17 @@ def test_log_that_nobody_reads_does_not_block_the_node(monkeypatch: pytest.Monke
     assert "lines before were lost: nobody read them)" in last
 
 
-class Manager:
-    """A datagram socket in the place of systemd's."""
-
-    def __init__(self, address: str | Path) -> None:
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.socket.bind(str(address))
-        self.socket.settimeout(0.0)
-
-    def told(self) -> list[str]:
-        """All messages received so far."""
-        texts = []
-        while True:
-            try:
-                texts.append(self.socket.recv(4096).decode())
-            except BlockingIOError:
-                return texts
-
-
 @pytest.fixture
-def managed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager]:
+def managed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ServiceManagerHere]:
     """A service manager whose watchdog expects a message every 4 s."""
-    manager = Manager(tmp_path / "notify")
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    monkeypatch.setenv("WATCHDOG_USEC", str(int(1e6 * WATCHDOG_S)))
+    manager = ServiceManagerHere(tmp_path / "notify", monkeypatch)
+    monkeypatch.setenv("WATCHDOG_USEC", "4000000")
     monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
-    yield manager
-    manager.socket.close()
+    with manager.socket:
+        yield manager
 
 
-def test_watchdog_is_fed_at_half_its_timeout(managed: Manager) -> None:
+def test_watchdog_is_fed_at_half_its_timeout(managed: ServiceManagerHere) -> None:
     service = ServiceManager()
     fed_s = []
     for tick in range(100):
@@ -71,7 +52,7 @@ def test_watchdog_is_fed_at_half_its_timeout(managed: Manager) -> None:
     assert fed_s == pytest.approx([1000.0, 1002.0, 1004.0, 1006.0, 1008.0], abs=0.11)
 
 
-def test_service_manager_that_does_not_read_does_not_block_the_node(managed: Manager) -> None:
+def test_service_manager_that_does_not_read_does_not_block_the_node(managed: ServiceManagerHere) -> None:
     service = ServiceManager()
     start_s = time.monotonic()
     told = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text()) + 3
@@ -104,3 +85,20 @@ def test_closed_log_does_not_end_the_node(monkeypatch: pytest.MonkeyPatch) -> No
         Log().say("nobody reads this")
         monkeypatch.undo()
         os.dup2(os.open(os.devnull, os.O_WRONLY), gone.fileno())  # what is left in its buffer can be closed
+
+
+def test_missing_real_time_permissions_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The memory lock is refused by the C library, whose error number says why."""
+
+    def refused(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    processors: list[object] = []
+    monkeypatch.setattr("os.sched_setscheduler", refused)
+    monkeypatch.setattr("os.sched_setaffinity", lambda _, allowed: processors.extend(allowed))
+    monkeypatch.setattr("resource.setrlimit", lambda *_: None)
+    monkeypatch.setattr("ctypes.CDLL", lambda *_, **__: SimpleNamespace(mlockall=lambda _: -1))
+    monkeypatch.setattr("ctypes.get_errno", lambda: errno.EPERM)
+    why = "[Errno 1] Operation not permitted"
+    assert be_real_time() == f"real time, but not allowed: SCHED_FIFO ({why}), memory lock ({why})"
+    assert len(processors) == 1

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.ecu_node.test_adapters import running
+from tests.ecu_node.processes import running
 from tests.ecu_node.vehicles import LAYOUT
 
 AT = """

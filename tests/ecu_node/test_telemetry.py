@@ -2,11 +2,8 @@
 
 import json
 import os
-import re
 import runpy
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,8 +20,7 @@ from ecu_node.bus.telemetry import Telemetry
 from ecu_node.bus.wiring import Mode
 from ecu_node.core.status import Counters, Latency
 from ecu_node.database import VehicleDatabase
-from tests.ecu_node.test_adapters import running
-from tests.ecu_node.test_node import wait_until
+from tests.ecu_node.processes import running, wait_until
 from tests.ecu_node.vehicles import LAYOUT, PAIR, SMALL_LAYOUT, Frame, MakeDatabase, answers, corrector_for
 
 ROOT = Path(__file__).parents[2]
@@ -200,16 +196,3 @@ def test_internal_error_in_telemetry_does_not_stop_the_correction(tmp_path: Path
     fault = "internal error in Telemetry, which is off now; please report it: ZeroDivisionError"
     with running("run", *options, *bus, program=("-c", code), until=fault) as log:
         assert fault in log[-1]
-
-
-def test_missing_real_time_permissions_are_reported() -> None:
-    code = (
-        "import os; from contextlib import suppress; from ecu_node.bus.service import be_real_time\n"
-        "user = os.geteuid()\n"
-        "with suppress(OSError): user or os.seteuid(65534)  # the root of a namespace may do nothing outside of it\n"
-        "print(be_real_time()); print(len(os.sched_getaffinity(0))); os.seteuid(user)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    line, processors = done.stdout.splitlines()
-    assert re.fullmatch(r"real time, but not allowed: SCHED_FIFO \(.*\), memory lock \(.*\)", line)
-    assert processors == "1"

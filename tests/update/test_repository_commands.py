@@ -17,7 +17,7 @@ from calibrator.files.storage import open_storage
 from ecu_node.parameters import VehicleParameters, write_parameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE, public_key_of
 from tests.disk import full_disk
-from tests.ecu_node.test_node import wait_until
+from tests.ecu_node.processes import wait_until
 from tests.ecu_node.vehicles import LAYOUT
 from tests.update.repo import ALL, Repo, expired
 

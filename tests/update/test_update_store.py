@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -20,7 +19,7 @@ from ecu_node.parameters import VehicleParameters
 from ecu_node.update.state import VehicleState, locked, read_state, write_state
 from ecu_node.update.store import ParameterStore
 from ecu_node.update.trial import ParameterTrial, TrialResult
-from tests.ecu_node.test_adapters import running
+from tests.ecu_node.processes import ServiceManagerHere, running
 from tests.ecu_node.vehicles import LAYOUT, AtOnce
 from tests.update.damage import a_folder, cut, without
 from tests.update.held import NOW, held, put_on_trial
@@ -203,14 +202,10 @@ def test_running_node_loads_a_set_written_to_its_state(
     vehicle: Path, parameters: VehicleParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It also reports this to the service manager."""
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    manager = ServiceManagerHere(tmp_path / "notify", monkeypatch)
     bus = ["--interface", "virtual", "--channel", "state"]
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        manager.settimeout(60.0)
-        with running("run", "--state", str(vehicle), "--layout", str(LAYOUT), *bus) as log:
-            write_state(vehicle, replace(read_state(vehicle), in_force=held(parameters, days=36500)))
-            while b"STATUS=parameter set" not in (told := manager.recv(4096)):
-                pass
-    assert told == b"STATUS=parameter set 44 is in force, correcting battery, motor"
+    with manager.socket, running("run", "--state", str(vehicle), "--layout", str(LAYOUT), *bus) as log:
+        write_state(vehicle, replace(read_state(vehicle), in_force=held(parameters, days=36500)))
+        said = manager.wait_for("STATUS=parameter set")
+    assert said == "STATUS=parameter set 44 is in force, correcting battery, motor"
     assert any("of vehicle v1 is in force" in line for line in log)

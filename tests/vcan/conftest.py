@@ -10,12 +10,20 @@ from typing import Protocol
 
 import pytest
 
+from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
 from tests.vcan.patient_layout import write_patient_layout
 from tests.vcan.processes import CHANNEL, OTHER_CHANNEL, NodeProcess, Recording, running_node, running_recording
 from tests.vcan.small_drive import true_parameters, write_drive
+
+STATUS, BATTERY, AUXILIARY, BATTERY_CORRECTED, MARKER = 0x5F0, 0x110, 0x130, 0x510, 0x7F0
+
+
+def state_of(frame: bytes) -> tuple[State, Reason]:
+    """State and reason in a status frame."""
+    return State(frame[1] >> 4), Reason(frame[2])
 
 
 class StartNode(Protocol):

@@ -1,56 +1,48 @@
-"""A small drive with known sensor faults, and the output expected by fractions and cantools, without the node's code.
+"""A small drive with known sensor faults among frames of others, and what a node makes of it.
 
 Three branches, sinusoidal currents that sum to zero; the sensors show (1 + d) i + o, quantised by the DBC. At each
-instant every branch sends one frame.
+instant every branch sends one frame. What is expected of the node is what its core makes of the frames:
+tests/ecu_node/test_random_vehicles.py compares that with fractions and cantools.
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
-from e2e.p01 import e2e_p01_check, e2e_p01_protect
 from msgspec.structs import replace
 
+from ecu_node.bus.wiring import InForce, Mode, wire
+from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import JunctionResidual, VehicleParameters
-from tests.ecu_node.vehicles import parameters_for
+from tests.ecu_node.vehicles import Frame, answers, parameters_for, passed_on, protected
+from tests.vcan.processes import LoggedFrame, frames_of
 
 PERIOD_S = 0.02
 VEHICLE = "v0007"
-STEP_A = Fraction(1, 50)
-"""Scale of all currents in the DBC. [A]"""
-LARGEST_CODE = 32500
-"""650 A, the largest value in the DBC."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SmallBranch:
-    """One branch: its signals in the DBC, its sign there, and the fault of its sensor."""
+class SmallBranch(NamedTuple):
+    """One branch: its message, its sign there, and the fault of its sensor."""
 
     message: str
-    signal: str
     sign: int
-    drift: str
-    offset_a: str
+    drift: float
+    offset_a: float
 
-    def measured(self, i: float) -> float:
-        """What the sensor shows, in the direction of its signal. [A]"""
-        return self.sign * ((1.0 + float(self.drift)) * i + float(self.offset_a))
-
-    def corrected_code(self, code: int) -> int:
-        """(25) in exact fractions, rounded half up to the DBC's step, kept in the DBC's range."""
-        i = (self.sign * code * STEP_A - Fraction(self.offset_a)) / (1 + Fraction(self.drift))
-        return min(max(math.floor(self.sign * i / STEP_A + Fraction(1, 2)), -LARGEST_CODE), LARGEST_CODE)
+    def frame(self, database: VehicleDatabase, k: int, i: float) -> LoggedFrame:
+        """Frame k of the sensor, with a current into the junction. [A]"""
+        shown_a = self.sign * ((1.0 + self.drift) * i + self.offset_a)
+        signal = f"{self.message.removeprefix('HV_')}Current"
+        data = protected(database, self.message, k % 15, **{signal: shown_a})
+        return LoggedFrame(f"{database.message(self.message).frame_id:03X}", data.hex().upper())
 
 
 BRANCHES = {
-    "battery": SmallBranch(message="HV_Battery", signal="BatteryCurrent", sign=1, drift="0.05", offset_a="3.3"),
-    "motor": SmallBranch(message="HV_Motor", signal="MotorCurrent", sign=-1, drift="-0.08", offset_a="-4.0"),
-    "auxiliary": SmallBranch(
-        message="HV_Auxiliary", signal="AuxiliaryCurrent", sign=-1, drift="0.125", offset_a="1.5025"
-    ),
+    "battery": SmallBranch("HV_Battery", 1, 0.05, 3.3),
+    "motor": SmallBranch("HV_Motor", -1, -0.08, -4.0),
+    "auxiliary": SmallBranch("HV_Auxiliary", -1, 0.125, 1.5025),
 }
 
 
@@ -63,63 +55,50 @@ def true_currents(t: float) -> dict[str, float]:
 
 def true_parameters(database: VehicleDatabase) -> VehicleParameters:
     """A parameter file that states the true faults."""
-    faults = {name: (float(branch.drift), float(branch.offset_a)) for name, branch in BRANCHES.items()}
+    faults = {name: (branch.drift, branch.offset_a) for name, branch in BRANCHES.items()}
     residual = JunctionResidual(measured_a=0.0, corrected_a=0.0)
     return replace(parameters_for(database, **faults), vehicle=VEHICLE, number=7, junction_residual=residual)
 
 
-def protected(database: VehicleDatabase, message: str, counter: int, **codes: int) -> bytes:
-    """A frame by cantools from raw codes, with counter and CRC; signals that are not given are 0."""
-    definition = database.message(message)
-    signals = {signal.name: 0 for signal in definition.signals} | codes | {"AliveCounter": counter % 15}
-    data = bytearray(definition.encode(signals, scaling=False))
-    e2e_p01_protect(data, definition.frame_id, increment_counter=False)
-    return bytes(data)
-
-
 def write_drive(
     path: Path, database: VehicleDatabase, instants: int, *, standing_at_s: float | None = None
-) -> dict[str, list[int]]:
-    """Write the drive as a candump log of can0, among frames of others; returns the measured codes per branch.
+) -> list[LoggedFrame]:
+    """Write the drive as a candump log of can0, among frames of others; returns all frames.
 
     With `standing_at_s` all instants have the currents of this one: their sum is right whenever it is looked at.
     """
-    codes: dict[str, list[int]] = {name: [] for name in BRANCHES}
     lines = []
     for k in range(instants):
         t = k * PERIOD_S
         frames = list(_foreign_frames(database, k))
         for name, i in true_currents(t if standing_at_s is None else standing_at_s).items():
-            branch = BRANCHES[name]
-            code = round(branch.measured(i) / float(STEP_A))
-            codes[name].append(code)
-            data = protected(database, branch.message, k, **{branch.signal: code})
-            frames.append((f"{database.message(branch.message).frame_id:03X}", data))
-        lines += [f"({t + 0.001 * n:.6f}) can0 {name}#{data.hex().upper()}" for n, (name, data) in enumerate(frames)]
+            frames.append(BRANCHES[name].frame(database, k, i))
+        lines += [f"({t + 0.001 * n:.6f}) can0 {'#'.join(frame)}" for n, frame in enumerate(frames)]
     path.write_text("\n".join(lines) + "\n")
-    return codes
+    return frames_of(path)
 
 
-def passed_on(database: VehicleDatabase, identifier: str, data: bytes) -> bytes | None:
-    """What a gateway makes of a frame of this drive: its current and its CRC another one; None if it holds it back."""
-    for branch in BRANCHES.values():
-        frame_id = database.message(branch.message).frame_id
-        if identifier == f"{frame_id:03X}":
-            if not e2e_p01_check(bytearray(data), frame_id):
-                return None
-            code = branch.corrected_code(int.from_bytes(data[2:4], "little", signed=True))
-            rewritten = bytearray(data[:2] + code.to_bytes(2, "little", signed=True) + data[4:])
-            e2e_p01_protect(rewritten, frame_id, increment_counter=False)
-            return bytes(rewritten)
-    return data
+def sent_by_core(
+    database: VehicleDatabase, mode: Mode, frames: Iterable[LoggedFrame], in_force: InForce | None = None
+) -> list[LoggedFrame]:
+    """What a node sends for some frames, with the true parameters unless others are given."""
+    corrector = wire(database, in_force or InForce(parameters=true_parameters(database)), 0.0, mode=mode)
+    sent = []
+    for number, (identifier, data) in enumerate(frames):
+        frame, now_s = Frame(FrameKey(int(identifier, 16), len(identifier) == 8), bytes.fromhex(data)), 1e-3 * number
+        if mode is Mode.OVERLAY:
+            sent += [(f"{answer.key.identifier:03X}", answer.data) for answer in answers(corrector, frame, now_s)]
+        elif (passed := passed_on(corrector, frame, now_s)) is not None:
+            sent.append((identifier, passed))
+    return [LoggedFrame(identifier, data.hex().upper()) for identifier, data in sent]
 
 
-def _foreign_frames(database: VehicleDatabase, k: int) -> Iterator[tuple[str, bytes]]:
+def _foreign_frames(database: VehicleDatabase, k: int) -> Iterator[LoggedFrame]:
     """Frames that are none of the node's business, of all lengths; one is a branch's frame with a wrong CRC."""
-    yield "200", protected(database, "VD_Motion", k, VehicleSpeed=k)
-    yield "3AB", bytes((17 * k + n) % 256 for n in range(k % 9))
-    yield "18FF1234", k.to_bytes(4, "big")
+    yield LoggedFrame("200", protected(database, "VD_Motion", k % 15, VehicleSpeed=k % 50).hex().upper())
+    yield LoggedFrame("3AB", bytes((17 * k + n) % 256 for n in range(k % 9)).hex().upper())
+    yield LoggedFrame("18FF1234", k.to_bytes(4, "big").hex().upper())
     if k % 10 == 3:
-        damaged = bytearray(protected(database, "HV_Motor", k, MotorCurrent=-30000))
+        damaged = bytearray(protected(database, "HV_Motor", k % 15, MotorCurrent=-600.0))
         damaged[4] ^= 1
-        yield "120", bytes(damaged)
+        yield LoggedFrame("120", damaged.hex().upper())

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from ecu_node.bus.wiring import Mode
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
-from tests.vcan.conftest import StartNode
+from tests.vcan.conftest import AUXILIARY, BATTERY, BATTERY_CORRECTED, MARKER, STATUS, StartNode, state_of
 from tests.vcan.processes import (
     CHANNEL,
     OTHER_CHANNEL,
     Recording,
     bring_up,
+    frames_of,
     ip_link,
     play,
     playing,
@@ -23,28 +25,15 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.small_drive import BRANCHES, passed_on, protected
+from tests.vcan.small_drive import BRANCHES, sent_by_core
 
 INSTANTS = 45
 """A multiple of the counter's period, so that a drive may follow itself."""
-STATUS, BATTERY, AUXILIARY, BATTERY_CORRECTED, MARKER = 0x5F0, 0x110, 0x130, 0x510, 0x7F0
 GATEWAY = ("--gateway", OTHER_CHANNEL)
-
-
-def expected_battery(database: VehicleDatabase, drive: Path) -> list[bytes]:
-    """The battery's frames of a drive as a gateway passes them on."""
-    lines = [line.split()[2].split("#") for line in drive.read_text().splitlines()]
-    frames = [bytes.fromhex(data) for identifier, data in lines if identifier == f"{BATTERY:03X}"]
-    return [found for frame in frames if (found := passed_on(database, f"{BATTERY:03X}", frame)) is not None]
 
 
 def qualities(frames: list[bytes]) -> set[int]:
     return {frame[1] >> 4 & 3 for frame in frames}
-
-
-def state_of(frame: bytes) -> tuple[State, Reason]:
-    """State and reason in a status frame."""
-    return State(frame[1] >> 4), Reason(frame[2])
 
 
 def wait_for_correcting(recording: Recording) -> None:
@@ -56,8 +45,7 @@ def wait_for_correcting(recording: Recording) -> None:
 def send_branches(database: VehicleDatabase, k: int) -> None:
     """One frame of each branch."""
     for branch in BRANCHES.values():
-        data = protected(database, branch.message, k, **{branch.signal: 1000 + k})
-        send(f"{database.message(branch.message).frame_id:03X}#{data.hex()}")
+        send("#".join(branch.frame(database, k, 20.0 + 0.02 * k)))
 
 
 @pytest.fixture
@@ -102,7 +90,11 @@ def test_bus_that_was_down_or_deleted_is_used_again(
 def test_full_send_queue_loses_frames_but_does_not_stop_the_gateway(
     database: VehicleDatabase, params: Path, drive: Path, start_node: StartNode, other_recording: Recording
 ) -> None:
-    expected = expected_battery(database, drive)
+    expected = [
+        bytes.fromhex(frame.data)
+        for frame in sent_by_core(database, Mode.GATEWAY, frames_of(drive))
+        if frame.identifier == f"{BATTERY:03X}"
+    ]
     with start_node(params, *GATEWAY) as node:
         other_recording.wait_for(STATUS, 1)
         run_tool("tc", "qdisc", "add", "dev", OTHER_CHANNEL, "root", "plug", "limit", "400")

@@ -18,7 +18,7 @@ from ecu_node.bus.kernel_routes import KernelRoutes
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from tests.vcan.conftest import StartNode
+from tests.vcan.conftest import AUXILIARY, BATTERY, STATUS, StartNode, state_of
 from tests.vcan.processes import (
     CHANNEL,
     ECU_NODE,
@@ -34,13 +34,13 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.test_faults_on_vcan import AUXILIARY, BATTERY, GATEWAY, STATUS, state_of
 
 NOISE, BACK = 0x345, 0x346
 """Identifiers of others, sent towards the vehicle and towards the sensors."""
 RULES = 2 * (34 + 1)
 """Both ways, all standard identifiers but those of the five branches and the status, and all extended ones."""
 INSTANTS = 150
+GATEWAY = ("--gateway", OTHER_CHANNEL)
 FOREIGN = "FFFFFFFFFFFFFFFF"
 """What another node sends under the battery's identifier."""
 
