@@ -73,12 +73,10 @@ def changed_json(draw: st.DrawFn, text: str) -> str:
 def changed_bundles(draw: st.DrawFn, first: bytes, second: bytes) -> bytes:
     """The second bundle, changed as it is or in one of its files, which may also be that of the first bundle."""
     old, files = files_of(first), files_of(second)
-    name, kind = draw(st.sampled_from(sorted(files))), draw(st.sampled_from(("bundle", "bytes", "json", "old", "none")))
+    name, kind = draw(st.sampled_from(sorted(files))), draw(st.sampled_from(("bundle", "bytes", "json", "old")))
     if kind == "bundle":
         return draw(changed_bytes(second))
-    if kind == "none":
-        del files[name]
-    elif kind == "bytes":
+    if kind == "bytes":
         files[name] = draw(changed_bytes(files[name].encode())).decode(errors="replace")
     elif kind == "json":
         files[name] = draw(changed_json(files[name]))
