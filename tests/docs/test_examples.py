@@ -8,11 +8,7 @@ import matplotlib.pyplot as plt
 import pandas as pd
 import pytest
 
-from tests.calibrator.command_here import calibrator as command
-from tests.real.test_junctions import I3_DBC, I3_LAYOUT
-
 EXAMPLES = Path(__file__).parents[2] / "examples"
-I3_LOGS = {"circontrol": "2019_Circontrol_end.csv.gz", "efacec": "2019_eacaec_enda.csv.gz"}
 
 
 @pytest.fixture
@@ -36,20 +32,6 @@ def test_chargers_disagree_with_one_battery(run: Any) -> None:
     ratio = 1.0 / (1.0 + run("two_chargers.py")["found"].gain_error)  # battery over charger
     assert ratio["circontrol"] == pytest.approx(0.988, abs=0.003)
     assert ratio["efacec"] == pytest.approx(1.012, abs=0.003)
-
-
-def test_table_of_the_chargers_equals_kirchhoff_output_for_its_logs(shared_data: Path, tmp_path: Path) -> None:
-    """The command that the head of the table names gives its rows."""
-    (tmp_path / "i3.dbc").write_text(I3_DBC)
-    (tmp_path / "i3.toml").write_text(I3_LAYOUT)
-    kept = pd.read_csv(EXAMPLES / "bmw_i3_two_chargers.csv", comment="#").groupby("station")
-    for station, name in I3_LOGS.items():
-        log, out = shared_data / "bmw_i3_charging" / name, tmp_path / "out.csv"
-        assert command("kirchhoff", log, "--layout", tmp_path / "i3.toml", "--table", out).returncode == 0
-        made = pd.read_csv(out).round(1)
-        rows = kept.get_group(station).reset_index(drop=True)
-        for column in ("battery", "charger"):
-            pd.testing.assert_series_equal(made[f"{column}_a"], rows[column], check_names=False, atol=0.051)
 
 
 def test_spreadsheet_in_german_is_calibrated(run: Any) -> None:

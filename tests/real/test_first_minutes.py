@@ -14,10 +14,8 @@ from calibrator.files.layout_files import vehicle_database
 from tests.calibrator.command_here import calibrator as calibrator_here
 from tests.calibrator.doctor.artificial_logs import examined
 from tests.calibrator.drive_logs import write_drive_log
+from tests.real.conftest import LAYOUT, ROOT
 
-ROOT = Path(__file__).parents[2]
-LAYOUT = ROOT / "dbc" / "tesla_model3.toml"
-I3_LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 Change = Callable[[str], str]
 
 
@@ -26,15 +24,6 @@ def calibrator(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[st
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         return calibrator_here(*arguments)
-
-
-@pytest.fixture(scope="module")
-def tesla(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with nothing but the DBC and the log."""
-    folder = tmp_path_factory.mktemp("tesla")
-    for name in ("Model3CAN.dbc", "drive.log.gz"):
-        (folder / name).symlink_to(shared_data / "tesla_model3" / name)
-    return folder
 
 
 def test_documented_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> None:
@@ -122,7 +111,7 @@ def tenfold_voltage(dbc: str) -> str:
 def test_doctor_finds_each_injected_mistake_and_no_other(
     change_layout: Change, change_dbc: Change, findings: list[tuple[str, str, str]], tesla: Path, tmp_path: Path
 ) -> None:
-    dbc, layout = (tesla / "Model3CAN.dbc").read_text(encoding="cp1252"), LAYOUT.read_text()
+    dbc, layout = (tesla / "Model3CAN.dbc").read_text(encoding="cp1252"), (tesla / "tesla_model3.toml").read_text()
     changed = change_layout(layout) != layout or change_dbc(dbc) != dbc
     assert changed or findings == [("hint", "mean", "sum")]
     (tmp_path / "Model3CAN.dbc").write_text(change_dbc(dbc), encoding="cp1252")
@@ -135,11 +124,11 @@ def test_doctor_finds_each_injected_mistake_and_no_other(
 @pytest.mark.parametrize("trip", ["TripA07", "TripA24"])
 def test_doctor_finds_i3_trips_sound_and_an_inverted_motor_wrong(trip: str, i3_store: Path, tmp_path: Path) -> None:
     """Its motor current is what the others leave, so the sum is exact; the voltage tells motor from battery."""
-    database = vehicle_database(I3_LAYOUT)
+    database = vehicle_database(LAYOUT)
     drive = next(d for d in iterate_drives(i3_store, database.layout) if d.name == trip)
     write_drive_log(tmp_path / "trip.log.gz", drive, database)
-    assert examined(I3_LAYOUT, tmp_path / "trip.log.gz").errors == []
-    text = I3_LAYOUT.read_text().replace('dbc = "hv', f'dbc = "{ROOT}/dbc/hv')
+    assert examined(LAYOUT, tmp_path / "trip.log.gz").errors == []
+    text = LAYOUT.read_text().replace('dbc = "hv', f'dbc = "{ROOT}/dbc/hv')
     changed = re.sub(r'("HV_Motor.MotorCurrent"\nsign = )-1', r"\g<1>1", text)
     (tmp_path / "wrong.toml").write_text(changed)
     assert examined(tmp_path / "wrong.toml", tmp_path / "trip.log.gz").errors == [("sign", "motor")]

@@ -1,6 +1,5 @@
 """Real sensors in one junction: a Tesla's inverters against its battery, a BMW i3's battery against two chargers."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,52 +9,10 @@ import pytest
 from calibrator import JunctionCalibrator, read_log
 from tests.calibrator.command_here import calibrator as command
 
-ROOT = Path(__file__).parents[2]
-I3_DBC = """VERSION ""
-NS_ :
-BS_:
-BU_: Car
-BO_ 274 Battery: 8 Car
- SG_ BatteryCurrent : 0|16@1+ (0.1,-819.2) [-819.2|819.2] "A" Car
-BO_ 690 Charger: 8 Car
- SG_ ChargerCurrent : 16|16@1+ (0.1,0) [0|6553.4] "A" Car
-"""
-I3_LAYOUT = """schema = 1
-name = "i3_charging"
-dbc = "i3.dbc"
-full_scale_a = 200.0
-branch = [
-    { name = "battery", signal = "Battery.BatteryCurrent", sign = -1, timeout_s = 0.1 },
-    { name = "charger", signal = "Charger.ChargerCurrent", sign = 1, timeout_s = 0.3, no_value = [65535] },
-]
-"""
-
 
 @pytest.fixture(scope="module")
-def i3(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recordings of one car at two stations, a folder each."""
-    folder = tmp_path_factory.mktemp("i3")
-    for path in (shared_data / "bmw_i3_charging").glob("*.csv.gz"):
-        station = folder / "car" / ("circontrol" if "Circontrol" in path.name else "efacec")
-        station.mkdir(parents=True, exist_ok=True)
-        shutil.copy(path, station)
-    (folder / "i3.dbc").write_text(I3_DBC)
-    (folder / "layout.toml").write_text(I3_LAYOUT)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def tesla(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("model3")
-    for name in ("drive.log.gz", "Model3CAN.dbc"):
-        (folder / name).symlink_to(shared_data / "tesla_model3" / name)
-    shutil.copy(ROOT / "dbc" / "tesla_model3.toml", folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def stations(i3: Path) -> JunctionCalibrator:
-    return JunctionCalibrator(meter="charger", trusted=["battery"]).fit(i3 / "car", i3 / "layout.toml")
+def stations(i3_charges: Path) -> JunctionCalibrator:
+    return JunctionCalibrator(meter="charger", trusted=["battery"]).fit(i3_charges / "car", i3_charges / "layout.toml")
 
 
 def test_charging_stations_differ_by_their_gains(stations: JunctionCalibrator) -> None:
@@ -68,21 +25,21 @@ def test_charging_stations_differ_by_their_gains(stations: JunctionCalibrator) -
     assert not any(each.parameters.findings for each in stations.vehicles_.values()), "a ramp is no fault of a sensor"
 
 
-def test_two_trusted_stations_that_differ_are_reported_as_a_contradiction(i3: Path, tmp_path: Path) -> None:
+def test_two_trusted_stations_that_differ_are_reported_as_a_contradiction(i3_charges: Path, tmp_path: Path) -> None:
     """Two meters that are both called right differ by 2.4 %: that is said, and nothing is corrected."""
     done = command(
-        "calibrate", i3 / "car", "--layout", i3 / "layout.toml", "--meter", "charger", "--trusted", "charger",
-        "--out", tmp_path / "r",
+        "calibrate", i3_charges / "car", "--layout", i3_charges / "layout.toml",
+        "--meter", "charger", "--trusted", "charger", "--out", tmp_path / "r",
     )  # fmt: skip
     assert done.returncode == 0
     assert "what is known contradicts itself" in done.stdout
     assert not pd.read_parquet(tmp_path / "r" / "results.parquet").applied.any()
 
 
-def test_offset_of_a_station_needs_the_load_of_the_car(i3: Path, stations: JunctionCalibrator) -> None:
+def test_offset_of_a_station_needs_the_load_of_the_car(i3_charges: Path, stations: JunctionCalibrator) -> None:
     """After the plug the car draws 0.7 to 0.9 A that no branch measures: declared, they leave no offset."""
     knowing = JunctionCalibrator(meter="charger", trusted=["battery"], load=(0.8, 0.1))
-    open_, declared = stations.parameters_, knowing.fit(i3 / "car", i3 / "layout.toml").parameters_
+    open_, declared = stations.parameters_, knowing.fit(i3_charges / "car", i3_charges / "layout.toml").parameters_
     assert (open_[open_.branch == "charger"].offset_sd_a > 1.0).all()
     chargers = declared[declared.branch == "charger"]
     assert (chargers.offset_a.abs() < 3.0 * chargers.offset_sd_a).all()

@@ -4,47 +4,32 @@ from pathlib import Path
 
 import can
 import cantools
-import msgspec
 import numpy as np
-import pytest
 from cantools.database.can import Database
 
 from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.readers import read_recording
-from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
-ROOT = Path(__file__).parents[2]
-LAYOUT = ROOT / "dbc" / "tesla_model3.toml"
 
-
-@pytest.fixture(scope="module")
-def folder(shared_data: Path) -> Path:
-    return shared_data / "tesla_model3"
-
-
-@pytest.fixture(scope="module")
-def tesla(folder: Path) -> VehicleDatabase:
-    layout = msgspec.structs.replace(read_layout(LAYOUT), dbc=str(folder / "Model3CAN.dbc"))
-    return read_database(layout)
-
-
-def test_tesla_frames_are_read_as_python_can_reads_them(folder: Path) -> None:
-    frames = read_frames(folder / "drive.log.gz")
-    messages = list(can.LogReader(folder / "drive.log.gz"))
+def test_tesla_frames_are_read_as_python_can_reads_them(tesla: Path) -> None:
+    frames = read_frames(tesla / "drive.log.gz")
+    messages = list(can.LogReader(tesla / "drive.log.gz"))
     assert frames.key.tolist() == [message.arbitration_id for message in messages]
     assert [frames.data[k, :n].tobytes() for k, n in enumerate(frames.length)] == [bytes(m.data) for m in messages]
     assert frames.damaged == 0
 
 
-def test_tesla_currents_decode_as_cantools_decodes_them(folder: Path, tesla: VehicleDatabase) -> None:
-    recording = read_recording(folder / "drive.log.gz", tesla, vehicle="model3", name="drive")
-    database = cantools.database.load_file(folder / "Model3CAN.dbc", strict=False)
+def test_tesla_currents_decode_as_cantools_decodes_them(tesla: Path) -> None:
+    layout = read_layout(tesla / "tesla_model3.toml")
+    recording = read_recording(tesla / "drive.log.gz", read_database(layout), vehicle="model3", name="drive")
+    database = cantools.database.load_file(tesla / "Model3CAN.dbc", strict=False)
     assert isinstance(database, Database)
     current: list[float] = []
     rear: list[float] = []
     voltage = np.nan
-    for message in can.LogReader(folder / "drive.log.gz"):
+    for message in can.LogReader(tesla / "drive.log.gz"):
         if message.arbitration_id not in {0x132, 0x266}:
             continue
         values = database.decode_message(message.arbitration_id, bytes(message.data), decode_choices=False)
