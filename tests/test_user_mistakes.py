@@ -140,6 +140,8 @@ MISTAKES = [
     ("ecu-node provision --vehicle v1 --root cut.json --state s", 1, "cut.json: 1.root.json of 'calibrator repository"),
     ("ecu-node update v1.json --state none LAYOUT", 1, "none: cannot be used as state: No such file or"),
     ("ecu-node inspect --state none", 1, "none: no state of a vehicle there; make one with 'ecu-node provision'"),
+    ("ecu-node faults --state none", 1, "none: no such state folder; name the one of 'ecu-node run --state'"),
+    ("ecu-node clear --state none", 1, "none: no such state folder; name the one of 'ecu-node run --state'"),
     ("ecu-node run LAYOUT --channel c --interface pigeon UNSIGNED", 1, "pigeon c: cannot open"),
     ("ecu-node run LAYOUT --channel nobus0 UNSIGNED", 1, "socketcan nobus0: cannot open the bus: "),
     ("ecu-node run NONE --channel nobus0 UNSIGNED", 1, "none.toml: cannot read the layout: No such"),

@@ -176,6 +176,11 @@ def test_unit_is_known_in_the_spellings_of_several_makers(unit: str, known: Mapp
     assert factor_of(unit, known, "test") == factor
 
 
+@pytest.mark.parametrize("scale", [1.0, 50.0])
+def test_scale_given_both_in_the_unit_and_as_factor_is_applied_once(scale: float) -> None:
+    assert current(scale, unit="50A/bit").scale == 50
+
+
 @pytest.mark.parametrize("names", [{5: "SNA"}, {3: "Error", 5: "Signal not available"}, {5: "invalid", 9: "x"}])
 def test_code_for_not_available_is_found_by_its_name(names: dict[int, str]) -> None:
     assert not_available_code(current(names=names), "test") == 5

@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
-from weakref import ref
 
 import pytest
 from e2e.p01 import e2e_p01_check
@@ -13,7 +12,6 @@ from msgspec.structs import replace
 
 from ecu_node.bus.wiring import InForce, Mode, put_in_force, wire
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.junction import REMEMBERED_FRAMES
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
@@ -21,7 +19,6 @@ from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.parameters import JunctionResidual
 from tests.ecu_node.vehicles import (
     BATTERY,
-    HEATER,
     MOTOR,
     NET,
     PAIR,
@@ -221,25 +218,6 @@ def test_value_from_before_bus_sleep_or_reload_is_never_published(make_database:
     in_force = InForce(parameters=parameters_for(database, **faults))
     put_in_force(corrector, database, in_force, 3600.4, mode=Mode.OVERLAY)
     assert published(database, corrector, pair, 3600.4, "motor")[0] == no_value
-
-
-def test_only_the_last_frames_are_remembered(database: VehicleDatabase) -> None:
-    class Payload(bytearray):
-        """Unlike a bytearray, it can be referred to weakly."""
-
-    source = corrector_for(database, battery=(0.25, 5.0)).sources[BATTERY]
-    (branch,) = source.branches
-    data = [battery(database, counter).data for counter in range(15)]
-    first = Payload(data[0])
-    is_kept = ref(first)
-    source.answer(first, 0.0)
-    del first
-    assert is_kept()
-    for k in range(1, 1 + REMEMBERED_FRAMES):
-        assert branch.time_s == pytest.approx(0.01 * (k - 1))
-        source.answer(bytearray(data[k % 15]), 0.01 * k)
-    assert not is_kept()
-    assert len([*branch.newest_first()]) == REMEMBERED_FRAMES
 
 
 def test_branches_going_silent_one_after_another_are_not_a_fault(database: VehicleDatabase) -> None:
@@ -451,17 +429,6 @@ def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDa
     assert corrector.branches[2].currents_at(0.9) is None, "nor one near zero"
 
 
-@pytest.mark.parametrize(("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")])
-def test_scale_given_both_in_the_unit_and_as_factor_is_applied_once(
-    make_database: MakeDatabase, scale: str, unit: str
-) -> None:
-    dbc = SMALL_DBC.replace('(1,0) [0|60000] "W"', f'({scale},0) [0|60000] "{unit}"')
-    corrector = corrector_for(make_database(SMALL_LAYOUT, dbc), heater=(0.0, 0.0))
-    answers(corrector, Frame(HEATER, (80).to_bytes(4, "little")), 0.0)
-    answers(corrector, Frame(NET, (40_000).to_bytes(2, "little")), 0.0)
-    assert corrector.branches[2].currents_at(0.0) == pytest.approx((-10.0, -10.0))
-
-
 def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_database: MakeDatabase) -> None:
     """Until it is stale, it is repeated in each answer to the other branches of its message."""
     layout = SMALL_LAYOUT.replace('"Net.Voltage"', '"Net.Voltage", corrected = "PairOut.Heater"')
@@ -499,11 +466,7 @@ def test_a_signal_beyond_the_end_of_its_frame_is_invalid(make_database: MakeData
 
 
 MOTOR_SNA = '512 Motor -32768 "SNA"'
-INIT = (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"')
-PAGE = (" SG_ Quality", ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1')
-OWN_E2E = '\n[e2e]\nprofile = "P01"\nmessages = ["PairOut"]\n'
-LOOP = ("PairOut.Motor", "Pair.Spare")
-SPARE = (" SG_ Battery", ' SG_ Spare : 48|16@1- (1,0) [0|0] "A" Node\n SG_ Battery')
+PAGED_QUALITY = ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1'
 OWN_STATUS = '\n[status]\nmessage = "Own"\nstate = "State"\nreason = "Reason"\n'
 OTHER_SENDER = (
     SMALL_DBC.replace("Node Corrector", "Node Corrector Other")
@@ -517,33 +480,43 @@ WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1-
 
 
 @pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("8 Corrector", "8 Node", r"small\.dbc has PairOut by Node; all corrected"),
+        ("Motor : 16|16", "Motor : 15|16", "PairOut.Motor is written twice"),
+        ("Quality : 32|2", "Quality : 64|2", "Quality ends in byte 9"),
+        ("Quality : 32|2", "Quality : 32|1", "Quality holds at most 1; 3 must fit"),
+        (
+            " SG_ Quality",
+            ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1',
+            "what the node sends .* in every",
+        ),
+        (MOTOR_SNA, '512 Motor 32767 "Max"', "Motor needs a code named SNA"),
+        (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"', "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
+        (MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"', r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'"),
+    ],
+)
+def test_dbc_disturbing_the_bus_is_refused(make_database: MakeDatabase, old: str, new: str, words: str) -> None:
+    with pytest.raises((LayoutError, DatabaseError), match=words):
+        corrector_for(make_database(dbc=SMALL_DBC.replace(old, new)))
+
+
+@pytest.mark.parametrize(
     ("layout", "dbc", "words"),
     [
-        (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC.replace(*SPARE), "Pair would be both received and sent"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("8 Corrector", "8 Node"), r"small\.dbc has PairOut by Node; all corrected"),
+        (
+            SMALL_LAYOUT.replace("PairOut.Motor", "Pair.Spare"),
+            SMALL_DBC.replace(" SG_ Battery", ' SG_ Spare : 48|16@1- (1,0) [0|0] "A" Node\n SG_ Battery'),
+            "Pair would be both received and sent",
+        ),
         (SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER, "PairOut by Corrector, Own by Other; all corrected values and the"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("Motor : 16|16", "Motor : 15|16"), "PairOut.Motor is written twice"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 64|2"), "Quality ends in byte 9"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
-        (
-            SMALL_LAYOUT,
-            SMALL_DBC.replace(*PAGE),
-            "PairOut.Quality is multiplexed; what the node sends .* in every frame",
-        ),
-        (SMALL_LAYOUT, SMALL_DBC.replace(MOTOR_SNA, '512 Motor 32767 "Max"'), "Motor needs a code named SNA"),
         (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
+        (SMALL_LAYOUT + OWN_SUM, WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n', "code 3 of signal Sum means .* beyond 0.2"),
         (
-            SMALL_LAYOUT + OWN_SUM,
-            WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n',
-            "code 3 of signal Sum means 'SNA', .* beyond 0.2",
+            f'{SMALL_LAYOUT}\n[e2e]\nprofile = "P01"\nmessages = ["PairOut"]\n',
+            SMALL_DBC,
+            "PairOut.Battery is written twice, or overlaps .*, or the E2E header",
         ),
-        (SMALL_LAYOUT, SMALL_DBC.replace(*INIT), "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
-        (
-            SMALL_LAYOUT,
-            SMALL_DBC.replace(MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"'),
-            r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'",
-        ),
-        (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery is written twice, or overlaps .*, or the E2E header"),
     ],
 )
 def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layout: str, dbc: str, words: str) -> None:
@@ -612,36 +585,6 @@ def test_branch_of_a_frozen_control_unit_becomes_stale(make_database: MakeDataba
         take(corrector, motor(own, k % 15, 100.0 + k % 2), 0.02 * k)
         corrector.look(0.02 * k)
     assert (used, corrector.latched, corrector.latched_branches) == (51, Reason.BRANCH_STALE, ("battery",))
-
-
-@pytest.mark.parametrize(
-    ("faulty", "name", "corrected_a", "quality"),
-    [
-        ("battery", "battery", (100.0 - 5.0) / 1.25, Quality.CORRECTED),
-        ("motor", "motor", -(-100.0 - 5.0) / 1.25, Quality.CORRECTED),
-        ("battery", "motor", 100.0, Quality.PASSED_THROUGH),
-    ],
-)
-def test_answer_is_corrected_if_parameters_name_the_branch(
-    database: VehicleDatabase, faulty: str, name: str, corrected_a: float, quality: Quality
-) -> None:
-    """Offsets are positive into the junction, the motor's signal is positive out of it."""
-    corrector = corrector_for(database, **{faulty: (0.25, 5.0)})
-    frame = battery(database, 3) if name == "battery" else motor(database, 3)
-    assert published(database, corrector, frame, 0.0, name) == (corrected_a, quality)
-    ((key, data),) = [(answer.key, answer.data) for answer in corrector.sources[frame.key].targets]
-    assert key == FrameKey(frame.key.identifier + 0x400, False)
-    assert e2e_p01_check(bytearray(data), key.identifier)
-
-
-@pytest.mark.parametrize("window_s", [1.0, 60.0])
-def test_watch_window_of_any_length_works_at_ten_looks_per_second(make_database: MakeDatabase, window_s: float) -> None:
-    own = whole_vehicle(make_database, f"\n[watch]\nwindow_s = {window_s}\n")
-    corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
-    balanced(own, corrector, 0.0, 0.85 * window_s, period_s=0.1)
-    assert corrector.state()[1] == Reason.NONE
-    balanced(own, corrector, 0.85 * window_s, window_s + 0.5, period_s=0.1)
-    assert corrector.state()[1] == Reason.CORRECTION_WORSE
 
 
 @pytest.mark.parametrize(("old", "new"), [("8 Corrector", "8 Vector__XXX"), ("8 Other", "8 Corrector")])

@@ -109,15 +109,6 @@ def test_drive_shorter_than_a_fifth_of_a_block_makes_no_record(drive: Drive, flo
     assert len(drive.ended()) == records
 
 
-def test_noise_is_that_of_rounding_without_four_consecutive_samples(drive: Drive) -> None:
-    for _ in range(60):
-        drive.go_on(0.3, open_s=0.0)
-        drive.stamp_s += 0.7
-    (record,) = drive.ended()
-    steps_a = [drive.database.current_step_a(name) for name in record.branches]
-    assert [*unpacked(record.noise_a2)] == pytest.approx([step_a**2 / 12.0 for step_a in steps_a])
-
-
 def test_full_record_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "MOST_BATCHES", 1)
     drive.go_on(400.0)

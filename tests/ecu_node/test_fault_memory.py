@@ -158,14 +158,6 @@ def test_damaged_fault_memory_is_reported_in_one_line(
     assert "'ecu-node clear' begins a new one" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["faults", "clear"])
-def test_missing_state_folder_is_reported_in_one_line(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run_ecu_node([command, "--state", str(tmp_path / "none")]) == 1
-    assert "no such state folder; name the one of 'ecu-node run --state'" in capsys.readouterr().err
-
-
 def test_node_without_vehicle_state_passes_values_through_and_reports_why(tmp_path: Path) -> None:
     bus = ["--interface", "virtual", "--channel", "state"]
     with running("run", "--state", str(tmp_path), "--layout", str(LAYOUT), *bus) as log:

@@ -74,12 +74,6 @@ def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: st
     assert "\n" not in str(caught.value)
 
 
-def test_layout_that_is_not_utf_8_text_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.toml").write_bytes(b"\xff")
-    with pytest.raises(LayoutError, match=r"x\.toml: not a layout: the file is not UTF-8 text; see the page 'Layout'"):
-        read_layout(tmp_path / "x.toml")
-
-
 @pytest.mark.parametrize(
     ("dbc", "words"),
     [

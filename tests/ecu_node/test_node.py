@@ -1,11 +1,10 @@
 """The node on python-can's virtual bus: a real bus object, the node in a thread of its own."""
 
 import errno
-import gc
 import operator
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from copy import deepcopy
@@ -18,7 +17,7 @@ from ecu_node.bus.node import Node
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.wiring import Mode, open_bus
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.status import Counters, Reason, State
+from ecu_node.core.status import Counters, Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from tests.ecu_node.processes import LONGEST_WAIT_S, wait_until
@@ -251,42 +250,6 @@ def test_frames_that_waited_too_long_are_not_used(database: VehicleDatabase, cha
     assert (corrector.counters.answers, corrector.counters.late) == (2, 1)
 
 
-class SetClockBus(VirtualBus):
-    """A bus during whose waits the time of day is set back by half a second each time; then a frame comes.
-
-    To the node it also stands for the module ``time``.
-    """
-
-    monotonic, sleep = staticmethod(time.monotonic), staticmethod(time.sleep)
-    frames: Sequence[can.Message] = ()
-    ahead_s = 0.0
-
-    def time(self) -> float:
-        return time.time() + self.ahead_s
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        if not self.frames or not timeout:
-            return super().recv(timeout)
-        self.ahead_s -= 0.5
-        frame, *self.frames = self.frames
-        frame.timestamp = self.time()
-        return frame
-
-
-def test_frame_after_a_clock_step_is_not_taken_for_an_old_one(
-    database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch, channel: str
-) -> None:
-    bus = SetClockBus(channel)
-    monkeypatch.setattr("ecu_node.bus.node.time", bus)
-    with node_on(database, "", lambda: bus) as corrector:
-        wait_until(lambda: corrector.state()[0] is State.STARTING)
-        bus.frames = [battery_frame(database, k) for k in range(8)]
-        wait_until(lambda: corrector.counters.frames_in == 8)
-        age_s = time.monotonic() - corrector.branches[0].time_s
-    assert age_s < 0.4
-    assert corrector.counters.clock_steps >= 8
-
-
 def test_failed_bus_is_reported_as_open_only_when_it_works_again(peer: can.BusABC, channel: str) -> None:
     """A bus-off that is reported as the bus opens again is counted."""
     down = can.CanOperationError("Network is down", errno.ENETDOWN)
@@ -324,27 +287,6 @@ def test_bus_whose_sending_fails_is_opened_again(database: VehicleDatabase, peer
     with node_on(database, "", lambda: next(buses)) as corrector:
         receive(peer, 0x5F0, 3)
     assert corrector.counters.reopened == 1
-
-
-def living_objects() -> int:
-    """Objects that are not garbage: the least of some counts, as the node makes some between collection and count."""
-    counts = []
-    for _ in range(5):
-        gc.collect()
-        counts.append(len(gc.get_objects()))
-    return min(counts)
-
-
-def test_running_node_does_not_accumulate_objects(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
-    frames, objects = [battery_frame(database, k) for k in range(15)], list[int]()
-    with node_on(database, channel):
-        for _ in range(3):  # after the first round all that remembers the last frames is full
-            for _ in range(84):
-                for frame in frames:
-                    peer.send(frame)
-                receive(peer, 0x510, len(frames))  # before the next ones, as a frame that waits too long is dropped
-            objects.append(living_objects())
-    assert objects[2] - objects[1] < 500
 
 
 def test_kernel_filter_passes_only_branches_voltages_and_own_frames(make_database: MakeDatabase) -> None:

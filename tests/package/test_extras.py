@@ -105,16 +105,6 @@ def test_cluster_calibrates_on_workers(installed: Installed, car: Path, fleet: P
     assert (tmp_path / "result" / "results.parquet").is_file()
 
 
-def test_mf4_logs_are_read(installed: Installed, car: Path, drive: Path, tmp_path: Path) -> None:
-    with can.Logger(tmp_path / "drive.mf4") as log:
-        for frame in can.LogReader(drive):
-            log(frame)
-    json_output = calibrator(
-        installed("mf4"), tmp_path, "kirchhoff", "drive.mf4", "--layout", car / "my_car.toml", "--json"
-    )
-    assert json.loads(json_output)["branches"] == ["battery", "motor"]
-
-
 def test_extra_bench_suffices_to_compare_the_posterior_with_basis_pursuit(installed: Installed, unpacked: Path) -> None:
     command = ("-m", "bench", "posterior", "--quick")
     done = installed("bench").run("python", *command, folder=unpacked / "tools")
@@ -172,7 +162,7 @@ def test_command_works_after_installing_the_extra_that_it_asks_for(wheel: Path, 
         venv.install(remedy)
         done = venv.run("calibrator", *arguments, folder=car)
         assert "pip install" not in done.stderr
-        assert done.returncode != 70
+        assert done.returncode == (1 if extra == "cluster" else 0), "there is no scheduler"
         assert "Traceback" not in done.stderr
 
 

@@ -45,17 +45,3 @@ def test_currents_are_corrected_on_a_virtual_bus(node: CleanVenv, car: Path, dri
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 50
     assert "Traceback" not in done.stderr
-
-
-def test_updates_without_their_extra_are_refused_in_one_line(node: CleanVenv, car: Path) -> None:
-    for words in (("provision", "--vehicle", VEHICLE, "--root", "x"), ("update", "x", *LAYOUT)):
-        done = node.run("ecu-node", *words, "--state", "state", folder=car)
-        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
-        assert "pip install 'hv-current-correction[update]'" in done.stderr
-
-
-def test_node_starts_quickly_enough_for_a_service(node: CleanVenv) -> None:
-    modules = node.run(
-        "python", "-c", "import ecu_node.cli, sys; print(*sys.modules)", folder=node.folder
-    ).stdout.split()
-    assert not {"can", "cantools", "cryptography", "numpy", "calibrator"} & set(modules)
