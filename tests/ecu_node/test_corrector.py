@@ -486,11 +486,7 @@ WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1-
         ("Motor : 16|16", "Motor : 15|16", "PairOut.Motor is written twice"),
         ("Quality : 32|2", "Quality : 64|2", "Quality ends in byte 9"),
         ("Quality : 32|2", "Quality : 32|1", "Quality holds at most 1; 3 must fit"),
-        (
-            " SG_ Quality",
-            ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1',
-            "what the node sends .* in every",
-        ),
+        (" SG_ Quality", PAGED_QUALITY, "PairOut.Quality is multiplexed; what the node sends .* in every frame"),
         (MOTOR_SNA, '512 Motor 32767 "Max"', "Motor needs a code named SNA"),
         (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"', "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
         (MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"', r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'"),

@@ -1,6 +1,9 @@
+"""Recorded trips of a BMW i3 become drives; what of a file cannot be used is labelled, and said."""
+
 import gzip
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,62 +13,60 @@ from calibrator.drive import Array
 from calibrator.drives.store import list_drives
 from calibrator.errors import DriveError, LogError
 from calibrator.recordings.tables import read_table
-from ecu_node.database import read_database
-from ecu_node.layout import read_layout
+from ecu_node.database import VehicleDatabase
 from import_bmw_i3 import COLUMNS, ImportedTrip, app, signal_ranges, trip_from_table
+from tests.ecu_node.vehicles import LAYOUT
 
-ROOT = Path(__file__).parents[2]
-LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 SAMPLES = 600
 IDLE_W = 500.0
-RANGES = signal_ranges(read_database(read_layout(LAYOUT)))
+OF_HEATER = ("auxiliary", "motor", "heater_demand")
+"""Channels for which the power of the heater is needed."""
 
 
-def columns() -> dict[str, Array]:
-    """A minute of a made-up trip: 1 kW of air conditioning, no heating, 500 W that nothing measures."""
-    time_s = np.round(0.1 * np.arange(SAMPLES), 1)
+def columns(**changes: Any) -> dict[str, Array]:
+    """A minute of a made-up trip: 1 kW of air conditioning, no heating, 500 W that nothing measures.
+
+    A change is a value for all samples, or a mapping of samples to values.
+    """
     torque = np.where(np.arange(SAMPLES) % 200 < 100, 0.0, 40.0)
-    power_w = 1000.0 + IDLE_W + 300.0 * torque
-    return {
-        "time": time_s,
+    made = {
+        "time": np.round(0.1 * np.arange(SAMPLES), 1),
         "speed": np.full(SAMPLES, 30.0),
         "accelerator": np.full(SAMPLES, 20.0),
         "torque": torque,
         "acceleration": np.zeros(SAMPLES),
         "voltage": np.full(SAMPLES, 400.0),
-        "current": -power_w / 400.0,
+        "current": -(1000.0 + IDLE_W + 300.0 * torque) / 400.0,
         "heater": np.zeros(SAMPLES),
         "aircon": np.full(SAMPLES, 1.0),
     }
+    for key, change in changes.items():
+        for samples, value in change.items() if isinstance(change, dict) else [(slice(None), change)]:
+            made[key][samples] = value
+    return made
 
 
-def write_csv(path: Path, values: dict[str, Array]) -> Path:
+def write_csv(path: Path, values: dict[str, Array], old: str = "", new: str = "") -> Path:
+    """Write a file as it is published; a value that is not a number is an empty cell."""
     header = ";".join({"time": "Time [s]", **COLUMNS}[key] + " " for key in values) + ";Battery Temperature [\xb0C]"
-    rows = [";".join(f"{cell:g}" for cell in row) + ";20" for row in zip(*values.values(), strict=True)]
-    text = "\n".join([header, *rows]) + "\n"
-    data = text.encode("latin-1")
+    rows = [
+        "".join(f"{cell:g};".replace("nan", "") for cell in row) + "20" for row in zip(*values.values(), strict=True)
+    ]
+    data = "\n".join([header.replace(old, new), *rows, ""]).encode("latin-1")
     path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
     return path
 
 
-def imported(path: Path) -> ImportedTrip:
-    return trip_from_table(read_table(path), vehicle="v", name="d", ranges=RANGES)
-
-
-def with_text(path: Path, old: str, new: str, line: int) -> Path:
-    lines = path.read_bytes().decode("latin-1").splitlines()
-    assert old in lines[line - 1]
-    lines[line - 1] = lines[line - 1].replace(old, new, 1)
-    path.write_bytes("\n".join(lines).encode("latin-1"))
-    return path
+def imported(path: Path, database: VehicleDatabase) -> ImportedTrip:
+    return trip_from_table(read_table(path), vehicle="v", name="d", ranges=signal_ranges(database))
 
 
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, [*map(str, arguments)])
 
 
-def test_currents_are_positive_into_the_junction_and_sum_to_zero(tmp_path: Path) -> None:
-    trip = imported(write_csv(tmp_path / "a.csv", columns()))
+def test_currents_are_positive_into_the_junction_and_sum_to_zero(tmp_path: Path, database: VehicleDatabase) -> None:
+    trip = imported(write_csv(tmp_path / "a.csv", columns()), database)
     values = {name: channel.value for name, channel in trip.drive.branches.items()}
     assert trip.notices == ()
     assert np.all(values["battery"] > 0.0)
@@ -75,59 +76,61 @@ def test_currents_are_positive_into_the_junction_and_sum_to_zero(tmp_path: Path)
     assert trip.drive.inputs["aircon_demand"].value[0] == 1000.0
 
 
-def test_default_value_of_the_heater_and_adjacent_lines_are_labelled(tmp_path: Path) -> None:
-    values = columns()
-    values["heater"][200:210] = 5.52
-    values["heater"][400:405] = [1.0, 2.0, 3.0, 4.0, 5.0]
-    values["heater"][405:415] = 5.52
-    trip = imported(write_csv(tmp_path / "a.csv", values))
-    bad = np.flatnonzero(~trip.drive.branches["auxiliary"].good)
-    assert bad.tolist() == [*range(199, 211), *range(399, 416)]
-    assert trip.drive.branches["battery"].good.all()
-    assert np.array_equal(trip.drive.branches["motor"].good, trip.drive.inputs["heater_demand"].good)
-    assert trip.notices == (
-        "heater power reads its default of 5.52 kW 2 times: 29 samples of auxiliary, motor and heater_demand not good",
-    )
+@pytest.mark.parametrize(
+    ("changes", "bad", "notice"),
+    [
+        (
+            {"heater": {range(200, 210): 5.52, range(400, 405): [1.0, 2.0, 3.0, 4.0, 5.0], range(405, 415): 5.52}},
+            dict.fromkeys(OF_HEATER, (*range(199, 211), *range(399, 416))),
+            "heater power reads its default of 5.52 kW 2 times: 29 samples of auxiliary, motor and heater_demand not",
+        ),
+        (
+            {"heater": 1.4},
+            dict.fromkeys(OF_HEATER, range(SAMPLES)),
+            "heater power is implausible over the whole trip: with the inverter idle it leaves -900 W",
+        ),
+        ({"heater": 1.4, "current": columns()["current"] - 1400.0 / 400.0}, {}, None),
+        (
+            {"voltage": {10: np.nan}},
+            {"auxiliary": [10], "motor": [10], "voltage": [10]},
+            "column 'Battery Voltage [V]': 1 cells without a number, the first at 1.0 s; labelled as not good",
+        ),
+        (
+            {"current": {100: -2000.0}, "voltage": {200: 1500.0}, "accelerator": {300: 250.0}},
+            {"battery": [100], "motor": [100, 200], "auxiliary": [200], "voltage": [200], "accelerator": [300]},
+            "accelerator: 1 samples beyond the DBC's 0 to 100; labelled as not good",
+        ),
+    ],
+    ids=["default and its ramps", "heater above battery", "heater within battery", "empty cell", "out of range"],
+)
+def test_what_cannot_be_used_is_labelled_with_what_is_computed_from_it(
+    changes: dict[str, Any], bad: dict[str, Any], notice: str | None, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    trip = imported(write_csv(tmp_path / "a.csv", columns(**changes)), database)
+    channels = {**trip.drive.branches, **trip.drive.inputs}
+    found = {name: np.flatnonzero(~channel.good).tolist() for name, channel in channels.items()}
+    assert {name: rows for name, rows in found.items() if rows} == {name: list(rows) for name, rows in bad.items()}
+    assert any(text.startswith(notice) for text in trip.notices) if notice else not trip.notices
 
 
-def test_heater_power_above_battery_power_is_implausible(tmp_path: Path) -> None:
-    trip = imported(write_csv(tmp_path / "a.csv", columns() | {"heater": np.full(SAMPLES, 1.4)}))
-    assert not trip.drive.branches["auxiliary"].good.any()
-    assert trip.drive.branches["battery"].good.all()
-    assert "implausible over the whole trip: with the inverter idle it leaves -900 W" in trip.notices[0]
-    values = columns() | {"heater": np.full(SAMPLES, 1.4), "current": columns()["current"] - 1400.0 / 400.0}
-    assert imported(write_csv(tmp_path / "b.csv", values)).notices == ()
-
-
-def test_an_empty_cell_is_labelled_with_its_line(tmp_path: Path) -> None:
-    path = with_text(write_csv(tmp_path / "a.csv", columns()), ";400;", ";;", line=12)
-    trip = imported(path)
-    assert np.flatnonzero(~trip.drive.inputs["voltage"].good).tolist() == [10]
-    assert np.flatnonzero(~trip.drive.branches["auxiliary"].good).tolist() == [10]
-    assert trip.notices == (
-        "column 'Battery Voltage [V]': 1 cells without a number, the first at 1.0 s; labelled as not good",
-    )
-
-
-def test_files_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
-    path = with_text(write_csv(tmp_path / "a.csv", columns()), "Battery V", "Batery V", line=1)
-    with pytest.raises(
-        LogError, match=r"a\.csv: there is no column 'Battery Voltage \[V\]'; the columns are 'Batery V"
-    ):
-        imported(path)
+def test_files_that_cannot_be_used_are_refused(tmp_path: Path, database: VehicleDatabase) -> None:
+    path = write_csv(tmp_path / "a.csv", columns(), "Battery V", "Batery V")
+    words = r"a\.csv: there is no column 'Battery Voltage \[V\]'; the columns are 'Batery V"
+    with pytest.raises(LogError, match=words):
+        imported(path, database)
     path = write_csv(tmp_path / "b.csv", {key: value[:31] for key, value in columns().items()})
     with pytest.raises(DriveError, match=r"b\.csv: only 3\.0 s long; at least 10 s are needed"):
-        imported(path)
-    path = write_csv(tmp_path / "c.csv", columns() | {"current": np.full(SAMPLES, np.nan)})
+        imported(path, database)
+    path = write_csv(tmp_path / "c.csv", columns(current=np.nan))
     with pytest.raises(DriveError, match=r"c\.csv: column 'Battery Current \[A\]' has no usable value; leave"):
-        imported(path)
+        imported(path, database)
 
 
 def test_bad_file_does_not_stop_the_import_but_sets_the_exit_code(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     write_csv(tmp_path / "in" / "A.csv", columns())
     write_csv(tmp_path / "in" / "B.csv.gz", columns())
-    with_text(write_csv(tmp_path / "in" / "C.csv", columns()), "Throttle", "Trottle", line=1)
+    write_csv(tmp_path / "in" / "C.csv", columns(), "Throttle", "Trottle")
     write_csv(tmp_path / "B.csv", columns())
     done = run(tmp_path / "in", tmp_path / "B.csv", "--layout", LAYOUT, "--out", tmp_path / "store")
     assert done.exit_code == 1
@@ -140,25 +143,11 @@ def test_bad_file_does_not_stop_the_import_but_sets_the_exit_code(tmp_path: Path
 
 def test_a_layout_without_these_branches_is_refused(tmp_path: Path) -> None:
     text = LAYOUT.read_text().replace('name = "auxiliary"', 'name = "heater"')
-    (tmp_path / "l.toml").write_text(text.replace('"hv_powertrain.dbc"', f'"{LAYOUT.parent / "hv_powertrain.dbc"}"'))
+    (tmp_path / "l.toml").write_text(text.replace('"hv_powertrain.dbc"', f'"{LAYOUT.with_suffix(".dbc")}"'))
     path = write_csv(tmp_path / "A.csv", columns())
     done = run(path, "--layout", tmp_path / "l.toml", "--out", tmp_path / "store")
     assert done.exit_code == 1
     assert "no branch or input named auxiliary" in str(done.exception)
-
-
-def test_values_outside_the_dbc_range_and_those_computed_from_them_are_labelled(tmp_path: Path) -> None:
-    values = columns()
-    values["current"][100] = -2000.0
-    values["voltage"][200] = 1500.0
-    values["accelerator"][300] = 250.0
-    trip = imported(write_csv(tmp_path / "a.csv", values))
-    channels = {**trip.drive.branches, **trip.drive.inputs}
-    bad = {name: np.flatnonzero(~channel.good).tolist() for name, channel in channels.items()}
-    inputs = {"voltage": [200], "accelerator": [300]}
-    wanted = {"battery": [100], "motor": [100, 200], "auxiliary": [200], **inputs}
-    assert {name: rows for name, rows in bad.items() if rows} == wanted
-    assert "accelerator: 1 samples beyond the DBC's 0 to 100; labelled as not good" in trip.notices
 
 
 def test_existing_trips_are_not_overwritten(tmp_path: Path) -> None:
@@ -167,8 +156,7 @@ def test_existing_trips_are_not_overwritten(tmp_path: Path) -> None:
     assert done.exit_code == 0
     assert json.loads(done.stdout)["drives"]["A"]["duration_s"] == pytest.approx(59.9)
     before = Path(list_drives(store)[0].place).read_bytes()
-    write_csv(path, columns() | {"speed": np.full(SAMPLES, 50.0)})
-    again = run(path, "--layout", LAYOUT, "--out", store)
+    again = run(write_csv(path, columns(speed=50.0)), "--layout", LAYOUT, "--out", store)
     assert again.exit_code == 0
     assert "0 trips imported, 0.0 h; 1 already there; 0 left out" in again.stdout
     assert Path(list_drives(store)[0].place).read_bytes() == before

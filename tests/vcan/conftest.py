@@ -4,7 +4,7 @@ import os
 import shutil
 import socket
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Protocol
 
@@ -27,9 +27,11 @@ def state_of(frame: bytes) -> tuple[State, Reason]:
 
 
 class StartNode(Protocol):
-    """Starts ``ecu-node run`` with a parameter file and further options."""
+    """Starts ``ecu-node run`` with some options, by another program if one is given."""
 
-    def __call__(self, params: Path, *options: str, by: Sequence[str] = ()) -> AbstractContextManager[NodeProcess]: ...
+    def __call__(
+        self, *options: str, params: Path | None = None, by: Sequence[str] = ()
+    ) -> AbstractContextManager[NodeProcess]: ...
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -79,26 +81,39 @@ def drive(database: VehicleDatabase, tmp_path: Path, request: pytest.FixtureRequ
 
 
 @pytest.fixture
-def start_node(database: VehicleDatabase, tmp_path: Path) -> StartNode:
+def start_node(database: VehicleDatabase, params: Path, tmp_path: Path) -> StartNode:
     """The node as a process of its own on vcan0; what it says is in node.err, of a second one in node2.err."""
-    logs = (tmp_path / name for name in ("node.err", "node2.err"))
+    logs, default, layout = (tmp_path / name for name in ("node.err", "node2.err")), params, str(database.layout.path)
 
-    def start(params: Path, *options: str, by: Sequence[str] = ()) -> AbstractContextManager[NodeProcess]:
-        layout = str(database.layout.path)
-        return running_node(next(logs), "--unsigned", "--params", str(params), "--layout", layout, *options, by=by)
+    def start(*options: str, params: Path | None = None, by: Sequence[str] = ()) -> AbstractContextManager[NodeProcess]:
+        files = ("--unsigned", "--params", str(params or default), "--layout", layout)
+        return running_node(next(logs), *files, *options, by=by)
 
     return start
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Iterator[Recording]:
+def start_gateway(start_node: StartNode, there: Recording) -> StartNode:
+    """The node as a gateway between vcan0 and vcan1, from when its status has come there."""
+
+    @contextmanager
+    def start(*options: str, params: Path | None = None, by: Sequence[str] = ()) -> Iterator[NodeProcess]:
+        with start_node("--gateway", OTHER_CHANNEL, *options, params=params, by=by) as node:
+            there.wait_for(STATUS, len(there.data_of(STATUS)) + 1)
+            yield node
+
+    return start
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Iterator[Recording]:
     """candump, recording vcan0 from before the test's first frame."""
-    with running_recording(tmp_path / "recorded.log") as running:
+    with running_recording(tmp_path / "here.log") as running:
         yield running
 
 
 @pytest.fixture
-def other_recording(tmp_path: Path) -> Iterator[Recording]:
+def there(tmp_path: Path) -> Iterator[Recording]:
     """candump, recording vcan1 from before the test's first frame."""
-    with running_recording(tmp_path / "other.log", OTHER_CHANNEL) as running:
+    with running_recording(tmp_path / "there.log", OTHER_CHANNEL) as running:
         yield running

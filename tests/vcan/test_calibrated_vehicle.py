@@ -30,19 +30,19 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_correction_reduces_kirchhoff_sum_tenfold_on_an_unseen_drive(
-    fleet: Path, tmp_path: Path, start_node: StartNode, recording: Recording
+    fleet: Path, tmp_path: Path, start_node: StartNode, here: Recording
 ) -> None:
     files = sorted((fleet.parent / "result" / "params").glob("*.json"))
     params = next(path for path in files if read_parameters(path).verdict == "corrected")
     unseen = gzip.decompress((fleet / "unseen" / params.stem / "drive.log.gz").read_bytes()).decode().splitlines()
     start = [line for line in unseen if float(line[1 : line.index(")")]) < SECONDS]
     (tmp_path / "drive.log").write_text("\n".join(start) + "\n")
-    with start_node(params, "--vehicle", params.stem) as node:
+    with start_node("--vehicle", params.stem, params=params) as node:
         play(tmp_path / "drive.log")
         played = Counter(frame.identifier for frame in frames_of(tmp_path / "drive.log"))
         for measured, corrected in (("110", 0x510), ("120", 0x520)):
-            recording.wait_for(corrected, played[measured])
+            here.wait_for(corrected, played[measured])
         assert node.stop() == 0
-    command = [sys.executable, "-m", "calibrator", "kirchhoff", str(recording.log), "--layout", str(LAYOUT), "--json"]
+    command = [sys.executable, "-m", "calibrator", "kirchhoff", str(here.log), "--layout", str(LAYOUT), "--json"]
     figures = json.loads(subprocess.run(command, check=True, capture_output=True, timeout=120).stdout)
     assert figures["before"]["sum"]["rmse_a"] >= 10.0 * figures["after"]["sum"]["rmse_a"], figures

@@ -29,17 +29,14 @@ from tests.vcan.small_drive import BRANCHES, sent_by_core
 
 INSTANTS = 45
 """A multiple of the counter's period, so that a drive may follow itself."""
-GATEWAY = ("--gateway", OTHER_CHANNEL)
 
 
 def qualities(frames: list[bytes]) -> set[int]:
     return {frame[1] >> 4 & 3 for frame in frames}
 
 
-def wait_for_correcting(recording: Recording) -> None:
-    wait_until(
-        lambda: state_of(recording.data_of(STATUS)[-1]) == (State.CORRECTING, Reason.NONE), "the node to correct"
-    )
+def wait_for_correcting(here: Recording) -> None:
+    wait_until(lambda: state_of(here.data_of(STATUS)[-1]) == (State.CORRECTING, Reason.NONE), "the node to correct")
 
 
 def send_branches(database: VehicleDatabase, k: int) -> None:
@@ -60,9 +57,9 @@ def bus_is_back() -> Iterator[None]:
 @pytest.mark.parametrize("how", ["down", "deleted"])
 @pytest.mark.usefixtures("bus_is_back")
 def test_bus_that_was_down_or_deleted_is_used_again(
-    params: Path, tmp_path: Path, drive: Path, start_node: StartNode, how: str
+    tmp_path: Path, drive: Path, start_node: StartNode, how: str
 ) -> None:
-    with start_node(params) as node:
+    with start_node() as node:
         with running_recording(tmp_path / "before.log") as before:
             play(drive)
             before.wait_for(BATTERY_CORRECTED, INSTANTS)
@@ -88,15 +85,14 @@ def test_bus_that_was_down_or_deleted_is_used_again(
 
 
 def test_full_send_queue_loses_frames_but_does_not_stop_the_gateway(
-    database: VehicleDatabase, params: Path, drive: Path, start_node: StartNode, other_recording: Recording
+    database: VehicleDatabase, drive: Path, start_gateway: StartNode, there: Recording
 ) -> None:
     expected = [
         bytes.fromhex(frame.data)
         for frame in sent_by_core(database, Mode.GATEWAY, frames_of(drive))
         if frame.identifier == f"{BATTERY:03X}"
     ]
-    with start_node(params, *GATEWAY) as node:
-        other_recording.wait_for(STATUS, 1)
+    with start_gateway() as node:
         run_tool("tc", "qdisc", "add", "dev", OTHER_CHANNEL, "root", "plug", "limit", "400")
         try:
             play(drive)
@@ -104,47 +100,39 @@ def test_full_send_queue_loses_frames_but_does_not_stop_the_gateway(
             run_tool("tc", "qdisc", "del", "dev", OTHER_CHANNEL, "root")
         assert node.process.poll() is None
         play(drive)
-        wait_until(lambda: other_recording.data_of(BATTERY)[-INSTANTS:] == expected, "the second drive")
+        wait_until(lambda: there.data_of(BATTERY)[-INSTANTS:] == expected, "the second drive")
         assert node.stop() == 0
-    assert len(other_recording.data_of(BATTERY)) < 2 * INSTANTS
+    assert len(there.data_of(BATTERY)) < 2 * INSTANTS
     assert "send errors" in node.messages.splitlines()[-1]
     assert "bus failed" not in node.messages
 
 
-def test_error_frames_are_not_passed_on(
-    database: VehicleDatabase, params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
-    with start_node(params, *GATEWAY) as node:
-        other_recording.wait_for(STATUS, 1)
+def test_error_frames_are_not_passed_on(database: VehicleDatabase, start_gateway: StartNode, there: Recording) -> None:
+    with start_gateway() as node:
         send("20000004#0008000000000000")
         send("20000040#0000000000000000")
         send_branches(database, 0)
-        other_recording.wait_for(AUXILIARY, 1)
+        there.wait_for(AUXILIARY, 1)
         assert node.stop() == 0
     assert "frames in 3, rewritten 3, forwarded 3, bus errors 2, bus off 1" in node.messages
-    assert {item.identifier for item in other_recording.frames} == {"110", "120", "130", "5F0"}
+    assert {item.identifier for item in there.frames} == {"110", "120", "130", "5F0"}
 
 
-def test_second_gateway_refuses_to_start_and_the_first_continues(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
-    with start_node(params, *GATEWAY) as first:
-        other_recording.wait_for(STATUS, 1)
+def test_second_gateway_refuses_to_start_and_the_first_continues(start_gateway: StartNode, there: Recording) -> None:
+    with start_gateway() as first:
         words = "vcan0 and vcan1: another gateway works between them on this computer; stop one"
-        with pytest.raises(AssertionError, match=words), start_node(params, *GATEWAY):
+        with pytest.raises(AssertionError, match=words), start_gateway():
             pass  # it refuses to start
-        other_recording.wait_for(STATUS, len(other_recording.data_of(STATUS)) + 3)
+        there.wait_for(STATUS, len(there.data_of(STATUS)) + 3)
         assert first.stop() == 0
-    counters = [data[1] & 15 for data in other_recording.data_of(STATUS)]
+    counters = [data[1] & 15 for data in there.data_of(STATUS)]
     assert counters == [k % 15 for k in range(len(counters))], "all of the first one"
 
 
-def test_clock_step_is_not_a_fault(
-    database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
-) -> None:
+def test_clock_step_is_not_a_fault(database: VehicleDatabase, start_node: StartNode, here: Recording) -> None:
     k = 0
-    with start_node(params) as node:
-        recording.wait_for(STATUS, 1)
+    with start_node() as node:
+        here.wait_for(STATUS, 1)
         right_s = time.time() - time.monotonic()
         try:
             for step_s in (0.0, 3600.0, -0.4, -86400.0):
@@ -152,29 +140,27 @@ def test_clock_step_is_not_a_fault(
                 for _ in range(2):
                     send_branches(database, k)
                     k += 1
-                recording.wait_for(BATTERY_CORRECTED, k)
-                recording.wait_for(STATUS, len(recording.data_of(STATUS)) + 2)
+                here.wait_for(BATTERY_CORRECTED, k)
+                here.wait_for(STATUS, len(here.data_of(STATUS)) + 2)
         finally:
             time.clock_settime(time.CLOCK_REALTIME, time.monotonic() + right_s)
         assert node.stop() == 0
-    assert qualities(recording.data_of(BATTERY_CORRECTED)) == {Quality.CORRECTED}
-    assert {state_of(data)[0] for data in recording.data_of(STATUS)} <= {State.STARTING, State.CORRECTING}
+    assert qualities(here.data_of(BATTERY_CORRECTED)) == {Quality.CORRECTED}
+    assert {state_of(data)[0] for data in here.data_of(STATUS)} <= {State.STARTING, State.CORRECTING}
 
 
-def test_restarted_node_corrects_again_after_a_kill(
-    params: Path, drive: Path, start_node: StartNode, recording: Recording
-) -> None:
+def test_restarted_node_corrects_again_after_a_kill(drive: Path, start_node: StartNode, here: Recording) -> None:
     with playing(drive, endlessly=True):
-        with start_node(params) as node:
-            recording.wait_for(BATTERY_CORRECTED, 5)
+        with start_node() as node:
+            here.wait_for(BATTERY_CORRECTED, 5)
             assert node.stop(signal.SIGKILL) == -signal.SIGKILL
-        recording.wait_for_marker(MARKER)
-        first = len(recording.data_of(BATTERY_CORRECTED))
-        with start_node(params) as node:
-            recording.wait_for(BATTERY_CORRECTED, first + 20)
-            wait_for_correcting(recording)
+        here.wait_for_marker(MARKER)
+        first = len(here.data_of(BATTERY_CORRECTED))
+        with start_node() as node:
+            here.wait_for(BATTERY_CORRECTED, first + 20)
+            wait_for_correcting(here)
             assert node.stop() == 0
-    corrected = recording.data_of(BATTERY_CORRECTED)
+    corrected = here.data_of(BATTERY_CORRECTED)
     assert qualities(corrected) == {Quality.CORRECTED}
     counters = [data[1] & 15 for data in corrected]
     assert counters[first : first + 20] == [k % 15 for k in range(20)], "receivers see it count from 0 again"

@@ -37,15 +37,9 @@ def apart(frames: Iterable[LoggedFrame]) -> dict[str, list[LoggedFrame]]:
 
 
 def test_gateway_changes_currents_and_crcs_and_nothing_else(
-    database: VehicleDatabase,
-    params: Path,
-    drive: Path,
-    start_node: StartNode,
-    recording: Recording,
-    other_recording: Recording,
+    database: VehicleDatabase, drive: Path, start_gateway: StartNode, here: Recording, there: Recording
 ) -> None:
-    with start_node(params, "--vehicle", VEHICLE, "--gateway", OTHER_CHANNEL, "--fd") as node:
-        other_recording.wait_for(STATUS, 1)
+    with start_gateway("--vehicle", VEHICLE, "--fd") as node:
         with playing(drive) as player:
             generate(CHANNEL, 150, "-I", NOISE, "-m")
             generate(CHANNEL, 50, "-e")
@@ -53,23 +47,23 @@ def test_gateway_changes_currents_and_crcs_and_nothing_else(
             generate(OTHER_CHANNEL, 10, "-I", BACK, "-R")
             assert player.wait() == 0
         total = len(frames_of(drive)) + 260
-        sent = recording.wait_for_frames(total)
+        sent = here.wait_for_frames(total)
         held_back = INSTANTS // 10
         arrived_at_least = total - held_back
         wait_until(
-            lambda: sum(item.identifier != f"{STATUS:03X}" for item in other_recording.frames) >= arrived_at_least,
+            lambda: sum(item.identifier != f"{STATUS:03X}" for item in there.frames) >= arrived_at_least,
             "all frames on the other bus",
         )
         assert node.stop() == 0
-    there, here = apart(other_recording.frames), apart(sent)
-    assert len(here["noise"]) == 200
-    assert any(item.data.startswith("#") for item in here["noise"]), "FD frames, too"
-    assert (there["noise"], there["others"]) == (here["noise"], here["others"])
-    assert there["branches"] == sent_by_core(database, Mode.GATEWAY, here["branches"])
-    assert there["branches"] != here["branches"]
-    back = [[item for item in side.frames if item.identifier == BACK] for side in (recording, other_recording)]
+    before, after = apart(sent), apart(there.frames)
+    assert len(before["noise"]) == 200
+    assert any(item.data.startswith("#") for item in before["noise"]), "FD frames, too"
+    assert (after["noise"], after["others"]) == (before["noise"], before["others"])
+    assert after["branches"] == sent_by_core(database, Mode.GATEWAY, before["branches"])
+    assert after["branches"] != before["branches"]
+    back = [[item for item in side.frames if item.identifier == BACK] for side in (here, there)]
     assert len(back[0]) == 60
     assert back[0] == back[1]
-    assert recording.frames == sent, "nothing comes back, and the status stays where it belongs"
-    counted = f"forwarded {len(there['branches'])}, held back {held_back}, corrupt {held_back}"
+    assert here.frames == sent, "nothing comes back, and the status stays where it belongs"
+    counted = f"forwarded {len(after['branches'])}, held back {held_back}, corrupt {held_back}"
     assert node.messages.endswith(f"{counted}\n")

@@ -85,30 +85,27 @@ def delays_s(identifier: int, sent: Recording, arrived: Recording) -> list[float
     return [after - before for before, after in zip(*stamps, strict=True)]
 
 
-def wait_for_state(recording: Recording, state: State, reason: Reason) -> None:
-    wait_until(lambda: state_of(recording.data_of(STATUS)[-1]) == (state, reason), f"the state {state.name}")
+def wait_for_state(here: Recording, state: State, reason: Reason) -> None:
+    wait_until(lambda: state_of(here.data_of(STATUS)[-1]) == (state, reason), f"the state {state.name}")
 
 
-def test_frames_pass_while_the_gateway_is_killed(
-    params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
-) -> None:
-    with start_node(params, *GATEWAY) as node:
-        other_recording.wait_for(STATUS, 1)
+def test_frames_pass_while_the_gateway_is_killed(start_gateway: StartNode, here: Recording, there: Recording) -> None:
+    with start_gateway() as node:
         at_work = rules()
         with noise(400):
-            other_recording.wait_for(NOISE, 100)
+            there.wait_for(NOISE, 100)
             node.stop(signal.SIGKILL)
-            while_killed = len(other_recording.data_of(NOISE))
-            other_recording.wait_for(NOISE, while_killed + 150)
-            with start_node(params, *GATEWAY) as again:
+            while_killed = len(there.data_of(NOISE))
+            there.wait_for(NOISE, while_killed + 150)
+            with start_gateway() as again:
                 assert rules() == at_work, "those that were left are used again, not doubled"
-        wait_until(lambda: len(recording.frames) >= 800, "all frames towards the sensors")
-        wait_until(lambda: len(other_recording.data_of(NOISE)) >= 400, "all frames towards the vehicle")
+        wait_until(lambda: len(here.frames) >= 800, "all frames towards the sensors")
+        wait_until(lambda: len(there.data_of(NOISE)) >= 400, "all frames towards the vehicle")
         for identifier in (NOISE, BACK):
-            numbers = [int.from_bytes(data, "little") for data in recording.data_of(identifier)]
+            numbers = [int.from_bytes(data, "little") for data in here.data_of(identifier)]
             assert numbers == list(range(400)), "none lost, none twice"
-            assert other_recording.data_of(identifier) == recording.data_of(identifier)
-        delays = delays_s(NOISE, recording, other_recording)
+            assert there.data_of(identifier) == here.data_of(identifier)
+        delays = delays_s(NOISE, here, there)
         alive_s, killed_s = median(delays[:100]), median(delays[while_killed : while_killed + 150])
         print(f"median delay {1e6 * alive_s:.0f} us while the node is at work, {1e6 * killed_s:.0f} us while killed")
         assert killed_s < 2e-3, "by the kernel alone"
@@ -116,26 +113,23 @@ def test_frames_pass_while_the_gateway_is_killed(
     assert again.process.returncode is not None
 
 
-def test_kernel_rules_are_removed_when_the_gateway_ends(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
-    with start_node(params, *GATEWAY, "--fd") as node:
-        other_recording.wait_for(STATUS, 1)
+def test_kernel_rules_are_removed_when_the_gateway_ends(start_gateway: StartNode, there: Recording) -> None:
+    with start_gateway("--fd") as node:
         assert len(rules()) == 2 * RULES, "both ways, classic and FD"
         node.stop(signal.SIGKILL)
-    with start_node(params, *GATEWAY) as node:
+    with start_gateway() as node:
         assert len(rules()) == RULES, "those of another kind are replaced"
         assert node.stop() == 0
     assert rules() == []
     send(f"{NOISE:X}#01")
     send(f"{BACK:X}#01", OTHER_CHANNEL)
-    other_recording.wait_for(BACK, 1)
-    assert other_recording.data_of(NOISE) == []
+    there.wait_for(BACK, 1)
+    assert there.data_of(NOISE) == []
 
 
-def test_removed_kernel_rules_are_restored(params: Path, start_node: StartNode) -> None:
+def test_removed_kernel_rules_are_restored(start_gateway: StartNode) -> None:
     mine = ("-s", CHANNEL, "-d", OTHER_CHANNEL, "-f", "345:7FF", "-X")
-    with start_node(params, *GATEWAY) as node:
+    with start_gateway() as node:
         before = rules()
         run_tool("cangw", "-F")
         run_tool("cangw", "-A", *mine)
@@ -154,14 +148,13 @@ WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin
 
 
 def test_node_forwards_frames_itself_without_kernel_rights(
-    params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
+    start_gateway: StartNode, here: Recording, there: Recording
 ) -> None:
-    with start_node(params, *GATEWAY, by=WITHOUT_RIGHTS) as node:
-        other_recording.wait_for(STATUS, 1)
+    with start_gateway(by=WITHOUT_RIGHTS) as node:
         with noise(50):
             pass
         assert rules() == []
-        assert len(other_recording.wait_for(NOISE, 50)) == len(recording.wait_for(BACK, 50)) == 50
+        assert len(there.wait_for(NOISE, 50)) == len(here.wait_for(BACK, 50)) == 50
         assert node.stop() == 0
     assert (
         "vcan0 and vcan1: the kernel carries no frames (CAP_NET_ADMIN is needed), so this program carries them all, "
@@ -169,15 +162,12 @@ def test_node_forwards_frames_itself_without_kernel_rights(
     ) in node.messages
 
 
-def test_node_forwards_frames_itself_without_module_can_gw(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
+def test_node_forwards_frames_itself_without_module_can_gw(start_gateway: StartNode, there: Recording) -> None:
     run_tool("rmmod", "can-gw")
     try:
-        with start_node(params, *GATEWAY) as node:
-            other_recording.wait_for(STATUS, 1)
+        with start_gateway() as node:
             send(f"{NOISE:X}#01")
-            other_recording.wait_for(NOISE, 1)
+            there.wait_for(NOISE, 1)
             assert node.stop() == 0
     finally:
         module = f"/usr/lib/uml/modules/{os.uname().release}/kernel/net/can/can-gw.ko"
@@ -185,14 +175,11 @@ def test_node_forwards_frames_itself_without_module_can_gw(
     assert "the kernel carries no frames (its module can-gw is needed)" in node.messages
 
 
-def test_gateway_refuses_to_start_if_rules_are_left_that_it_cannot_change(
-    params: Path, start_node: StartNode, other_recording: Recording
-) -> None:
-    with start_node(params, *GATEWAY) as node:
-        other_recording.wait_for(STATUS, 1)
+def test_gateway_refuses_to_start_if_rules_are_left_that_it_cannot_change(start_gateway: StartNode) -> None:
+    with start_gateway() as node:
         node.stop(signal.SIGKILL)
     words = "an earlier gateway left rules in the kernel, which only CAP_NET_ADMIN may change"
-    with pytest.raises(AssertionError, match=words), start_node(params, *GATEWAY, by=WITHOUT_RIGHTS):
+    with pytest.raises(AssertionError, match=words), start_gateway(by=WITHOUT_RIGHTS):
         pass  # it refuses to start
     assert len(rules()) == RULES, "others are still carried"
 
@@ -214,32 +201,31 @@ def test_rules_for_a_vanished_interface_are_refused_in_one_line() -> None:
 
 
 def test_foreign_branch_frames_are_reported_and_dropped(
-    params: Path, drive: Path, start_node: StartNode, recording: Recording, other_recording: Recording
+    drive: Path, start_gateway: StartNode, here: Recording, there: Recording
 ) -> None:
     command = ["cangen", OTHER_CHANNEL, "-I", f"{BATTERY:X}", "-D", FOREIGN, "-L", "8", "-g", "1"]
-    with start_node(params, *GATEWAY) as node:
-        other_recording.wait_for(STATUS, 1)
+    with start_gateway() as node:
         with subprocess.Popen(command) as foreigner:
             with playing(drive) as player:
-                wait_for_state(other_recording, State.CORRECTING, Reason.FOREIGN_FRAMES)
+                wait_for_state(there, State.CORRECTING, Reason.FOREIGN_FRAMES)
                 assert player.wait(LONGEST_WAIT_S) == 0
             foreigner.terminate()
-        sent = len(recording.wait_for(BATTERY, INSTANTS))
-        other_recording.wait_for(AUXILIARY, INSTANTS)
-        print(f"{len(other_recording.data_of(BATTERY)) - sent} foreign frames among {sent}")
+        sent = len(here.wait_for(BATTERY, INSTANTS))
+        there.wait_for(AUXILIARY, INSTANTS)
+        print(f"{len(there.data_of(BATTERY)) - sent} foreign frames among {sent}")
         assert node.stop() == 0
     foreign = bytes.fromhex(FOREIGN)
-    assert foreign not in recording.data_of(BATTERY), "none reaches the sensors' bus"
-    passed = [data for data in other_recording.data_of(BATTERY) if data != foreign]
+    assert foreign not in here.data_of(BATTERY), "none reaches the sensors' bus"
+    passed = [data for data in there.data_of(BATTERY) if data != foreign]
     assert [data[1] & 15 for data in passed] == [k % 15 for k in range(INSTANTS)], "each frame of the branch arrives"
-    assert passed != recording.data_of(BATTERY), "corrected"
+    assert passed != here.data_of(BATTERY), "corrected"
     assert "vcan1': another node sends frames 0x110, which only this one may send there; they are dropped" in (
         node.messages
     )
 
 
 def test_gateway_whose_standard_error_nobody_reads_forwards_frames_and_can_be_ended(
-    database: VehicleDatabase, params: Path, drive: Path, recording: Recording, other_recording: Recording
+    database: VehicleDatabase, params: Path, drive: Path, here: Recording, there: Recording
 ) -> None:
     read, write = os.pipe()
     os.set_blocking(write, False)
@@ -251,13 +237,13 @@ def test_gateway_whose_standard_error_nobody_reads_forwards_frames_and_can_be_en
     command = [*ECU_NODE, "run", "--channel", CHANNEL, "--unsigned", "--params", str(params), *GATEWAY]
     with subprocess.Popen([*command, "--layout", str(database.layout.path)], stderr=write) as process:
         try:
-            other_recording.wait_for(STATUS, 1)
+            there.wait_for(STATUS, 1)
             with noise(100), playing(drive) as player:
                 generate(OTHER_CHANNEL, 20, "-I", f"{BATTERY:X}")  # each is worth a line
                 assert player.wait(LONGEST_WAIT_S) == 0
-            other_recording.wait_for(AUXILIARY, INSTANTS)
-            other_recording.wait_for(NOISE, 100)
-            recording.wait_for(BACK, 100)
+            there.wait_for(AUXILIARY, INSTANTS)
+            there.wait_for(NOISE, 100)
+            here.wait_for(BACK, 100)
             process.terminate()
             assert process.wait(LONGEST_WAIT_S) == 0
         finally:
@@ -296,17 +282,16 @@ def joined() -> Iterator[None]:
 
 @pytest.mark.parametrize("killed", [False, True], ids=["gateway running", "gateway killed before"])
 def test_joined_buses_stop_the_gateway_and_no_frame_circulates(
-    params: Path, drive: Path, tmp_path: Path, start_node: StartNode, other_recording: Recording, killed: bool
+    drive: Path, tmp_path: Path, start_gateway: StartNode, killed: bool
 ) -> None:
     words = "which only this one may send there; two nodes on one bus, or two buses that are joined? Stop one"
-    with start_node(params, *GATEWAY) as node:
-        other_recording.wait_for(STATUS, 1)
+    with start_gateway() as node:
         if killed:
             node.stop(signal.SIGKILL)
         with joined(), playing(drive, endlessly=True):
             joined_s = time.monotonic()
             if killed:
-                with pytest.raises(AssertionError, match=re.escape(words)), start_node(params, *GATEWAY):
+                with pytest.raises(AssertionError, match=re.escape(words)), start_gateway():
                     pass  # it hears the branches where only it may send them, and removes what the first one left
             else:
                 assert node.wait_for_end() == 1

@@ -53,19 +53,19 @@ def test_monitor_shows_branches_sums_and_node_status(patient: VehicleDatabase, t
     assert abs(view["sums"]["corrected_a"]) < 1.0 < abs(view["sums"]["measured_a"])
 
 
-def test_node_needs_no_capability(start_node: StartNode, params: Path, drive: Path, recording: Recording) -> None:
+def test_node_needs_no_capability(start_node: StartNode, drive: Path, here: Recording) -> None:
     """As in deploy/ecu-node@.service: an empty bounding set, no ambient capabilities, no new privileges."""
-    with start_node(params, by=UNPRIVILEGED) as node:
+    with start_node(by=UNPRIVILEGED) as node:
         capabilities = Path(f"/proc/{node.process.pid}/status").read_text().partition("CapPrm:")[2].split()
         assert int(capabilities[0], 16) == 0
         play(drive)
-        assert len(recording.wait_for(CORRECTED_BATTERY, INSTANTS)) == INSTANTS
-        assert recording.wait_for(STATUS, 1)
+        assert len(here.wait_for(CORRECTED_BATTERY, INSTANTS)) == INSTANTS
+        assert here.wait_for(STATUS, 1)
         assert node.stop() == 0
 
 
-def test_real_time_is_fifo_on_one_processor_with_locked_memory(start_node: StartNode, params: Path) -> None:
-    with start_node(params, "--realtime") as node:
+def test_real_time_is_fifo_on_one_processor_with_locked_memory(start_node: StartNode) -> None:
+    with start_node("--realtime") as node:
         number = node.process.pid
         status = Path(f"/proc/{number}/status").read_text()
         locked_kb = int(status.partition("VmLck:")[2].split()[0])
