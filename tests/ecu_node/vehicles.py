@@ -1,7 +1,7 @@
 """Small vehicles for the node's tests: layouts and DBCs made to measure, parameters, and frames with cantools."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -12,7 +12,7 @@ from e2e.p01 import e2e_p01_protect
 from ecu_node.bus.wiring import InForce, Mode, key_of, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import FrameKey
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Quality, Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.parameters import (
@@ -168,6 +168,11 @@ def damaged(frame: Frame) -> Frame:
     return Frame(frame.key, bytes([frame.data[0] ^ 1]) + frame.data[1:])
 
 
+def motor(database: VehicleDatabase, counter: int, current: float = 100.0) -> Frame:
+    """A frame of the motor of the project's own layout. [A]"""
+    return Frame(MOTOR, protected(database, "HV_Motor", counter, MotorCurrent=current))
+
+
 def corrector_for(
     database: VehicleDatabase, mode: Mode = Mode.OVERLAY, start_s: float = 0.0, /, **faults: tuple[float, float]
 ) -> Corrector:
@@ -175,3 +180,42 @@ def corrector_for(
     parameters = parameters_for(database, **faults) if faults else None
     in_force = InForce(parameters=parameters, reason=Reason.NONE if faults else Reason.NO_PARAMETERS)
     return wire(database, in_force, start_s, mode=mode)
+
+
+Current = float | Callable[[int], float]
+"""Of all frames, or of each by its number. [A]"""
+
+
+def drive(
+    database: VehicleDatabase,
+    corrector: Corrector,
+    start_s: float,
+    end_s: float,
+    *,
+    silent: Collection[str] = (),
+    battery_a: Current = 80.0,
+    motor_a: Current = 60.0,
+    period_s: float = 0.05,
+    spoil: int = 0,
+    look: Callable[[Corrector, float], object] = lambda *_: None,
+    **more: float,
+) -> list[Quality]:
+    """Battery and motor frames of the project's own layout, and a look of the node's core, and of another, after each.
+
+    Some may be silent, every so many of the battery damaged. Further signals are those of the battery's message.
+    Returns the qualities of the answers to the battery.
+    """
+    qualities = []
+    for k in range(round(start_s / period_s), round(end_s / period_s)):
+        battery_now_a, motor_now_a = (item(k) if callable(item) else item for item in (battery_a, motor_a))
+        if "battery" not in silent:
+            frame = battery(database, k % 15, battery_now_a, **more)
+            found = answers(corrector, damaged(frame) if spoil and k % spoil == 0 else frame, k * period_s)
+            values = [decoded(database, "HV_BatteryCorrected", answer.data) for answer in found]
+            qualities += [item["BatteryCurrentQuality"] for item in values]
+        if "motor" not in silent:
+            answers(corrector, motor(database, k % 15, motor_now_a), k * period_s)
+        now_s = (k + 0.5) * period_s
+        corrector.look(now_s)
+        look(corrector, now_s)
+    return qualities

@@ -16,7 +16,6 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE
 from tests.ecu_node.vehicles import parameters_for
-from tests.update.held import held, new_vehicle
 from tests.update.repo import Repo, pass_trial
 
 
@@ -91,15 +90,3 @@ def new(offered: Repo, tmp_path: Path) -> Path:
 def state(offered: Repo, tmp_path: Path) -> Path:
     """State of a vehicle with set 300 in force."""
     return Path(shutil.copytree(offered.folder / "in force", tmp_path / "v1 in force"))
-
-
-@pytest.fixture
-def vehicle(tmp_path: Path) -> Path:
-    """State of a vehicle that holds nothing."""
-    return new_vehicle(tmp_path / "vehicle")
-
-
-@pytest.fixture
-def correcting(tmp_path: Path, parameters: VehicleParameters) -> Path:
-    """State of a vehicle with set 300 in force."""
-    return new_vehicle(tmp_path / "correcting", held(parameters))

@@ -1,7 +1,6 @@
 """Kinds of damage to a file."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 
@@ -29,12 +28,3 @@ def huge(path: Path) -> None:
 
 def zeros(path: Path) -> None:
     path.write_bytes(bytes(path.stat().st_size))
-
-
-def with_text(old: bytes, new: bytes) -> Callable[[Path], None]:
-    def change(path: Path) -> None:
-        content = path.read_bytes()
-        assert old in content
-        path.write_bytes(content.replace(old, new, 1))
-
-    return change

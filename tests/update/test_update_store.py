@@ -55,23 +55,21 @@ class _Ended(ParameterTrial):
 
 
 @pytest.fixture
-def ended(
-    correcting: Path, other: VehicleParameters, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
-) -> Running:
+def ended(state: Path, other: VehicleParameters, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> Running:
     """A node whose trial of set 301 ends well as soon as it is looked at."""
     monkeypatch.setattr("ecu_node.update.store.ParameterTrial", _Ended)
-    put_on_trial(correcting, other)
-    running = Running(correcting, database)
+    put_on_trial(state, other)
+    running = Running(state, database)
     monkeypatch.setattr(running.corrector.watch, "is_whole", lambda _: True)
     return running
 
 
 @pytest.mark.parametrize("damage", [without, cut, a_folder])
 def test_running_node_keeps_its_parameters_while_the_state_is_damaged(
-    damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
+    damage: Callable[[Path], None], state: Path, database: VehicleDatabase
 ) -> None:
     """A running node keeps the set in force; a node that starts with a damaged state passes values through."""
-    running, path = Running(correcting, database), correcting / "state.json"
+    running, path = Running(state, database), state / "state.json"
     whole = path.read_bytes()
     damage(path)
     assert not any(running.look(2.0, 4.0, 6.0))
@@ -81,7 +79,7 @@ def test_running_node_keeps_its_parameters_while_the_state_is_damaged(
     running.now = NOW + timedelta(days=400)
     assert running.look(8.0) == [True], "it expires all the same"
     assert running.corrector.reason is Reason.NOT_VALID_NOW
-    started = Running(correcting, database)
+    started = Running(state, database)
     assert started.corrector.reason in (Reason.MALFORMED_PARAMETERS, Reason.NO_PARAMETERS)
     assert not any(started.look(1.0))
     shutil.rmtree(path, ignore_errors=True)
@@ -93,55 +91,55 @@ def test_running_node_keeps_its_parameters_while_the_state_is_damaged(
     assert running.drift == DRIFT
 
 
-def test_state_of_another_vehicle_is_not_used(correcting: Path, database: VehicleDatabase) -> None:
+def test_state_of_another_vehicle_is_not_used(state: Path, database: VehicleDatabase) -> None:
     store = ParameterStore(
-        correcting, database, mode=Mode.OVERLAY, say=print, now=lambda: NOW, vehicle="v2", background=AT_ONCE
+        state, database, mode=Mode.OVERLAY, say=print, now=lambda: NOW, vehicle="v2", background=AT_ONCE
     )
     assert store.in_force.reason is Reason.WRONG_VEHICLE
     assert store.in_force.why_not is not None
 
 
-def test_end_of_a_trial_is_written_later_if_the_state_is_locked(correcting: Path, ended: Running) -> None:
-    with locked(correcting):
+def test_end_of_a_trial_is_written_later_if_the_state_is_locked(state: Path, ended: Running) -> None:
+    with locked(state):
         ended.look(*range(0, 59, 2))
-    assert (ended.drift, read_state(correcting).on_trial is None) == (DRIFT, False)
+    assert (ended.drift, read_state(state).on_trial is None) == (DRIFT, False)
     assert [line.split(":")[0] for line in ended.said[1:]] == [
         "a decision cannot be written now, what was in force stays, and it is tried again in 60 s"
     ]
     ended.look(*range(60, 70, 2))
-    assert (ended.drift, read_state(correcting).on_trial) == (OTHER_DRIFT, None)
+    assert (ended.drift, read_state(state).on_trial) == (OTHER_DRIFT, None)
 
 
-def test_writer_waits_while_another_one_changes_the_state(correcting: Path) -> None:
+def test_writer_waits_while_another_one_changes_the_state(state: Path) -> None:
     def change() -> None:
-        with locked(correcting):
+        with locked(state):
             pass
 
     with ThreadPoolExecutor(1) as pool:
-        with locked(correcting):
+        with locked(state):
             waiting = pool.submit(change)
             with pytest.raises(TimeoutError):
                 waiting.result(0.1)
         waiting.result(30.0)
 
 
-def test_end_of_a_trial_in_a_damaged_state_does_not_end_the_node(correcting: Path, ended: Running) -> None:
-    cut(correcting / "state.json")
+def test_end_of_a_trial_in_a_damaged_state_does_not_end_the_node(state: Path, ended: Running) -> None:
+    cut(state / "state.json")
     ended.look(1.0, 3.0, 5.0)
     assert ended.drift == DRIFT
     assert all(line.isprintable() for line in ended.said)
 
 
 def test_changed_state_is_read_again_after_a_read_error(
-    correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+    state: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise a revocation would take effect only at the next start."""
 
     def broken_disk(folder: Path) -> VehicleState:
         raise TrustError(Reason.NO_PARAMETERS, f"{folder}: Input/output error")
 
-    running = Running(correcting, database)
-    write_state(correcting, replace(read_state(correcting), in_force=None, ended="revoked"))
+    running = Running(state, database)
+    write_state(state, replace(read_state(state), in_force=None, ended="revoked"))
     with monkeypatch.context() as broken:
         broken.setattr("ecu_node.update.store.read_state", broken_disk)
         assert not any(running.look(2.0, 4.0))
@@ -150,7 +148,7 @@ def test_changed_state_is_read_again_after_a_read_error(
 
 
 def test_slow_disk_does_not_block_the_node(
-    correcting: Path, ended: Running, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+    state: Path, ended: Running, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writing, may_go_on = threading.Event(), threading.Event()
 
@@ -161,51 +159,51 @@ def test_slow_disk_does_not_block_the_node(
 
     monkeypatch.setattr("ecu_node.update.state.os.fsync", slow_fsync)
     with ThreadPoolExecutor(1) as background:
-        running = Running(correcting, database, background=background)
+        running = Running(state, database, background=background)
         monkeypatch.setattr(running.corrector.watch, "is_whole", lambda _: True)
         running.look(*range(0, 10, 2))
         assert writing.wait(20.0)
         running.look(10.0)
-        assert (running.drift, read_state(correcting).on_trial is None) == (DRIFT, False)
+        assert (running.drift, read_state(state).on_trial is None) == (DRIFT, False)
         may_go_on.set()
     running.look(*range(12, 20, 2))
-    assert (running.drift, read_state(correcting).on_trial) == (OTHER_DRIFT, None)
+    assert (running.drift, read_state(state).on_trial) == (OTHER_DRIFT, None)
     assert any("has passed its trial: seen" in line for line in running.said)
 
 
 def test_set_that_expires_on_trial_does_not_come_in_force(
-    correcting: Path, ended: Running, other: VehicleParameters
+    state: Path, ended: Running, other: VehicleParameters
 ) -> None:
-    put_on_trial(correcting, other, days=1)
+    put_on_trial(state, other, days=1)
     ended.look(2.0, 2.1)
     ended.now = NOW + timedelta(days=2)
     ended.look(4.0, 6.0, 8.0)
-    assert (ended.drift, read_state(correcting).on_trial) == (DRIFT, None)
-    assert "expired at" in (correcting / "decisions.log").read_text().splitlines()[-1]
+    assert (ended.drift, read_state(state).on_trial) == (DRIFT, None)
+    assert "expired at" in (state / "decisions.log").read_text().splitlines()[-1]
     assert ended.said[-1].split(" is ")[1].startswith("not in force, though its trial went well")
 
 
 def test_trial_starts_only_once_the_set_is_valid(
-    correcting: Path, other: VehicleParameters, database: VehicleDatabase
+    state: Path, other: VehicleParameters, database: VehicleDatabase
 ) -> None:
-    put_on_trial(correcting, other, days=-1)
-    running = Running(correcting, database)
+    put_on_trial(state, other, days=-1)
+    running = Running(state, database)
     running.look(*range(0, 110, 2))
     (line,) = running.said
     assert line.startswith("no trial yet: ")
-    put_on_trial(correcting, other)
+    put_on_trial(state, other)
     running.look(*range(110, 120, 2))
     assert running.said[-1].endswith(" is on trial")
 
 
 def test_running_node_loads_a_set_written_to_its_state(
-    vehicle: Path, parameters: VehicleParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    new: Path, parameters: VehicleParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It also reports this to the service manager."""
     manager = ServiceManagerHere(tmp_path / "notify", monkeypatch)
     bus = ["--interface", "virtual", "--channel", "state"]
-    with manager.socket, running("run", "--state", str(vehicle), "--layout", str(LAYOUT), *bus) as log:
-        write_state(vehicle, replace(read_state(vehicle), in_force=held(parameters, days=36500)))
+    with manager.socket, running("run", "--state", str(new), "--layout", str(LAYOUT), *bus) as log:
+        write_state(new, replace(read_state(new), in_force=held(parameters, days=36500)))
         said = manager.wait_for("STATUS=parameter set")
     assert said == "STATUS=parameter set 44 is in force, correcting battery, motor"
     assert any("of vehicle v1 is in force" in line for line in log)

@@ -2,26 +2,22 @@
 
 import math
 import shutil
-from collections.abc import Iterator
 from datetime import timedelta
-from itertools import count
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
 from ecu_node.bus.wiring import Mode, wire
-from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import JunctionResidual, VehicleParameters
 from ecu_node.update.state import read_state, write_state
 from ecu_node.update.store import ParameterStore
-from tests.ecu_node.vehicles import LAYOUT, AtOnce, Frame, answers, parameters_for, protected
+from tests.ecu_node.vehicles import LAYOUT, AtOnce, drive, parameters_for
 from tests.update.held import NOW, put_on_trial
 
-PERIOD_S = 0.1
 DRIFT, OFFSET_A = 0.05, 2.0
 """Of the battery's sensor in this vehicle."""
 
@@ -30,7 +26,7 @@ TRIAL_S = 30.0
 
 
 @pytest.fixture(scope="module")
-def database(tmp_path_factory: pytest.TempPathFactory) -> VehicleDatabase:
+def car(tmp_path_factory: pytest.TempPathFactory) -> VehicleDatabase:
     """The project's own layout and DBC, with a short trial."""
     return own_vehicle(tmp_path_factory.mktemp("vehicle"))
 
@@ -52,7 +48,7 @@ class Drive:
             state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.time, background=AtOnce()
         )
         self.corrector = wire(database, self.store.in_force, 0.0)
-        self._steps: Iterator[int] = count()
+        self.now_s = 0.0
 
     def go_on(
         self,
@@ -65,21 +61,22 @@ class Drive:
         moving: bool = True,
     ) -> None:
         """Drive, or stand; a load that nobody measures takes its share from the battery."""
-        others = {"ContactorState": contactor}
-        for _ in range(round(duration_s / PERIOD_S)):
-            k = next(self._steps)
-            now_s = PERIOD_S * k
-            motor_a = moving * (100.0 * math.sin(0.3 * k) + 40.0)
-            battery_a = (1.0 + drift) * (motor_a + load_a) + offset_a
-            frames = {
-                0x110: ("HV_Battery", {"BatteryCurrent": battery_a, **others}),
-                0x120: ("HV_Motor", {"MotorCurrent": motor_a}),
-            }
-            for identifier, (message, values) in frames.items():
-                data = protected(self.database, message, k % 15, **values)
-                answers(self.corrector, Frame(FrameKey(identifier, False), data), now_s)
-            self.corrector.look(now_s + 0.01)
-            self.store.look(self.corrector, now_s + 0.01)
+
+        def motor_a(k: int) -> float:
+            return moving * (100.0 * math.sin(0.3 * k) + 40.0)
+
+        drive(
+            self.database,
+            self.corrector,
+            self.now_s,
+            self.now_s + duration_s,
+            battery_a=lambda k: (1.0 + drift) * (motor_a(k) + load_a) + offset_a,
+            motor_a=motor_a,
+            period_s=0.1,
+            look=self.store.look,
+            ContactorState=contactor,
+        )
+        self.now_s += duration_s
 
     def has_said(self, words: str) -> bool:
         return any(words in line for line in self.said)
@@ -108,14 +105,14 @@ def tried(vehicle: Path, parameters: VehicleParameters, database: VehicleDatabas
     return drive
 
 
-def test_right_set_comes_in_force_after_its_trial_and_not_before(vehicle: Path, database: VehicleDatabase) -> None:
-    put_on_trial(vehicle, right(database))
-    drive = Drive(vehicle, database)
+def test_right_set_comes_in_force_after_its_trial_and_not_before(new: Path, car: VehicleDatabase) -> None:
+    put_on_trial(new, right(car))
+    drive = Drive(new, car)
     drive.go_on(0.9 * TRIAL_S)
     assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
     drive.go_on(0.2 * TRIAL_S)
     assert drive.told == (State.CORRECTING, Reason.NONE)
-    assert read_state(vehicle).in_force is not None
+    assert read_state(new).in_force is not None
     assert drive.has_said(PASSED)
     drive.go_on(10.0)
     assert drive.corrector.watch.sums is not None
@@ -127,18 +124,18 @@ def test_right_set_comes_in_force_after_its_trial_and_not_before(vehicle: Path, 
 )
 @pytest.mark.parametrize("left_a", [0.5, 20.0], ids=["small remaining sum", "large remaining sum"])
 def test_wrong_set_fails_its_trial(
-    vehicle: Path, database: VehicleDatabase, drift: float, offset_a: float, left_a: float
+    new: Path, car: VehicleDatabase, drift: float, offset_a: float, left_a: float
 ) -> None:
     """Also if the calibrator stated a large remaining sum."""
-    drive = tried(vehicle, right(database, drift, offset_a, left_a=left_a), database)
+    drive = tried(new, right(car, drift, offset_a, left_a=left_a), car)
     assert drive.told == (State.PASSING_THROUGH, Reason.NO_PARAMETERS)
-    assert (read_state(vehicle).in_force, read_state(vehicle).on_trial) == (None, None)
+    assert (read_state(new).in_force, read_state(new).on_trial) == (None, None)
     assert drive.has_said(FAILED)
 
 
-def test_previous_set_stays_in_force_during_and_after_a_failed_trial(vehicle: Path, database: VehicleDatabase) -> None:
-    drive = tried(vehicle, right(database), database)
-    put_on_trial(vehicle, right(database, -DRIFT, 0.0))
+def test_previous_set_stays_in_force_during_and_after_a_failed_trial(new: Path, car: VehicleDatabase) -> None:
+    drive = tried(new, right(car), car)
+    put_on_trial(new, right(car, -DRIFT, 0.0))
     drive.go_on(0.5 * TRIAL_S)
     assert drive.told == (State.CORRECTING, Reason.NONE)
     assert drive.corrector.branches[0].fault.drift == DRIFT
@@ -147,69 +144,65 @@ def test_previous_set_stays_in_force_during_and_after_a_failed_trial(vehicle: Pa
     assert drive.has_said(FAILED)
 
 
-def test_set_that_promises_to_remove_less_error_passes_if_it_removes_less(
-    vehicle: Path, database: VehicleDatabase
-) -> None:
+def test_set_that_promises_to_remove_less_error_passes_if_it_removes_less(new: Path, car: VehicleDatabase) -> None:
     """A load that no sensor sees is half of the change: the share is about 0."""
     residual = JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0)
-    promising_half = replace(right(database), junction_residual=residual)
-    assert not tried(vehicle, right(database), database, load_a=-3.0).has_said(PASSED)
-    assert tried(vehicle, promising_half, database, load_a=-3.0).has_said(PASSED)
+    promising_half = replace(right(car), junction_residual=residual)
+    assert not tried(new, right(car), car, load_a=-3.0).has_said(PASSED)
+    assert tried(new, promising_half, car, load_a=-3.0).has_said(PASSED)
 
 
-def test_set_on_trial_is_judged_relative_to_the_expected_sum(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_on_trial_is_judged_relative_to_the_expected_sum(new: Path, car: VehicleDatabase) -> None:
     """A load that no sensor sees hides no error, and is no error itself."""
-    expected = replace(right(database).junction_residual, expected_a=3.0, measured_mean_a=7.0, corrected_mean_a=3.0)
-    found = replace(right(database), junction_residual=expected)
-    drive = tried(vehicle, found, database, load_a=3.0)
+    expected = replace(right(car).junction_residual, expected_a=3.0, measured_mean_a=7.0, corrected_mean_a=3.0)
+    found = replace(right(car), junction_residual=expected)
+    drive = tried(new, found, car, load_a=3.0)
     drive.go_on(30.0, load_a=3.0)
     assert drive.told == (State.CORRECTING, Reason.NONE), "the watch does not take the load for an error either"
-    takes_load_for_offset = replace(right(database, 0.0, 3.0), junction_residual=expected)
-    drive = tried(vehicle, takes_load_for_offset, database, load_a=3.0, drift=0.0, offset_a=0.0)
+    takes_load_for_offset = replace(right(car, 0.0, 3.0), junction_residual=expected)
+    drive = tried(new, takes_load_for_offset, car, load_a=3.0, drift=0.0, offset_a=0.0)
     assert drive.has_said(FAILED)
 
 
-def test_set_that_corrects_half_of_the_error_fails_its_trial(vehicle: Path, database: VehicleDatabase) -> None:
-    drive = tried(vehicle, right(database, DRIFT / 2.0, OFFSET_A / 2.0), database)
+def test_set_that_corrects_half_of_the_error_fails_its_trial(new: Path, car: VehicleDatabase) -> None:
+    drive = tried(new, right(car, DRIFT / 2.0, OFFSET_A / 2.0), car)
     (told,) = (line for line in drive.said if FAILED in line)
     assert "at most 2 A were to be left" in told
 
 
-def test_set_without_a_change_passes_its_trial(vehicle: Path, database: VehicleDatabase) -> None:
-    drive = tried(vehicle, right(database, 0.0, 0.0), database, drift=0.0, offset_a=0.0)
+def test_set_without_a_change_passes_its_trial(new: Path, car: VehicleDatabase) -> None:
+    drive = tried(new, right(car, 0.0, 0.0), car, drift=0.0, offset_a=0.0)
     (told,) = (line for line in drive.said if PASSED in line)
     assert "no change that counts" in told
 
 
-def test_set_without_a_predicted_change_may_leave_a_residual(vehicle: Path, database: VehicleDatabase) -> None:
+def test_set_without_a_predicted_change_may_leave_a_residual(new: Path, car: VehicleDatabase) -> None:
     """As in a file written by hand: the reduction of the sum is measured all the same."""
     unknown = JunctionResidual(measured_a=4.0, corrected_a=0.5)
-    parameters = replace(right(database), junction_residual=unknown)
-    assert tried(vehicle, parameters, database, load_a=-0.5).has_said(PASSED)
+    parameters = replace(right(car), junction_residual=unknown)
+    assert tried(new, parameters, car, load_a=-0.5).has_said(PASSED)
 
 
-def test_trial_waits_in_invalid_states_and_while_no_current_flows(vehicle: Path, tmp_path: Path) -> None:
+def test_trial_waits_in_invalid_states_and_while_no_current_flows(new: Path, tmp_path: Path) -> None:
     """As while the vehicle charges, if the layout excludes this state."""
     own = own_vehicle(tmp_path, '[watch]\ninput = "contactor_state"\nvalid = [2]\n')
-    drive = tried(vehicle, right(own), own, contactor=1)
+    drive = tried(new, right(own), own, contactor=1)
     drive.go_on(1.1 * TRIAL_S, contactor=2, moving=False)
     assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
     drive.go_on(1.1 * TRIAL_S, contactor=2)
     assert drive.told == (State.CORRECTING, Reason.NONE)
 
 
-def test_revocation_takes_effect_at_once_in_a_running_node(vehicle: Path, database: VehicleDatabase) -> None:
-    drive = tried(vehicle, right(database), database)
-    write_state(vehicle, replace(read_state(vehicle), in_force=None, ended="revoked"))
+def test_revocation_takes_effect_at_once_in_a_running_node(new: Path, car: VehicleDatabase) -> None:
+    drive = tried(new, right(car), car)
+    write_state(new, replace(read_state(new), in_force=None, ended="revoked"))
     drive.go_on(2.0)
     assert drive.told == (State.PASSING_THROUGH, Reason.REVOKED)
     assert drive.said[-1].startswith("passing measured values through: ")
 
 
-def test_set_expired_for_two_minutes_does_not_return_if_the_clock_goes_back(
-    vehicle: Path, database: VehicleDatabase
-) -> None:
-    drive = tried(vehicle, right(database), database)
+def test_set_expired_for_two_minutes_does_not_return_if_the_clock_goes_back(new: Path, car: VehicleDatabase) -> None:
+    drive = tried(new, right(car), car)
     drive.time = NOW + timedelta(days=366)
     drive.go_on(2.0)
     assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)
@@ -219,4 +212,4 @@ def test_set_expired_for_two_minutes_does_not_return_if_the_clock_goes_back(
     for drive.time in (NOW + timedelta(days=366), NOW + timedelta(days=366, minutes=2), NOW):
         drive.go_on(3.0)
         assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)
-    assert read_state(vehicle).in_force is None
+    assert read_state(new).in_force is None
