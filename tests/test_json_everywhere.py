@@ -56,49 +56,43 @@ def test_every_command_has_json_unless_listed_as_an_exception(command: str) -> N
     assert ("--json" in COMMANDS[command]) is (command not in WITHOUT)
 
 
-def documented() -> set[str]:
-    return set(re.findall(r"`([a-z0-9_]+)`", DOCUMENT.read_text()))
-
-
 def test_json_of_each_step_of_an_update_has_documented_keys(
     database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each step prints one document whose keys are documented, and which names what the next step needs."""
-    params = tmp_path / "v1.json"
-    write_parameters(parameters_for(database, battery=(0.05, 2.3)), params)
+    documented = set(re.findall(r"`([a-z0-9_]+)`", DOCUMENT.read_text()))
 
-    def done(program: str, *arguments: object) -> dict[str, Any]:
-        words = [*map(str, arguments), "--json"]
+    def done(command: str, *arguments: object) -> dict[str, Any]:
+        program, *words = [*command.split(), *map(str, arguments), "--json"]
         code = node_cli.run_ecu_node(words) if program == "ecu-node" else run_app(app, program, words)
         printed = capsys.readouterr()
         assert (code, printed.err) == (0, "")
         found: dict[str, Any] = json.loads(printed.out)
-        assert found.keys() <= documented()
+        assert found.keys() <= documented
         return found
 
-    layout, state = ["--layout", LAYOUT], ["--state", tmp_path / "state"]
-    exported = done("calibrator", "export", params, *layout, "--format", "c", "--output", tmp_path / "c" / "car.c")
+    params, repo, layout = tmp_path / "v1.json", tmp_path / "repo", ("--layout", LAYOUT)
+    state = ("--state", tmp_path / "state")
+    write_parameters(parameters_for(database, battery=(0.05, 2.3)), params)
+    exported = done("calibrator export --format c", params, *layout, "--output", tmp_path / "c" / "car.c")
     assert (exported["format"], exported["notices"]) == ("c", [])
     assert all(Path(file).is_file() for file in exported["files"])
-    repo = tmp_path / "repo"
-    made = done("calibrator", "repository", "key", "anna", "--no-passphrase", "--out", tmp_path / "keys")
-    roles = [
-        word for role in ("--root", "--targets", "--snapshot", "--timestamp") for word in (role, made["public_key"])
-    ]
-    assert done("calibrator", "repository", "init", repo, *roles)["root"] == {"keys": 1, "threshold": 1}
-    publish = ["calibrator", "repository", "publish", repo, "--key", made["private_key"]]
-    assert done("calibrator", "repository", "add", repo, params)["added"] == 1
+    made = done("calibrator repository key anna --no-passphrase --out", tmp_path / "keys")
+    public, publish = made["public_key"], ("calibrator repository publish", repo, "--key", made["private_key"])
+    roles = [word for role in ("--root", "--targets", "--snapshot", "--timestamp") for word in (role, public)]
+    assert done("calibrator repository init", repo, *roles)["root"] == {"keys": 1, "threshold": 1}
+    assert done("calibrator repository add", repo, params)["added"] == 1
     assert done(*publish)["published"] == 3
-    done("ecu-node", "provision", "--vehicle", "v1", "--root", repo / "metadata" / "1.root.json", *state)
-    (bundle,) = done("calibrator", "repository", "bundle", repo, "v1", "--out", tmp_path / "bundles")["bundles"]
-    would = done("ecu-node", "update", bundle, *state, *layout, "--dry-run")
-    taken = done("ecu-node", "update", bundle, *state, *layout)
+    done("ecu-node provision --vehicle v1 --root", repo / "metadata" / "1.root.json", *state)
+    (bundle,) = done("calibrator repository bundle", repo, "v1", "--out", tmp_path / "bundles")["bundles"]
+    would = done("ecu-node update --dry-run", bundle, *state, *layout)
+    taken = done("ecu-node update", bundle, *state, *layout)
     assert (would["taken"], taken["taken"], taken["on_trial"]["parameter_set"]) == (False, True, 300)
-    assert done("calibrator", "repository", "revoke", repo, "v1")["revoked"] == ["v1"]
-    done("calibrator", "repository", "rotate", repo, "timestamp", "--public", made["public_key"])
+    assert done("calibrator repository revoke", repo, "v1")["revoked"] == ["v1"]
+    done("calibrator repository rotate", repo, "timestamp", "--public", public)
     done(*publish)
-    assert done("ecu-node", "update", repo, *state, *layout)["on_trial"] is None
-    after = done("ecu-node", "inspect", *state)
+    assert done("ecu-node update", repo, *state, *layout)["on_trial"] is None
+    after = done("ecu-node inspect", *state)
     assert (after["ended"], after["trusted"]["root"], after["problems"]) == ("revoked", 2, [])
 
 

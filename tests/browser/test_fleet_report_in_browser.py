@@ -113,9 +113,7 @@ def test_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     assert peaks[0][2] > peaks[1][2], "the more probable, the larger"
 
 
-def test_alternative_explanations_of_an_undecided_sensor_are_drawn(
-    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
-) -> None:
+def test_alternatives_are_drawn(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
     vehicles = six_vehicles(database)
     rivals = [vehicles[3].explanations[0], Explanation(probability=0.4, offset_a={"battery": -12.0})]
     vehicles[3] = replace(vehicles[3], explanations=rivals)
@@ -132,9 +130,7 @@ def test_alternative_explanations_of_an_undecided_sensor_are_drawn(
     assert layout["yaxis"]["range"] == pytest.approx([-13.2, 13.2])
 
 
-def test_unknown_values_are_not_shown_as_zero(
-    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
-) -> None:
+def test_unknown_values_are_not_zero(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
     lost = replace(sensor(), drift_sd=None, offset_sd_a=None, fault_probability=None, delay_s=None)
     items = [
         vehicle(database, "V1", lost, lost, verdict="cannot tell"),
@@ -202,9 +198,7 @@ def test_heading_levels_are_in_order_and_controls_have_names(page: webdriver.Chr
     assert "at hand" in page.title
 
 
-def test_report_of_a_single_vehicle_opens_without_an_error(
-    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
-) -> None:
+def test_report_of_a_single_vehicle_opens(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
     rivals = [Explanation(probability=0.6), Explanation(probability=0.4, offset_a={"motor": 2.2})]
     mixed = replace(sensor(0.0, 0.9, sd=0.011), identifiable=False)
     item = vehicle(database, "car", sensor(0.1, 4.0, apply=True), mixed, explanations=rivals)

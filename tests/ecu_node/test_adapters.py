@@ -187,9 +187,7 @@ def test_dry_run_of_a_gateway_prints_both_directions(dry_run: Callable[..., list
         ("virtual", "nothing is sent$"),
     ],
 )
-def test_listen_only_reports_whether_the_adapter_acknowledges_frames(
-    interface: str, words: str, dry_run: Callable[..., list[str]]
-) -> None:
+def test_listen_only_reports_acknowledgement(interface: str, words: str, dry_run: Callable[..., list[str]]) -> None:
     rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
     *_, sends, last = dry_run("--interface", interface, "--channel", "c0", *rate, "--listen-only")
     assert sends == "  sends nothing"

@@ -37,9 +37,7 @@ def check(params: Path, *more: str, layout: Path = LAYOUT) -> list[str]:
 # ---- what 'check' and 'template' print
 
 
-def test_check_shows_parameters_that_fit_with_their_integer_plan(
-    params: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_shows_fit_parameters_and_their_integer_plan(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_ecu_node(check(params, "--vehicle", "v1", "--json")) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["fit"], report["reason"], report["vehicle"], report["parameter_set"]) == (True, "NONE", "v1", 300)
@@ -102,9 +100,7 @@ def test_check_shows_a_fault_that_is_not_applied_and_warns_that_can_fd_needs_its
 
 
 @pytest.mark.parametrize(("load", "expected_a"), [("[unmeasured_load]\nmean_a = 6.1\nsd_a = 1.0\n", 6.1), ("", 0.0)])
-def test_template_expects_the_load_that_the_layout_declares(
-    make_database: MakeDatabase, load: str, expected_a: float
-) -> None:
+def test_template_expects_the_load_of_the_layout(make_database: MakeDatabase, load: str, expected_a: float) -> None:
     database = make_database(f"{SMALL_LAYOUT}{load}")
     document = json.loads(template_text(database, "v1", datetime(2026, 6, 1, 12, 0, tzinfo=UTC)))
     assert document["junction_residual"]["expected_a"] == expected_a
@@ -123,9 +119,7 @@ def test_template_expects_the_load_that_the_layout_declares(
         (TypeError("a\nb"), INTERNAL_ERROR, "prog: internal error: TypeError: a b; run again with --debug and report "),
     ],
 )
-def test_every_error_is_reported_in_one_line(
-    error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_error_is_one_line(error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert end_of("prog", error, debug=False) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(text)
@@ -136,9 +130,7 @@ def test_trust_error_keeps_its_reason_when_pickled() -> None:
     assert (type(found), found.reason, str(found)) == (TrustError, Reason.REVOKED, "number 5 was revoked")
 
 
-def test_internal_error_names_file_and_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_internal_error_names_its_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("nobody thought of that")
 

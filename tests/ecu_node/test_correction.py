@@ -130,9 +130,7 @@ def test_correction_error_stays_within_its_bound_at_any_signal_width(
     offset=st.floats(-150, 150),
     sign=st.sampled_from([1, -1]),
 )
-def test_power_is_corrected_with_the_offset_current_times_voltage(
-    code: int, volts: int, drift: float, offset: float, sign: int
-) -> None:
+def test_power_offset_is_current_times_voltage(code: int, volts: int, drift: float, offset: float, sign: int) -> None:
     power, voltage = current(2.0, limits=(-60000, 60000)), current(0.02, signed=False, limits=(0, 1000))
     signals = Signals(source=power, target=power, sign=sign, voltage=voltage)
     plan = correction_plan(signals, SensorFault(drift=drift, offset_a=offset))
@@ -150,9 +148,7 @@ def test_power_is_corrected_with_the_offset_current_times_voltage(
         (current(), -0.3, 100.0),
     ],
 )
-def test_correction_uses_the_bits_of_a_64_bit_word_and_never_overflows_it(
-    source: Codes, drift: float, offset_a: float
-) -> None:
+def test_correction_uses_a_64_bit_word_and_never_overflows_it(source: Codes, drift: float, offset_a: float) -> None:
     plan = integer_plan(source, current(), sign=1, drift=drift, offset_a=offset_a)
     largest = max(abs(source.lowest), abs(source.highest)) * plan.gain + abs(plan.bias) + (1 << (plan.shift - 1))
     assert 1 << 58 <= largest < 1 << 59

@@ -225,9 +225,7 @@ WATCHED = '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
 
 
 @pytest.mark.parametrize(("contactor", "reason"), [(1, Reason.NONE), (2, Reason.CORRECTION_WORSE)])
-def test_junction_sum_is_judged_only_in_the_valid_states_of_the_watch(
-    make_database: MakeDatabase, contactor: int, reason: Reason
-) -> None:
+def test_sum_is_judged_only_in_valid_states(make_database: MakeDatabase, contactor: int, reason: Reason) -> None:
     own = whole_vehicle(make_database, WATCHED)
     corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
     balanced(own, corrector, 0.0, 12.0, ContactorState=contactor)
@@ -249,9 +247,7 @@ def test_missing_input_of_the_watch_is_reported(make_database: MakeDatabase) -> 
 @pytest.mark.parametrize(
     ("key", "value"), [("[watch] valid", "4"), ("[watch] valid", "-1"), ("[contactor] open", "0.5")]
 )
-def test_layout_with_an_impossible_value_of_an_input_is_refused(
-    make_database: MakeDatabase, key: str, value: str
-) -> None:
+def test_layout_with_an_impossible_input_value_is_refused(make_database: MakeDatabase, key: str, value: str) -> None:
     name = key.partition(" ")[2]
     words = rf"{re.escape(key)}: {value} is no value of HV_Battery\.ContactorState, which has 2 bits"
     with pytest.raises(LayoutError, match=words):

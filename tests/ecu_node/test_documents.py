@@ -44,9 +44,7 @@ def test_every_code_of_the_status_is_documented_with_its_number(kind: type[IntEn
     assert in_dbc - documented == set()
 
 
-def test_overlay_signals_shown_in_the_layout_document_are_sufficient(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_overlay_signals_of_the_layout_document_suffice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """They are put in as the document says, and a template of the layout then fits."""
     document = (ROOT / "docs" / "layout.md").read_text()
     layout = re.findall(r"(?s)```toml\n(.*?)```", document.partition("\n## ")[0])[0]

@@ -142,9 +142,7 @@ def test_record_of_another_version_is_refused(drive: Drive) -> None:
         decode_summary(encode_summary(other))
 
 
-def test_unusable_summary_folder_vehicle_name_and_formula_are_refused(
-    make_database: MakeDatabase, tmp_path: Path
-) -> None:
+def test_unusable_summary_folder_vehicle_or_formula_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
     database = make_database(SMALL_LAYOUT)
     (tmp_path / "file").touch()
     options = argparse.Namespace(summary=tmp_path / "file", vehicle="V1")

@@ -181,9 +181,7 @@ def test_gateway_with_both_ends_on_one_bus_stops(database: VehicleDatabase, ends
             running.result(LONGEST_WAIT_S)
 
 
-def test_second_gateway_between_the_same_buses_refuses_to_start(
-    database: VehicleDatabase, ends: Ends, channel: str
-) -> None:
+def test_second_gateway_between_two_buses_refuses_to_start(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     _, vehicle = ends
     with gateway(database, channel) as (_, first):
         receive(vehicle, STATUS, 1)

@@ -100,9 +100,7 @@ def test_a_diagnostics_database_is_refused(make_database: MakeDatabase, tmp_path
 
 @pytest.mark.parametrize("mark", [1 << 31, 0])
 @pytest.mark.parametrize("more", ["", 'VAL_ 258 Gone 1 "On";\n'])
-def test_dbc_with_unmarked_29_bit_ids_or_names_of_missing_signals_is_read(
-    make_database: MakeDatabase, mark: int, more: str
-) -> None:
+def test_dbc_with_unmarked_29_bit_ids_or_stray_names_is_read(make_database: MakeDatabase, mark: int, more: str) -> None:
     """As they stand in many public DBCs."""
     number = mark | 0x18FF0200
     texts = f'CM_ SG_ {number} Power "Taken up";\nVAL_ {number} Power 65535 "SNA";\n'

@@ -182,9 +182,7 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("handlers")
-def test_monitor_once_prints_a_view_and_sends_nothing(
-    database: VehicleDatabase, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_monitor_prints_a_view_and_sends_nothing(database: VehicleDatabase, capsys: pytest.CaptureFixture[str]) -> None:
     counters = cycle(range(15))
 
     def count_on(message: can.Message) -> None:

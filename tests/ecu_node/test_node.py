@@ -83,9 +83,7 @@ def peer(channel: str) -> Iterator[can.BusABC]:
 
 
 @pytest.mark.parametrize("filters", [True, False])
-def test_node_corrects_branch_frames_only(
-    database: VehicleDatabase, peer: can.BusABC, channel: str, *, filters: bool
-) -> None:
+def test_node_corrects_only_branches(database: VehicleDatabase, peer: can.BusABC, channel: str, filters: bool) -> None:
     with node_on(database, channel, None if filters else lambda: VirtualBus(channel)) as corrector:
         for k in range(100):
             frame = battery_frame(database, k, current_a=float(k))
@@ -142,9 +140,7 @@ class EchoingBus(VirtualBus):
         self.queue.put(deepcopy(msg))
 
 
-def test_echoes_of_own_frames_are_counted_and_ignored(
-    database: VehicleDatabase, peer: can.BusABC, channel: str
-) -> None:
+def test_echo_of_own_frames_is_counted_and_ignored(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
     with node_on(database, "", lambda: EchoingBus(channel)) as corrector:
         receive(peer, 0x5F0, 1)
         peer.send(battery_frame(database, 0))
@@ -228,9 +224,7 @@ def test_pause_of_the_process_makes_no_branch_stale(database: VehicleDatabase, c
     assert corrector.counters.clock_steps == 0
 
 
-def test_pause_after_waiting_for_a_frame_does_not_count_as_listening(
-    channel: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pause_after_waiting_for_a_frame_is_not_listening(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     silent, now_s = VirtualBus(channel), time.monotonic()
     with closing(SteadyBus(lambda: silent, Counters())) as bus:
         clock = iter([now_s, now_s + 5.0])

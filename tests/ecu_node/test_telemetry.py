@@ -160,9 +160,7 @@ def test_mqtt_example_extracts_the_currents_from_a_line(make_outlet: Any, tmp_pa
     assert currents((tmp_path / "node.jsonl").read_text()) == {VSS: -60.0, "motor": -80.0}
 
 
-def test_partly_written_telemetry_line_is_removed(
-    make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_partly_written_line_is_removed(make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, write = tmp_path / "node.jsonl", os.write
     outlet = make_outlet(path)
     monkeypatch.setattr(os, "write", lambda file, line: write(file, line[:7] if line.startswith(b'{"time"') else line))

@@ -53,9 +53,7 @@ def test_calibrator_extra_covers_all_steps_from_logs_to_exports(
     assert " frames in " in played
 
 
-def test_update_extra_takes_parameters_published_by_the_calibrator(
-    installed: Installed, car: Path, tmp_path: Path
-) -> None:
+def test_update_extra_takes_what_the_calibrator_published(installed: Installed, car: Path, tmp_path: Path) -> None:
     off_board, on_board = installed("calibrator"), installed("update")
     calibrator(off_board, tmp_path, "repository", "key", "anna", "--no-passphrase", "--out", ".")
     roles = [word for role in ("root", "targets", "snapshot", "timestamp") for word in (f"--{role}", "anna.pub")]

@@ -79,9 +79,7 @@ def test_right_set_stays_in_force_on_real_drives(tmp_path: Path, shared_data: Pa
 
 
 @pytest.mark.parametrize("name", ["battery", "motor"])
-def test_sensor_that_breaks_on_a_real_drive_is_named_within_100_ms(
-    tmp_path: Path, shared_data: Path, name: str
-) -> None:
+def test_sensor_that_breaks_on_real_drives_is_named_within_100_ms(tmp_path: Path, shared_data: Path, name: str) -> None:
     paths = sorted((shared_data / "bmw_i3_summer").glob("*.csv.gz"))[3:4]
     drives = RecordedDrives(paths, seed=1)
     junction = Junction(three_branches(tmp_path), sd_a=1.2, sd_per_a=0.012, period_s=0.02)

@@ -56,9 +56,7 @@ def test_change_after_a_signature_invalidates_all_signatures(repo: Repo, other: 
     assert f"what is staged is not published: {repo.bin} has 1 of 2 signatures" in out
 
 
-def test_staged_but_unsigned_roles_do_not_block_a_new_timestamp(
-    repo: Repo, state: Path, other: VehicleParameters
-) -> None:
+def test_staged_unsigned_roles_do_not_block_a_new_timestamp(repo: Repo, state: Path, other: VehicleParameters) -> None:
     """Otherwise a signer who is away for 30 days would stop the updates of the whole fleet."""
     repo.updated(state)
     repo.add(other)
@@ -186,9 +184,7 @@ def test_partly_written_key_is_removed(free_bytes: int, repo: Repo) -> None:
     assert not list(repo.folder.glob("*anna*"))
 
 
-def test_mistakes_are_reported_in_one_line_and_change_nothing(
-    repo: Repo, other: VehicleParameters, tmp_path: Path
-) -> None:
+def test_each_mistake_is_one_line_and_changes_nothing(repo: Repo, other: VehicleParameters, tmp_path: Path) -> None:
     def files() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in repo.path.rglob("*") if path.is_file()}
 

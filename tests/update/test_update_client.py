@@ -44,9 +44,7 @@ def numbers(state: Path) -> list[int | None]:
     return [item.parameters.number if item else None for item in (found.in_force, found.on_trial, found.before)]
 
 
-def test_set_is_on_trial_then_in_force_and_the_previous_one_is_kept(
-    repo: Repo, new: Path, other: VehicleParameters
-) -> None:
+def test_set_is_on_trial_then_in_force_and_the_old_one_is_kept(repo: Repo, new: Path, other: VehicleParameters) -> None:
     repo.updated(new)
     assert numbers(new)[:2] == [None, 300]
     pass_trial(new)
@@ -129,9 +127,7 @@ def test_revoked_set_ends_while_a_new_one_goes_on_trial(repo: Repo, state: Path,
     assert numbers(state)[:2] == [None, 301]
 
 
-def test_revocation_applies_even_if_the_new_set_is_refused(
-    repo: Repo, state: Path, parameters: VehicleParameters
-) -> None:
+def test_revocation_applies_if_the_new_set_is_refused(repo: Repo, state: Path, parameters: VehicleParameters) -> None:
     repo.add(drifting(parameters, 0.5))
     repo.revoke("--sha256", held_set(state).sha256)
     one_line(repo.update(state), "nothing is in force now")
@@ -171,9 +167,7 @@ def test_dry_run_of_an_update_writes_nothing(repo: Repo, new: Path) -> None:
     assert {path.name: path.read_bytes() for path in new.iterdir()} == before
 
 
-def test_expired_set_ends_on_trial_and_in_force(
-    repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters
-) -> None:
+def test_expired_set_ends(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
     update(state, str(repo.path), database, now)
@@ -314,9 +308,7 @@ def test_two_simultaneous_updates_do_not_disturb_each_other(repo: Repo, new: Pat
     assert sorted(process.communicate(timeout=120)[0][:8] for process in both) == [b"nothing ", b"on trial"]
 
 
-def test_inspect_and_report_show_the_sets_and_root_of_the_vehicle(
-    repo: Repo, state: Path, other: VehicleParameters
-) -> None:
+def test_inspect_and_report_show_the_sets_and_the_root(repo: Repo, state: Path, other: VehicleParameters) -> None:
     repo.offer(other)
     repo.updated(state)
     code, out, _ = repo.node("inspect", "--state", state)
@@ -331,9 +323,7 @@ def test_inspect_and_report_show_the_sets_and_root_of_the_vehicle(
     assert msgspec.json.decode(repo.node("report", "--state", state)[1])["on_trial"] == facts["on_trial"]
 
 
-def test_inspect_fails_if_the_set_in_force_has_expired(
-    state: Path, repo: Repo, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_inspect_fails_if_the_set_in_force_expired(state: Path, repo: Repo, monkeypatch: pytest.MonkeyPatch) -> None:
     late = replace(read_state(state), latest=held_set(state).expires)
     monkeypatch.setattr("ecu_node.update.state.read_state", lambda _: late)
     code, _, err = repo.node("inspect", "--state", state)

@@ -102,9 +102,7 @@ def left_by_cut(disk: Disk, place: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("change", ["update", "revoke", "conclude"], indirect=True)
-def test_power_cut_leaves_the_old_or_the_new_state(
-    change: Callable[[Path], object], state: Path, tmp_path: Path
-) -> None:
+def test_power_cut_leaves_the_old_or_new_state(change: Callable[[Path], object], state: Path, tmp_path: Path) -> None:
     whole = Disk(copied(state, tmp_path / "whole"))
     with whole.in_use():
         change(whole.folder)

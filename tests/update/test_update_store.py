@@ -171,9 +171,7 @@ def test_slow_disk_does_not_block_the_node(
     assert any("has passed its trial: seen" in line for line in running.said)
 
 
-def test_set_that_expires_on_trial_does_not_come_in_force(
-    state: Path, ended: Running, other: VehicleParameters
-) -> None:
+def test_set_expiring_on_trial_does_not_come_in_force(state: Path, ended: Running, other: VehicleParameters) -> None:
     put_on_trial(state, other, days=1)
     ended.look(2.0, 2.1)
     ended.now = NOW + timedelta(days=2)
@@ -183,9 +181,7 @@ def test_set_that_expires_on_trial_does_not_come_in_force(
     assert ended.said[-1].split(" is ")[1].startswith("not in force, though its trial went well")
 
 
-def test_trial_starts_only_once_the_set_is_valid(
-    state: Path, other: VehicleParameters, database: VehicleDatabase
-) -> None:
+def test_trial_starts_once_the_set_is_valid(state: Path, other: VehicleParameters, database: VehicleDatabase) -> None:
     put_on_trial(state, other, days=-1)
     running = Running(state, database)
     running.look(*range(0, 110, 2))

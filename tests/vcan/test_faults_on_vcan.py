@@ -56,9 +56,7 @@ def bus_is_back() -> Iterator[None]:
 
 @pytest.mark.parametrize("how", ["down", "deleted"])
 @pytest.mark.usefixtures("bus_is_back")
-def test_bus_that_was_down_or_deleted_is_used_again(
-    tmp_path: Path, drive: Path, start_node: StartNode, how: str
-) -> None:
+def test_bus_once_down_or_deleted_is_used_again(tmp_path: Path, drive: Path, start_node: StartNode, how: str) -> None:
     with start_node() as node:
         with running_recording(tmp_path / "before.log") as before:
             play(drive)

@@ -147,9 +147,7 @@ def test_removed_kernel_rules_are_restored(start_gateway: StartNode) -> None:
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin")
 
 
-def test_node_forwards_frames_itself_without_kernel_rights(
-    start_gateway: StartNode, here: Recording, there: Recording
-) -> None:
+def test_node_carries_frames_itself_without_rights(start_gateway: StartNode, here: Recording, there: Recording) -> None:
     with start_gateway(by=WITHOUT_RIGHTS) as node:
         with noise(50):
             pass
@@ -162,7 +160,7 @@ def test_node_forwards_frames_itself_without_kernel_rights(
     ) in node.messages
 
 
-def test_node_forwards_frames_itself_without_module_can_gw(start_gateway: StartNode, there: Recording) -> None:
+def test_node_carries_frames_itself_without_module_can_gw(start_gateway: StartNode, there: Recording) -> None:
     run_tool("rmmod", "can-gw")
     try:
         with start_gateway() as node:
