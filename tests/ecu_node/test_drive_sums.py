@@ -15,7 +15,7 @@ from ecu_node.bus.on_board_summary import OnBoardSummary, on_board_summary
 from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
-from ecu_node.summary import SummaryFile, decode_summary, encode_summary, unpacked
+from ecu_node.summary import SummaryFile, decode_summary, encode_summary
 from tests.ecu_node.processes import running
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, MakeDatabase
 
@@ -66,20 +66,6 @@ class Drive:
 @pytest.fixture
 def drive(make_database: MakeDatabase, tmp_path: Path) -> Drive:
     return Drive(tmp_path / "sums", make_database(WITH_CONTACTOR))
-
-
-def test_record_has_mean_currents_and_the_offset_at_open_contactors(drive: Drive) -> None:
-    drive.go_on(120.0)
-    for battery in (3000, 500):  # of two samples at one instant the last one counts
-        drive.take(256, False, battery.to_bytes(2, "big") + bytes(6))
-    drive.take(999, False, bytes(8))
-    (record,) = drive.ended()
-    assert record.branches == ["battery", "motor", "heater"]
-    assert record.zero_offset_a == [pytest.approx(OFFSET_A), pytest.approx(0.0), None]
-    battery_a, motor_a, heater_a = unpacked(record.mean)
-    assert heater_a == pytest.approx(-HEATER_W / NET_V)
-    assert battery_a + motor_a + heater_a == pytest.approx(OFFSET_A, abs=0.05)
-    assert record.starts == [True]
 
 
 def test_clock_step_starts_a_new_drive(drive: Drive) -> None:

@@ -1,7 +1,12 @@
-"""Messages to the service manager over a real socket, and the log's rate limit."""
+"""The node as a service: its log, the service manager, real time, and signals while it starts.
+
+A signal comes at a moment found by Python's audit events: the process sends it to itself, and nothing else is changed.
+"""
 
 import errno
 import os
+import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -10,8 +15,13 @@ from types import SimpleNamespace
 
 import pytest
 
+from ecu_node.bus.run import StateChanges
 from ecu_node.bus.service import Log, ServiceManager, be_real_time
-from tests.ecu_node.processes import ServiceManagerHere
+from ecu_node.bus.wiring import InForce, Mode, put_in_force
+from ecu_node.core.status import Reason
+from ecu_node.database import VehicleDatabase
+from tests.ecu_node.processes import ServiceManagerHere, running
+from tests.ecu_node.vehicles import LAYOUT, answers, battery, corrector_for, parameters_for
 
 
 def test_log_that_nobody_reads_does_not_block_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,3 +110,119 @@ def test_missing_real_time_permissions_are_reported(monkeypatch: pytest.MonkeyPa
     why = "[Errno 1] Operation not permitted"
     assert be_real_time() == f"real time, but not allowed: SCHED_FIFO ({why}), memory lock ({why})"
     assert len(processors) == 1
+
+
+# ---- lines in the log: each fall-back, each sleep, and their ends, once each
+
+FALLS_BACK = "passing measured values through until"
+
+
+class Node:
+    """A node whose battery may send; what it says of its state."""
+
+    def __init__(self, database: VehicleDatabase, *, has_memory: bool = True) -> None:
+        self.database, self.now_s = database, 0.0
+        self.corrector = corrector_for(database, battery=(0.0, 5.0))
+        self.changes = StateChanges(self.corrector, has_memory=has_memory)
+
+    def drive(self) -> str | None:
+        answers(self.corrector, battery(self.database, round(self.now_s) % 15), self.now_s)
+        return self.later(0.02)
+
+    def later(self, seconds: float) -> str | None:
+        self.now_s += seconds
+        self.corrector.look(self.now_s)
+        news = self.changes.news()
+        assert self.changes.news() is None, "once each"
+        return news
+
+    def latch(self, reason: Reason, *branches: str) -> str | None:
+        self.corrector.latch(reason, branches)
+        return self.changes.news()
+
+    def load(self, in_force: InForce) -> str | None:
+        put_in_force(self.corrector, self.database, in_force, self.now_s, mode=Mode.OVERLAY)
+        return self.changes.news()
+
+
+@pytest.mark.parametrize("before", [Reason.NONE, Reason.BRANCH_STALE])
+@pytest.mark.parametrize("revoked", [False, True])
+def test_every_bus_silence_and_its_end_are_reported(database: VehicleDatabase, before: Reason, revoked: bool) -> None:
+    """After a fall-back, or without parameters, in the same way."""
+    node = Node(database)
+    assert node.drive() is None
+    node.latch(before, "motor")
+    if revoked:
+        assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None, "it does not correct again"
+    for _ in range(2):
+        assert [node.later(1.0), node.later(6.0), node.drive()] == ["no branch sends", None, "branches send again"]
+
+
+def test_fall_back_is_reported_with_reason_end_and_resumption(database: VehicleDatabase) -> None:
+    node = Node(database)
+    stuck = node.latch(Reason.BRANCH_STUCK, "motor", "dcdc")
+    assert stuck == f"{FALLS_BACK} the bus has slept: {Reason.BRANCH_STUCK.words} (motor, dcdc)"
+    wrong = node.latch(Reason.SUM_IMPLAUSIBLE, "motor", "dcdc")
+    until = f"{FALLS_BACK} other parameters or 'ecu-node clear'"
+    assert wrong == f"{until}: {Reason.SUM_IMPLAUSIBLE.words} (motor or dcdc)"
+    assert node.latch(Reason.CORRECTION_WORSE) == f"{until}: {Reason.CORRECTION_WORSE.words}"
+    fit = InForce(parameters=parameters_for(database, battery=(0.0, 5.0)))
+    assert node.load(fit) == "correcting again"
+    alone = Node(database, has_memory=False)
+    assert f"{FALLS_BACK} a restart: " in (alone.latch(Reason.CORRECTION_WORSE) or "")
+
+
+def test_revocation_during_bus_sleep_is_not_reported_as_waking_up(database: VehicleDatabase) -> None:
+    node = Node(database)
+    assert [node.drive(), node.later(1.0)] == [None, "no branch sends"]
+    assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None
+
+
+# ---- signals at the very moment when the node opens its layout, or begins to import a library
+
+AT = """
+import signal, sys
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever the tests were started with
+def hook(event, arguments):
+    if event == {event!r} and str(arguments[0]) == {what!r}:
+        signal.raise_signal({number})
+sys.addaudithook(hook)
+from ecu_node.__main__ import ecu_node_program
+sys.argv[1:] = {arguments!r}
+sys.exit(ecu_node_program())
+"""
+MOMENTS = [("import", "can"), ("open", str(LAYOUT))]
+
+
+def program(event: str, what: str, number: int, arguments: list[str]) -> list[str]:
+    return [sys.executable, "-c", AT.format(event=event, what=what, number=int(number), arguments=arguments)]
+
+
+def files(tmp_path: Path) -> list[str]:
+    return ["--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT)]
+
+
+@pytest.mark.parametrize(("event", "what"), [("import", "ecu_node.cli"), *MOMENTS])
+def test_ctrl_c_during_startup_prints_one_line_and_exits_with_130(tmp_path: Path, event: str, what: str) -> None:
+    command = program(event, what, signal.SIGINT, ["check", *files(tmp_path)])
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ecu-node: interrupted\n")
+    for nobody in ("2>&-", "2>/dev/full"):
+        done = subprocess.run(
+            ["sh", "-c", f'"$@" {nobody}', "sh", *command], stdout=subprocess.PIPE, text=True, check=False
+        )
+        assert (done.returncode, done.stdout) == (130, "")
+
+
+@pytest.mark.parametrize(("event", "what"), MOMENTS)
+def test_sighup_during_startup_does_not_end_a_node(tmp_path: Path, event: str, what: str) -> None:
+    bus = ["--interface", "virtual", "--channel", "hangup"]
+    _, *program_text = program(event, what, signal.SIGHUP, ["run", "--unsigned", *files(tmp_path), *bus])
+    with running(program=program_text) as log:
+        assert "running on virtual hangup" in log[-1]
+
+
+def test_sighup_ends_commands_other_than_run(tmp_path: Path) -> None:
+    command = program("open", str(LAYOUT), signal.SIGHUP, ["check", *files(tmp_path)])
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == -signal.SIGHUP

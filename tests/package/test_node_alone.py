@@ -12,7 +12,6 @@ from packaging.utils import canonicalize_name
 from tests.package.clean_venv import ROOT, CleanVenv
 from tests.package.conftest import VEHICLE, Installed
 
-PLAYER = Path(__file__).with_name("virtual_drive.py")
 LAYOUT = ("--layout", "my_car.toml")
 
 
@@ -38,10 +37,14 @@ def test_node_only_install_checks_a_parameter_file(node: CleanVenv, car: Path) -
     assert json.loads(done.stdout)["branches"]["battery"]["applied"] is True
 
 
-def test_currents_are_corrected_on_a_virtual_bus(node: CleanVenv, car: Path, drive: Path) -> None:
+def test_node_runs_on_a_virtual_bus_until_it_is_ended(node: CleanVenv, car: Path) -> None:
     bus = ("--interface", "virtual", "--channel", "drive")
     options = ("--unsigned", "--params", "V001.json", *LAYOUT, "--vehicle", VEHICLE, *bus)
-    done = node.run("python", PLAYER, drive, *options, folder=car, timeout_s=120.0)
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) >= 50
-    assert "Traceback" not in done.stderr
+    program = (
+        "import os, signal, sys, threading; from ecu_node.cli import run_ecu_node\n"
+        "threading.Timer(5.0, os.kill, (os.getpid(), signal.SIGTERM)).start()\n"
+        "sys.exit(run_ecu_node(sys.argv[1:]))"
+    )
+    done = node.run("python", "-c", program, "run", *options, folder=car, timeout_s=120.0)
+    assert (done.returncode, done.stdout) == (0, "")
+    assert "running on virtual drive, correcting battery" in done.stderr
