@@ -5,12 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from calibrator.cli import app
-from calibrator.terminal.command_line import run_app
-from ecu_node import cli as node_cli
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
+from tests.calibrator.command_here import calibrator
+from tests.ecu_node.processes import Done, ecu_node
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
 MISTAKES = [
@@ -174,26 +173,25 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run(command: str) -> int:
+def run(command: str) -> Done:
     command = command.replace("CURRENTS", "--branches battery=Ibat,-motor=Imot").replace("CAR", "--layout car.toml")
     command = command.replace("NONE", "--layout none.toml").replace("PUBLISHED", "--method published")
     command = command.replace("UNSIGNED", "--params v1.json --unsigned")
     words = command.replace("LAYOUT", f"--layout {LAYOUT}").replace("DBC", str(LAYOUT.with_suffix(".dbc"))).split()
-    if words[0] == "calibrator":
-        return run_app(app, "calibrator", words[1:])
-    try:
-        return node_cli.run_ecu_node(words[1:])
-    except SystemExit as end:
-        return int(end.code or 0)
+    if words[0] == "ecu-node":
+        return ecu_node(*words[1:])
+    done = calibrator(*words[1:])
+    return Done(done.returncode, done.stdout, done.stderr)
 
 
 @pytest.mark.parametrize(("command", "code", "words"), MISTAKES)
 def test_user_mistake_is_reported_in_one_line_and_writes_nothing(
-    command: str, code: int, words: str, place: Path, capsys: pytest.CaptureFixture[str]
+    command: str, code: int, words: str, place: Path
 ) -> None:
     before = sorted(path.name for path in place.rglob("*"))
-    assert run(command) == code
-    (line,) = capsys.readouterr().err.splitlines()
+    done = run(command)
+    (line,) = done.err.splitlines()
+    assert done.code == code
     assert line.startswith(command.partition(" ")[0])
     assert words in line
     assert sorted(path.name for path in place.rglob("*")) == before

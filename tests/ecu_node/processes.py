@@ -1,4 +1,4 @@
-"""The node in a process of its own, the service manager that it reports to, and waiting for either."""
+"""Commands of the node in this process; the node in one of its own, and the service manager that it reports to."""
 
 import os
 import signal
@@ -7,13 +7,36 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
+from ecu_node.cli import run_ecu_node
+
 LONGEST_WAIT_S = 60.0
 """A busy machine is slow; nothing here takes this long unless it is broken. [s]"""
+
+
+class Done(NamedTuple):
+    """What comes of a command."""
+
+    code: int
+    out: str
+    err: str
+
+
+def ecu_node(*words: object) -> Done:
+    """Run a command of the node in this process."""
+    arguments = [os.fsdecode(word) if isinstance(word, bytes) else str(word) for word in words]
+    with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+        try:
+            code = run_ecu_node(arguments)
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Done(code, out.getvalue(), err.getvalue())
 
 
 def wait_until(done: Callable[[], bool]) -> None:

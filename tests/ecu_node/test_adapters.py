@@ -21,10 +21,9 @@ import pytest
 from can.typechecking import BitTimingFdDict
 
 from ecu_node.bus.adapters import bus_config, carries_fd, connect
-from ecu_node.cli import run_ecu_node
 from ecu_node.errors import BusError
 from ecu_node.parameters import write_parameters
-from tests.ecu_node.processes import ServiceManagerHere, running
+from tests.ecu_node.processes import ServiceManagerHere, ecu_node, running
 from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, parameters_for
 
 _FD_VALUES = (80_000_000, 2, 63, 16, 16, 2, 15, 4, 4)
@@ -128,28 +127,26 @@ PCAN = ("--interface", "pcan", "--channel", "PCAN_USBBUS1")
 
 
 @pytest.fixture
-def dry_run(node: list[str], capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
+def dry_run(node: list[str]) -> Callable[..., list[str]]:
     """Lines that the node with these options prints of what it would do."""
 
     def run(*options: str) -> list[str]:
-        assert run_ecu_node([*node, *options, "--dry-run"]) == 0
-        out, err = capsys.readouterr()
-        assert err == ""
-        return out.splitlines()
+        done = ecu_node(*node, *options, "--dry-run")
+        assert (done.code, done.err) == (0, "")
+        return done.out.splitlines()
 
     return run
 
 
-def test_dry_run_prints_the_bus_that_would_be_opened(
-    node: list[str], dry_run: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dry_run_prints_the_bus_that_would_be_opened(node: list[str], dry_run: Callable[..., list[str]]) -> None:
     rate = ("--bitrate", "250000")
     reads, sends = "  reads Pair (0x100), Heater (0x200), Net (0x102)", "  sends PairOut (0x200)"
     assert dry_run(*PCAN, *rate) == ["would open pcan PCAN_USBBUS1: bitrate 250000", reads, sends]
     last = dry_run(*PCAN, *rate, "--params", "none.json")[-1]
     assert last.startswith("would correct nothing: none.json: no such parameter")
-    assert run_ecu_node([*node, *PCAN, "--dry-run"]) == 1
-    assert "no bitrate" in capsys.readouterr().err
+    done = ecu_node(*node, *PCAN, "--dry-run")
+    assert done.code == 1
+    assert "no bitrate" in done.err
 
 
 @pytest.mark.parametrize("timing", [can.BitTiming(**CLASSIC_TIMING), can.BitTimingFd(**FD_TIMING)])

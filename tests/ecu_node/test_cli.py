@@ -14,12 +14,13 @@ import pytest
 from msgspec.structs import replace
 
 from ecu_node import cli
-from ecu_node.cli import run_ecu_node, template_text
+from ecu_node.cli import template_text
 from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.parameters import write_parameters
 from ecu_node.program import FAILED, INTERNAL_ERROR, end_of, split_debug
+from tests.ecu_node.processes import ecu_node
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
 
 
@@ -37,9 +38,8 @@ def check(params: Path, *more: str, layout: Path = LAYOUT) -> list[str]:
 # ---- what 'check' and 'template' print
 
 
-def test_check_shows_fit_parameters_and_their_integer_plan(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_ecu_node(check(params, "--vehicle", "v1", "--json")) == 0
-    report = json.loads(capsys.readouterr().out)
+def test_check_shows_fit_parameters_and_their_integer_plan(params: Path) -> None:
+    report = json.loads(ecu_node(*check(params, "--vehicle", "v1", "--json")).out)
     assert (report["fit"], report["reason"], report["vehicle"], report["parameter_set"]) == (True, "NONE", "v1", 300)
     battery, motor = report["branches"]["battery"], report["branches"]["motor"]
     assert (battery["drift"], battery["offset_a"], battery["applied"]) == (0.25, 5.0, True)
@@ -48,8 +48,9 @@ def test_check_shows_fit_parameters_and_their_integer_plan(params: Path, capsys:
     assert battery["plan"]["bias"] / 2 ** battery["plan"]["shift"] == pytest.approx(-5.0 / 1.25 / 0.02)
     assert motor["plan"]["gain"] == 2 ** motor["plan"]["shift"]
     assert not report["branches"]["dcdc"]["applied"]
-    assert run_ecu_node(check(params)) == 0
-    lines = capsys.readouterr().out.splitlines()
+    code, out, _ = ecu_node(*check(params))
+    lines = out.splitlines()
+    assert code == 0
     assert lines[0] == "vehicle v1, parameter set 300: fit"
     assert re.fullmatch(r"battery +\+25\.0000% +\+5\.000 A  corrected", lines[2])
     assert lines[3] == "  target HV_BatteryCorrected.BatteryCurrentCorrected"
@@ -59,41 +60,41 @@ def test_check_shows_fit_parameters_and_their_integer_plan(params: Path, capsys:
 
 
 def test_check_of_unfit_parameters_exits_with_1_and_gives_the_reason(
-    params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    params: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run_ecu_node(check(params, "--vehicle", "v2", "--json")) == 1
-    report = json.loads(capsys.readouterr().out)
-    assert (report["fit"], report["reason"]) == (False, "WRONG_VEHICLE")
+    done = ecu_node(*check(params, "--vehicle", "v2", "--json"))
+    report = json.loads(done.out)
+    assert (done.code, report["fit"], report["reason"]) == (1, False, "WRONG_VEHICLE")
     assert report["message"] == f"{params}: parameters are for vehicle 'v1', this is 'v2'"
     monkeypatch.setenv("ECU_NODE_VEHICLE", "v2")
-    assert run_ecu_node(check(params)) == 1
-    assert capsys.readouterr().out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
+    done = ecu_node(*check(params))
+    assert (done.code, done.err) == (1, "")
+    assert done.out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
 
 
 def test_layout_without_signals_for_corrected_currents_needs_a_gateway(
-    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    make_database: MakeDatabase, tmp_path: Path
 ) -> None:
     """The options of run are those of check."""
     database = make_database(re.sub(r', (corrected|quality) = "[\w.]+"', "", SMALL_LAYOUT))
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
     options = check(tmp_path / "v1.json", layout=database.layout.path)
-    assert run_ecu_node(options) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "page 'Layout'" in line
-    assert line.endswith("--gateway CHANNEL")
-    assert run_ecu_node([*options, "--gateway", "can1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
+    code, _, err = ecu_node(*options)
+    assert (code, err.count("\n")) == (1, 1)
+    assert "page 'Layout'" in err
+    assert err.endswith("--gateway CHANNEL\n")
+    report = json.loads(ecu_node(*options, "--gateway", "can1", "--json").out)
+    assert report["branches"]["battery"]["target"] == "Pair.Battery"
 
 
 def test_check_shows_a_fault_that_is_not_applied_and_warns_that_can_fd_needs_its_option(
-    make_database: MakeDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    make_database: MakeDatabase, tmp_path: Path
 ) -> None:
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
     parameters = parameters_for(database, battery=(0.25, 5.0))
     held = {"battery": replace(parameters.branches["battery"], apply=False)}
     write_parameters(replace(parameters, vehicle="v\x1b[2J", branches=held), tmp_path / "v1.json")
-    assert run_ecu_node(check(tmp_path / "v1.json", layout=database.layout.path)) == 0
-    text = capsys.readouterr().out
+    text = ecu_node(*check(tmp_path / "v1.json", layout=database.layout.path)).out
     assert '+5.000 A  passed through, "apply" is false' in text
     assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in text
@@ -130,16 +131,15 @@ def test_trust_error_keeps_its_reason_when_pickled() -> None:
     assert (type(found), found.reason, str(found)) == (TrustError, Reason.REVOKED, "number 5 was revoked")
 
 
-def test_internal_error_names_its_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_internal_error_names_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("nobody thought of that")
 
     monkeypatch.setattr(cli, "load_python_can", broken)
-    assert run_ecu_node(["schema"]) == INTERNAL_ERROR
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("ecu-node: internal error: ZeroDivisionError: nobody thought of that (cli.py, line ")
-    assert run_ecu_node(["schema", "--debug"]) == INTERNAL_ERROR
-    assert "in broken" in capsys.readouterr().err
+    code, _, err = ecu_node("schema")
+    assert (code, err.count("\n")) == (INTERNAL_ERROR, 1)
+    assert err.startswith("ecu-node: internal error: ZeroDivisionError: nobody thought of that (cli.py, line ")
+    assert "in broken" in ecu_node("schema", "--debug").err
 
 
 def test_debug_option_works_anywhere_before_a_double_dash() -> None:
@@ -179,22 +179,22 @@ def huge(path: Path) -> None:
     ],
 )
 def test_input_that_is_not_a_regular_file_is_reported_in_one_line(
-    tmp_path: Path, make: Callable[[Path], None], words: str, role: str, said: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, make: Callable[[Path], None], words: str, role: str, said: str
 ) -> None:
     """Nobody waits for its end."""
     make(tmp_path / role)
     (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
     layout = {"small.dbc": tmp_path / "small.toml", "other.toml": tmp_path / role}.get(role, LAYOUT)
-    assert run_ecu_node(check(tmp_path / "p.json", layout=layout)) == 1
-    printed = "".join(capsys.readouterr())
-    assert re.match(said + words, printed)
-    assert role == "p.json" or printed.count("\n") == 1
+    code, out, err = ecu_node(*check(tmp_path / "p.json", layout=layout))
+    assert code == 1
+    assert re.match(said + words, out + err)
+    assert role == "p.json" or (out + err).count("\n") == 1
 
 
 # ---- as a program
 
 
-def ecu_node(*arguments: str, stdout: int = subprocess.PIPE, **environment: str) -> "subprocess.CompletedProcess[str]":
+def program(*arguments: str, stdout: int = subprocess.PIPE, **environment: str) -> "subprocess.CompletedProcess[str]":
     command, settings = [sys.executable, "-m", "ecu_node", *arguments], {**os.environ, **environment}
     return subprocess.run(
         command, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=60, check=False, env=settings
@@ -208,7 +208,7 @@ COMMANDS = [(check(Path("p")), ""), (["--help"], ""), (["--version"], "1"), (MON
 @pytest.mark.parametrize(("arguments", "unbuffered"), COMMANDS)
 def test_unwritable_output_prints_one_line_and_exits_with_1(arguments: list[str], unbuffered: str) -> None:
     with Path("/dev/full").open("w") as full:
-        done = ecu_node(*arguments, stdout=full.fileno(), PYTHONUNBUFFERED=unbuffered)
+        done = program(*arguments, stdout=full.fileno(), PYTHONUNBUFFERED=unbuffered)
     line = "ecu-node: standard output: cannot write the result: No space left on device; give it somewhere else to go\n"
     assert (done.returncode, done.stderr) == (1, line)
 
@@ -217,13 +217,13 @@ def test_unwritable_output_prints_one_line_and_exits_with_1(arguments: list[str]
 def test_closed_output_pipe_causes_no_traceback(arguments: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    done = ecu_node(*arguments, stdout=writing)
+    done = program(*arguments, stdout=writing)
     os.close(writing)
     assert (done.returncode, done.stderr) == (1, "")
 
 
 def test_names_that_the_terminal_cannot_show_are_escaped() -> None:
-    done = ecu_node(*check(Path("\N{SUN}.json")), PYTHONIOENCODING="ascii")
+    done = program(*check(Path("\N{SUN}.json")), PYTHONIOENCODING="ascii")
     assert (done.returncode, done.stderr) == (1, "")
     assert done.stdout.startswith("NOT FIT (NO_PARAMETERS): \\u2609.json: no such parameter file")
 

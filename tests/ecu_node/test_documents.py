@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Reason, State
+from tests.ecu_node.processes import ecu_node
 
 ROOT = Path(__file__).parents[2]
 MEASURED = """VERSION ""
@@ -44,7 +44,7 @@ def test_every_code_of_the_status_is_documented_with_its_number(kind: type[IntEn
     assert in_dbc - documented == set()
 
 
-def test_overlay_signals_of_the_layout_document_suffice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_overlay_signals_of_the_layout_document_suffice(tmp_path: Path) -> None:
     """They are put in as the document says, and a template of the layout then fits."""
     document = (ROOT / "docs" / "layout.md").read_text()
     layout = re.findall(r"(?s)```toml\n(.*?)```", document.partition("\n## ")[0])[0]
@@ -54,10 +54,8 @@ def test_overlay_signals_of_the_layout_document_suffice(tmp_path: Path, capsys: 
     (tmp_path / "my_car.toml").write_text(f"{layout.replace(sign, sign + branch)}\n{status}")
     (tmp_path / "my_car.dbc").write_text(f"{MEASURED.format(senders=' CorrectionNode')}\n{dbc}")
     files = ["--layout", str(tmp_path / "my_car.toml"), "--vehicle", "V1"]
-    assert run_ecu_node(["template", *files]) == 0
-    (tmp_path / "V1.json").write_text(capsys.readouterr().out)
-    assert run_ecu_node(["check", "--params", str(tmp_path / "V1.json"), *files, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    (tmp_path / "V1.json").write_text(ecu_node("template", *files).out)
+    report = json.loads(ecu_node("check", "--params", tmp_path / "V1.json", *files, "--json").out)
     shown = {name: (branch["target"], branch["applied"]) for name, branch in report["branches"].items()}
     assert shown == {"battery": ("BMS_1_Corrected.PackCurrentCorrected", False), "motor": (None, False)}
     assert (report["vehicle"], report["warnings"]) == ("V1", [])

@@ -1,18 +1,15 @@
 """The fault memory: latched faults are stored, listed and cleared."""
 
 import json
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ecu_node.bus.faults import FaultMemory
-from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Reason
 from tests.ecu_node.junctions import Junction, driving, three_branches
-from tests.ecu_node.processes import running
+from tests.ecu_node.processes import ecu_node, running
 from tests.ecu_node.vehicles import LAYOUT, AtOnce
 
 
@@ -48,13 +45,11 @@ class Vehicle:
         return self.corrector.latched
 
     def clear(self) -> None:
-        assert run_ecu_node(["clear", "--state", str(self.state)]) == 0
+        assert ecu_node("clear", "--state", self.state).code == 0
         self.later(2.0)
 
     def faults(self) -> Any:
-        with redirect_stdout(StringIO()) as said:
-            assert run_ecu_node(["faults", "--state", str(self.state), "--json"]) == 0
-        return json.loads(said.getvalue())
+        return json.loads(ecu_node("faults", "--state", self.state, "--json").out)
 
 
 @pytest.fixture
@@ -62,7 +57,7 @@ def vehicle(tmp_path: Path) -> Vehicle:
     return Vehicle(tmp_path)
 
 
-def test_fault_is_stored_with_its_currents(vehicle: Vehicle, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fault_is_stored_with_its_currents(vehicle: Vehicle) -> None:
     assert vehicle.faults() == []
     vehicle.junction.run(5.0, driving)
     vehicle.junction.wrong = {"battery": lambda shown_a: shown_a + 100.0}
@@ -72,8 +67,7 @@ def test_fault_is_stored_with_its_currents(vehicle: Vehicle, capsys: pytest.Capt
     assert (fault["reason"], fault["branches"], fault["count"]) == ("SUM_IMPLAUSIBLE", ["battery"], 1)
     assert fault["active"]
     assert sum(fault["corrected_a"].values()) == pytest.approx(100.0, abs=10.0)
-    assert run_ecu_node(["faults", "--state", str(vehicle.state)]) == 0
-    assert "SUM_IMPLAUSIBLE (battery), active: 1 times" in capsys.readouterr().out
+    assert "SUM_IMPLAUSIBLE (battery), active: 1 times" in ecu_node("faults", "--state", vehicle.state).out
 
 
 @pytest.mark.parametrize(("number", "latched"), [(44, Reason.SUM_IMPLAUSIBLE), (43, Reason.NONE)])
@@ -142,9 +136,7 @@ def test_cleared_faults_do_not_return(vehicle: Vehicle) -> None:
         ("", None, "cannot read the fault memory: it is a folder"),
     ],
 )
-def test_damaged_fault_memory_is_reported_in_one_line(
-    vehicle: Vehicle, old: str, new: str | None, why: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_fault_memory_is_reported_in_one_line(vehicle: Vehicle, old: str, new: str | None, why: str) -> None:
     vehicle.latch(Reason.BRANCH_STALE, "motor")
     content = vehicle.file.read_text()
     vehicle.file.unlink()
@@ -154,8 +146,9 @@ def test_damaged_fault_memory_is_reported_in_one_line(
         vehicle.file.write_text(content.replace(old, new, 1))
     vehicle.start()
     assert why in vehicle.said[-1]
-    assert run_ecu_node(["faults", "--state", str(vehicle.state)]) == 1
-    assert "'ecu-node clear' begins a new one" in capsys.readouterr().err
+    code, _, err = ecu_node("faults", "--state", vehicle.state)
+    assert code == 1
+    assert "'ecu-node clear' begins a new one" in err
 
 
 def test_node_without_vehicle_state_passes_values_through_and_reports_why(tmp_path: Path) -> None:

@@ -14,10 +14,10 @@ import can
 import pytest
 
 from ecu_node.bus.wiring import key_of
-from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.monitor import BusMonitor, View, view_lines
+from tests.ecu_node.processes import ecu_node
 from tests.ecu_node.vehicles import LAYOUT, MakeDatabase, protected
 
 CHANNEL = "monitor"
@@ -182,7 +182,7 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("handlers")
-def test_monitor_prints_a_view_and_sends_nothing(database: VehicleDatabase, capsys: pytest.CaptureFixture[str]) -> None:
+def test_monitor_prints_a_view_and_sends_nothing(database: VehicleDatabase) -> None:
     counters = cycle(range(15))
 
     def count_on(message: can.Message) -> None:
@@ -191,22 +191,21 @@ def test_monitor_prints_a_view_and_sends_nothing(database: VehicleDatabase, caps
     with can.Bus(interface="virtual", channel=CHANNEL) as bus:
         frame = can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8))
         bus.send_periodic(frame, 0.01, modifier_callback=count_on)
-        assert run_ecu_node([*MONITOR, "--listen-only", "--once", "0.2"]) == 0
-        lines = capsys.readouterr().out.splitlines()
-        assert run_ecu_node([*MONITOR, "--once", "0.2", "--json"]) == 0
-        document = json.loads(capsys.readouterr().out)
+        shown = ecu_node(*MONITOR, "--listen-only", "--once", "0.2")
+        document = json.loads(ecu_node(*MONITOR, "--once", "0.2", "--json").out)
         bus.stop_all_periodic_tasks()
         assert bus.recv(0.0) is None
-        assert run_ecu_node([*MONITOR, "--once", "0.1"]) == 1
+        nothing = ecu_node(*MONITOR, "--once", "0.1")
+    lines = shown.out.splitlines()
+    assert (shown.code, nothing.code) == (0, 1)
     assert lines[0] == f"virtual {CHANNEL}: no node on this bus"
     assert next(line.split() for line in lines if line.startswith("battery"))[1] == "+100.00"
     assert lines[-1] == "no corrected messages on this bus: the currents are shown as they are on it"
     assert document["branches"][0]["measured_a"] == pytest.approx(100.0)
     assert document["is_bus_open"] is True
-    said = capsys.readouterr()
     line = f"ecu-node: virtual {CHANNEL}: no branch of {LAYOUT} was seen; see that the bus is the right one\n"
-    assert said.err == line
-    assert said.out.splitlines()[-1].startswith("no frame of any branch")
+    assert nothing.err == line
+    assert nothing.out.splitlines()[-1].startswith("no frame of any branch")
 
 
 def test_monitor_draws_a_table_in_a_terminal_and_exits_with_0_on_ctrl_c() -> None:

@@ -2,44 +2,25 @@
 
 import os
 import shutil
-import sys
 from collections.abc import Iterator
-from io import StringIO
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
-from calibrator.cli import run_calibrator as calibrator_main
-from ecu_node.cli import run_ecu_node as node_main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE
+from tests.calibrator.command_here import calibrator as calibrator_here
+from tests.ecu_node.processes import Done, ecu_node
 from tests.ecu_node.vehicles import parameters_for
 from tests.update.repo import Repo, pass_trial
 
 
-def _command(name: str, *arguments: object) -> tuple[int, str, str]:
-    """Run a command in this process: exit code, output, errors."""
-    words = [os.fsdecode(item) if isinstance(item, bytes) else str(item) for item in arguments]
-    with pytest.MonkeyPatch.context() as patch:
-        out, err = StringIO(), StringIO()
-        patch.setattr(sys, "argv", [name, *words])
-        patch.setattr(sys, "stdout", out)
-        patch.setattr(sys, "stderr", err)
-        try:
-            code = node_main(words) if name == "ecu-node" else calibrator_main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-    return code, out.getvalue(), err.getvalue()
-
-
-def node(*arguments: object) -> tuple[int, str, str]:
-    return _command("ecu-node", *arguments)
-
-
-def calibrator(*arguments: object) -> tuple[int, str, str]:
-    return _command("calibrator", *arguments)
+def calibrator(*arguments: object) -> Done:
+    """Run a command of the calibrator in this process."""
+    done = calibrator_here(*(os.fsdecode(item) if isinstance(item, bytes) else item for item in arguments))
+    return Done(done.returncode, done.stdout, done.stderr)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -64,7 +45,7 @@ def other(parameters: VehicleParameters) -> VehicleParameters:
 @pytest.fixture(scope="session")
 def offered(tmp_path_factory: pytest.TempPathFactory, parameters: VehicleParameters) -> Repo:
     """A repository that offers parameters for v1 and v2; not to be changed, see :func:`repo`."""
-    made = Repo(tmp_path_factory.mktemp("offered"), calibrator, node)
+    made = Repo(tmp_path_factory.mktemp("offered"), calibrator, ecu_node)
     made.create()
     made.add(parameters)
     made.offer(parameters, vehicle="v2")

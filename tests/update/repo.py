@@ -14,11 +14,12 @@ from ecu_node.parameters import VehicleParameters, write_parameters
 from ecu_node.update.signers import signer_of
 from ecu_node.update.state import read_state
 from ecu_node.update.store import conclude
+from tests.ecu_node.processes import Done
 from tests.ecu_node.vehicles import LAYOUT
 
 VEHICLE = "v1"
-Run = Callable[..., tuple[int, str, str]]
-"""A command line, and what comes of it: exit code, output, errors."""
+Run = Callable[..., Done]
+"""A command line, and what comes of it."""
 ALL = ("r1", "r2", "t1", "t2", "snapshot", "timestamp")
 """Names of the keys in the folder of a repository."""
 
@@ -30,7 +31,7 @@ def pass_trial(state: Path, *, passed: bool = True) -> None:
     conclude(state, on_trial, passed=passed, text="seen", now=datetime.now(UTC))
 
 
-def one_line(found: tuple[int, str, str], *words: object) -> None:
+def one_line(found: Done, *words: object) -> None:
     """Require that a command failed in one line with these words."""
     code, out, err = found
     assert (code, out, err.count("\n"), err[:-1].isprintable()) == (1, "", 1, True), (out, err)
@@ -76,6 +77,11 @@ class Repo:
         self.add(parameters, *options, vehicle=vehicle)
         self.publish()
 
+    def take(self, state: Path, parameters: VehicleParameters, *options: object) -> str:
+        """Let the vehicle update to parameters that are offered now."""
+        self.offer(parameters, *options)
+        return self.updated(state)
+
     def revoke(self, *options: object) -> None:
         self.done("revoke", self.path, VEHICLE, *options)
         self.publish()
@@ -90,7 +96,7 @@ class Repo:
         )
         assert code == 0, err
 
-    def update(self, state: Path, source: object = None, *options: object) -> tuple[int, str, str]:
+    def update(self, state: Path, source: object = None, *options: object) -> Done:
         source = self.path if source is None else source
         return self.node("update", source, "--state", state, "--layout", LAYOUT, *options)
 

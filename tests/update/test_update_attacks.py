@@ -67,8 +67,7 @@ def test_rollback_is_refused(repo: Repo, state: Path) -> None:
 
 def test_rollback_of_a_single_bin_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
     """By somebody who has the keys of snapshot and timestamp."""
-    repo.offer(other)
-    repo.updated(state)
+    repo.take(state, other)
 
     def back(snapshot: Snapshot) -> None:
         snapshot.meta[f"{repo.bin}.json"].version -= 1

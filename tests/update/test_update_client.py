@@ -25,6 +25,7 @@ from ecu_node.update.client import update
 from ecu_node.update.signers import public_key_of
 from ecu_node.update.state import ParameterSet, add_decision, read_state
 from ecu_node.update.store import conclude, end_expired
+from tests.ecu_node.processes import Done
 from tests.ecu_node.vehicles import LAYOUT
 from tests.update.damage import a_folder, a_pipe, cut, huge, without, zeros
 from tests.update.repo import Repo, one_line, pass_trial
@@ -48,8 +49,7 @@ def test_set_is_on_trial_then_in_force_and_the_old_one_is_kept(repo: Repo, new: 
     repo.updated(new)
     assert numbers(new)[:2] == [None, 300]
     pass_trial(new)
-    repo.offer(other)
-    repo.updated(new)
+    repo.take(new, other)
     assert numbers(new)[:2] == [300, 301]
     assert "301 (" in repo.updated(new), "again: nothing new"
     pass_trial(new)
@@ -57,8 +57,7 @@ def test_set_is_on_trial_then_in_force_and_the_old_one_is_kept(repo: Repo, new: 
 
 
 def test_failed_set_is_removed_and_not_tried_again(repo: Repo, state: Path, other: VehicleParameters) -> None:
-    repo.offer(other)
-    repo.updated(state)
+    repo.take(state, other)
     pass_trial(state, passed=False)
     assert numbers(state)[:2] == [300, None]
     one_line(repo.update(state), "has failed its trial here")
@@ -67,11 +66,9 @@ def test_failed_set_is_removed_and_not_tried_again(repo: Repo, state: Path, othe
 
 
 def test_result_of_a_replaced_trial_is_ignored(repo: Repo, state: Path, other: VehicleParameters) -> None:
-    repo.offer(other)
-    repo.updated(state)
+    repo.take(state, other)
     tried = held_set(state, "on_trial")
-    repo.offer(replace(other, number=302))
-    repo.updated(state)
+    repo.take(state, replace(other, number=302))
     conclude(state, tried, passed=True, text="seen", now=datetime.now(UTC))
     assert numbers(state)[:2] == [300, 302]
 
@@ -104,13 +101,11 @@ def drifting(parameters: VehicleParameters, drift: float) -> VehicleParameters:
 
 
 def test_large_step_is_taken_if_the_signers_allow_it(repo: Repo, state: Path, parameters: VehicleParameters) -> None:
-    repo.offer(drifting(parameters, -0.17), "--allow-large-step")
-    assert repo.updated(state).startswith("on trial: ")
+    assert repo.take(state, drifting(parameters, -0.17), "--allow-large-step").startswith("on trial: ")
 
 
 def test_previous_set_replaces_a_revoked_one(repo: Repo, state: Path, other: VehicleParameters) -> None:
-    repo.offer(other)
-    repo.updated(state)
+    repo.take(state, other)
     pass_trial(state)
     repo.revoke()
     assert "parameter set 300 (" in repo.updated(state)
@@ -151,10 +146,8 @@ def test_same_set_with_a_later_expiry_needs_no_trial(
     repo: Repo, state: Path, parameters: VehicleParameters, other: VehicleParameters
 ) -> None:
     assert repo.updated(state).startswith("nothing new: parameter set 300 (")
-    repo.offer(other)
-    repo.updated(state)
-    repo.offer(parameters, "--days", 800)
-    assert repo.updated(state).startswith("extended: parameter set 300")
+    repo.take(state, other)
+    assert repo.take(state, parameters, "--days", 800).startswith("extended: parameter set 300")
     assert numbers(state)[:2] == [300, None]
     assert held_set(state).expires > datetime.now(UTC) + timedelta(days=799)
 
@@ -280,8 +273,11 @@ def test_update_without_package_tuf_is_refused_in_one_line(state: Path) -> None:
     code = "import sys; sys.modules['tuf'] = None; from ecu_node.__main__ import ecu_node_program as run; exit(run())"
     command = [sys.executable, "-c", code, "update", "none", "--state", state, "--layout", LAYOUT]
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=120, check=False)
-    found = done.returncode, done.stdout, done.stderr
-    one_line(found, "updates need the package tuf", ": pip install 'hv-current-correction[update]'\n")
+    one_line(
+        Done(done.returncode, done.stdout, done.stderr),
+        "updates need the package tuf",
+        ": pip install 'hv-current-correction[update]'\n",
+    )
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
@@ -309,8 +305,7 @@ def test_two_simultaneous_updates_do_not_disturb_each_other(repo: Repo, new: Pat
 
 
 def test_inspect_and_report_show_the_sets_and_the_root(repo: Repo, state: Path, other: VehicleParameters) -> None:
-    repo.offer(other)
-    repo.updated(state)
+    repo.take(state, other)
     code, out, _ = repo.node("inspect", "--state", state)
     assert code == 0
     for words in ("vehicle v1; trusts root 1", "in force: parameter set 300", "on trial: parameter set 301"):
