@@ -49,6 +49,17 @@ def until(browser: webdriver.Chrome, script: str) -> Any:
     return WebDriverWait(browser, PATIENCE_S).until(lambda it: it.execute_script(script))
 
 
+def drawn(browser: webdriver.Chrome, count: int, where: str = "#vehicle") -> None:
+    """Wait until so many figures are drawn."""
+    until(browser, f"return document.querySelectorAll('{where} .plot[data-drawn]').length === {count}")
+
+
+def find(browser: webdriver.Chrome, *keys: str, shown: str) -> None:
+    """Type into the field that searches for names, and wait for the count of vehicles that are shown."""
+    browser.find_element(By.ID, "find").send_keys(*keys)
+    until(browser, f"return document.getElementById('count').textContent.startsWith('{shown}')")
+
+
 def rows(browser: webdriver.Chrome) -> list[list[str]]:
     found: list[list[str]] = browser.execute_script(
         "return [...document.querySelectorAll('#table tbody tr')]"
@@ -69,10 +80,7 @@ def names(browser: webdriver.Chrome) -> list[str]:
 
 
 def test_report_opens_without_an_error_and_loads_nothing_from_the_network(page: webdriver.Chrome) -> None:
-    until(
-        page,
-        "return document.querySelectorAll('.plot[data-drawn]').length === 2",
-    )
+    drawn(page, 2, "body")
     assert page.execute_script("return document.body.dataset.failed") is None
     assert page.get_log("browser") == []
     events = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
@@ -103,7 +111,7 @@ def test_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     assert "40.0 % no fault −3.00 % all currents +1.00 %" in text
     assert "a zero-current window (contactors open) would decide" in text.lower()
     assert "does not correct it: the correction might do harm" in text
-    until(page, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 2")
+    drawn(page, 2)
     peaks = page.execute_script(
         "const [, offsets] = document.querySelector('#vehicle .plot').data;"
         "return offsets.x.map((x, n) => [offsets.y[n], x, offsets.marker.size[n]])"
@@ -144,11 +152,9 @@ def test_unknown_values_are_not_zero(browser: webdriver.Chrome, database: Vehicl
 
 
 def test_filters_show_only_matching_vehicles(page: webdriver.Chrome) -> None:
-    page.find_element(By.ID, "find").send_keys("v1")
-    until(page, "return document.getElementById('count').textContent.startsWith('2 of 6')")
+    find(page, "v1", shown="2 of 6")
     assert sorted(names(page)) == ["V1", "V10"]
-    page.find_element(By.ID, "find").send_keys(Keys.BACKSPACE, Keys.BACKSPACE)
-    until(page, "return document.getElementById('count').textContent.startsWith('6 of 6')")
+    find(page, Keys.BACKSPACE, Keys.BACKSPACE, shown="6 of 6")
     verdict = Select(page.find_element(By.ID, "verdict"))
     verdict.select_by_value("cannot tell")
     assert sorted(names(page)) == ["V4", "V5"]
@@ -173,8 +179,7 @@ def test_column_headings_sort_the_table_and_set_aria_sort(page: webdriver.Chrome
 
 
 def test_vehicle_can_be_chosen_with_the_keyboard(page: webdriver.Chrome) -> None:
-    page.find_element(By.ID, "find").send_keys("V10")
-    until(page, "return document.getElementById('count').textContent.startsWith('1 of 6')")
+    find(page, "V10", shown="1 of 6")
     focused = page.switch_to.active_element
     for _ in range(40):
         focused.send_keys(Keys.TAB)
@@ -211,7 +216,7 @@ def test_report_of_a_single_vehicle_opens(browser: webdriver.Chrome, database: V
     assert "battery +10.00 ± 0.10 +4.00 ± 0.10 99.5 % 0.02 % 20 ms corrects it" in text
     assert "motor not known none (60 %) or +2.20 (40 %)" in text
     assert "Not known: this calibration keeps no evidence." in text
-    until(browser, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 1")
+    drawn(browser, 1)
     axes = browser.execute_script(
         "const {yaxis, yaxis2} = document.querySelector('#vehicle .plot').layout;"
         "return [yaxis, yaxis2].map(({categoryarray, range}) => [categoryarray, range])"
@@ -227,7 +232,7 @@ def test_report_of_a_single_vehicle_opens(browser: webdriver.Chrome, database: V
 
 def test_report_prints_on_a4_with_complete_figures(page: webdriver.Chrome) -> None:
     vehicle_text(page, "V4")
-    until(page, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 2")
+    drawn(page, 2)
     printed = base64.b64decode(page.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"])
     boxes = [tuple(map(float, box.split())) for box in re.findall(rb"/MediaBox \[([0-9. ]+)\]", printed)]
     assert boxes

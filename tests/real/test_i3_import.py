@@ -45,32 +45,29 @@ def trips(i3_store: Path) -> RecordedFleet:
     return read_fleet(i3_store, read_database(read_layout(LAYOUT)))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("balanced", [True, False])
-def test_fleet_with_many_faults_is_partly_corrected_and_not_harmed(trips: RecordedFleet, balanced: bool) -> None:
-    """Three branches, S = 60: some vehicles of every fleet are corrected, and none is made worse."""
-    for seed in (400, 401):
-        trial = recorded_trial(trips, RecordedCase(branches=3, sparsity=60.0, balanced=balanced, world=""), seed)
-        found = judge(POSTERIOR.estimate(trial), trial)
-        assert found["corrected"].any()
-        assert not found["harmed"].any()
+LONG = pytest.mark.long
 
 
-@pytest.mark.parametrize(("vehicles", "branches", "least"), [
-    (6, 2, 0.5),
-    pytest.param(12, 2, 0.8, marks=pytest.mark.long),
-    pytest.param(6, 3, 0.5, marks=pytest.mark.long),
-    (12, 3, 0.5),
-])  # fmt: skip
-def test_small_fleet_is_corrected_and_not_harmed(
-    trips: RecordedFleet, vehicles: int, branches: int, least: float
+@pytest.mark.parametrize(
+    ("vehicles", "case", "least"),
+    [
+        (6, RecordedCase(branches=2, sparsity=80.0, balanced=True, world=""), 0.5),
+        pytest.param(12, RecordedCase(branches=2, sparsity=80.0, balanced=True, world=""), 0.8, marks=LONG),
+        pytest.param(6, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5, marks=LONG),
+        (12, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5),
+        pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=True, world=""), 0.01, marks=LONG),
+        pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=False, world=""), 0.01, marks=LONG),
+    ],
+)
+def test_fleet_is_corrected_and_not_harmed(
+    trips: RecordedFleet, vehicles: int | None, case: RecordedCase, least: float
 ) -> None:
-    """Of S = 80: of four fleets so many of the faulty vehicles, and no vehicle is made worse."""
+    """Of four fleets of some vehicles, or of all, so many of the faulty ones; no vehicle is made worse."""
     found = []
     for seed in range(420, 424):
         some = np.random.default_rng(seed).permutation(len(trips.trips))[:vehicles]
         fleet = replace(trips, trips=tuple(trips.trips[place] for place in some))
-        trial = recorded_trial(fleet, RecordedCase(branches=branches, sparsity=80.0, balanced=True, world=""), seed)
+        trial = recorded_trial(fleet, case, seed)
         found.append(judge(POSTERIOR.estimate(trial), trial))
     assert np.concatenate([each["deployed"] for each in found]).mean() >= least
     assert not np.concatenate([each["harmed"] for each in found]).any()

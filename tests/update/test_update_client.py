@@ -273,11 +273,8 @@ def test_update_without_package_tuf_is_refused_in_one_line(state: Path) -> None:
     code = "import sys; sys.modules['tuf'] = None; from ecu_node.__main__ import ecu_node_program as run; exit(run())"
     command = [sys.executable, "-c", code, "update", "none", "--state", state, "--layout", LAYOUT]
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=120, check=False)
-    one_line(
-        Done(done.returncode, done.stdout, done.stderr),
-        "updates need the package tuf",
-        ": pip install 'hv-current-correction[update]'\n",
-    )
+    found = Done(done.returncode, done.stdout, done.stderr)
+    one_line(found, "updates need the package tuf", ": pip install 'hv-current-correction[update]'\n")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")

@@ -144,14 +144,6 @@ def test_previous_set_stays_in_force_during_and_after_a_failed_trial(new: Path, 
     assert drive.has_said(FAILED)
 
 
-def test_set_that_promises_to_remove_less_error_passes_if_it_removes_less(new: Path, car: VehicleDatabase) -> None:
-    """A load that no sensor sees is half of the change: the share is about 0."""
-    residual = JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0)
-    promising_half = replace(right(car), junction_residual=residual)
-    assert not tried(new, right(car), car, load_a=-3.0).has_said(PASSED)
-    assert tried(new, promising_half, car, load_a=-3.0).has_said(PASSED)
-
-
 def test_set_on_trial_is_judged_relative_to_the_expected_sum(new: Path, car: VehicleDatabase) -> None:
     """A load that no sensor sees hides no error, and is no error itself."""
     expected = replace(right(car).junction_residual, expected_a=3.0, measured_mean_a=7.0, corrected_mean_a=3.0)
@@ -168,19 +160,32 @@ def test_set_that_corrects_half_of_the_error_fails_its_trial(new: Path, car: Veh
     drive = tried(new, right(car, DRIFT / 2.0, OFFSET_A / 2.0), car)
     (told,) = (line for line in drive.said if FAILED in line)
     assert "at most 2 A were to be left" in told
+    assert tried(new, right(car), car, load_a=-3.0).has_said(FAILED), "a load that no sensor sees is half of the change"
 
 
-def test_set_without_a_change_passes_its_trial(new: Path, car: VehicleDatabase) -> None:
-    drive = tried(new, right(car, 0.0, 0.0), car, drift=0.0, offset_a=0.0)
-    (told,) = (line for line in drive.said if PASSED in line)
-    assert "no change that counts" in told
+UNCHANGED = {"drift": 0.0, "offset_a": 0.0}
 
 
-def test_set_without_a_predicted_change_may_leave_a_residual(new: Path, car: VehicleDatabase) -> None:
-    """As in a file written by hand: the reduction of the sum is measured all the same."""
-    unknown = JunctionResidual(measured_a=4.0, corrected_a=0.5)
-    parameters = replace(right(car), junction_residual=unknown)
-    assert tried(new, parameters, car, load_a=-0.5).has_said(PASSED)
+@pytest.mark.parametrize(
+    ("fault", "residual", "conditions", "words"),
+    [
+        (UNCHANGED, None, UNCHANGED, "no change that counts"),
+        ({}, JunctionResidual(measured_a=4.0, corrected_a=0.5), {"load_a": -0.5}, PASSED),
+        ({}, JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0), {"load_a": -3.0}, PASSED),
+    ],
+    ids=["without a change", "without a predicted change, as written by hand", "promises half, and a load is half"],
+)
+def test_set_that_keeps_its_promise_passes_its_trial(
+    fault: dict[str, float],
+    residual: JunctionResidual | None,
+    conditions: dict[str, float],
+    words: str,
+    new: Path,
+    car: VehicleDatabase,
+) -> None:
+    parameters = right(car, **fault)
+    promising = replace(parameters, junction_residual=residual or parameters.junction_residual)
+    assert tried(new, promising, car, **conditions).has_said(words)
 
 
 def test_trial_waits_in_invalid_states_and_while_no_current_flows(new: Path, tmp_path: Path) -> None:
