@@ -50,11 +50,7 @@ MISTAKES = [
     ("ecu-node run --nonsense", 2, "; see 'ecu-node run --help'"),
     ("ecu-node run LAYOUT", 2, "required: --channel; see 'ecu-node run --help'"),
     ("ecu-node run LAYOUT --channel c --params v1.json", 2, "--params names a file that nobody signed: give --state"),
-    (
-        "ecu-node run LAYOUT --channel c --state s --unsigned",
-        2,
-        "--state holds signed parameters; leave --unsigned",
-    ),
+    ("ecu-node run LAYOUT --channel c --state s --unsigned", 2, "--state holds signed parameters; leave --unsigned"),
     ("ecu-node run LAYOUT --channel c UNSIGNED --gateway c", 2, "c is the bus of the sensors itself; two"),
     ("ecu-node run LAYOUT --channel c UNSIGNED --gateway d --listen-only", 2, "a gateway must pass frames on"),
     ("ecu-node run LAYOUT --channel c UNSIGNED --telemetry udp://h", 2, "is expected, found 'udp://h'"),

@@ -121,10 +121,7 @@ class Junction:
         self.step += 1
 
     def break_sensors(
-        self,
-        seconds: float,
-        true_a: Callable[[float], Mapping[str, float]],
-        **wrong: Callable[[float], float],
+        self, seconds: float, true_a: Callable[[float], Mapping[str, float]], **wrong: Callable[[float], float]
     ) -> None:
         """Run for 15 s with the sensors as they are, and so many seconds with some that are broken."""
         self.run(BREAK_S, true_a)

@@ -120,13 +120,7 @@ BOTH, LATE = ("battery", "motor"), ("motor",)
     "phases",
     [
         [(1.0, (), CORRECTING), (0.5, LATE, STALE), (1.5, (), STALE)],
-        [
-            (1.0, (), CORRECTING),
-            (0.5, LATE, STALE),
-            (1.5, BOTH, STALE),
-            (6.0, BOTH, ASLEEP),
-            (1.0, (), CORRECTING),
-        ],
+        [(1.0, (), CORRECTING), (0.5, LATE, STALE), (1.5, BOTH, STALE), (6.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
         [(2.9, LATE, STARTING), (0.4, LATE, STALE)],
         [(10.0, BOTH, STARTING), (1.0, (), CORRECTING), (2.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
     ],
@@ -286,10 +280,7 @@ def test_junction_sum_is_judged_relative_to_the_expected_sum(
 
 @pytest.mark.parametrize(
     ("drift", "base_a", "swing_a", "motor_a", "stuck"),
-    [
-        (0.1, 100.0, 50.0, 60.0, ("motor",)),
-        (-0.2, 0.0, 10.0, 0.0, ()),
-    ],
+    [(0.1, 100.0, 50.0, 60.0, ("motor",)), (-0.2, 0.0, 10.0, 0.0, ())],
     ids=["stuck", "at rest"],
 )
 def test_branch_is_stuck_if_it_stays_constant_while_the_sum_moves(

@@ -90,17 +90,6 @@ def test_telemetry_line_has_currents_by_vss_name_sums_state_and_counters(make_ou
     assert abs((datetime.now(UTC) - datetime.fromisoformat(line["time"])).total_seconds()) < 60.0
 
 
-def test_telemetry_of_an_invalid_frame_has_no_value(make_outlet: Any, tmp_path: Path) -> None:
-    outlet = make_outlet(tmp_path / "node.jsonl")
-    outlet.second()
-    lines_of(tmp_path / "node.jsonl", 1)
-    for data in (CURRENTS, bytes(1)):
-        answers(outlet.corrector, Frame(PAIR, data), outlet.now_s + 0.9)
-    outlet.telemetry.look(outlet.now_s + 1.0)
-    _, line = lines_of(tmp_path / "node.jsonl", 2)
-    assert line["branches"][VSS] == {"measured_a": None, "corrected_a": None, "quality": "INVALID"}
-
-
 def test_telemetry_lines_are_sent_by_udp(make_outlet: Any) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))

@@ -33,10 +33,12 @@ def test_each_extra_alone_installs_without_conflicts(installed: Installed, extra
     assert venv.run("ecu-node", "schema", folder=car).returncode == 0
 
 
-def test_calibrator_extra_covers_all_steps_from_logs_to_exports(
-    installed: Installed, car: Path, fleet: Path, drive: Path, tmp_path: Path
+@pytest.mark.parametrize("interpreter", os.environ.get("HV_PYTHONS", "").split() or [sys.executable])
+def test_calibrator_extra_covers_all_steps(
+    interpreter: str, wheel: Path, car: Path, fleet: Path, drive: Path, tmp_path: Path
 ) -> None:
-    venv, result = installed("calibrator"), tmp_path / "result"
+    """From logs to parameters, reports and exports."""
+    venv, result = new_venv(tmp_path / "environment", wheel, "calibrator", interpreter=interpreter), tmp_path / "result"
     layout = ("--layout", car / "my_car.toml")
     calibrator(venv, tmp_path, "import", fleet / "logs", *layout, "--out", "store")
     calibrator(venv, tmp_path, "calibrate", "store", *layout, "--out", result)
@@ -51,6 +53,8 @@ def test_calibrator_extra_covers_all_steps_from_logs_to_exports(
     assert json.loads(calibrator(venv, tmp_path, "kirchhoff", drive, *layout, "--plot", "x.html", "--json"))["instants"]
     played = calibrator(venv, tmp_path, "replay", drive, "--interface", "virtual", "--channel", "x", "--speed", 0)
     assert " frames in " in played
+    checked = venv.run("ecu-node", "check", "--params", parameters, *layout, "--vehicle", VEHICLE, folder=tmp_path)
+    assert (checked.returncode, checked.stderr) == (0, "")
 
 
 def test_update_extra_takes_what_the_calibrator_published(installed: Installed, car: Path, tmp_path: Path) -> None:
@@ -161,25 +165,4 @@ def test_command_works_after_installing_the_extra_that_it_asks_for(wheel: Path, 
         done = venv.run("calibrator", *arguments, folder=car)
         assert "pip install" not in done.stderr
         assert done.returncode == (1 if extra == "cluster" else 0), "there is no scheduler"
-        assert "Traceback" not in done.stderr
-
-
-INTERPRETERS = os.environ.get("HV_PYTHONS", "").split() or [sys.executable]
-
-
-@pytest.mark.parametrize("interpreter", INTERPRETERS)
-def test_a_fleet_is_calibrated_and_its_parameters_fit(interpreter: str, wheel: Path, car: Path, tmp_path: Path) -> None:
-    venv = new_venv(tmp_path / "environment", wheel, "demo", interpreter=interpreter)
-    layout = ("--layout", car / "my_car.toml")
-    small = ("--vehicles", 6, "--currents", 2, "--minutes", 2)
-    for program, *arguments in (
-        ("calibrator", "simulate", *layout, *small, "--out", "fleet"),
-        ("calibrator", "calibrate", "fleet", *layout, "--out", "result"),
-        ("calibrator", "score", "result", "--truth", "fleet/truth.json"),
-        ("calibrator", "report", "result"),
-        ("ecu-node", "check", "--params", "result/params/V001.json", *layout, "--vehicle", "V001"),
-        ("ecu-node", "schema"),
-    ):
-        done = venv.run(str(program), *arguments, folder=tmp_path)
-        assert done.returncode == 0, done.stderr
         assert "Traceback" not in done.stderr

@@ -110,19 +110,6 @@ def test_end_of_a_trial_is_written_later_if_the_state_is_locked(state: Path, end
     assert (ended.drift, read_state(state).on_trial) == (OTHER_DRIFT, None)
 
 
-def test_writer_waits_while_another_one_changes_the_state(state: Path) -> None:
-    def change() -> None:
-        with locked(state):
-            pass
-
-    with ThreadPoolExecutor(1) as pool:
-        with locked(state):
-            waiting = pool.submit(change)
-            with pytest.raises(TimeoutError):
-                waiting.result(0.1)
-        waiting.result(30.0)
-
-
 def test_end_of_a_trial_in_a_damaged_state_does_not_end_the_node(state: Path, ended: Running) -> None:
     cut(state / "state.json")
     ended.look(1.0, 3.0, 5.0)
