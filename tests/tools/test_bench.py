@@ -8,7 +8,7 @@ from importlib import reload
 import can.io.mf4
 import pytest
 
-from bench import ingest, posterior
+from bench import ingest
 from bench.fleet_run import resident_bytes
 from bench.node import core_rows, process_rows
 
@@ -45,8 +45,3 @@ def test_benchmark_compares_reading_of_logs_with_python_can_and_cantools() -> No
     found = {row.name: row for row in ingest.rows(quick=True)}  # compares the channels of both ways
     assert [row.unit for row in found.values()] == ["frames/s"] * 4 + ["h/s"] * 2
     assert all((found[f"{name} log to drive"].ratio or 0.0) > 1.0 for name in ("BLF", "candump", "ASC"))
-
-
-@pytest.mark.long
-def test_benchmark_compares_the_posterior_with_basis_pursuit() -> None:
-    assert all("basis pursuit" in (row.peer or "") for row in posterior.rows(quick=True))

@@ -1,14 +1,19 @@
-"""Parameter sets that a vehicle holds, put there without a repository."""
+"""Parameter sets that a vehicle holds, put there without a repository; its node, which uses them."""
 
+from concurrent.futures import Executor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from msgspec.structs import replace
 
+from ecu_node.bus.wiring import Mode, wire
+from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, encode_parameters
 from ecu_node.update.state import ParameterSet, read_state, write_state
+from ecu_node.update.store import ParameterStore
+from tests.ecu_node.vehicles import AtOnce
 
-NOW = datetime.now(UTC)
+NOW, AT_ONCE = datetime.now(UTC), AtOnce()
 
 
 def held(parameters: VehicleParameters, *, days: int = 365) -> ParameterSet:
@@ -18,3 +23,21 @@ def held(parameters: VehicleParameters, *, days: int = 365) -> ParameterSet:
 
 def put_on_trial(vehicle: Path, parameters: VehicleParameters, *, days: int = 365) -> None:
     write_state(vehicle, replace(read_state(vehicle), on_trial=held(parameters, days=days)))
+
+
+class Running:
+    """The core of a node with the store of its parameters, in time that is counted."""
+
+    def __init__(self, state: Path, database: VehicleDatabase, *, background: Executor = AT_ONCE) -> None:
+        self.database, self.now, self.said = database, NOW, list[str]()
+        self.store = ParameterStore(
+            state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.now, background=background
+        )
+        self.corrector = wire(database, self.store.in_force, 0.0)
+
+    def look(self, *times_s: float) -> list[bool]:
+        return [self.store.look(self.corrector, now_s) for now_s in times_s]
+
+    @property
+    def drift(self) -> float:
+        return self.corrector.branches[0].fault.drift

@@ -4,15 +4,14 @@ import os
 import shutil
 import threading
 from collections.abc import Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
-from ecu_node.bus.wiring import Mode, wire
-from ecu_node.core.corrector import Corrector
+from ecu_node.bus.wiring import Mode
 from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
@@ -20,31 +19,11 @@ from ecu_node.update.state import VehicleState, locked, read_state, write_state
 from ecu_node.update.store import ParameterStore
 from ecu_node.update.trial import ParameterTrial, TrialResult
 from tests.ecu_node.processes import ServiceManagerHere, running
-from tests.ecu_node.vehicles import LAYOUT, AtOnce
+from tests.ecu_node.vehicles import LAYOUT
 from tests.update.damage import a_folder, cut, without
-from tests.update.held import NOW, held, put_on_trial
+from tests.update.held import AT_ONCE, NOW, Running, held, put_on_trial
 
 DRIFT, OTHER_DRIFT = 0.05, 0.06
-AT_ONCE = AtOnce()
-
-
-class Running:
-    """A corrector with the store of its parameters, in time that is counted."""
-
-    def __init__(self, state: Path, database: VehicleDatabase, *, background: Executor = AT_ONCE) -> None:
-        self.said: list[str] = []
-        self.now = NOW
-        self.store = ParameterStore(
-            state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.now, background=background
-        )
-        self.corrector: Corrector = wire(database, self.store.in_force, 0.0)
-
-    def look(self, *times_s: float) -> list[bool]:
-        return [self.store.look(self.corrector, now_s) for now_s in times_s]
-
-    @property
-    def drift(self) -> float:
-        return self.corrector.branches[0].fault.drift
 
 
 class _Ended(ParameterTrial):

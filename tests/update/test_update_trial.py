@@ -8,15 +8,13 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from ecu_node.bus.wiring import Mode, wire
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import JunctionResidual, VehicleParameters
 from ecu_node.update.state import read_state, write_state
-from ecu_node.update.store import ParameterStore
-from tests.ecu_node.vehicles import LAYOUT, AtOnce, drive, parameters_for
-from tests.update.held import NOW, put_on_trial
+from tests.ecu_node.vehicles import LAYOUT, drive, parameters_for
+from tests.update.held import NOW, Running, put_on_trial
 
 DRIFT, OFFSET_A = 0.05, 2.0
 """Of the battery's sensor in this vehicle."""
@@ -38,17 +36,10 @@ def own_vehicle(folder: Path, more: str = "") -> VehicleDatabase:
     return read_database(read_layout(path))
 
 
-class Drive:
-    """A vehicle whose battery's sensor is faulty, and its node, in time that is counted."""
+class Drive(Running):
+    """A vehicle whose battery's sensor is faulty."""
 
-    def __init__(self, state: Path, database: VehicleDatabase) -> None:
-        self.database, self.said = database, list[str]()
-        self.time = NOW
-        self.store = ParameterStore(
-            state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.time, background=AtOnce()
-        )
-        self.corrector = wire(database, self.store.in_force, 0.0)
-        self.now_s = 0.0
+    now_s = 0.0
 
     def go_on(
         self,
@@ -208,13 +199,13 @@ def test_revocation_takes_effect_at_once_in_a_running_node(new: Path, car: Vehic
 
 def test_set_expired_for_two_minutes_does_not_return_if_the_clock_goes_back(new: Path, car: VehicleDatabase) -> None:
     drive = tried(new, right(car), car)
-    drive.time = NOW + timedelta(days=366)
+    drive.now = NOW + timedelta(days=366)
     drive.go_on(2.0)
     assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)
-    drive.time = NOW  # the clock was wrong for a moment
+    drive.now = NOW  # the clock was wrong for a moment
     drive.go_on(2.0)
     assert drive.told == (State.CORRECTING, Reason.NONE)
-    for drive.time in (NOW + timedelta(days=366), NOW + timedelta(days=366, minutes=2), NOW):
+    for drive.now in (NOW + timedelta(days=366), NOW + timedelta(days=366, minutes=2), NOW):
         drive.go_on(3.0)
         assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)
     assert read_state(new).in_force is None
