@@ -4,7 +4,7 @@ The exact code is rounded, halves up; that of the node may be of a value greater
 Which frames are intact and in order is taken from the node's receiver, which test_e2e.py compares with AUTOSAR.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from math import floor
 from typing import Any, NamedTuple
@@ -185,40 +185,40 @@ class Oracle:
         """What is wrong with a frame that a gateway passes on."""
         if len(sent) != 1 or self._messages.get(sent[0][0]) is not message or len(sent[0][1]) != len(data):
             return "another frame was sent"
-        made, mask = sent[0][1], 0
-        before, after, protection = _codes(message, data), _codes(message, made), self._protections.get(message.name)
-        for item in own:
-            if (name := item.source.name) in before:
-                lowest, highest = item.outcome.allowed or (before[name], before[name])
-                if not lowest <= after[name] <= highest:
-                    return f"{name} is {after[name]}, must be {lowest} to {highest}, was {before[name]}"
-                mask |= mask_of(item.source)
-        if made != data and protection is not None:
-            mask |= protection.header_mask
-            if not protection.is_sound(bytearray(made)) or protection.counter_of(made) != protection.counter_of(data):
-                return "the rewritten frame has a wrong CRC, or another counter"
-        changed = (int.from_bytes(data, "little") ^ int.from_bytes(made, "little")) & ~mask
-        return f"bits {changed:X} changed, which are nobody's business" if changed else None
+        before, protection = _codes(message, data), self._protections.get(message.name)
+        sources = {item.source.name: item for item in own if item.source.name in before}
+        allowed = {item.source: item.outcome.allowed or (before[name], before[name]) for name, item in sources.items()}
+        return self._wrong_frame(message, data, sent[0][1], allowed, protection.counter_of(data) if protection else 0)
 
     def _wrong_answer(self, message: Message, data: bytes) -> str | None:
         """What is wrong with a frame that an overlay node sends."""
-        codes, protection, mask = _codes(message, data), self._protections.get(message.name), 0
+        allowed, protection = dict[Signal, tuple[int, int]](), self._protections.get(message.name)
         for item in self._branches:
-            if item.target is None or item.target[0] is not message:
-                continue
-            target, quality = item.target[1], item.quality
-            missing = next(code for code, text in (target.choices or {}).items() if text == "SNA")
-            lowest, highest = item.outcome.allowed or (missing, missing)
-            told = codes[quality.name] if quality is not None else item.outcome.quality
-            if not lowest <= codes[target.name] <= highest or told != item.outcome.quality:
-                return f"{target.name} is {codes[target.name]} of quality {told}, must be {item.outcome}"
-            mask |= mask_of(target) | (mask_of(quality) if quality is not None else 0)
+            if item.target is not None and item.target[0] is message:
+                target, quality = item.target[1], item.outcome.quality
+                missing = next(code for code, text in (target.choices or {}).items() if text == "SNA")
+                allowed[target] = item.outcome.allowed or (missing, missing)
+                if item.quality is not None:
+                    allowed[item.quality] = quality, quality
         if protection is not None:
-            mask |= protection.header_mask
             self._counters[message.name] = (self._counters[message.name] + 1) % protection.modulus
-            if not protection.is_sound(bytearray(data)) or protection.counter_of(data) != self._counters[message.name]:
+        return self._wrong_frame(message, bytes(len(data)), data, allowed, self._counters[message.name])
+
+    def _wrong_frame(
+        self, message: Message, before: bytes, made: bytes, allowed: Mapping[Signal, tuple[int, int]], counter: int
+    ) -> str | None:
+        """What is wrong with the signals, the protection, or the other bits of a frame that the node made."""
+        codes, mask, protection = _codes(message, made), 0, self._protections.get(message.name)
+        for signal, (lowest, highest) in allowed.items():
+            if not lowest <= codes[signal.name] <= highest:
+                return f"{signal.name} is {codes[signal.name]}, must be {lowest} to {highest}"
+            mask |= mask_of(signal)
+        if made != before and protection is not None:
+            mask |= protection.header_mask
+            if not protection.is_sound(bytearray(made)) or protection.counter_of(made) != counter:
                 return f"{message.name}: wrong CRC or counter"
-        return f"{message.name}: a bit that is nobody's is set" if int.from_bytes(data, "little") & ~mask else None
+        changed = (int.from_bytes(before, "little") ^ int.from_bytes(made, "little")) & ~mask
+        return f"bits {changed:X} changed, which are nobody's business" if changed else None
 
 
 def require_right(
