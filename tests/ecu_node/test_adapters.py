@@ -62,12 +62,7 @@ def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("interfaces", "config", "settings", "words"),
     [
-        (
-            "pcan kvaser vector slcan gs_usb ixxat cantact",
-            {},
-            {},
-            "no bitrate: .* put bitrate into section .* also --bitrate BIT_PER_S",
-        ),
+        ("pcan kvaser vector slcan gs_usb ixxat cantact", {}, {}, "no bitrate: .* into section .* --bitrate BIT_PER_S"),
         ("kvaser vector ixxat", {}, {"fd": True, "bitrate": 500_000}, "no data_bitrate: .* --data-bitrate BIT_PER_S"),
         ("pcan slcan nixnet", {}, FD_RATES, r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"),
         ("socketcan virtual udp_multicast serial", {}, {"bitrate": 250_000}, "the bit rate of .* is not set from here"),

@@ -6,9 +6,9 @@ import pickle
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -161,33 +161,29 @@ def huge(path: Path) -> None:
     os.truncate(path, 1 << 40)  # sparse: no disk is filled
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (pipe, "it is a pipe; a file is expected"),
-        (endless, "it is a device; a file is expected"),
-        (Path.mkdir, "it is a folder; a file is expected"),
-        (huge, "it is larger than [0-9]+ bytes"),
-    ],
-)
-@pytest.mark.parametrize(
-    ("role", "said"),
-    [
-        ("small.dbc", "ecu-node: .*small.dbc: cannot read the DBC: "),
-        ("other.toml", "ecu-node: .*other.toml: cannot read the layout: "),
-        ("p.json", r"NOT FIT \(MALFORMED_PARAMETERS\): .*p\.json: not a parameter file: "),
-    ],
-)
-def test_input_that_is_not_a_regular_file_is_reported_in_one_line(
-    tmp_path: Path, make: Callable[[Path], None], words: str, role: str, said: str
-) -> None:
+UNSUITABLE = {
+    pipe: "it is a pipe; a file is expected",
+    endless: "it is a device; a file is expected",
+    Path.mkdir: "it is a folder; a file is expected",
+    huge: "it is larger than [0-9]+ bytes",
+}
+ROLES = {
+    "small.dbc": "ecu-node: .*small.dbc: cannot read the DBC: ",
+    "other.toml": "ecu-node: .*other.toml: cannot read the layout: ",
+    "p.json": r"NOT FIT \(MALFORMED_PARAMETERS\): .*p\.json: not a parameter file: ",
+}
+
+
+@pytest.mark.parametrize("make", UNSUITABLE)
+@pytest.mark.parametrize("role", ROLES)
+def test_input_that_is_not_a_regular_file_is_reported_in_one_line(make: Any, role: str, tmp_path: Path) -> None:
     """Nobody waits for its end."""
     make(tmp_path / role)
     (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
     layout = {"small.dbc": tmp_path / "small.toml", "other.toml": tmp_path / role}.get(role, LAYOUT)
     code, out, err = ecu_node(*check(tmp_path / "p.json", layout=layout))
     assert code == 1
-    assert re.match(said + words, out + err)
+    assert re.match(ROLES[role] + UNSUITABLE[make], out + err)
     assert role == "p.json" or (out + err).count("\n") == 1
 
 

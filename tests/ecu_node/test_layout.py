@@ -48,11 +48,7 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ("full_scale_a", 'watch.input = "x"\nwatch.valid = [1]\nfull_scale_a', r"input: 'x' is no \[\[input\]\]"),
         ("full_scale_a", "watch.valid = [1]\nfull_scale_a", "give both 'input' and 'valid', or neither"),
         ("full_scale_a", "watch.valid = [nan]\nfull_scale_a", r"\[watch\], valid, entry number 1: .* found NaN"),
-        (
-            "\n]\n",
-            f'{E2E} "P01"\nvalid = {{ window = 3, min_ok = 5, max_error = 0 }}\n',
-            "valid: min_ok = 5 of 3 frames;",
-        ),
+        ("\n]\n", f'{E2E} "P01"\nvalid = {{ window = 3, min_ok = 5, max_error = 0 }}\n', "min_ok = 5 of 3 frames;"),
         ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
         ("\n]\n", f'{E2E} ["P01"]\n', r"profile: expected one of P01.*found \[\"P01\"\]"),
         ("sign = ", 'vss = "Vehicle.A", sign = ', "vss 'Vehicle.A' stands at two branches; each needs a name of"),

@@ -31,6 +31,7 @@ from tests.update.damage import a_folder, a_pipe, cut, huge, without, zeros
 from tests.update.repo import Repo, one_line, pass_trial
 
 DIGEST = "0" * 64
+Change = Callable[[VehicleParameters], VehicleParameters]
 
 
 def held_set(state: Path, place: str = "in_force") -> ParameterSet:
@@ -83,11 +84,7 @@ def test_result_of_a_replaced_trial_is_ignored(repo: Repo, state: Path, other: V
     ],
 )
 def test_set_that_does_not_fit_is_refused(
-    change: Callable[[VehicleParameters], VehicleParameters],
-    words: str,
-    repo: Repo,
-    state: Path,
-    parameters: VehicleParameters,
+    change: Change, words: str, repo: Repo, state: Path, parameters: VehicleParameters
 ) -> None:
     repo.offer(change(parameters))
     one_line(repo.update(state), words, repo.path)
@@ -225,7 +222,7 @@ def test_vehicle_is_provisioned_once_and_with_a_signed_root(repo: Repo, state: P
     [
         (
             lambda file: file.custom.update(expires="2100-01-01T00:00:00"),
-            "custom fields of v1.json: Expected `datetime` with a timezone component",
+            "v1.json: Expected `datetime` with a timezone",
         ),
         (lambda file: file.custom.update(layout=DIGEST), "layout and DBC are not those of the signed description"),
         (lambda file: setattr(file, "length", 1_000_001), "v1.json is no parameter file"),

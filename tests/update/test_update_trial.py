@@ -154,6 +154,7 @@ def test_set_that_corrects_half_of_the_error_fails_its_trial(new: Path, car: Veh
     assert tried(new, right(car), car, load_a=-3.0).has_said(FAILED), "a load that no sensor sees is half of the change"
 
 
+Numbers = dict[str, float]
 UNCHANGED = {"drift": 0.0, "offset_a": 0.0}
 
 
@@ -167,12 +168,7 @@ UNCHANGED = {"drift": 0.0, "offset_a": 0.0}
     ids=["without a change", "without a predicted change, as written by hand", "promises half, and a load is half"],
 )
 def test_set_that_keeps_its_promise_passes_its_trial(
-    fault: dict[str, float],
-    residual: JunctionResidual | None,
-    conditions: dict[str, float],
-    words: str,
-    new: Path,
-    car: VehicleDatabase,
+    fault: Numbers, residual: JunctionResidual | None, conditions: Numbers, words: str, new: Path, car: VehicleDatabase
 ) -> None:
     parameters = right(car, **fault)
     promising = replace(parameters, junction_residual=residual or parameters.junction_residual)
