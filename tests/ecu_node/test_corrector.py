@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
+from weakref import ref
 
 import pytest
 from e2e.p01 import e2e_p01_check
@@ -12,6 +13,7 @@ from msgspec.structs import replace
 
 from ecu_node.bus.wiring import InForce, Mode, put_in_force, wire
 from ecu_node.core.corrector import Corrector
+from ecu_node.core.junction import REMEMBERED_FRAMES
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
@@ -174,6 +176,21 @@ def test_value_from_before_bus_sleep_or_reload_is_never_published(make_database:
     in_force = InForce(parameters=parameters_for(database, **faults))
     put_in_force(corrector, database, in_force, 3600.4, mode=Mode.OVERLAY)
     assert published(database, corrector, pair, 3600.4, "motor")[0] == no_value
+
+
+def test_only_the_last_frames_are_remembered(database: VehicleDatabase) -> None:
+    class Payload(bytearray):
+        """Unlike a bytearray, it can be referred to weakly."""
+
+    source = corrector_for(database, battery=(0.25, 5.0)).sources[BATTERY]
+    (branch,) = source.branches
+    payloads = [Payload(battery(database, k % 15).data) for k in range(1 + REMEMBERED_FRAMES)]
+    first = ref(payloads[0])
+    for k in range(1 + REMEMBERED_FRAMES):
+        source.answer(payloads.pop(0), 0.01 * k)
+        assert branch.time_s == pytest.approx(0.01 * k)
+    assert first() is None
+    assert len([*branch.newest_first()]) == REMEMBERED_FRAMES
 
 
 def test_branches_going_silent_one_after_another_are_not_a_fault(database: VehicleDatabase) -> None:
