@@ -21,7 +21,7 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from tests.ecu_node.processes import LONGEST_WAIT_S, wait_until
-from tests.ecu_node.test_node import at_work, battery_frame, receive
+from tests.ecu_node.test_node import Adapter, at_work, battery_frame, receive
 from tests.ecu_node.test_socketcan import fields, random_frame
 from tests.ecu_node.vehicles import corrector_for, decoded
 
@@ -85,23 +85,13 @@ def test_branch_frame_that_waited_too_long_is_held_back(database: VehicleDatabas
         assert ([frame["AliveCounter"] for frame in frames], corrector.counters.late) == ([0, 2], 1)
 
 
-class BlockingBus(VirtualBus):
-    """A bus on which sending waits until it is let go."""
-
-    let_go: threading.Event
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        assert self.let_go.wait(LONGEST_WAIT_S)
-        super().send(msg, timeout)
-
-
 def test_watchdog_is_not_fed_while_sending_towards_the_sensors_blocks(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)
     corrector = corrector_for(database, Mode.GATEWAY)
-    near, works = BlockingBus(f"{channel} a"), deque[bool](maxlen=20)
-    near.let_go = threading.Event()
+    let_go, works = threading.Event(), deque[bool](maxlen=20)
+    near = Adapter(f"{channel} a", sending=lambda _: let_go.wait(LONGEST_WAIT_S))
     sensors = SteadyBus(lambda: near, corrector.counters)
     vehicle = SteadyBus(lambda: VirtualBus(f"{channel} b"), corrector.counters)
     node = Node(sensors, vehicle, corrector, period_s=0.02, on_tick=lambda _, fed: works.append(fed))
@@ -111,7 +101,7 @@ def test_watchdog_is_not_fed_while_sending_towards_the_sensors_blocks(
             ends[1].send(can.Message(arbitration_id=0x300))
             wait_until(lambda: True not in works)
         finally:
-            near.let_go.set()
+            let_go.set()
         wait_until(lambda: True in works)
 
 

@@ -114,34 +114,40 @@ def test_node_stops_if_another_node_sends_its_frames(database: VehicleDatabase, 
             pass
 
 
-class FailingBus(VirtualBus):
-    """A bus on which sending or receiving fails."""
+Hook = Callable[..., object]
 
-    def __init__(self, channel: str, *, sending: Exception | None = None, receiving: Exception | None = None) -> None:
+
+def undisturbed(*_: object) -> None:
+    """Nothing happens."""
+
+
+class Adapter(VirtualBus):
+    """A bus whose sending and receiving may be disturbed: what is to be done before either may fail, or wait."""
+
+    def __init__(self, channel: str, *, sending: Hook = undisturbed, receiving: Hook = undisturbed) -> None:
         super().__init__(channel)
         self.sending, self.receiving = sending, receiving
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if self.sending is not None:
-            raise self.sending
+        self.sending(msg)
         super().send(msg, timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        if self.receiving is not None:
-            raise self.receiving
+        self.receiving()
         return super()._recv_internal(timeout)
 
 
-class EchoingBus(VirtualBus):
-    """A bus that returns what is sent, as some adapters do."""
+def failing(error: Exception) -> Hook:
+    def fail(*_: object) -> None:
+        raise error
 
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        super().send(msg, timeout)
-        self.queue.put(deepcopy(msg))
+    return fail
 
 
 def test_echo_of_own_frames_is_counted_and_ignored(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
-    with node_on(database, "", lambda: EchoingBus(channel)) as corrector:
+    """As some adapters return what is sent."""
+    bus = Adapter(channel, sending=lambda message: bus.queue.put(deepcopy(message)))
+    with node_on(database, "", lambda: bus) as corrector:
         receive(peer, 0x5F0, 1)
         peer.send(battery_frame(database, 0))
         receive(peer, 0x510, 1)
@@ -152,7 +158,7 @@ def test_echo_of_own_frames_is_counted_and_ignored(database: VehicleDatabase, pe
 
 def test_gateway_stops_if_one_direction_fails(database: VehicleDatabase, channel: str) -> None:
     corrector = corrector_for(database, Mode.GATEWAY, battery=(0.25, 5.0))
-    near = SteadyBus(lambda: FailingBus(channel, sending=RuntimeError("defect")), corrector.counters)
+    near = SteadyBus(lambda: Adapter(channel, sending=failing(RuntimeError("defect"))), corrector.counters)
     far = SteadyBus(lambda: VirtualBus(f"{channel} vehicle"), corrector.counters)
     with (
         can.Bus(interface="virtual", channel=f"{channel} vehicle") as vehicle,
@@ -167,7 +173,7 @@ def test_gateway_stops_if_one_direction_fails(database: VehicleDatabase, channel
 
 def test_full_send_queue_is_reported_until_it_is_free(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     said, states = list[str](), list[str]()
-    full = FailingBus(channel, sending=can.CanOperationError("Transmit buffer full"))
+    full = Adapter(channel, sending=failing(can.CanOperationError("Transmit buffer full")))
     now_s, frame = time.monotonic(), can.Message(arbitration_id=1)
     with closing(SteadyBus(lambda: full, Counters(), said.append)) as bus:
         for later_s in (0.0, 0.5, 1.5, 12.0):
@@ -175,7 +181,7 @@ def test_full_send_queue_is_reported_until_it_is_free(channel: str, monkeypatch:
             bus.send(frame)
             assert bus.flush() == (0, 1)
             states.append(bus.state)
-        full.sending = None
+        full.sending = undisturbed
         bus.send(frame)
         assert bus.flush() == (1, 0)
         states.append(bus.state)
@@ -247,7 +253,7 @@ def test_frames_that_waited_too_long_are_not_used(database: VehicleDatabase, cha
 def test_failed_bus_is_reported_as_open_only_when_it_works_again(peer: can.BusABC, channel: str) -> None:
     """A bus-off that is reported as the bus opens again is counted."""
     down = can.CanOperationError("Network is down", errno.ENETDOWN)
-    opened = iter([*(FailingBus(f"{channel} down", receiving=down) for _ in range(3)), VirtualBus(channel)])
+    opened = iter([*(Adapter(f"{channel} down", receiving=failing(down)) for _ in range(3)), VirtualBus(channel)])
     peer.send(can.Message(arbitration_id=0x40, is_error_frame=True))
     said, counters = list[str](), Counters()
     with closing(SteadyBus(lambda: next(opened), counters, said.append)) as bus:
@@ -257,17 +263,12 @@ def test_failed_bus_is_reported_as_open_only_when_it_works_again(peer: can.BusAB
     assert (counters.bus_errors, counters.bus_off) == (1, 1)
 
 
-class ClassicBus(VirtualBus):
-    """A bus that takes no frame of CAN FD."""
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if msg.is_fd:
-            raise can.CanOperationError("Invalid argument", errno.EINVAL)
-        super().send(msg, timeout)
-
-
 def test_frame_that_the_bus_rejects_does_not_block_later_frames(peer: can.BusABC, channel: str) -> None:
-    with closing(SteadyBus(lambda: ClassicBus(channel), Counters())) as bus:
+    def take_classic(message: can.Message) -> None:
+        if message.is_fd:
+            raise can.CanOperationError("Invalid argument", errno.EINVAL)
+
+    with closing(SteadyBus(lambda: Adapter(channel, sending=take_classic), Counters())) as bus:
         for identifier, is_fd in ((1, False), (2, True), (3, False)):
             bus.send(can.Message(arbitration_id=identifier, is_fd=is_fd))
         assert bus.flush() == (2, 1)
@@ -277,7 +278,7 @@ def test_frame_that_the_bus_rejects_does_not_block_later_frames(peer: can.BusABC
 def test_bus_whose_sending_fails_is_opened_again(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
     """The kernel reports the error only once."""
     gone = can.CanOperationError("No such device or address", errno.ENXIO)
-    buses = iter([FailingBus(channel, sending=gone), overlay_bus(database, channel)])
+    buses = iter([Adapter(channel, sending=failing(gone)), overlay_bus(database, channel)])
     with node_on(database, "", lambda: next(buses)) as corrector:
         receive(peer, 0x5F0, 3)
     assert corrector.counters.reopened == 1

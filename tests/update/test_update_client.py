@@ -220,10 +220,7 @@ def test_vehicle_is_provisioned_once_and_with_a_signed_root(repo: Repo, state: P
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (
-            lambda file: file.custom.update(expires="2100-01-01T00:00:00"),
-            "v1.json: Expected `datetime` with a time",
-        ),
+        (lambda file: file.custom.update(expires="2100-01-01T00:00:00"), "v1.json: Expected `datetime` with a time"),
         (lambda file: file.custom.update(layout=DIGEST), "layout and DBC are not those of the signed description"),
         (lambda file: setattr(file, "length", 1_000_001), "v1.json is no parameter file"),
         (lambda file: file.hashes.update(sha512=DIGEST), "v1.json is no parameter file"),
