@@ -52,5 +52,5 @@ def test_tests_in_the_source_distribution_are_complete_and_run(unpacked: Path) -
     )
     assert len(here) > 1000
     assert in_source == here
-    some = ("tests/ecu_node/test_correction.py", "tests/deploy", "tests/docs/test_links.py")
+    some = ("tests/ecu_node/test_correction.py", "tests/deploy", "tests/docs/test_documents.py")
     assert " passed" in pytest_in(unpacked, *some)
