@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +44,11 @@ def frames_of(log: Path) -> list[LoggedFrame]:
     """Frames of a candump log in their order."""
     whole_lines = log.read_text().rpartition("\n")[0].splitlines()  # of one that is being written
     return [LoggedFrame(*line.split()[2].split("#", 1)) for line in whole_lines]
+
+
+def data_of(frames: Iterable[LoggedFrame], identifier: int) -> list[bytes]:
+    """Data of the frames of one identifier (11 bits)."""
+    return [bytes.fromhex(frame.data) for frame in frames if frame.identifier == f"{identifier:03X}"]
 
 
 def wait_until(done: Callable[[], bool], what: str) -> None:
@@ -108,7 +113,7 @@ class Recording:
 
     def data_of(self, identifier: int) -> list[bytes]:
         """Data of the frames of one identifier (11 bits) so far."""
-        return [bytes.fromhex(frame.data) for frame in self.frames if frame.identifier == f"{identifier:03X}"]
+        return data_of(self.frames, identifier)
 
     def wait_for_frames(self, count: int) -> list[LoggedFrame]:
         """Wait until so many frames of any identifier are recorded; returns all of them."""

@@ -16,6 +16,7 @@ from tests.vcan.processes import (
     OTHER_CHANNEL,
     Recording,
     bring_up,
+    data_of,
     frames_of,
     ip_link,
     play,
@@ -85,11 +86,7 @@ def test_bus_once_down_or_deleted_is_used_again(tmp_path: Path, drive: Path, sta
 def test_full_send_queue_loses_frames_but_does_not_stop_the_gateway(
     database: VehicleDatabase, drive: Path, start_gateway: StartNode, there: Recording
 ) -> None:
-    expected = [
-        bytes.fromhex(frame.data)
-        for frame in sent_by_core(database, Mode.GATEWAY, frames_of(drive))
-        if frame.identifier == f"{BATTERY:03X}"
-    ]
+    expected = data_of(sent_by_core(database, Mode.GATEWAY, frames_of(drive)), BATTERY)
     with start_gateway() as node:
         run_tool("tc", "qdisc", "add", "dev", OTHER_CHANNEL, "root", "plug", "limit", "400")
         try:

@@ -1,6 +1,9 @@
 """The node as a process on a real SocketCAN bus, with can-utils playing and recording."""
 
+import json
+import os
 import signal
+import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -8,20 +11,27 @@ import pytest
 
 from ecu_node.bus.wiring import InForce, Mode
 from ecu_node.core.status import Reason, State
-from ecu_node.database import VehicleDatabase
-from tests.vcan.conftest import MARKER, STATUS, StartNode, state_of
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import write_parameters
+from tests.vcan.conftest import BATTERY_CORRECTED, MARKER, STATUS, StartNode, state_of
+from tests.vcan.patient_layout import write_patient_layout
 from tests.vcan.processes import (
     CHANNEL,
+    ECU_NODE,
+    LONGEST_WAIT_S,
     OTHER_CHANNEL,
     LoggedFrame,
     Recording,
+    data_of,
     frames_of,
     generate,
     play,
     playing,
+    running_node,
     wait_until,
 )
-from tests.vcan.small_drive import VEHICLE, sent_by_core, write_drive
+from tests.vcan.small_drive import BRANCHES, VEHICLE, sent_by_core, true_parameters, write_drive
 
 INSTANTS = 150
 CORRECTED = (0x510, 0x520, 0x530)
@@ -39,7 +49,7 @@ def test_drive_is_corrected_and_other_frames_are_unchanged(
         status = here.wait_for(STATUS, 10)
         assert node.stop() == 0
     for identifier, found in recorded.items():
-        assert found == [bytes.fromhex(frame.data) for frame in expected if frame.identifier == f"{identifier:03X}"]
+        assert found == data_of(expected, identifier)
     here.wait_for_marker(MARKER)
     assert [frame for frame in here.frames if frame.identifier not in OWN] == drive
     assert state_of(status[-1]) == (State.CORRECTING, Reason.NONE)
@@ -55,8 +65,7 @@ def test_measured_values_pass_through_with_unfit_parameters(
     with start_node("--vehicle", "v9999") as node:
         play(tmp_path / "drive.log")
         for identifier in CORRECTED:
-            wanted = [bytes.fromhex(frame.data) for frame in expected if frame.identifier == f"{identifier:03X}"]
-            assert here.wait_for(identifier, 20) == wanted
+            assert here.wait_for(identifier, 20) == data_of(expected, identifier)
         (status, *_) = here.wait_for(STATUS, 1)
         assert node.stop() == 0
     assert state_of(status) == (State.PASSING_THROUGH, Reason.WRONG_VEHICLE)
@@ -76,6 +85,69 @@ def test_nonexistent_interface_is_reported_in_one_line(tmp_path: Path, start_nod
     with pytest.raises(AssertionError, match=words), start_node("--channel", "nocan0"):
         pass  # it does not start
     assert (tmp_path / "node.err").read_text().count("\n") == 1
+
+
+# ---- as its service runs it, without any privilege; the monitor beside it
+
+
+UNPRIVILEGED = ["setpriv", "--bounding-set=-all", "--inh-caps=-all", "--ambient-caps=-all", "--no-new-privs"]
+
+
+def filters() -> int:
+    """Identifiers that sockets wait for on vcan0."""
+    files = Path("/proc/net/can").glob("rcvlist_*")
+    return sum(line.split()[0] == CHANNEL for file in files for line in file.read_text().splitlines() if line.split())
+
+
+@pytest.fixture
+def patient(tmp_path: Path) -> VehicleDatabase:
+    """The layout with timeouts that a slow machine keeps."""
+    return read_database(read_layout(write_patient_layout(tmp_path, timeout_s=30.0)))
+
+
+def test_monitor_shows_branches_sums_and_node_status(patient: VehicleDatabase, tmp_path: Path) -> None:
+    write_drive(tmp_path / "drive.log", patient, 500, standing_at_s=1.0)
+    write_parameters(true_parameters(patient), tmp_path / "params.json")
+    files = ["--layout", str(patient.layout.path), "--channel", CHANNEL]
+    command = [*ECU_NODE, "monitor", *files, "--once", "4", "--json"]
+    with running_node(tmp_path / "node.err", "--unsigned", "--params", str(tmp_path / "params.json"), *files) as node:
+        before = filters()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as monitor:
+            wait_until(lambda: filters() > before, "the monitor to listen")
+            with playing(tmp_path / "drive.log"):
+                out, _ = monitor.communicate(timeout=LONGEST_WAIT_S)
+        assert node.stop() == 0
+    view = json.loads(out)
+    branches = {branch["name"]: branch for branch in view["branches"]}
+    assert monitor.returncode == 0
+    assert [name for name, branch in branches.items() if branch["is_seen"]] == list(BRANCHES)
+    assert {branches[name]["quality"] for name in BRANCHES} == {"CORRECTED"}
+    assert branches["motor"]["faults"]["corrupt"] > 0
+    assert (view["node"]["state"], view["node"]["parameter_set"]) == ("CORRECTING", 7)
+    assert abs(view["sums"]["corrected_a"]) < 1.0 < abs(view["sums"]["measured_a"])
+
+
+def test_node_needs_no_capability(start_node: StartNode, drive: Path, here: Recording) -> None:
+    """As in deploy/ecu-node@.service: an empty bounding set, no ambient capabilities, no new privileges."""
+    with start_node(by=UNPRIVILEGED) as node:
+        capabilities = Path(f"/proc/{node.process.pid}/status").read_text().partition("CapPrm:")[2].split()
+        assert int(capabilities[0], 16) == 0
+        play(drive)
+        assert len(here.wait_for(BATTERY_CORRECTED, INSTANTS)) == INSTANTS
+        assert here.wait_for(STATUS, 1)
+        assert node.stop() == 0
+
+
+def test_real_time_is_fifo_on_one_processor_with_locked_memory(start_node: StartNode) -> None:
+    with start_node("--realtime") as node:
+        number = node.process.pid
+        status = Path(f"/proc/{number}/status").read_text()
+        locked_kb = int(status.partition("VmLck:")[2].split()[0])
+        scheduler, processors = os.sched_getscheduler(number), os.sched_getaffinity(number)
+        assert node.stop() == 0
+    assert "real time: SCHED_FIFO, memory lock, one processor" in node.messages
+    assert (scheduler, len(processors)) == (os.SCHED_FIFO, 1)
+    assert locked_kb > 1000
 
 
 # ---- a gateway between vcan0, where the sensors are, and vcan1
