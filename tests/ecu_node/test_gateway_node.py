@@ -77,14 +77,6 @@ def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, end
     assert sensors.recv(0.0) is None, "nothing comes back"
 
 
-def test_branch_frame_that_waited_too_long_is_held_back(database: VehicleDatabase, ends: Ends, channel: str) -> None:
-    with gateway(database, channel) as (corrector, _), VirtualBus(f"{channel} a", preserve_timestamps=True) as bus:
-        for counter, age_s in enumerate((0.0, 5.0, 0.0)):
-            bus.send(battery_frame(database, counter, time.time() - age_s))
-        frames = [decoded(database, "HV_Battery", bytes(frame.data)) for frame in received(ends[1], 2)]
-        assert ([frame["AliveCounter"] for frame in frames], corrector.counters.late) == ([0, 2], 1)
-
-
 def test_watchdog_is_not_fed_while_sending_towards_the_sensors_blocks(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:

@@ -7,18 +7,9 @@ import cantools
 import numpy as np
 from cantools.database.can import Database
 
-from calibrator.recordings.log_formats import read_frames
 from calibrator.recordings.readers import read_recording
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
-
-
-def test_tesla_frames_are_read_as_python_can_reads_them(tesla: Path) -> None:
-    frames = read_frames(tesla / "drive.log.gz")
-    messages = list(can.LogReader(tesla / "drive.log.gz"))
-    assert frames.key.tolist() == [message.arbitration_id for message in messages]
-    assert [frames.data[k, :n].tobytes() for k, n in enumerate(frames.length)] == [bytes(m.data) for m in messages]
-    assert frames.damaged == 0
 
 
 def test_tesla_currents_decode_as_cantools_decodes_them(tesla: Path) -> None:

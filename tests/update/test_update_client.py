@@ -149,14 +149,6 @@ def test_same_set_with_a_later_expiry_needs_no_trial(
     assert held_set(state).expires > datetime.now(UTC) + timedelta(days=799)
 
 
-def test_dry_run_of_an_update_writes_nothing(repo: Repo, new: Path) -> None:
-    before = {path.name: path.read_bytes() for path in new.iterdir()}
-    code, out, _ = repo.update(new, None, "--dry-run")
-    assert code == 0
-    assert out.startswith("dry run, nothing is changed: on trial: parameter set 300")
-    assert {path.name: path.read_bytes() for path in new.iterdir()} == before
-
-
 def test_expired_set_ends(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
