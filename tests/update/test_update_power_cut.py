@@ -104,8 +104,10 @@ def left_by_cut(disk: Disk, place: Path) -> Iterator[Path]:
 @pytest.mark.parametrize("change", ["update", "revoke", "conclude"], indirect=True)
 def test_power_cut_leaves_the_old_or_new_state(change: Callable[[Path], object], state: Path, tmp_path: Path) -> None:
     whole = Disk(copied(state, tmp_path / "whole"))
+    inode = (whole.folder / "state.json").stat().st_ino
     with whole.in_use():
         change(whole.folder)
+    assert (whole.folder / "state.json").stat().st_ino != inode, "it is replaced whole, never written in place"
     before, after = timeless(state), timeless(whole.folder)
     seen = []
     for place, call in enumerate(whole.calls):
