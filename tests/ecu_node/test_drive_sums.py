@@ -15,7 +15,7 @@ from ecu_node.bus.on_board_summary import OnBoardSummary, on_board_summary
 from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
-from ecu_node.summary import SummaryFile, decode_summary, encode_summary
+from ecu_node.summary import SummaryFile, decode_summary, encode_summary, unpacked
 from tests.ecu_node.processes import running
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, MakeDatabase
 
@@ -68,6 +68,20 @@ def drive(make_database: MakeDatabase, tmp_path: Path) -> Drive:
     return Drive(tmp_path / "sums", make_database(WITH_CONTACTOR))
 
 
+def test_record_has_mean_currents_and_the_offset_at_open_contactors(drive: Drive) -> None:
+    drive.go_on(120.0)
+    for battery in (3000, 500):  # of two samples at one instant the last one counts
+        drive.take(256, False, battery.to_bytes(2, "big") + bytes(6))
+    drive.take(999, False, bytes(8))
+    (record,) = drive.ended()
+    assert record.branches == ["battery", "motor", "heater"]
+    assert record.zero_offset_a == [pytest.approx(OFFSET_A), pytest.approx(0.0), None]
+    battery_a, motor_a, heater_a = unpacked(record.mean)
+    assert heater_a == pytest.approx(-HEATER_W / NET_V)
+    assert battery_a + motor_a + heater_a == pytest.approx(OFFSET_A, abs=0.05)
+    assert record.starts == [True]
+
+
 def test_clock_step_starts_a_new_drive(drive: Drive) -> None:
     drive.go_on(60.0)
     drive.stamp_s += 3600.0
@@ -93,6 +107,15 @@ def test_single_branch_makes_no_record(drive: Drive) -> None:
 def test_drive_shorter_than_a_fifth_of_a_block_makes_no_record(drive: Drive, flows_s: float, records: int) -> None:
     drive.go_on(flows_s, open_s=0.0)
     assert len(drive.ended()) == records
+
+
+def test_noise_is_that_of_rounding_without_four_consecutive_samples(drive: Drive) -> None:
+    for _ in range(60):
+        drive.go_on(0.3, open_s=0.0)
+        drive.stamp_s += 0.7
+    (record,) = drive.ended()
+    steps_a = [drive.database.current_step_a(name) for name in record.branches]
+    assert [*unpacked(record.noise_a2)] == pytest.approx([step_a**2 / 12.0 for step_a in steps_a])
 
 
 def test_full_record_file_is_followed_by_another(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,10 @@ from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError
 from tests.ecu_node.vehicles import (
+    NET,
     SMALL_DBC,
     SMALL_LAYOUT,
+    Frame,
     MakeDatabase,
     battery,
     corrector_for,
@@ -83,6 +85,16 @@ def test_branch_over_e2e_header_is_refused(make_database: MakeDatabase, profile:
     layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'
     with pytest.raises(LayoutError, match=rf"branch {branch}: Pair\.{branch.title()} is written twice, or overlaps"):
         gateway_for(make_database(layout, SMALL_DBC.replace("Pair: 8", "Pair: 24")))
+
+
+def test_message_without_branches_is_forwarded_even_if_corrupt(make_database: MakeDatabase) -> None:
+    entry = '\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\n'
+    dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "16|16@1+ (0.01")
+    database = make_database(SMALL_LAYOUT + entry, dbc)
+    corrector = gateway_for(database, heater=(0.25, -2.0))
+    spoilt = Frame(NET, b"\x00\x01\x40\x9c")
+    assert passed_on(corrector, spoilt, 0.0) == spoilt.data
+    assert (corrector.counters.corrupt, corrector.counters.held_back) == (1, 0)
 
 
 def test_gateway_refuses_a_named_code_within_the_range_of_a_branch(make_database: MakeDatabase) -> None:

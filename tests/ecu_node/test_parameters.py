@@ -33,6 +33,7 @@ from ecu_node.parameters import (
     write_parameters,
 )
 from tests.disk import full_disk
+from tests.ecu_node.processes import ecu_node as run_node
 from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, as_document, corrector_for, parameters_for
 
 SCHEMA_FILE = Path(ecu_node.__file__).parent / "parameters.schema.json"
@@ -48,7 +49,7 @@ def is_readable(content: object) -> bool:
 
 
 def test_published_json_schema_matches_the_data_structures() -> None:
-    assert json.loads(SCHEMA_FILE.read_text()) == parameter_schema()
+    assert json.loads(SCHEMA_FILE.read_text()) == parameter_schema() == json.loads(run_node("schema").out)
 
 
 def test_written_parameters_are_read_back_and_match_the_schema(database: VehicleDatabase, tmp_path: Path) -> None:

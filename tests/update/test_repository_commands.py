@@ -207,6 +207,15 @@ def test_each_mistake_is_one_line_and_changes_nothing(repo: Repo, other: Vehicle
     assert files() == before
 
 
+def test_full_disk_does_not_change_what_vehicles_receive(repo: Repo, new: Path, other: VehicleParameters) -> None:
+    repo.updated(new)
+    repo.add(other)
+    with full_disk(300):
+        code, _, err = repo.calibrator("repository", "publish", repo.path, *keys(repo, *ALL))
+    assert (code, err.count("\n")) == (1, 1)
+    assert repo.updated(new).startswith("nothing new: ")
+
+
 def test_status_gives_the_expiry_of_a_root_that_expires_before_the_timestamp_role(repo: Repo) -> None:
     def expire_soon(root: Root) -> None:
         root.expires = datetime.now(UTC).replace(microsecond=0) + timedelta(days=3)
