@@ -1,18 +1,20 @@
 """The calibrator's command line in this process: starting Python takes longer than most of them."""
 
 import fcntl
+import json
 import os
 import subprocess
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.calibrator.conftest import LAYOUT, run_command
 
-__all__ = ["calibrator", "made_once", "once"]
+__all__ = ["calibrator", "made_once", "once", "refused", "reported", "succeeded"]
 
 
 def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -22,6 +24,25 @@ def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
     with redirect_stdout(output), redirect_stderr(errors):
         code = run_command(line)
     return subprocess.CompletedProcess(line, code, said(output), said(errors))
+
+
+def succeeded(*arguments: object) -> str:
+    """Output of a command that ends without an error."""
+    done = calibrator(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def reported(*arguments: object) -> Any:
+    """What a command reports with ``--json``."""
+    return json.loads(succeeded(*arguments, "--json"))
+
+
+def refused(*arguments: object, code: int = 1) -> str:
+    """The only line of a command that is refused."""
+    done = calibrator(*arguments)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (code, "", 1), done.stderr
+    return done.stderr
 
 
 def said(stream: TextIOWrapper) -> str:
@@ -34,8 +55,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, *arguments: object) ->
     """Folder that a command writes once for all tests."""
 
     def make(out: Path) -> None:
-        done = calibrator(*arguments, "--layout", LAYOUT, "--out", out, "--workers", 1)
-        assert done.returncode == 0, done.stderr
+        succeeded(*arguments, "--layout", LAYOUT, "--out", out, "--workers", 1)
 
     return once(factory, name, make)
 
