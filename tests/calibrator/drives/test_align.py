@@ -1,6 +1,5 @@
 """Alignment of channels to one time base, labels of bad samples, and the choice of inputs."""
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -96,18 +95,14 @@ def test_missing_channel_is_named_with_the_available_ones(layout: Layout) -> Non
         align(drive_of({"battery": ramp(0.0, 1.0, 0.1)}), layout, ["battery", "motor"], inputs=["voltage"])
 
 
-@pytest.mark.parametrize(("dcdc", "words"), [
-    (channel(np.array([0.0]), np.array([1.0]), bad=[0]), "drive d: no good sample of dcdc"),
-    (ramp(2.0, 3.0, 0.1), "no instant in common"),
+@pytest.mark.parametrize(("branches", "words"), [
+    ({"battery": channel(np.zeros(1), np.ones(1), bad=[0])}, "drive d: no good sample of battery"),
+    ({"battery": ramp(0.0, 1.0, 0.1), "dcdc": ramp(2.0, 3.0, 0.1)}, "no instant in common"),
+    ({"battery": channel(np.array([0.0, 1e9]), np.zeros(2))}, "the time stamps are wrong"),
 ])  # fmt: skip
-def test_channels_that_cannot_be_aligned_are_refused(layout: Layout, dcdc: Channel, words: str) -> None:
+def test_channels_that_cannot_be_aligned_are_refused(layout: Layout, branches: dict[str, Channel], words: str) -> None:
     with pytest.raises(DriveError, match=words):
-        aligned(layout, {"battery": ramp(0.0, 1.0, 0.1), "dcdc": dcdc})
-
-
-def test_drive_longer_than_years_is_refused(layout: Layout) -> None:
-    with pytest.raises(DriveError, match="the time stamps are wrong"):
-        aligned(layout, {"battery": channel(np.array([0.0, 1e9]), np.zeros(2))})
+        aligned(layout, branches)
 
 
 def test_model_inputs_missing_in_all_drives_are_left_out_and_named(layout: Layout) -> None:
@@ -116,10 +111,3 @@ def test_model_inputs_missing_in_all_drives_are_left_out_and_named(layout: Layou
     assert left_out == ("low_voltage_current",)
     assert kept + left_out == tuple(layout.model_inputs)
     assert choose_inputs(layout, set()) == ((), tuple(layout.model_inputs))
-
-
-def test_base_inputs_of_derived_inputs_are_found(layout: Layout) -> None:
-    assert layout.base_inputs(["copper_loss", "accelerator"]) == {"torque", "voltage", "accelerator"}
-    doubled = msgspec.structs.replace(layout.derived[0], name="doubled", formula="2 * copper_loss + speed")
-    nested = msgspec.structs.replace(layout, derived=[*layout.derived, doubled])
-    assert nested.base_inputs(["doubled"]) == {"torque", "speed", "voltage"}

@@ -40,33 +40,28 @@ def kept(channel: Channel, which: Mask) -> Channel:
     return Channel(time_s=channel.time_s[which], value=channel.value[which], good=channel.good[which])
 
 
-def test_delay_is_found_whatever_gain_and_offset_the_sensors_have() -> None:
-    found = estimate_delays([made_up_drive(1, PAIR)], TWO)
-    assert found.branches == TWO
+SIMILAR = MadeUp(
+    size_a={"motor": 50.0, "motor_rear": 80.0, "dcdc": 20.0},
+    delay_s={"battery": 0.1, "motor": 0.28, "motor_rear": 0.0, "dcdc": 0.2},
+    noise_a=0.2,
+    alike=0.95,
+)
+
+
+@pytest.mark.parametrize(("vehicle", "branches", "delays_s", "within_s"), [
+    *((replace(PAIR, delay_s={"battery": 0.5, "motor": 0.5 + late_s}), TWO, [late_s], 1e-3)
+      for late_s in (-0.49, -0.301, 0.0, 0.0137, 0.187, 0.49)),
+    (SIMILAR, ("battery", "motor", "motor_rear", "dcdc"), [0.18, -0.1, 0.1], 5e-3),
+])  # fmt: skip
+def test_delays_are_found_whatever_gains_and_offsets_the_sensors_have(
+    vehicle: MadeUp, branches: tuple[str, ...], delays_s: list[float], within_s: float
+) -> None:
+    found = estimate_delays([made_up_drive(4, vehicle)], branches)
+    assert found.branches == branches
     assert found.known.all()
-    np.testing.assert_allclose(found.delay_s, [0.0, 0.187], atol=1e-3)
+    np.testing.assert_allclose(found.delay_s, [0.0, *delays_s], atol=within_s)
     assert found.sd_s[0] == 0.0
-    assert 0.0 < found.sd_s[1] < 1e-3
-
-
-@pytest.mark.parametrize("delay_s", [-0.49, -0.301, 0.0, 0.0137, 0.49])
-def test_positive_and_negative_delays_up_to_the_longest_are_found(delay_s: float) -> None:
-    vehicle = replace(PAIR, delay_s={"battery": 0.5, "motor": 0.5 + delay_s})
-    found = estimate_delays([made_up_drive(3, vehicle)], TWO)
-    assert found.known.all()
-    assert found.delay_s[1] == pytest.approx(delay_s, abs=1e-3)
-
-
-def test_delays_of_two_similar_motors_and_a_slow_converter_are_found() -> None:
-    vehicle = MadeUp(
-        size_a={"motor": 50.0, "motor_rear": 80.0, "dcdc": 20.0},
-        delay_s={"battery": 0.1, "motor": 0.28, "motor_rear": 0.0, "dcdc": 0.2},
-        noise_a=0.2,
-        alike=0.95,
-    )
-    found = estimate_delays([made_up_drive(4, vehicle)], ("battery", "motor", "motor_rear", "dcdc"))
-    assert found.known.all()
-    np.testing.assert_allclose(found.delay_s, [0.0, 0.18, -0.1, 0.1], atol=5e-3)
+    assert ((found.sd_s[1:] > 0.0) & (found.sd_s[1:] < within_s)).all()
 
 
 def honest_sd_s(vehicles: list[MadeUp], branches: tuple[str, ...]) -> Array:
@@ -92,12 +87,6 @@ def test_delay_of_a_noisy_branch_is_unbiased_with_a_correct_deviation() -> None:
     sd_s = honest_sd_s([replace(small, delay_s={"auxiliary": 0.1 + 0.05 * k / 30.0}) for k in range(30)], THREE)
     assert np.isfinite(sd_s).all()
     assert np.median(sd_s) < 5.3e-3
-
-
-def test_shifting_a_channel_in_time_shifts_its_delay_by_as_much() -> None:
-    later = changed("motor", lambda c: replace(c, time_s=c.time_s + 0.0731))
-    before, after = estimate_delays([made_up_drive(1, PAIR)], TWO), estimate_delays([later], TWO)
-    assert after.delay_s[1] - before.delay_s[1] == pytest.approx(0.0731, abs=2e-4)
 
 
 def test_more_drives_reduce_the_standard_deviation_of_the_delay() -> None:
@@ -159,22 +148,6 @@ def test_drive_without_information_on_a_delay_is_flagged(drive: Drive) -> None:
     assert found.sd_s.tolist() == [0.0, np.inf]
 
 
-def test_drives_without_information_do_not_change_the_delay() -> None:
-    found = estimate_delays([NO_SAMPLES, made_up_drive(1, PAIR), SHORT], TWO)
-    assert found.delay_s[1] == pytest.approx(0.187, abs=1e-3)
-
-
-@pytest.mark.parametrize("duration_s", [300.0, 1500.0])
-def test_branch_lost_in_noise_is_flagged_and_other_delays_are_found(duration_s: float) -> None:
-    vehicle = replace(TRIO, size_a={"motor": 50.0, "auxiliary": 0.05}, duration_s=duration_s)
-    found = estimate_delays([made_up_drive(2, vehicle)], THREE)
-    assert found.known.tolist() == [True, True, False]
-    assert found.delay_s[1] == pytest.approx(-0.23, abs=1e-3)
-    assert found.delay_s[2] == 0.0
-    assert found.sd_s[1] < 1e-3
-    assert np.isinf(found.sd_s[2])
-
-
 def test_missing_drives_or_branches_are_refused() -> None:
     drive = made_up_drive(1, replace(PAIR, duration_s=1.0))
     with pytest.raises(DriveError, match="no drive to estimate delays from"):
@@ -185,28 +158,3 @@ def test_missing_drives_or_branches_are_refused() -> None:
         estimate_delays([drive], ("battery",))
     with pytest.raises(DriveError, match="no branch heater"):
         without_delays(drive, {"heater": 0.1})
-
-
-def test_delays_are_exact_without_noise() -> None:
-    found = estimate_delays([made_up_drive(5, replace(TRIO, noise_a=0.0, duration_s=900.0))], THREE)
-    np.testing.assert_allclose(found.delay_s, [0.0, -0.23, -0.067], atol=5e-4)
-    found = estimate_delays([made_up_drive(1, replace(PAIR, noise_a=0.0))], TWO)
-    assert found.delay_s[1] == pytest.approx(0.187, abs=1e-4)
-
-
-def test_scaling_or_offsetting_a_branch_does_not_change_its_delay() -> None:
-    before = estimate_delays([made_up_drive(1, PAIR)], TWO)
-    after = estimate_delays([with_value("motor", lambda a: 1.3 * a - 40.0)], TWO)
-    np.testing.assert_allclose(after.delay_s, before.delay_s, atol=1e-6)
-
-
-def test_delays_do_not_depend_on_the_order_of_branches_after_the_first() -> None:
-    drive = made_up_drive(2, TRIO)
-    found, swapped = estimate_delays([drive], THREE), estimate_delays([drive], ("battery", "auxiliary", "motor"))
-    np.testing.assert_allclose(swapped.delay_s, found.delay_s[[0, 2, 1]], atol=1e-5)
-
-
-def test_exchanging_the_reference_branch_reverses_the_sign_of_the_delay() -> None:
-    drive = made_up_drive(1, PAIR)
-    found, turned = estimate_delays([drive], TWO), estimate_delays([drive], TWO[::-1])
-    assert turned.delay_s[1] == pytest.approx(-found.delay_s[1], abs=2e-4)
