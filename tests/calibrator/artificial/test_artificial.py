@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrator.artificial.simulate import FleetPlan, Vehicle, simulate_fleet, vehicle_drive, vehicle_frames
+from calibrator.artificial.simulate import FleetPlan, Vehicle, simulate_fleet, vehicle_frames
 from calibrator.artificial.trips import GroundTruth, RecordedTrips
 from calibrator.drive import Array
 from calibrator.errors import FleetError
@@ -63,17 +63,6 @@ def test_frames_contain_true_currents_with_fault_delay_and_noise(database: Vehic
         assert np.all(np.diff(time_s) > 0.0)
         instants.append(time_s)
     assert not np.intersect1d(instants[0], instants[1]).size
-
-
-def test_drive_made_directly_equals_the_drive_decoded_from_frames(database: VehicleDatabase) -> None:
-    drive = vehicle_drive(np.random.default_rng(3), database, vehicle(1.0), TRIP)
-    for name, message, signal, sign in BRANCHES:
-        time_s, value = decoded(database, 1.0, message, signal)
-        np.testing.assert_array_equal(drive.branches[name].time_s, time_s)
-        np.testing.assert_allclose(drive.branches[name].value, sign * value, atol=1e-9)
-        assert drive.branches[name].good.all()
-    _, speed = decoded(database, 1.0, "VD_Motion", "VehicleSpeed")
-    np.testing.assert_allclose(drive.inputs["speed"].value, speed, atol=1e-9)
 
 
 def test_truth_of_a_fleet_is_written_and_read_back(database: VehicleDatabase, tmp_path: Path) -> None:

@@ -14,14 +14,12 @@ import pytest
 from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
 from calibrator.artificial.trips import (
-    BuiltinTrips,
     GroundTruth,
     RecordedTrips,
     TripSource,
     choose_trips,
     cut_and_rejoin,
     ground_truth_from_drive,
-    with_branches,
 )
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.store import write_drive
@@ -44,11 +42,6 @@ def recorded(level: float, rise: float = 0.0) -> GroundTruth:
 
 def levels(trip: GroundTruth) -> set[float]:
     return set(trip.currents_a["battery"].tolist())
-
-
-def test_balancing_branch_is_minus_the_sum_of_the_others() -> None:
-    two = with_branches(recorded(10.0), ("battery", "motor"), "motor")
-    np.testing.assert_array_equal(two.currents_a["motor"], -recorded(10.0).currents_a["battery"])
 
 
 def test_rejoined_trip_has_jumps_only_at_standstills() -> None:
@@ -97,14 +90,6 @@ def test_builtin_trip_obeys_the_junction_law_and_has_all_channels(database: Vehi
     np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
     assert set(trip.currents_a) == set(database.layout.branch_names)
     assert set(trip.inputs) == {item.name for item in database.layout.input} - NOT_MODELLED
-
-
-def test_common_trip_is_the_same_for_all_vehicles_and_not_the_unseen_trip() -> None:
-    trips = BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0, common=True)
-    first, second = trips.trip(0, "calibration"), trips.trip(5, "calibration")
-    np.testing.assert_array_equal(first.currents_a["battery"], second.currents_a["battery"])
-    unseen = trips.trip(0, "unseen")
-    assert len(unseen) != len(first) or not np.array_equal(unseen.inputs["speed"], first.inputs["speed"])
 
 
 def test_builtin_trips_without_fastsim_report_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,10 +148,6 @@ def free_parameters(faults: Faults) -> Array:
 def test_every_vehicle_has_as_many_faults_as_the_paper_counts(branches: int, sparsity: float, count: int) -> None:
     faults = draw(branches=branches, sparsity=sparsity)
     assert np.all(np.count_nonzero(free_parameters(faults), axis=1) == count)
-
-
-def test_balanced_fleet_has_hardware_faults_in_half_of_the_drawn_cases() -> None:
-    assert np.mean(draw(balanced=True, vehicles=20_000).has_hardware_fault) == pytest.approx(0.30, abs=0.01)
 
 
 def test_mean_of_a_symmetric_fleet_is_the_ideal_current() -> None:
