@@ -14,7 +14,8 @@ import numpy as np
 from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
-from calibrator.estimator.posterior import WIDE_SD, Evidence, evidence_of
+from calibrator.estimator.posterior import WIDE_SD, Evidence, FaultModel, Spread, evidence_of
+from calibrator.estimator.prior import first_prior
 from calibrator.faults import Faults
 
 SCALE_A = 1.0
@@ -128,6 +129,14 @@ def plain_evidence(rows: EvidenceRows, *, centre: Array | None = None, shared: A
         shared=np.zeros(2 * K + 1) if shared is None else shared,
         feed=0,
     )
+
+
+def model_of_equals(K: int, shared: Array | None = None) -> FaultModel:
+    """Model of vehicles that are alike but for their faults, and for errors that they share: offsets and gains."""
+    shared, mean = np.zeros(2 * K + 1) if shared is None else shared, np.zeros(5 * K)
+    mean[3 * K - 1 : 4 * K - 1], mean[4 * K - 1] = shared[:K], shared[:K].sum()
+    spread = Spread(mean=mean, covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=shared)
+    return FaultModel(spread=spread, priors=((1.0, first_prior(K)),))
 
 
 def plain_residual(rows: EvidenceRows, theta: Array) -> Array:

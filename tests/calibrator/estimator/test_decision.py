@@ -19,12 +19,12 @@ from calibrator.estimator.decision import (
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT
 from calibrator.estimator.learning import learn_fault_models
-from calibrator.estimator.posterior import FaultModel, Spread, draw_explanations, fit_explanations, weigh
+from calibrator.estimator.posterior import draw_explanations, fit_explanations, weigh
 from calibrator.estimator.prior import Prior, Slab, first_prior
 from calibrator.faults import Faults
 from calibrator.score import harmed, recovered
 from tests.calibrator.estimator.simulated_drives import no_faults
-from tests.calibrator.estimator.simulated_rows import plain_evidence, random_faults, rows_of
+from tests.calibrator.estimator.simulated_rows import model_of_equals, plain_evidence, random_faults, rows_of
 
 K = 2
 LEAST = np.array([0.05, 0.05])
@@ -64,13 +64,6 @@ def test_confidence_is_the_probability_of_being_recovered(sd: float) -> None:
     assert confidence <= 0.7 + 1e-9
 
 
-def test_more_probable_explanation_becomes_the_estimate_in_any_order() -> None:
-    found = points([(0.499, [0.1, 0, 0, 0]), (0.501, [0, 0.1, 0, 0])], sd=1e-6, draws=50)
-    reverse = Points(found.faults[::-1], found.weight[::-1], 1 - found.explanation[::-1], found.model, found.fit)
-    for each in (found, reverse):
-        np.testing.assert_allclose(best_estimate(each, LEAST)[0], [0, 0.1, 0, 0], atol=1e-5)
-
-
 def test_harm_probability_equals_that_of_simulated_currents() -> None:
     """(25) on drawn true currents, against the moments of (M19)."""
     rng = np.random.default_rng(1)
@@ -96,12 +89,6 @@ def test_confidence_adds_up_explanations_within_tolerance() -> None:
     assert confidence == pytest.approx(0.6)
 
 
-def test_confidence_tolerates_errors_below_the_smallest_fault() -> None:
-    found = points([(0.5, [0, 0, 0, 0]), (0.5, [0.004, 0, 0, 0])])
-    assert best_estimate(found, np.array([0.05, 0.05]))[1] == pytest.approx(1.0)
-    assert best_estimate(found, np.array([0.005, 0.05]))[1] == pytest.approx(0.5)
-
-
 def test_harm_counts_once_over_several_drives_and_needs_a_correction() -> None:
     found, estimate = points(TWO_EXPLANATIONS, sd=0.05), np.array([0.12, 0.0, 0.0, 0.0])
     still = np.zeros((1, K)), np.full((1, K), 1e-4)
@@ -113,10 +100,8 @@ def test_harm_counts_once_over_several_drives_and_needs_a_correction() -> None:
 
 def explained(truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0) -> Explained:
     """One model's draws of a fleet."""
-    shared = np.zeros(2 * K + 1) if shared is None else shared
-    centre = np.zeros(5 * K)
-    centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
-    evidence = plain_evidence(rows_of(truth, seed=2, load=load), centre=centre, shared=shared)
+    alike = model_of_equals(K, shared).spread
+    evidence = plain_evidence(rows_of(truth, seed=2, load=load), centre=alike.mean, shared=alike.shared)
     log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
     draws = draw_explanations(fit_explanations(evidence, prior.log_supports + 1.0, log_load), evidence)
     return Explained(1.0, draws, weigh(draws, prior)[0], prior.group_centre)
@@ -143,18 +128,6 @@ def group_prior() -> Prior:
 
 
 @pytest.mark.parametrize("of_sensor", [False, True])
-def test_constant_of_a_group_is_an_offset_only_if_sensors_cause_it(of_sensor: bool) -> None:
-    truth, load = no_faults(1, K), 0.0
-    if of_sensor:
-        truth.offset_a[0, 0] = 0.03
-    else:
-        load = 0.03
-    found = posterior_points([explained(truth, group_prior(), shared=np.append(np.zeros(4), of_sensor), load=load)])[0]
-    expected = [0.0, 0.0, 0.03 * of_sensor, 0.0]
-    np.testing.assert_allclose(best_estimate(found, LEAST)[0], expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("of_sensor", [False, True])
 def test_estimated_offset_includes_the_group_constant_only_if_of_sensors(of_sensor: bool) -> None:
     truth = no_faults(1, K)
     truth.offset_a[0, 0], truth.drift[0, 0] = (0.18 if of_sensor else 0.15), 0.1
@@ -168,28 +141,12 @@ def test_estimated_offset_includes_the_group_constant_only_if_of_sensors(of_sens
 
 def test_shared_offset_is_no_more_certain_than_sensor_resolution() -> None:
     shared = np.array([0.03, 0.0, 0.0, 0.0, 0.0])
-    truth, centre = no_faults(3, K), np.zeros(5 * K)
+    truth, model, moments = no_faults(3, K), model_of_equals(K, shared), np.full((3, K), 0.1)
     truth.offset_a[:, 0] = 0.03
-    centre[[3 * K - 1, 4 * K - 1]] = 0.03
-    spread = Spread(mean=centre, covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=shared)
-    law, moments = FaultModel(spread=spread, priors=((1.0, first_prior(K)),)), np.full((3, K), 0.1)
-    found = estimate_rows(rows_of(truth), [law], feed=0, mean=moments, mean_square=moments, usual=moments[:2])
+    found = estimate_rows(rows_of(truth), [model], feed=0, mean=moments, mean_square=moments, usual=moments[:2])
     np.testing.assert_allclose(found.offset_a[:, 0], 0.03)
     assert (found.offset_sd_a[:, 0] > 1e-4).all()
     assert not found.offset_sd_a[:, 1].any()
-
-
-def test_groups_are_matched_across_fault_models_in_any_order() -> None:
-    rows, prior = rows_of(no_faults(2, K), load=np.array([0.03, 0.0])), group_prior()
-    prior = replace(prior, group_share=np.array([0.3, 0.2]), group_sd=np.array([0.001, 0.001]))
-    spread = Spread(mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(5))
-    models = [
-        FaultModel(probability=0.5, spread=spread, priors=((1.0, replace(prior, group_centre=centre)),))
-        for centre in (np.array([0.03, -0.02]), np.array([-0.02, 0.03]))
-    ]
-    square = np.full((2, K), 0.04)
-    found = estimate_rows(rows, models, feed=0, mean=np.zeros((2, K)), mean_square=square, usual=square)
-    np.testing.assert_allclose(found.group_probability, [[1.0, 0.0], [0.0, 0.0]], atol=0.1)
 
 
 # From rows to estimates: correct where confident, and harmless
@@ -266,9 +223,7 @@ def test_vehicle_without_information_has_no_confidence() -> None:
     rows = rows_of(no_faults(2, K), seed=1)
     covariance = rows.covariance.copy()
     covariance[1] = UNKNOWN_VARIANCE * np.eye(5 * K)
-    spread = Spread(mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(5))
-    law, moments = FaultModel(spread=spread, priors=((1.0, first_prior(K)),)), np.full((2, K), 0.1)
-    rows = replace(rows, covariance=covariance)
-    found = estimate_rows(rows, [law], feed=0, mean=moments, mean_square=moments, usual=moments[:2])
+    rows, moments = replace(rows, covariance=covariance), np.full((2, K), 0.1)
+    found = estimate_rows(rows, [model_of_equals(K)], feed=0, mean=moments, mean_square=moments, usual=moments[:2])
     assert found.confidence[0] > 0.9
     assert found.confidence[1] == 0.0
