@@ -116,16 +116,6 @@ def test_misfit_common_to_all_vehicles_is_not_a_finding() -> None:
     assert checked([summarise_samples([drive], period_s=PERIOD_S) for drive in bent], 2) == [()] * 9
 
 
-def test_findings_do_not_depend_on_the_order_of_the_branches() -> None:
-    summaries, order = a_fleet(3, CAUSES["quadratic"], 1), [2, 0, 1]
-    (first,) = checked(summaries, 3)[BAD]
-    turned = [summary.take_branches(order) for summary in summaries]
-    usual = learn_usual_misfits(turned, read_out(3)[:, order], full_scale_a=FULL_SCALE_A)
-    names = [BRANCHES[k] for k in order]
-    (second,) = find_misfits(turned, read_out(3)[:, order], usual, full_scale_a=FULL_SCALE_A, branches=names)[BAD]
-    assert (second.cause, second.branch, second.text) == (first.cause, first.branch, first.text)
-
-
 def test_standing_vehicle_has_no_findings() -> None:
     summaries = a_fleet(2)
     still = samples_of(np.zeros((SAMPLES, INPUTS)), np.zeros((SAMPLES, 2)))

@@ -21,9 +21,9 @@ from calibrator.summaries.filter_bank import FilterBank, read_bank
 from calibrator.summaries.summariser import summarise_samples
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import read_layout
+from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.estimator.simulated_drives import coloured, samples_of
 
-LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 INPUTS, BRANCHES = ("driving_current", "heater_current"), ("battery", "motor", "auxiliary")
 PERIOD_S = 0.1
 
@@ -69,16 +69,6 @@ def test_filter_bank_of_some_vehicles_fits_others_with_different_poles() -> None
     assert without.max() < 20.0
     assert np.median(with_bank) > 50.0
     assert with_bank.min() > 40.0
-
-
-def test_common_pole_is_found_despite_noise_and_a_constant_input() -> None:
-    drives = [recorded(j, 0.95 + 0.0j, snr_db=20.0) for j in range(3)]
-    ((pole, imag),) = choose_filter_bank([[each] for each in drives], period_s=PERIOD_S).poles
-    assert pole == pytest.approx(0.95, abs=0.002)
-    assert imag == 0.0
-    for drive in drives:
-        drive.inputs[:, 2] = 5.0
-    assert choose_filter_bank([[each] for each in drives], period_s=PERIOD_S).poles != ()
 
 
 # Drives of a motor that takes the driving current with a lag, and a heater that follows at once
