@@ -23,12 +23,12 @@ from calibrator.estimator.results import read_results
 from calibrator.summaries.summary_store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
-from tests.calibrator.command_here import calibrator as command
+from tests.calibrator.command_here import succeeded
+from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.estimator.test_run import contents, failing_for
 from tests.calibrator.summaries.small_stores import random_faults, small_store
 
 ROOT = Path(__file__).parents[3]
-LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 JUNCTION = Junction(branches=["battery", "motor"], full_scale_a=400.0)
 INPUTS = ["power", "heat"]
 Frames = dict[str, Any]
@@ -160,15 +160,14 @@ def test_python_interface_writes_the_same_result_as_the_command(
     bench = pd.DataFrame([("V001", "motor", 0.0, 0.001)], columns=["vehicle", "branch", "drift", "drift_sd"])
     bench.to_csv(tmp_path / "readings.csv", index=False)
     options = ("--workers", 1, "--hold-out", "V003,V004", "--harm-limit", 0.01, "--readings", tmp_path / "readings.csv")
-    done = command("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "command", *options)
-    assert done.returncode == 0, done.stderr
+    said = succeeded("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "command", *options)
     capsys.readouterr()
     settings: dict[str, Any] = {"workers": 1, "hold_out": ["V003", "V004"], "harm_limit": 0.01, "readings": bench}
     found = FleetCalibrator(**settings).fit(Fleet.from_folder(store.url, LAYOUT))
     here, there = contents(found.write(tmp_path / "python")), contents(tmp_path / "command")
     here["run.json"] = here["run.json"].replace(b'"data frame"', b'"readings.csv"')  # where the readings came from
     assert here == there
-    assert found.summary() in done.stdout
+    assert found.summary() in said
     assert found.notices_ == ["a notice"]
     assert capsys.readouterr() == ("", "")
 
@@ -194,23 +193,9 @@ def test_log_converts_to_a_data_frame_usable_for_a_fleet(two_vehicles: Path) -> 
     assert np.diff(found.index) == pytest.approx(0.1)
     assert {"battery", "motor"} <= set(found)
     assert repr(log).startswith(f"RecordedLog({paths[0].parent.name} {log.drive.name}, ")
-    two = Junction(branches=["battery", "motor"], full_scale_a=400.0)
     recorded = {path.parent.name: read_log(path, LAYOUT).to_frame() for path in paths}
-    of_layout = Junction.from_layout(LAYOUT, branches=["battery", "motor"])
-    for junction in (two, of_layout):
-        assert len(FleetCalibrator().fit(Fleet.from_frames(recorded, junction)).vehicles_) == 2
-
-
-def test_script_without_main_guard_reads_logs_in_processes(two_vehicles: Path, tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(
-        f"from calibrator import Fleet, FleetCalibrator\n"
-        f"print('begun')\n"
-        f"fleet = Fleet.from_folder({str(two_vehicles)!r}, {str(LAYOUT)!r})\n"
-        f"print(len(FleetCalibrator(workers=1).fit(fleet).vehicles_))\n"
-    )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, cwd=ROOT)
-    assert (done.returncode, done.stdout.split(), done.stderr) == (0, ["begun", "2"], "")
+    junction = Junction.from_layout(LAYOUT, branches=["battery", "motor"])
+    assert len(FleetCalibrator().fit(Fleet.from_frames(recorded, junction)).vehicles_) == 2
 
 
 def test_internal_error_in_one_vehicle_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
