@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,11 +26,11 @@ from calibrator.summaries.record import Record
 from calibrator.summaries.summary_store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.command_here import calibrator
+from tests.calibrator.command_here import calibrator, succeeded
+from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.estimator.simulated_drives import Conditions, summaries_of
 from tests.calibrator.summaries.small_stores import BRANCHES, random_faults, record_of, small_store
 
-LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 VEHICLES = 24
 ONE = Workers(processes=1)
 
@@ -45,8 +44,9 @@ def environment() -> Iterator[None]:
         yield
 
 
-def calibrate(store: str, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
-    return calibrator("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
+def words(store: str, out: Path, *options: object) -> tuple[object, ...]:
+    """The command line that calibrates a store."""
+    return "calibrate", store, "--layout", LAYOUT, "--out", out, "--workers", 1, *options
 
 
 def contents(result: Path) -> dict[str, bytes]:
@@ -61,8 +61,7 @@ def store(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -
 @pytest.fixture(scope="module")
 def result(store: SummaryStore) -> Path:
     out = Path(store.url).parent / "result"
-    done = calibrate(store.url, out, "--workers", 1)
-    assert done.returncode == 0, done.stderr
+    succeeded(*words(store.url, out))
     return out
 
 
@@ -127,8 +126,7 @@ def test_result_is_the_same_for_any_number_of_workers(
     store: SummaryStore, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run, "WORTH_PROCESSES", 1)
-    done = calibrate(store.url, tmp_path / "two", "--workers", 2)
-    assert done.returncode == 0, done.stderr
+    succeeded(*words(store.url, tmp_path / "two", "--workers", 2))
     assert contents(tmp_path / "two") == contents(result)
 
 
@@ -136,7 +134,7 @@ def test_small_fleet_is_calibrated_without_worker_processes(
     store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_many, "_outcomes", None)  # which starts processes
-    assert calibrate(store.url, tmp_path / "out", "--workers", 2).returncode == 0
+    succeeded(*words(store.url, tmp_path / "out", "--workers", 2))
 
 
 # What is refused
@@ -163,10 +161,8 @@ def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
     store: SummaryStore, tmp_path: Path, options: tuple[str, ...], code: int, message: str, monkeypatch: Any
 ) -> None:
     monkeypatch.setattr(run_many, "CONNECT_S", 0.5)
-    done = calibrate(store.url, tmp_path / "out", *options)
-    assert done.returncode == code
-    assert message in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr
+    done = calibrator(*words(store.url, tmp_path / "out", *options))
+    assert (done.returncode, message in done.stderr.splitlines()[-1]) == (code, True), done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -179,7 +175,7 @@ def test_place_without_a_fleet_is_refused(store: SummaryStore, tmp_path: Path) -
         (tmp_path / "empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
         ("", 2, "an empty name; give the path"),
     ):
-        done = calibrate(str(place), tmp_path / "out")
+        done = calibrator(*words(str(place), tmp_path / "out"))
         assert (done.returncode, message in done.stderr.splitlines()[-1]) == (code, True), done.stderr
         assert not list(tmp_path.glob(".out.*"))
 
@@ -219,17 +215,6 @@ def test_vehicle_with_impossible_numbers_is_left_out_of_both_passes(
     assert left_out(chunk)[bad].startswith("its summary holds impossible numbers; look at its recordings")
 
 
-def test_vehicle_without_usable_drives_is_left_out(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
-    bucket = fullest(store)
-    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
-    bad = next(name for name in (f"V9{j:02d}" for j in range(100)) if store.bucket_of(name) == bucket)
-    records[bad] = [Record(vehicle=bad, drives=("x",), sources=("",), found=None, problem="drive x:\ncut")]
-    other = rewritten(store, tmp_path, bucket, records)
-    assert left_out(calibrate_bucket(bucket, store=other, task=task)) == {bad: "drive x: cut"}
-    census = take_census(other, ONE)
-    assert (census.size, census.reasons) == (len(records) - 1, {bad: "drive x: cut"})
-
-
 def failing_for(bad: str, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the estimation of vehicles fail if this one is among them."""
     estimate = FleetTask.estimate
@@ -260,7 +245,7 @@ def test_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
 
 def test_internal_error_exits_with_70(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failing_for("V012", ZeroDivisionError("by nothing"), monkeypatch)
-    done = calibrate(store.url, tmp_path / "out", "--workers", 1)
+    done = calibrator(*words(store.url, tmp_path / "out"))
     assert done.returncode == 70
     last = done.stderr.splitlines()[-1]
     assert last.startswith("calibrator: internal error in 1 vehicle, which are left out: V012: ZeroDivisionError: by")
@@ -284,14 +269,13 @@ def test_option_since_recalibrates_changed_vehicles_and_detects_moved_sensors(
     grown = SummaryStore(storage=open_storage(tmp_path / "store"), identity=store.identity)
     records = grown.read(bucket := grown.bucket_of("V009"))
     grown.append(bucket, {**records, "V009": [*records["V009"], record_of("V009", new, ("d2",))]}, whole=True)
-    done = calibrate(grown.url, tmp_path / "out", "--since", result, "--workers", 1)
-    assert done.returncode == 0, done.stderr
+    said = succeeded(*words(grown.url, tmp_path / "out", "--since", result))
     old, now = contents(result / "params"), contents(tmp_path / "out" / "params")
     assert [name for name in old if old[name] != now[name]] == ["V009.json"]
     (battery,) = [
         row for row in read_results(tmp_path / "out") if (row["vehicle"], row["branch"]) == ("V009", "battery")
     ]
-    assert f"V009: {moved}" in done.stdout if moved else "moved since" not in done.stdout
+    assert f"V009: {moved}" in said if moved else "moved since" not in said
     assert (b'"d1"' in now["V009.json"]) == (moved is None)
     assert abs(battery["drift"] - faults.drift[0, 0]) <= 4.0 * battery["drift_sd"]
     assert abs(battery["offset_a"] - faults.offset_a[0, 0]) <= 4.0 * battery["offset_sd_a"]
@@ -303,8 +287,7 @@ def test_vehicle_removed_from_the_store_is_named(store: SummaryStore, result: Pa
     gone = {name for name in (f"V{j:03d}" for j in range(VEHICLES)) if store.bucket_of(name) == fullest(store)}
     for path in (tmp_path / "store" / "buckets").glob(f"{fullest(store):05d}-*"):
         path.unlink()
-    done = calibrate(str(tmp_path / "store"), tmp_path / "out", "--since", result, "--workers", 1)
-    assert done.returncode == 0, done.stderr
+    succeeded(*words(str(tmp_path / "store"), tmp_path / "out", "--since", result))
     why = "it is not in this store; its earlier parameters are in the earlier result"
     assert left_out_of(tmp_path / "out") == dict.fromkeys(gone, why)
 
@@ -321,5 +304,5 @@ def test_option_since_refuses_an_incompatible_result(
     shutil.copytree(result, tmp_path / "earlier")
     run_file = tmp_path / "earlier" / "run.json"
     run_file.write_text(json.dumps({**json.loads(run_file.read_text()), key: value}))
-    done = calibrate(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
+    done = calibrator(*words(store.url, tmp_path / "out", "--since", tmp_path / "earlier"))
     assert (done.returncode, message in done.stderr.splitlines()[-1]) == (1, True), done.stderr

@@ -10,11 +10,10 @@ from calibrator.drive import Array
 from calibrator.estimator.evidence import evidence_names, reported_evidence
 from calibrator.estimator.fleet_estimate import FleetEstimate
 from calibrator.estimator.vehicle_parameters import deciding_evidence, impossible
-from calibrator.estimator.vehicle_report import explained, held_back_lines
+from calibrator.estimator.vehicle_report import explained
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, SensorFinding
 from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
-from tests.calibrator.report.results_at_hand import sensor, vehicle
 from tests.ecu_node.vehicles import parameters_for
 
 NAMES = ("battery", "motor")
@@ -164,13 +163,3 @@ def test_reported_evidence_without_noise_equals_that_of_the_true_faults() -> Non
 def test_gain_error_of_100_percent_or_more_is_impossible() -> None:
     assert impossible(estimate(of(1.0, drift=(0.9, 0))), 0, NAMES) == ""
     assert "its motor current does not follow its inputs" in impossible(estimate(of(1.0, drift=(0, 1.2))), 0, NAMES)
-
-
-def test_each_branch_has_its_own_probability_of_harm(database: VehicleDatabase) -> None:
-    battery, motor = (
-        changed(sensor(0.1, held_back="harm limit"), harm_probability=probability) for probability in (0.0027, 0.0914)
-    )
-    assert held_back_lines(vehicle(database, "V1", battery, motor)) == [
-        "battery, motor not corrected, because the correction might do harm, with a probability of 0.27%, 9.14% (see "
-        "--harm-limit)"
-    ]
