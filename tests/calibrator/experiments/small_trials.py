@@ -13,8 +13,7 @@ from calibrator.experiments.common_drive import CommonDrive
 from calibrator.experiments.recorded_trips import RecordedFleet
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
-
-LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+from tests.calibrator.conftest import LAYOUT
 
 
 def smooth_drive(branches: int = 2, samples: int = 6000) -> CommonDrive:

@@ -8,9 +8,7 @@ from calibrator.experiments.common_drive import (
     CommonCase,
     CommonDrive,
     builtin_common_drive,
-    common_rows,
     common_trial,
-    measured_moments,
 )
 from calibrator.experiments.figures import figure_rows, judge
 from calibrator.experiments.methods import BASELINES, CEILING, PERFECT, POSTERIOR, THRESHOLD, TREE, MethodRow
@@ -41,35 +39,6 @@ def test_state_space_models_of_a_symmetric_fleet_give_the_slopes_of_the_faults()
     a, b = slopes_and_intercepts(trial.truth)
     np.testing.assert_allclose(trial.evidence.slopes, a, atol=1e-5)
     np.testing.assert_allclose(trial.evidence.intercepts_a, b, atol=1e-3)
-
-
-@pytest.mark.parametrize("branches", [2, 3])
-def test_junction_rows_of_a_common_drive_follow_from_the_faults(branches: int) -> None:
-    drive = smooth_drive(branches=branches)
-    trial = common_trial(drive, replace(CASE, branches=branches), 0)
-    moments = measured_moments(drive.unity, trial.truth)
-    rows = common_rows(trial.evidence, drive.unity.mean(axis=0), *moments, full_scale_a=drive.full_scale_a)
-    factor, offset = 1.0 + trial.truth.drift, trial.truth.offset_a / drive.full_scale_a
-    gains = np.log(factor[:, :1] / factor[:, 1:])
-    constant = factor[:, 0] * np.sum(offset / factor, axis=1)
-    np.testing.assert_allclose(rows.relative[:, branches : 2 * branches - 1], gains, atol=1e-9)
-    np.testing.assert_allclose(rows.constant[:, branches], constant, atol=1e-9)
-
-
-def test_cluster_reference_is_unbiased_in_an_asymmetric_fleet() -> None:
-    drive = smooth_drive()
-    trial = common_trial(drive, replace(CASE, vehicles=300, symmetric=False, sign_bias=0.4), 0)
-    (a, b), evidence = slopes_and_intercepts(trial.truth), trial.evidence
-    mean_a = np.median((a * drive.unity.mean(axis=0) + b - evidence.intercepts_a) / evidence.slopes, 0)
-    moments = measured_moments(drive.unity, trial.truth)
-    rows = common_rows(evidence, mean_a, *moments, full_scale_a=drive.full_scale_a)
-    sd = np.sqrt(np.einsum("nii->ni", rows.covariance))
-    assert np.abs(evidence.slopes - a).max() > 10.0 * sd[:, :2].max()
-    slope_error = (rows.relative[:, :2] - np.log(a)) / sd[:, :2]
-    intercept_error = (rows.constant[:, :2] - b / drive.full_scale_a) / (a * sd[:, 5:7])
-    for error in (slope_error, intercept_error):
-        assert error.std() == pytest.approx(1.0, abs=0.1)
-        assert np.abs(error.mean(axis=0)).max() < 0.5
 
 
 @pytest.mark.long

@@ -4,12 +4,16 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.container import ErrorbarContainer
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -25,14 +29,15 @@ from calibrator.experiments.experiments import (
     fleet_for,
     read_records,
 )
-from calibrator.experiments.figures import ALL
+from calibrator.experiments.figures import ALL, figure_rows
 from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR, MethodRow
-from calibrator.experiments.pages import headline, result_markdown, result_table, write_page
+from calibrator.experiments.pages import draw_result, headline, result_markdown, result_table, write_page
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
 from calibrator.experiments.runner import pool_confidences, run_experiment
 from calibrator.experiments.trial import ComparedMethod, Estimate, Trial
 from calibrator.faults import Faults
-from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
+from tests.calibrator.conftest import LAYOUT
+from tests.calibrator.experiments.small_trials import small_fleet, smooth_drive
 
 RUN = [name for name in EXPERIMENTS if name != CALIBRATION.name]
 
@@ -183,12 +188,6 @@ def test_experiment_that_cannot_give_a_table_is_refused(change: dict[str, Any], 
         run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive(), repetitions=repetitions)
 
 
-def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
-    small = EXPERIMENTS["asymmetry"].small()
-    assert [(each.series, each.x) for each in small.settings] == [("0", 20.0), ("0.4", 20.0)]
-    assert {each.case.vehicles for each in small.settings} == {20}
-
-
 def test_settings_are_chosen_by_a_text_in_their_name() -> None:
     kept = EXPERIMENTS["attacks"].only("cubic").small().settings
     assert [(each.series, each.x) for each in kept] == [("cubic 5-20 %", 2.0), ("cubic 5-20 %", 3.0)]
@@ -282,3 +281,59 @@ def test_table_shows_own_methods_and_the_first_available_confidence() -> None:
 def test_invalid_estimate_is_refused_with_the_name_of_the_method(change: Change, message: str) -> None:
     with pytest.raises(FleetError, match=f"^method 'mine': {message}"):
         run(Own("mine", change))
+
+
+# Pictures: nothing is hidden, cut off or indistinguishable
+
+BIASES = ("0", "0.2", "0.4", "0.5")
+
+
+def shown_as(result: ExperimentResult, name: str) -> ExperimentResult:
+    """The same figures, drawn as another experiment."""
+    return replace(result, experiment=EXPERIMENTS[name])
+
+
+@pytest.fixture(scope="module")
+def equal() -> ExperimentResult:
+    """All series and methods the same, at the ends of the scale, of 30 vehicles each; the default knows it."""
+    tables = []
+    for series, (x, rate), method in product(BIASES, ((20.0, 0.0), (2000.0, 1.0)), (PERFECT, POSTERIOR)):
+        within = np.full(30, rate > 0.0)
+        values = {"recovery_rate": within}
+        if method is POSTERIOR:
+            values |= {"confidence": within + 0.0, "sure": within, "sure_confidence": within[within] + 0.0}
+            values |= {"ece": np.column_stack([np.where(within, 0.99, 0.25), within])}
+        tables.append([table.assign(series=series, x=x, method=method.name) for table in figure_rows([values])])
+    figures, tenths = (pd.concat(some, ignore_index=True) for some in zip(*tables, strict=True))
+    return ExperimentResult(experiment=EXPERIMENTS["asymmetry"], settings={"seed": 0}, figures=figures, tenths=tenths)
+
+
+def drawn(result: ExperimentResult) -> Figure:
+    figure = draw_result(result)
+    figure.draw_without_rendering()
+    return figure
+
+
+def test_identical_curves_do_not_hide_each_other(equal: ExperimentResult) -> None:
+    for axes in drawn(equal).axes:
+        curves = [container.lines[0] for container in axes.containers if isinstance(container, ErrorbarContainer)]
+        assert len(curves) == len(BIASES)
+        for looks in (Line2D.get_color, Line2D.get_marker, Line2D.get_linestyle):
+            assert len({looks(curve) for curve in curves}) == len(BIASES)
+        places = axes.transData.transform(np.concatenate([np.asarray(curve.get_xydata())[:1] for curve in curves]))
+        assert np.all(np.diff(places[:, 0]) > 5.0)
+
+
+def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult) -> None:
+    for result in (equal, shown_as(equal, "real"), pool_confidences([equal])):
+        figure = drawn(result)
+        (legend,) = figure.legends
+        assert not any(legend.get_window_extent().overlaps(axes.get_window_extent()) for axes in figure.axes)
+        names = [text.get_text() for text in legend.get_texts()]
+        assert len(names) == len(set(names))
+    assert [text.get_text() for text in drawn(equal).legends[0].get_texts()] == [f"sign bias {b}" for b in BIASES]
+
+
+def test_every_cell_of_a_map_shows_its_rate(equal: ExperimentResult) -> None:
+    texts = [text.get_text() for text in drawn(shown_as(equal, "phase")).axes[0].texts]
+    assert sorted(texts) == ["0.00"] * len(BIASES) + ["1.00"] * len(BIASES)

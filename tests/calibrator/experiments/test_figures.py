@@ -71,14 +71,6 @@ def test_calibration_error_equals_the_excess_of_confidence_over_recovery() -> No
     assert np.isnan(calibration_errors(tenths_of({}))).all()
 
 
-def test_calibration_error_by_chance_equals_that_of_exact_confidences() -> None:
-    rng = np.random.default_rng(1)
-    confidence = rng.beta(4.0, 1.0, 300)
-    drawn = [calibration_errors(tenths_of({"ece": np.column_stack([confidence, rng.random(300) < confidence])}))
-             for _ in range(200)]  # fmt: skip
-    assert drawn[0][1] == pytest.approx(np.mean([error for error, _ in drawn]), rel=0.1)
-
-
 @pytest.mark.parametrize(
     ("drift", "harm_second", "recovery_rate", "harmed"),
     [(0.1, 0.0, 1.0, 0.0), (0.1, 0.2, 0.5, 0.5), (0.1, -1.0, 0.5, 0.5)],

@@ -16,7 +16,8 @@ from calibrator.faults import Faults
 from calibrator.score import recovered
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
-from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, write_store
+from tests.calibrator.conftest import LAYOUT
+from tests.calibrator.experiments.small_trials import small_fleet, write_store
 
 VEHICLES = 12
 
