@@ -1,14 +1,21 @@
 """``calibrator export``: one file, written whole or not at all, and what is refused with one line."""
 
+import dataclasses
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
-from calibrator.errors import ContradictionError, ExportError
+from calibrator.errors import ExportError
+from calibrator.export.core import Checked
+from calibrator.export.tool_formats import cdfx_text, dcm_text
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError
-from ecu_node.parameters import write_parameters
-from tests.calibrator.export.exports import export, refused
+from ecu_node.parameters import BranchParameters, write_parameters
+from tests.calibrator.export.exports import checked_with, export, refused
 from tests.ecu_node.vehicles import SMALL_LAYOUT, MakeDatabase, parameters_for
 
 
@@ -36,20 +43,6 @@ def test_export_replaces_a_different_file_only_with_replace(form: str, params: P
     assert (out.read_bytes(), len(list(out.parent.iterdir()))) == (content, 1)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--format", "hex"), "--format hex needs --elf PROGRAM"),
-        (("--format", "dcm", "--elf", "v1.json"), "--format dcm takes no --elf PROGRAM"),
-    ],
-)
-def test_contradictory_export_options_are_refused(words: tuple[str, ...], message: str, params: Path) -> None:
-    words = tuple(str(params) if word == "v1.json" else word for word in words)
-    with pytest.raises(ContradictionError, match=message):
-        raise refused(params, *words, "--output", params.with_name("out"))
-    assert [*params.parent.iterdir()] == [params]
-
-
 def test_parameters_that_do_not_fit_are_refused(params: Path, tmp_path: Path, make_database: MakeDatabase) -> None:
     more = ("--format", "c", "--output", tmp_path / "out")
     with pytest.raises(ParameterError, match=r"v1\.json: parameters are for vehicle 'v1', this is 'v7'"):
@@ -65,3 +58,86 @@ def test_e2e_profile_unknown_to_the_c_core_is_reported(make_database: MakeDataba
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), tmp_path / "v1.json")
     run = export(tmp_path / "v1.json", "--format", "c", "--output", tmp_path / "v1.c", layout=database.layout.path)
     assert run.stderr.startswith("notice: the C core knows the E2E profiles P01 and P02: check Pair before hv_forward")
+
+
+# DCM and CDFX as readers find them: values, units, provenance, and texts that a format cannot hold
+
+ORDER = {
+    "MSRSW": ["SHORT-NAME", "CATEGORY", "SW-SYSTEMS"],
+    "SW-SYSTEMS": ["SW-SYSTEM"],
+    "SW-SYSTEM": ["SHORT-NAME", "SW-INSTANCE-SPEC"],
+    "SW-INSTANCE-SPEC": ["SW-INSTANCE-TREE"],
+    "SW-INSTANCE-TREE": ["SHORT-NAME", "CATEGORY", "SW-INSTANCE-TREE-ORIGIN", "SW-CS-COLLECTIONS", "SW-INSTANCE"],
+    "SW-INSTANCE-TREE-ORIGIN": ["SYMBOLIC-FILE", "DATA-FILE"],
+    "SW-CS-COLLECTIONS": ["SW-CS-COLLECTION"],
+    "SW-CS-COLLECTION": ["CATEGORY", "SW-FEATURE-REF", "REVISION"],
+    "SW-INSTANCE": ["SHORT-NAME", "LONG-NAME", "CATEGORY", "SW-FEATURE-REF", "SW-VALUE-CONT", "SW-CS-HISTORY"],
+    "SW-VALUE-CONT": ["UNIT-DISPLAY-NAME", "SW-VALUES-PHYS"],
+    "SW-VALUES-PHYS": ["VT", "V"],
+    "SW-CS-HISTORY": ["CS-ENTRY"],
+    "CS-ENTRY": ["STATE", "DATE", "CSUS", "CSPR", "CSWP", "CSTO", "CSPI", "CSDI", "REMARK"],
+    "REMARK": ["P"],
+}
+"""Children of each element that the export writes, in the order of ASAM's DTD ``cdf_v2.0.0.sl.dtd``."""
+FAULT = {"drift": 0.05, "offset": -1.23456789012345}
+BATTERY = {"gain": 1 / 1.05, "applied": 1, **FAULT, **{f"found.{name}": value for name, value in FAULT.items()}}
+MOTOR = {"gain": 1.0, "bias": 0.0, "fraction": 0.5, "applied": 0, "drift": 0.0, "offset": 0.0}
+MOTOR |= {"found.drift": 0.2, "found.drift_sd": 0.01, "found.offset": 7.0}
+BRANCHES = {"battery": BATTERY, "motor": MOTOR, "motor_rear": {"applied": 0, "drift": 0.0}}
+VALUES = {f"HV.{branch}.{name}": value for branch, values in BRANCHES.items() for name, value in values.items()}
+VALUES["HV.parameter_set"] = 300.0
+
+
+@pytest.fixture
+def checked(database: VehicleDatabase, tmp_path: Path) -> Checked:
+    """The battery is corrected, the motor held back, of the others nothing is known."""
+    parameters = parameters_for(database, battery=(0.05, -1.23456789012345))
+    motor = BranchParameters(drift=0.2, offset_a=7.0, drift_sd=0.01, apply=False, held_back="harm limit")
+    return checked_with(database, replace(parameters, branches={**parameters.branches, "motor": motor}), tmp_path)
+
+
+def renamed(checked: Checked, vehicle: str) -> Checked:
+    return dataclasses.replace(checked, parameters=replace(checked.parameters, vehicle=vehicle))
+
+
+def test_cdfx_follows_the_order_of_the_dtd_and_keeps_its_values(checked: Checked) -> None:
+    document = ET.fromstring(cdfx_text(checked))
+    for element in document.iter():
+        tags, order = [child.tag for child in element], ORDER.get(element.tag, [])
+        assert tags == sorted(tags, key=order.index), element.tag
+        once = [tag for tag in tags if tag not in {"SW-INSTANCE", "SW-CS-COLLECTION"}]
+        assert len(once) == len(set(once)), element.tag
+    (tree,) = document.iter("SW-INSTANCE-TREE")
+    assert [tree.findtext(tag) for tag in ("SHORT-NAME", "CATEGORY", "*/DATA-FILE")] == ["v1", "NO_VCD", "v1.json"]
+    instances = {item.findtext("SHORT-NAME", ""): item for item in document.iter("SW-INSTANCE")}
+    words = {"true": "1", "false": "0"}
+    found = {
+        name: float(instances[name].findtext(".//V") or words[instances[name].findtext(".//VT", "")]) for name in VALUES
+    }
+    assert found == pytest.approx(VALUES, abs=1e-12)
+    assert instances["HV.battery.offset"].findtext(".//UNIT-DISPLAY-NAME") == "A"
+    declared = {item.findtext("SW-FEATURE-REF") for item in document.iter("SW-CS-COLLECTION")}
+    for item in instances.values():
+        entry = [item.findtext(f".//CS-ENTRY/{tag}") for tag in ("DATE", "CSUS", "CSTO", "CSDI")]
+        assert entry == ["2026-01-01T00:00:00Z", "test", "v1", f"300 {checked.digest}"]
+        assert item.findtext("SW-FEATURE-REF") in declared
+
+
+def test_dcm_and_cdfx_hold_the_provenance(checked: Checked) -> None:
+    checked = dataclasses.replace(renamed(checked, "<Zoë & 1>"), name="<a>&\udcff.json")
+    wanted = {key: value for key, value in checked.provenance.items() if key != "parameter_set"}
+    form = r'^TEXTSTRING HV\.(\w+)\n  LANGNAME "[^"\n]*"\n  FUNKTION \w+\n  TEXT "([^"\n]*)"\nEND$'
+    assert dict(re.findall(form, dcm_text(checked), flags=re.MULTILINE)) == wanted
+    document = ET.fromstring(cdfx_text(checked))
+    texts = {item.findtext("LONG-NAME"): item.findtext(".//VT") for item in document.iter("SW-INSTANCE")}
+    assert wanted.items() <= texts.items()
+    assert document.findtext(".//DATA-FILE") == "<a>&\\udcff.json"
+
+
+@pytest.mark.parametrize("write", [dcm_text, cdfx_text])
+@pytest.mark.parametrize("vehicle", ['a "b"', "a\\b", "a\nb"])
+def test_vehicle_name_with_quotation_mark_or_control_character_is_refused(
+    write: Callable[[Checked], object], vehicle: str, checked: Checked
+) -> None:
+    with pytest.raises(ExportError, match=r"^v1\.json: vehicle '.*' has a quotation mark, a backslash or a control"):
+        write(renamed(checked, vehicle))
