@@ -1,9 +1,7 @@
 import errno
-import os
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 import fsspec
@@ -129,37 +127,9 @@ def test_empty_path_or_url_is_refused(place: str) -> None:
         open_storage(place)
 
 
-def test_full_disk_is_reported_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(path: Path, content: bytes) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("calibrator.files.storage.write_atomically", full)
-    expected = rf"^{tmp_path}/x: cannot write it: No space left on device; make room, and run the same command again"
-    with pytest.raises(StorageError, match=expected):
-        open_storage(tmp_path).write("x", b"")
-
-
 def test_unknown_kind_of_storage_is_refused() -> None:
     with pytest.raises(StorageError, match=r"^nokind://x: no way to reach this kind of storage: "):
         open_storage("nokind://x").names()
-
-
-def test_file_that_vanishes_while_listing_does_not_hide_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "there").touch()
-
-    class Vanishing:
-        """Entry of os.scandir for a file that another process removes."""
-
-        name = "gone"
-        is_dir, is_file = staticmethod(lambda: False), staticmethod(lambda: True)
-
-        def stat(self) -> None:
-            raise FileNotFoundError
-
-    with os.scandir(tmp_path) as entries:
-        listed = [Vanishing(), *entries]
-    monkeypatch.setattr("calibrator.files.storage.os.scandir", lambda _: nullcontext(listed))
-    assert open_storage(tmp_path).names() == ["there"]
 
 
 def test_unreadable_inner_folder_is_reported_and_others_are_found(
@@ -193,11 +163,17 @@ def test_folder_on_a_file_system_without_locks_is_usable(tmp_path: Path, monkeyp
         pass
 
 
-def test_storage_that_denies_access_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_credentials(*_: object) -> None:
-        raise RuntimeError("Unable to locate credentials")
+@pytest.mark.parametrize(("error", "words"), [
+    (OSError(errno.ENOSPC, "No space left on device"), "No space left on device; make room, and run the same command"),
+    (RuntimeError("Unable to locate credentials"), "Unable to locate credentials; check the credentials, "),
+])  # fmt: skip
+def test_storage_that_fails_is_reported_with_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
+) -> None:
+    def failing(*_: object) -> None:
+        raise error
 
-    monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "open", no_credentials)
-    expected = r"^memory://x/y: cannot read it: Unable to locate credentials; check the credentials, "
+    monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "open", failing)
+    expected = f"^memory://x/y: cannot read it: {words}"
     with pytest.raises(StorageError, match=expected), open_storage("memory://x").opened("y"):
         pass
