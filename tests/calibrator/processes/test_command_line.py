@@ -46,22 +46,6 @@ def test_failure_to_start_is_reported_in_one_line(code: str, exit_code: int, sai
     assert (run.returncode, run.stdout, run.stderr) == (exit_code, "", said)
 
 
-def test_ctrl_c_ends_workers_too_and_leaves_no_partial_result(tmp_path: Path) -> None:
-    command = [
-        *(sys.executable, "-m", "calibrator", "simulate", "--vehicles", "200", "--minutes", "2"),
-        *("--layout", str(LAYOUT), "--out", str(tmp_path / "x")),
-    ]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
-        while not [path for path in tmp_path.iterdir() if not path.name.startswith(".trial")]:
-            assert process.poll() is None
-            time.sleep(0.01)
-        time.sleep(0.4)  # the hidden folder is there: the workers are about to start
-        os.killpg(process.pid, signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (INTERRUPTED, f"{interrupted_message(command[3:])}\n")
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("delay_s", [0.0, 2.0])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_or_sigterm_ends_reader_processes_too(
@@ -114,10 +98,3 @@ def test_previous_handler_of_ctrl_c_is_restored_after_imports(before: "Callable[
         assert handler() is before
     finally:
         signal.signal(signal.SIGINT, of_pytest)
-
-
-def test_message_on_interruption_tells_whether_the_command_can_resume() -> None:
-    goes_on = "; it goes on with what it had read"
-    for arguments, kept in ((["--debug", "import", "x"], goes_on), (["simulate", "--out", "import"], ""), ([], "")):
-        assert interrupted_message(arguments) == f"calibrator: interrupted; run the same command again{kept}"
-    assert interrupted_message([], ENDED) == "calibrator: ended by SIGTERM; run the same command again"

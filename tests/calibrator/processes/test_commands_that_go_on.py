@@ -17,9 +17,9 @@ from bench.fleets import make_store
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.processes.dask_cluster import DaskCluster
 
-LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 ENVIRONMENT = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
 HUGE_BYTES = 100 * 10**9
 KILLS = int(os.environ.get("HV_KILLS", "4"))

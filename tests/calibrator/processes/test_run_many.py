@@ -6,17 +6,14 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from typing import Any
 
 import pytest
-from pebble import ProcessPool
 
 from calibrator.errors import DriveError, FleetError
 from calibrator.processes.run_many import AHEAD_PER_WORKER, Failed, Workers, run_many, try_many
@@ -119,23 +116,6 @@ def test_number_of_items_taken_in_advance_is_bounded() -> None:
             assert next(results) == (number, 2 * number)
             assert len(taken) <= number + 1 + AHEAD_PER_WORKER * 2
         assert children()
-    assert not children()
-
-
-def test_worker_started_while_the_run_is_closing_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, is_ending = list[ProcessPool](), threading.Event()
-
-    def pool(**options: Any) -> ProcessPool:
-        if len(made) == 1:
-            is_ending.wait()
-        made.append(ProcessPool(**options))
-        return made[-1]
-
-    monkeypatch.setattr("calibrator.processes.run_many.ProcessPool", pool)
-    with closing(try_many(time.sleep, [0.0, 60.0], TWO)) as results:
-        assert next(results) == (0.0, None)
-        threading.Timer(0.5, is_ending.set).start()
-    assert len(made) == 2
     assert not children()
 
 
