@@ -89,27 +89,11 @@ def test_variances_of_slopes_and_intercepts_match_white_noise() -> None:
     assert intercept_score.std() == pytest.approx(1.0, abs=0.06)
 
 
-def test_criterion_equals_the_squared_distance_of_the_projections() -> None:
-    """(7) equals (8) and (9): project the measured current on the plane of zero sum."""
-    i_s, rng = ideal_currents(), np.random.default_rng(0)
-    i_m = 1.1 * i_s + rng.normal(size=i_s.shape) + 0.5
-    features = np.append(np.mean((i_m - i_s) ** 2, axis=0), np.mean(i_m.sum(axis=1) ** 2))
-    projected = i_m - i_m.mean(axis=1, keepdims=True)
-    expected = np.mean(np.sum((projected - i_s) ** 2, axis=1))
-    assert classify.decision_criterion(features[None])[0] == pytest.approx(expected)
-
-
 def test_threshold_is_a_third_of_the_fleets_spread() -> None:
     eta = np.array([0.0, 1.0, 2.0, 9.0])
     found = classify.classify_by_threshold(np.column_stack([eta, np.zeros(4), np.zeros(4)]))
     np.testing.assert_array_equal(found.hardware, eta > eta.std(ddof=1) / 3.0)
     assert found.sensor.all()
-
-
-def test_expected_features_equal_those_without_noise_in_an_asymmetric_fleet() -> None:
-    faults = fleet(40, symmetric=False)
-    expected = classify.expected_features(faults, ideal_currents(), np.zeros(3), reference_vehicles=40)
-    np.testing.assert_allclose(evidence_of_noisy(faults, 0.0)[0].features, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("branches", [2, 4])
