@@ -147,6 +147,14 @@ def test_damaged_blf_is_refused_with_the_byte_position(content: bytes, message: 
         blf_frames(io.BytesIO(content), "x.blf")
 
 
+@pytest.mark.parametrize("wrong", [b"LOBJ" + bytes(60), b"no object" + bytes(40)])
+def test_damaged_container_is_reported_with_the_number_of_frames_before_it(wrong: bytes) -> None:
+    sound = an_object(CLASSIC, classic(0x123, b"\1"))
+    before = of_objects(sound, sound) + a_container(sound)
+    with pytest.raises(LogError, match=f"at byte {len(before)} .*; 3 frames before it are readable"):
+        blf_frames(io.BytesIO(before + a_container(wrong) + a_container(sound)), "x.blf")
+
+
 @pytest.mark.parametrize("batch_bytes", [1, 100, 1 << 21])
 def test_result_does_not_depend_on_the_batch_size_of_containers(
     batch_bytes: int, monkeypatch: pytest.MonkeyPatch
@@ -154,11 +162,3 @@ def test_result_does_not_depend_on_the_batch_size_of_containers(
     monkeypatch.setattr(blf, "BATCH_BYTES", batch_bytes)
     messages = [can.Message(timestamp=START + k, arbitration_id=k, data=bytes([k])) for k in range(100)]
     assert len(assert_the_same(written(messages, container_bytes=150))) == 100
-
-
-@pytest.mark.parametrize("wrong", [b"LOBJ" + bytes(60), b"no object" + bytes(40)])
-def test_damaged_container_is_reported_with_the_number_of_frames_before_it(wrong: bytes) -> None:
-    sound = an_object(CLASSIC, classic(0x123, b"\1"))
-    before = of_objects(sound, sound) + a_container(sound)
-    with pytest.raises(LogError, match=f"at byte {len(before)} .*; 3 frames before it are readable"):
-        blf_frames(io.BytesIO(before + a_container(wrong) + a_container(sound)), "x.blf")

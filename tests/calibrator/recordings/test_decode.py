@@ -1,5 +1,5 @@
 from collections.abc import Sequence
-from math import isfinite, nan
+from math import nan
 from typing import Any, Literal
 
 import numpy as np
@@ -42,7 +42,6 @@ def by_cantools(message: Message, row: bytes) -> dict[str, Any]:
     return values
 
 
-SIZES = st.sampled_from([1, 2, 7, 8, 12, 48, 64])
 BYTE_ORDERS: tuple[Literal["little_endian", "big_endian"], ...] = ("little_endian", "big_endian")
 
 
@@ -78,13 +77,6 @@ def places(
 
 
 @st.composite
-def signals(draw: st.DrawFn) -> tuple[Message, Signal]:
-    size = draw(SIZES)
-    signal = a_signal(draw, size, "S")
-    return Message(1, "M", size, [signal]), signal
-
-
-@st.composite
 def multiplexed_messages(draw: st.DrawFn) -> Message:
     """Pages within pages: a selector, another one on some of its pages, and signals on every page of both."""
     size = draw(st.sampled_from([8, 12, 64]))
@@ -112,28 +104,20 @@ def multiplexed_messages(draw: st.DrawFn) -> Message:
     return Message(1, "M", size, [*selectors, *leaves])
 
 
-@given(multiplexed_messages(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=8))
-def test_nested_multiplexed_signals_decode_as_in_cantools(message: Message, rows: list[bytes]) -> None:
-    rows = [row[: message.length] for row in rows]
-    expected = [by_cantools(message, row) for row in rows]
+@given(multiplexed_messages(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=8), st.data())
+def test_nested_multiplexed_signals_of_frames_of_any_length_decode_as_in_cantools(
+    message: Message, rows: list[bytes], data: st.DataObject
+) -> None:
+    lengths = st.one_of(st.just(message.length), st.integers(0, message.length))
+    rows = [row[: data.draw(lengths)] for row in rows]
+    expected, whole = [by_cantools(message, row) for row in rows], [len(row) == message.length for row in rows]
     for signal in message.signals:
         decoded = decode_signal(message, signal, *payloads(rows, 64 if message.length > 8 else 8))
-        present = [signal.name in values for values in expected]
-        values = [float(values.get(signal.name, 0.0)) for values in expected]
-        assert decoded.present.tolist() == present
-        np.testing.assert_allclose(decoded.value[present], np.array(values)[present], rtol=1e-15)
-        assert decoded.good.tolist() == [there and isfinite(v) for there, v in zip(present, values, strict=True)]
-
-
-@given(signals(), st.lists(st.binary(max_size=64), min_size=1, max_size=8))
-def test_frames_of_any_length_decode_as_in_cantools(pair: tuple[Message, Signal], rows: list[bytes]) -> None:
-    message, signal = pair
-    decoded = decode_signal(message, signal, *payloads(rows, 64))
-    for k, row in enumerate(rows):
-        values = by_cantools(message, row)
-        value = float(values.get("S", nan))
-        np.testing.assert_allclose(decoded.value[k], value, rtol=1e-15)
-        assert decoded.good[k] == isfinite(value)
+        present = np.array([signal.name in values for values in expected])
+        np.testing.assert_array_equal(decoded.present[whole], present[whole])
+        values = np.array([float(values.get(signal.name, nan)) for values in expected])
+        np.testing.assert_allclose(decoded.value[decoded.good], values[decoded.good], rtol=1e-15)
+        assert decoded.good.tolist() == np.isfinite(values).tolist()
 
 
 @pytest.mark.parametrize("code", [-32768, 0x8000])

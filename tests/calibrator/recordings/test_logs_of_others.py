@@ -1,20 +1,19 @@
 """Logs and databases as other programs write them, through the command line: one car, a battery and a motor."""
 
 import json
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import asammdf
 import can
 import cantools
 import pytest
 
 from calibrator.files.layout_files import vehicle_database
-from tests.calibrator.command_here import calibrator
+from ecu_node.database import node_database
+from ecu_node.errors import LayoutError
+from tests.calibrator.command_here import calibrator, refused, reported
 
 DBC = """VERSION ""
 BU_: Car
@@ -148,11 +147,9 @@ LOGS: dict[str, tuple[str, Callable[[Path], None]]] = {
 }
 
 
-def before(log: Path, layout: Path, *options: object) -> dict[str, Any]:
+def before(log: Path, layout: Path) -> dict[str, Any]:
     """Figures of the currents by branch, as `calibrator kirchhoff` gives them, and its notices."""
-    done = calibrator("kirchhoff", log, "--layout", layout, *options, "--json")
-    assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
+    said = reported("kirchhoff", log, "--layout", layout)
     return {**said["before"], "notices": said["notices"]}
 
 
@@ -170,20 +167,6 @@ def test_logs_written_by_other_programs_give_the_currents(tmp_path: Path, layout
     require_currents(before(tmp_path / name, layout))
 
 
-def test_archives_and_folders_are_imported_and_calibrated_as_vehicles(tmp_path: Path, layout: Path) -> None:
-    fleet = tmp_path / "fleet"
-    for vehicle in ("V1", "V2"):
-        (fleet / vehicle).mkdir(parents=True)
-    packed(fleet / "V1" / "monday.zip")
-    (fleet / "V1" / "inner.blf").unlink()
-    LOGS["SavvyCAN"][1](fleet / "V2" / "tuesday.csv")
-    (fleet / "V2" / "notes.txt").write_text("nothing to see here\n")
-    done = calibrator("import", fleet, "--layout", layout, "--out", tmp_path / "store", "--json")
-    assert done.returncode == 0, done.stderr
-    drives = json.loads(done.stdout)["drives"]
-    assert [(drive["vehicle"], drive["name"]) for drive in drives] == [("V2", "tuesday"), ("car", "inner")]
-
-
 def test_logs_in_a_folder_are_one_recording_with_gaps_whatever_notes_lie_beside_them(
     tmp_path: Path, layout: Path
 ) -> None:
@@ -197,18 +180,6 @@ def test_logs_in_a_folder_are_one_recording_with_gaps_whatever_notes_lie_beside_
     found = before(tmp_path / "logs", layout)
     assert found["sum"]["mean_a"] == pytest.approx(2.2, abs=2e-3)
     assert any("the clock was set 1 times" in notice for notice in found["notices"])
-
-
-@pytest.mark.filterwarnings("ignore:The inplace keyword")  # of asammdf
-@pytest.mark.parametrize("suffix", [".mf4", ".parquet"])
-def test_log_decoded_by_asammdf_is_read_as_a_table(tmp_path: Path, layout: Path, suffix: str) -> None:
-    write_with_python_can(tmp_path / "raw.mf4")
-    with asammdf.MDF(tmp_path / "raw.mf4") as raw, raw.extract_bus_logging({"CAN": [(tmp_path / "car.dbc", 0)]}) as mdf:
-        if suffix == ".mf4":
-            mdf.save(tmp_path / "x.mf4")
-        else:
-            mdf.to_dataframe(use_display_names=True).to_parquet(tmp_path / "x.parquet")
-    assert before(tmp_path / f"x{suffix}", layout)["sum"]["mean_a"] == pytest.approx(2.2, abs=0.02)
 
 
 def write_database(path: Path) -> Path:
@@ -268,10 +239,9 @@ def test_branches_are_read_only_from_the_buses_in_the_layout(
 
 
 def test_ambiguous_bus_is_refused_with_the_layout_lines_to_add(tmp_path: Path, layout: Path) -> None:
-    done = calibrator("kirchhoff", on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 40)), "--layout", layout)
-    assert done.returncode == 1
-    assert "Pack comes on several buses (frames: can0 40, can1 20)" in done.stderr
-    assert '[[bus]] with name = "hv", channel = "can0", dbc = "car.dbc"' in done.stderr
+    said = refused("kirchhoff", on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 40)), "--layout", layout)
+    assert "Pack comes on several buses (frames: can0 40, can1 20)" in said
+    assert '[[bus]] with name = "hv", channel = "can0", dbc = "car.dbc"' in said
 
 
 def test_bus_prefix_is_needed_only_if_two_buses_have_the_message(tmp_path: Path, layout: Path) -> None:
@@ -279,28 +249,20 @@ def test_bus_prefix_is_needed_only_if_two_buses_have_the_message(tmp_path: Path,
     text = of_buses("pt", "aux").replace('can1"\ndbc = "car', 'can1"\ndbc = "motor')
     log = on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 80))
     layout.write_text(text)
-    done = calibrator("kirchhoff", log, "--layout", layout)
-    assert "message 'Motor' is in the DBCs of the buses pt and aux; write 'pt:Motor'" in done.stderr
+    said = refused("kirchhoff", log, "--layout", layout)
+    assert "message 'Motor' is in the DBCs of the buses pt and aux; write 'pt:Motor'" in said
     layout.write_text(text.replace("Motor.", "aux:Motor."))
     require_currents(before(log, layout))
 
 
-@pytest.mark.parametrize(("formula", "sum_a"), [("2 * m", 20.0 - 2 * 17.8), ("m - one", 3.2), ("p / u * 1000", 2.2)])
-def test_branch_can_be_computed_by_a_formula(tmp_path: Path, layout: Path, formula: str, sum_a: float) -> None:
-    (tmp_path / "car.dbc").write_text(
-        DBC + ' SG_ One : 16|8@1+ (1,1) [0|0] "" Car\n SG_ Power : 0|16@1- (0.04,0) [-1000|1000] "kW" Car\n'
-    )
-    layout.write_text(
-        LAYOUT.replace('signal = "Motor.Current"', f'formula = "{formula}"\nuncertainty = 0.05')
-        + "".join(
-            f'[[input]]\nname = "{name}"\nsignal = "{signal}"\n'
-            for name, signal in (
-                ("m", "Motor.Current"), ("one", "Motor.One"), ("p", "Motor.Power"), ("u", "Pack.Voltage")
-            )
-        )
-    )  # fmt: skip
+def test_branch_can_be_computed_by_a_formula(tmp_path: Path, layout: Path) -> None:
+    power = ' SG_ Power : 0|16@1- (0.04,0) [-1000|1000] "kW" Car\n'
+    (tmp_path / "car.dbc").write_text(DBC + power)
+    formula = 'formula = "p / u * 1000"\nuncertainty = 0.05'
+    inputs = '[[input]]\nname = "p"\nsignal = "Motor.Power"\n[[input]]\nname = "u"\nsignal = "Pack.Voltage"\n'
+    layout.write_text(LAYOUT.replace('signal = "Motor.Current"', formula) + inputs)
     write_with_python_can(tmp_path / "x.blf")
-    assert before(tmp_path / "x.blf", layout)["sum"]["mean_a"] == pytest.approx(sum_a, abs=0.02)
+    assert before(tmp_path / "x.blf", layout)["sum"]["mean_a"] == pytest.approx(2.2, abs=0.02)
     branch = vehicle_database(layout).layout.find_branch("motor")
     assert (branch.computed, branch.uncertainty) == (True, 0.05)
 
@@ -326,13 +288,7 @@ def test_mistake_in_a_layout_is_reported_in_one_line(
     assert change[0] in LAYOUT
     layout.write_text(LAYOUT.replace(*change))
     write_with_python_can(tmp_path / "x.log")
-    require_one_line(calibrator("kirchhoff", tmp_path / "x.log", "--layout", layout), words)
-
-
-def require_one_line(done: subprocess.CompletedProcess[str], words: str) -> None:
-    assert done.returncode == 1
-    assert words in done.stderr
-    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert words in refused("kirchhoff", tmp_path / "x.log", "--layout", layout)
 
 
 def nameless_archive(path: Path) -> None:
@@ -351,6 +307,7 @@ def nameless_archive(path: Path) -> None:
         ("x.zip", nameless_archive, "x.zip: no logs in it; expected .log, .asc"),
         ("x.zip", lambda path: zipfile.ZipFile(path, "w").close(), "x.zip: no logs in it; expected .log, .asc"),
         ("x.log", lines("{n} {id} {data}"), "line 1 is damaged"),
+        ("x.log", lines("({epoch:.6f}) can0 100#{digits}"), "usable frames of battery only; a sum needs two branches"),
         ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
     ],
 )  # fmt: skip
@@ -358,7 +315,7 @@ def test_mistake_in_a_log_is_reported_in_one_line(
     tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str
 ) -> None:
     write(tmp_path / name)
-    require_one_line(calibrator("kirchhoff", tmp_path / name, "--layout", layout), words)
+    assert words in refused("kirchhoff", tmp_path / name, "--layout", layout)
 
 
 DAMAGED = {name: program for program, (name, _) in LOGS.items() if "." in name}
@@ -379,7 +336,7 @@ def test_damaged_log_gives_one_error_line_or_is_counted(tmp_path: Path, layout: 
     log.write_bytes(DAMAGES[damage](log.read_bytes()))
     done = calibrator("kirchhoff", log, "--layout", layout, "--json")
     if done.returncode:
-        require_one_line(done, name)
+        assert (done.returncode, done.stderr.count("\n"), name in done.stderr) == (1, 1, True), done.stderr
         return
     said = json.loads(done.stdout)
     assert damage in {"cut at its end", "damaged in its middle"}
@@ -414,7 +371,7 @@ def test_damaged_database_is_reported_in_one_line(tmp_path: Path, layout: Path, 
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     layout.write_text(LAYOUT.replace("car.dbc", path.name))
     write_with_python_can(tmp_path / "x.blf")
-    require_one_line(calibrator("kirchhoff", tmp_path / "x.blf", "--layout", layout), path.name)
+    assert path.name in refused("kirchhoff", tmp_path / "x.blf", "--layout", layout)
 
 
 @pytest.mark.parametrize(("text", "words"), [
@@ -422,7 +379,7 @@ def test_damaged_database_is_reported_in_one_line(tmp_path: Path, layout: Path, 
     (of_buses(), "has no 'dbc', so that it fits tables only"),
     (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
 ])  # fmt: skip
-def test_template_refuses_layouts_without_one_dbc(layout: Path, text: str, words: str) -> None:
+def test_node_refuses_layouts_without_one_dbc(layout: Path, text: str, words: str) -> None:
     layout.write_text(text)
-    command = [sys.executable, "-m", "ecu_node", "template", "--layout", str(layout), "--vehicle", "V1"]
-    require_one_line(subprocess.run(command, capture_output=True, text=True, check=False), words)
+    with pytest.raises(LayoutError, match=words):
+        node_database(layout)

@@ -9,7 +9,7 @@ from e2e.p07 import e2e_p07_check
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibrator.drive import Array, Channel, Drive
+from calibrator.drive import Drive
 from calibrator.errors import LogError
 from calibrator.recordings.decode import message_is_sound
 from calibrator.recordings.readers import read_recording
@@ -17,7 +17,7 @@ from calibrator.recordings.write_logs import encode_message, write_candump
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import DatabaseError
 from ecu_node.layout import EndToEnd, ProfileP07, read_layout
-from tests.calibrator.drive_logs import write_drive_log
+from tests.calibrator.conftest import LAYOUT
 
 POWER_DBC = """VERSION ""
 BU_: A
@@ -46,72 +46,47 @@ timeout_s = 0.5
 """
 
 
-@pytest.fixture
-def power_database(tmp_path: Path) -> VehicleDatabase:
-    (tmp_path / "power.dbc").write_text(POWER_DBC)
-    (tmp_path / "power.toml").write_text(POWER_LAYOUT)
-    return read_database(read_layout(tmp_path / "power.toml"))
-
-
-def recorded(folder: Path, database: VehicleDatabase, *lines: tuple[float, str]) -> Drive:
+def recorded(folder: Path, *lines: tuple[float, str], dbc: str = POWER_DBC, layout: str = POWER_LAYOUT) -> Drive:
     """The drive of a log of frames at some times [s]."""
+    (folder / "power.dbc").write_text(dbc)
+    (folder / "power.toml").write_text(layout)
     (folder / "x.log").write_text("".join(f"({1e9 + time:.6f}) can0 {text}\n" for time, text in lines))
+    database = read_database(read_layout(folder / "power.toml"))
     return read_recording(folder / "x.log", database, vehicle="v", name="d").drive
 
 
-def test_current_has_the_sign_of_the_layout_and_is_in_ampere(tmp_path: Path, power_database: VehicleDatabase) -> None:
-    drive = recorded(tmp_path, power_database, (0.0, "00000003#9CFF"))
+def test_current_has_the_sign_of_the_layout_and_is_in_ampere(tmp_path: Path) -> None:
+    drive = recorded(tmp_path, (0.0, "00000003#9CFF"))
     np.testing.assert_allclose(drive.branches["battery"].value, [-10.0])
-    with pytest.raises(LogError, match="no branch"):  # of 11 bits, not of 29
-        recorded(tmp_path, power_database, (0.0, "003#9CFF"))
+    with pytest.raises(LogError, match=r"no branch .* 0x003; expected "):  # of 11 bits, not of 29
+        recorded(tmp_path, (0.0, "003#9CFF"))
 
 
-def test_power_is_divided_by_the_latest_voltage_unless_stale(tmp_path: Path, power_database: VehicleDatabase) -> None:
+def test_power_is_divided_by_the_latest_voltage_unless_stale(tmp_path: Path) -> None:
     lines = [(0.0, "001#1400"), (0.1, "002#A00F"), (0.1, "001#1400"), (0.2, "002#D007"), (0.25, "001#1400")]
-    motor = recorded(tmp_path, power_database, *lines, (0.7, "001#1400"), (0.8, "001#1400")).branches["motor"]
+    motor = recorded(tmp_path, *lines, (0.7, "001#1400"), (0.8, "001#1400")).branches["motor"]
     np.testing.assert_allclose(motor.time_s, [0.0, 0.1, 0.25, 0.7, 0.8], atol=1e-9)
     assert motor.good.tolist() == [False, True, True, True, False]
     np.testing.assert_allclose(motor.value[1:3], [-10_000 / 400.0, -10_000 / 200.0])
 
 
-def test_codes_for_no_value_in_dbc_or_layout_are_not_currents(tmp_path: Path, power_database: VehicleDatabase) -> None:
+def test_codes_for_no_value_in_dbc_or_layout_are_not_currents(tmp_path: Path) -> None:
     names = 'VAL_ 1 Power -200 "Signal_ungueltig" ;\nVAL_ 2 Voltage 4000 "Ersatzwert" ;\n'
-    (tmp_path / "power.dbc").write_text(POWER_DBC + names)
-    (tmp_path / "power.toml").write_text(POWER_LAYOUT + "no_value = [-100, 21]\n")
-    database = read_database(read_layout(tmp_path / "power.toml"))
     texts = ["002#A10F", "001#1400", "001#38FF", "001#9CFF", "001#1500", "002#A00F", "001#1400"]
     lines = list(zip((0.0, 0.1, 0.2, 0.3, 0.4, 0.41, 0.45), texts, strict=True))
-    motor = recorded(tmp_path, database, *lines).branches["motor"]
+    changed = {"dbc": POWER_DBC + names, "layout": POWER_LAYOUT + "no_value = [-100, 21]\n"}
+    motor = recorded(tmp_path, *lines, **changed).branches["motor"]
     assert motor.good.tolist() == [True, False, False, False, True]
     np.testing.assert_allclose(motor.value[4], -10_000 / 400.1)
-    assert recorded(tmp_path, power_database, *lines).branches["motor"].good.all()
+    assert recorded(tmp_path, *lines).branches["motor"].good.all()
 
 
 def test_named_values_of_an_input_count_unless_they_mean_not_available(tmp_path: Path) -> None:
-    gear = ' SG_ Gear : 16|8@1+ (1,0) [0|0] "" A\n'
-    dbc = POWER_DBC.replace('[0|1000] "V" A\n', f'[0|1000] "V" A\n{gear}')
-    (tmp_path / "power.dbc").write_text(dbc + 'VAL_ 2 Gear 1 "Drive" 2 "Ungueltig" 3 "SNA" ;\n')
-    (tmp_path / "power.toml").write_text(POWER_LAYOUT + '[[input]]\nname = "gear"\nsignal = "Volt.Gear"\n')
-    database = read_database(read_layout(tmp_path / "power.toml"))
+    gear = '"V" A\n SG_ Gear : 16|8@1+ (1,0) [0|0] "" A\n'
+    dbc = POWER_DBC.replace('"V" A\n', gear) + 'VAL_ 2 Gear 1 "Drive" 2 "Ungueltig" 3 "SNA" ;\n'
+    layout = POWER_LAYOUT + '[[input]]\nname = "gear"\nsignal = "Volt.Gear"\n'
     lines = [(0.0, "001#1400"), (0.1, "002#A00F01"), (0.2, "002#A00F02"), (0.3, "002#A00F03")]
-    drive = recorded(tmp_path, database, *lines)
-    assert drive.inputs["gear"].good.tolist() == [True, True, False]
-
-
-def test_log_without_any_branch_is_refused_with_the_expected_messages(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
-    with pytest.raises(LogError, match=r"x\.log: no branch .* 0x7FF, 0x18DAF110; expected HV_Battery \(0x110\)"):
-        recorded(tmp_path, database, (0.0, "7FF#00"), (0.1, "18DAF110#00"))
-
-
-def test_input_that_is_never_available_is_left_out_and_reported(tmp_path: Path, database: VehicleDatabase) -> None:
-    battery = Channel(time_s=np.array([0.0, 0.1]), value=np.array([1.0, 2.0]), good=np.ones(2, bool))
-    drive = Drive(vehicle="v", name="d", branches={"battery": battery}, inputs={})
-    write_drive_log(tmp_path / "d.log", drive, database)
-    recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
-    assert "voltage" not in recording.drive.inputs
-    assert "voltage: 2 of 2 frames not usable" in map(str, recording.report.notices())
+    assert recorded(tmp_path, *lines, dbc=dbc, layout=layout).inputs["gear"].good.tolist() == [True, True, False]
 
 
 def test_sample_of_a_frame_with_wrong_crc_is_not_good(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -120,16 +95,6 @@ def test_sample_of_a_frame_with_wrong_crc_is_not_good(tmp_path: Path, database: 
     write_candump(tmp_path / "d.log", [series])
     battery = read_recording(tmp_path / "d.log", database, vehicle="v", name="d").drive.branches["battery"]
     assert battery.good.tolist() == [True, False]
-
-
-def test_corrected_frames_are_read_beside_the_measured_ones(tmp_path: Path, database: VehicleDatabase) -> None:
-    time_s: Array = np.array([0.0, 0.1])
-    measured = encode_message(database, "HV_Motor", time_s, {"MotorCurrent": np.array([10.0, 20.0])})
-    corrected = encode_message(database, "HV_MotorCorrected", time_s, {"MotorCurrentCorrected": np.array([9.0, 18.0])})
-    write_candump(tmp_path / "d.log", [measured, corrected])
-    recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
-    np.testing.assert_allclose(recording.drive.branches["motor"].value, [-10.0, -20.0])
-    np.testing.assert_allclose(recording.corrected["motor"].value, [-9.0, -18.0])
 
 
 # Logs that are written
@@ -189,7 +154,7 @@ def test_values_are_written_as_the_nearest_codes_in_both_byte_orders(a: int, b: 
 
 
 def big_endian_database(dbc: str = BIG_ENDIAN_DBC, **keys: EndToEnd) -> VehicleDatabase:
-    layout = msgspec.structs.replace(read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"), **keys)
+    layout = msgspec.structs.replace(read_layout(LAYOUT), **keys)
     database = cantools.database.load_string(dbc)
     assert isinstance(database, cantools.database.can.Database)
     return VehicleDatabase(layout=layout, databases={"": database}, digest="0" * 64)
