@@ -173,9 +173,3 @@ def test_margin_gain_is_given_in_kilowatts_if_the_voltage_is_known(margin: Margi
     assert "With --voltage the same is given in kW." in text
     none, _ = margin(sensor(0.1, 4.0), sensor(), voltage_v=350.0)
     assert (none["common_gain_a"], none["own_gain_a"]) == (0.0, None)
-
-
-def test_margin_of_a_large_fleet_covers_all_but_one_in_a_thousand(margin: Margin) -> None:
-    usual = [sensor(0.0, 5.0)] * 1000
-    assert margin(*usual, sensor(0.0, 300.0))[0]["common_before_a"] == pytest.approx(5.0 + DOUBT_A)
-    assert margin(*usual[:100], sensor(0.0, 300.0))[0]["common_before_a"] == pytest.approx(300.0 + DOUBT_A)
