@@ -1,7 +1,5 @@
 import gzip
-import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,9 +7,7 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from calibrator.drives.store import recording_digest
 from calibrator.processes.run_many import Workers
-from calibrator.sources.fleet_source import find_fleet, load_drive
 from calibrator.sources.import_logs import ImportReport, import_logs
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator
@@ -33,22 +29,6 @@ def test_only_new_logs_are_added(two_vehicles: Path, tmp_path: Path, database: V
 @pytest.fixture(scope="module")
 def report(two_vehicles: Path, tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) -> ImportReport:
     return imported([two_vehicles / "logs"], tmp_path_factory.mktemp("store"), database)
-
-
-def test_stored_drives_equal_the_logs(two_vehicles: Path, report: ImportReport, database: VehicleDatabase) -> None:
-    logs, store = find_fleet(two_vehicles).vehicles, find_fleet(report.store).vehicles
-    assert list(logs) == list(store) == ["V001", "V002"]
-    for vehicle, (log,) in logs.items():
-        (kept,) = store[vehicle]
-        assert recording_digest(load_drive(kept, database)) == recording_digest(load_drive(log, database))
-
-
-def test_equal_notices_are_merged_in_text_and_kept_per_drive_in_json(report: ImportReport) -> None:
-    told = [line for line in report.as_text().splitlines() if "junction_box_temperature" in line]
-    kept = [notice for drive in json.loads(report.as_json())["drives"] for notice in drive["notices"]]
-    frames = [int(re.findall(r"(\d+) of", notice)[0]) for notice in kept if "junction_box_temperature" in notice]
-    assert len(frames) == 2
-    assert told == [f"  in 2 vehicles: junction_box_temperature: {sum(frames)} of {sum(frames)} frames not usable"]
 
 
 def test_damaged_drive_is_not_imported(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
