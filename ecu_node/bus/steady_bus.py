@@ -146,43 +146,34 @@ class SteadyBus:
             Numbers of frames that the bus took, and did not take. A full bus is tried a few times; while it stays full,
             once.
         """
-        queue, done, lost = self._queue, 0, 0
-        while done < len(queue):
-            refused = len(queue) - done  # a bus that is full or gone is so for all that follow
-            link = self._link
-            if link is not None:
-                try:
-                    done += self._send_some(link, done)
+        queue, first, lost = self._queue, 0, 0
+        attempts_left = _SEND_ATTEMPTS if self._full_since_s is None else 1
+        while first < len(queue) and (link := self._link) is not None:
+            try:
+                with self._closing:
+                    first += link.send(queue, first)
+            except _ERRORS as error:
+                if _number(error) in _OF_FRAME:
+                    first, lost = first + 1, lost + 1
                     continue
-                except _ERRORS as error:
-                    if _number(error) in _GONE:
-                        # The kernel reports this once only, so receiving might not fail: note it for receive.
-                        self._failed = link, error
-                    elif _number(error) in _OF_FRAME:
-                        refused = 1
-            done, lost = done + refused, lost + refused
+                if _number(error) in _GONE:
+                    # The kernel reports this once only, so receiving might not fail: note it for receive.
+                    self._failed = link, error
+                    break
+                attempts_left -= 1
+                if not attempts_left:
+                    self._stays_full(error)
+                    break
+                time.sleep(_SEND_PAUSE_S)
+            else:
+                attempts_left = _SEND_ATTEMPTS
+                if self._is_full_told:
+                    self.say(f"{self.channel}: the bus takes frames again")
+                self._full_since_s, self._is_full_told = None, False
+        lost += len(queue) - first  # a bus that is full or gone is so for all that follow
         sent = len(queue) - lost
         queue.clear()
         return sent, lost
-
-    def _send_some(self, link: "_Link", first: int) -> int:
-        """Send what the bus takes now, trying a full one a few times; return how many frames, or raise if none."""
-        for attempts_left in reversed(range(_SEND_ATTEMPTS if self._full_since_s is None else 1)):
-            try:
-                with self._closing:
-                    taken = link.send(self._queue, first)
-                break
-            except _ERRORS as error:
-                is_full = _number(error) not in _GONE | _OF_FRAME
-                if is_full and not attempts_left:
-                    self._stays_full(error)
-                if not (is_full and attempts_left):
-                    raise
-            time.sleep(_SEND_PAUSE_S)
-        if self._is_full_told:
-            self.say(f"{self.channel}: the bus takes frames again")
-        self._full_since_s, self._is_full_told = None, False
-        return taken
 
     def _stays_full(self, error: Exception) -> None:
         """Note that the send queue is full, and log it once if it stays so."""
