@@ -32,7 +32,7 @@ from ecu_node.core.signals import Codes, FrameKey, PlacedSignal, placed_signal
 from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase, codes_of_no_value
 from ecu_node.documents import write_atomically
-from ecu_node.errors import LayoutError, UserError
+from ecu_node.errors import UserError
 from ecu_node.formulas import formula_value, parse_formula
 from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
@@ -209,7 +209,7 @@ class OnBoardSummary:
     Raises
     ------
     UserError
-        If the layout has a branch that is computed by a formula, or the folder cannot be made.
+        If the folder cannot be made.
     """
 
     def __init__(
@@ -222,11 +222,6 @@ class OnBoardSummary:
         say: Callable[[str], None],
     ) -> None:
         layout = database.layout
-        if computed := [branch.name for branch in layout.branch if branch.computed]:
-            raise LayoutError(
-                f"{layout.path}: branch {computed[0]} is computed by a formula, which --summary does not; leave it out "
-                f"of the layout, or record logs"
-            )
         try:
             (folder / vehicle).mkdir(parents=True, exist_ok=True)
         except OSError as error:

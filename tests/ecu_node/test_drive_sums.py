@@ -14,7 +14,7 @@ from ecu_node.bus import on_board_summary as room
 from ecu_node.bus.on_board_summary import OnBoardSummary, on_board_summary
 from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import LayoutError, UserError
+from ecu_node.errors import UserError
 from ecu_node.summary import SummaryFile, decode_summary, encode_summary, unpacked
 from tests.ecu_node.processes import running
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, MakeDatabase
@@ -151,7 +151,7 @@ def test_record_of_another_version_is_refused(drive: Drive) -> None:
         decode_summary(encode_summary(other))
 
 
-def test_unusable_summary_folder_vehicle_or_formula_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_unusable_summary_folder_or_vehicle_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
     database = make_database(SMALL_LAYOUT)
     (tmp_path / "file").touch()
     options = argparse.Namespace(summary=tmp_path / "file", vehicle="V1")
@@ -161,10 +161,6 @@ def test_unusable_summary_folder_vehicle_or_formula_is_refused(make_database: Ma
         options = argparse.Namespace(summary=tmp_path, vehicle=vehicle)
         with pytest.raises(UserError, match=re.escape(f"--summary: vehicle {vehicle!r} cannot name a folder; rename")):
             on_board_summary(options, {}, database, None, print)
-    computed = SMALL_LAYOUT.replace('power = "Heater.Power", voltage = "Net.Voltage"', 'formula = "2.0 * net"')
-    database = make_database(f'{computed}\ninput = [{{ name = "net", signal = "Net.Voltage" }}]\n')
-    with pytest.raises(LayoutError, match="branch heater is computed by a formula, which --summary does not"):
-        OnBoardSummary(tmp_path, "V1", database, delays={}, say=print)
 
 
 def test_node_with_summary_option_creates_the_folder_of_its_vehicle(tmp_path: Path) -> None:
