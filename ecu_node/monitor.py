@@ -1,12 +1,13 @@
 """``ecu-node monitor``: what a listener sees of the junction and of the node. It listens, and never sends.
 
-The node is asked nothing: measured and corrected currents, their sums, rates and faults are worked out from the frames
-on the bus. An answer counts at the time of the last frame that it can be the answer to, so that sums are of one instant
-of the junction. The calibrated delays of the branches are only in the parameter file, and not known here. Currents are
-positive into the junction. Times are those of one steady clock. [s]
+The node is asked nothing: measured and corrected currents, their sums, rates, faults and the node's latency are worked
+out from the frames on the bus. An answer counts at the time of the frame that it answers, so that sums are of one
+instant of the junction. The calibrated delays of the branches are only in the parameter file, and not known here.
+Currents are positive into the junction. Times are those of one steady clock. [s]
 """
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -28,7 +29,7 @@ from ecu_node.bus.wiring import Mode, branch_signals, key_of, open_bus, received
 from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
 from ecu_node.core.junction import REMEMBERED_FRAMES, Frames, HeardSignal, LiveBranch, aligned_currents
 from ecu_node.core.signals import AMPERE, bit_place, placed_signal, read_codes
-from ecu_node.core.status import Counters, Quality, Reason, State
+from ecu_node.core.status import Counters, Latency, Quality, Reason, State
 from ecu_node.database import VehicleDatabase, node_database
 from ecu_node.layout import Branch, SignalName
 from ecu_node.program import say_error, write_output
@@ -38,6 +39,8 @@ View = dict[str, Any]
 
 _RATE_WINDOW_S = 2.0
 """Frame rates are means over this long. [s]"""
+_LONGEST_LATENCY_S = 1.0
+"""A frame that was not answered within this time counts as never answered. [s]"""
 _FAULTS = {Check.CORRUPT: "corrupt", Check.REPEATED: "repeated", Check.LOST: "lost", Check.JUMPED: "lost"}
 
 
@@ -84,7 +87,7 @@ class BusMonitor:
         messages = received(database) | transmitted(database, Mode.OVERLAY)
         self._heard: _Heard = {key: _HeardMessage(protection_of(database, item)) for key, item in messages.items()}
         self._branches = [_BranchOnBus(database, branch, self._heard) for branch in database.layout.branch]
-        self._database, self._start_s = database, start_s
+        self._database, self._start_s, self._latency = database, start_s, Latency()
 
     def take(self, key: tuple[int, bool], payload: bytearray, time_s: float) -> None:
         """Take a frame.
@@ -102,7 +105,7 @@ class BusMonitor:
         if message is not None and message.take(payload, time_s):
             for branch in self._branches:
                 if branch.answering is message:
-                    branch.answer(payload, time_s)
+                    branch.answer(payload, time_s, self._latency)
 
     def look(self, now_s: float) -> View:
         """Work out what is to be shown now. [s]
@@ -117,6 +120,8 @@ class BusMonitor:
             ``sums`` : ``measured_a`` and ``corrected_a``, each at the newest instant that all branches have reached.
             ``node`` : what its last intact status says, or None: ``state`` and ``reason`` (codes that have no name stay
             numbers), ``parameter_set``, ``sums``, ``age_s``, ``is_silent`` (it must be gone), ``faults``.
+            ``latency_us`` : time from a frame to its answer, as seen on the bus: ``p50``, ``p99.9``, ``max``; None if
+            none was answered.
             ``has_status``, ``publishes_corrected``, ``is_bus_open`` [bool].
             What is not known is None.
         """
@@ -130,6 +135,7 @@ class BusMonitor:
                 "corrected_a": _sum_a([branch.shown for branch in seen], now_s) if publishes else None,
             },
             "node": _status_view(self._database, self._heard, now_s),
+            "latency_us": self._latency.microseconds() if any(self._latency.counts) else None,
             "has_status": self._database.layout.status is not None,
             "publishes_corrected": publishes,
             "is_bus_open": True,
@@ -155,6 +161,8 @@ class _BranchOnBus:
         self.measured, self.corrected = make(codes=signals.source), make(codes=signals.target)
         self._answers: Frames = deque(maxlen=REMEMBERED_FRAMES)
         """Usable corrected frames, with the times of the frames that they answer."""
+        self._asked_s = -math.inf
+        """Time of the last frame that was answered. [s]"""
         self._source = follow(self.measured, branch.source)
         self.answering = follow(self.corrected, branch.corrected, self._answers) if branch.corrected else None
         self._quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
@@ -164,10 +172,14 @@ class _BranchOnBus:
         """The current that counts in the corrected sum: the measured one if the layout publishes no corrected one."""
         return self.corrected if self.answering is not None else self.measured
 
-    def answer(self, payload: bytearray, time_s: float) -> None:
-        """Take a corrected frame that came at a time [s], as the answer to the last measured one."""
-        asked = self._source.frames
-        self._answers.append((asked[-1][0] if asked else time_s, payload))
+    def answer(self, payload: bytearray, time_s: float, latency: Latency) -> None:
+        """Take a corrected frame that came at a time [s], as the answer to the first measured one that waits for it."""
+        earliest_s = max(self._asked_s, time_s - _LONGEST_LATENCY_S)
+        waiting_s = [asked_s for asked_s, _ in self._source.frames if asked_s > earliest_s]
+        if waiting_s:
+            latency.add(time_s - waiting_s[0])
+        self._asked_s = waiting_s[0] if waiting_s else time_s
+        self._answers.append((self._asked_s, payload))
 
     def view(self, now_s: float, window_s: float) -> View:
         """Return what is to be shown of the branch; its rate is that of the last `window_s`. [s]"""
@@ -268,6 +280,9 @@ def view_lines(view: View, where: str, counters: Counters) -> list[str]:
         lines.append("no corrected messages on this bus: the currents are shown as they are on it")
     if node is not None and node["state"] in ("PASSING_THROUGH", "SHADOW"):
         lines.append("node's sum, corrected: what its parameters would make of it; it publishes what was measured")
+    if view["latency_us"] is not None:
+        found = ", ".join(f"{name} {latency_us}" for name, latency_us in view["latency_us"].items())
+        lines.append(f"from a frame to its answer [us]: {found}")
     if counters.bus_errors:
         lines.append(f"error frames of the bus: {counters.bus_errors}; a wrong bit rate, or a fault in the wiring?")
     if counters.dropped:
