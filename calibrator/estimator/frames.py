@@ -211,7 +211,7 @@ def summarise_frames(
     store = SummaryStore(storage=open_storage(folder), identity=identity)
     write_identity(store.storage, identity)
     for bucket, names in store.by_bucket(drives).items():
-        store.append(bucket, {name: [_record(drives[name], store, database)] for name in names}, whole=True)
+        store.append(bucket, [_record(drives[name], store, database) for name in names])
     return database
 
 

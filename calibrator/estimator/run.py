@@ -311,7 +311,7 @@ class _Run:
     def bench_table(self, store: SummaryStore) -> BenchTable:
         """Read the bench readings, if there are any."""
         given, scale_a = self.settings.readings, self.identity.database.layout.full_scale_a
-        return {} if given is None else read_bench_table(given, store.identity.branches, full_scale_a=scale_a)
+        return {} if given is None else read_bench_table(given, store.identity.equipment.branches, full_scale_a=scale_a)
 
     def check(self, bench: BenchTable, vehicles: Collection[str], left_out: Mapping[str, str]) -> None:
         """Refuse bench readings of vehicles that do not exist, or that contradict the trust in one."""
@@ -335,7 +335,7 @@ class _Run:
                 read_sample(store, census, settings, checked),
                 settings,
                 bench,
-                branches=store.identity.branches,
+                branches=store.identity.equipment.branches,
                 identity=self.identity,
                 fleet_size=census.size,
             )
@@ -403,7 +403,7 @@ def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdent
     run, layout = read_run(folder), database.layout
     for what, was, now in (
         ("method", run.method, Method.POSTERIOR.value),
-        ("list of branches", ", ".join(run.branches), ", ".join(store.branches)),
+        ("list of branches", ", ".join(run.branches), ", ".join(store.equipment.branches)),
         (f"version of {layout.path}", run.layout_sha256[:8], layout.digest[:8]),
         ("version of the DBC", run.dbc_sha256[:8], database.digest[:8]),
         ("number of buckets", run.buckets, store.buckets),

@@ -8,7 +8,7 @@ import msgspec
 from calibrator.drive import Equipment
 from calibrator.errors import DriveError, FleetError
 from calibrator.files.storage import Storage
-from calibrator.summaries.filter_bank import FilterBank
+from calibrator.summaries.filter_bank import FilterBank, plain_bank
 from calibrator.summaries.moments import BLOCK_S
 from ecu_node.database import VehicleDatabase
 
@@ -22,7 +22,7 @@ __all__ = [
     "write_identity",
 ]
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 FILE = "summaries.json"
 FEWEST_BUCKETS, MOST_BUCKETS = 16, 32_768
 """Range of the number of buckets: with more, a killed run loses fewer vehicles; with too many, listing takes long."""
@@ -40,16 +40,14 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         Version of the store's format.
     layout, layout_sha256, dbc_sha256 : str
         Name of the layout, and digests of layout and DBC.
-    branches, inputs, fleet_inputs : tuple of str
-        Branches and model inputs of the fleet, see :class:`~calibrator.drive.Equipment`.
-    notices : tuple of str
-        Branches and inputs of the layout that the store does not use, and why, in words.
+    equipment : Equipment
+        Branches and inputs of the fleet, and those of the layout that the store does not use.
     bank : FilterBank
-        Filters of the inputs ``fleet_inputs``.
+        Filters of the fleet inputs.
     block_s : float
         Length of a block. [s]
     buckets : int
-        Number of files that the vehicles are spread over.
+        Number of parts that the vehicles are spread over.
     fleet : str
         Name of the fleet.
     """
@@ -58,35 +56,11 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     layout: str
     layout_sha256: str
     dbc_sha256: str
-    branches: Annotated[tuple[str, ...], msgspec.Meta(min_length=2)]
-    inputs: tuple[str, ...]
-    fleet_inputs: tuple[str, ...]
-    notices: tuple[str, ...]
+    equipment: Equipment
     bank: FilterBank
     block_s: float
     buckets: Annotated[int, msgspec.Meta(ge=FEWEST_BUCKETS, le=MOST_BUCKETS)]
     fleet: str
-
-    @property
-    def equipment(self) -> Equipment:
-        """Branches and inputs of the fleet."""
-        return Equipment(
-            branches=self.branches, inputs=self.inputs, fleet_inputs=self.fleet_inputs, notices=self.notices
-        )
-
-    def difference(self, other: "StoreIdentity") -> str:
-        """Say in words why summaries of another store cannot be added to this one; return an empty text if they can."""
-        for name in ("layout_sha256", "dbc_sha256", "branches", "fleet_inputs", "bank", "block_s"):
-            mine, its = getattr(self, name), getattr(other, name)
-            if mine != its:
-                return f"{name} {_short(mine)} against {_short(its)}"
-        return ""
-
-
-def _short(value: object) -> str:
-    text = ", ".join(value) if isinstance(value, tuple) else str(value)
-    text = value.identity if isinstance(value, FilterBank) else text
-    return text[:60]
 
 
 def bucket_of(vehicle: str, buckets: int) -> int:
@@ -123,16 +97,13 @@ def store_identity(
     StoreIdentity
         Identity with the present schema version.
     """
-    wanted = 1 << max(vehicles // VEHICLES_PER_BUCKET, 1).bit_length()
+    layout, wanted = database.layout, 1 << max(vehicles // VEHICLES_PER_BUCKET, 1).bit_length()
     return StoreIdentity(
-        layout=database.layout.name,
-        layout_sha256=database.layout.digest,
+        layout=layout.name,
+        layout_sha256=layout.digest,
         dbc_sha256=database.digest,
-        branches=equipment.branches,
-        inputs=equipment.inputs,
-        fleet_inputs=equipment.fleet_inputs,
-        notices=equipment.notices,
-        bank=bank or FilterBank(input_names=equipment.fleet_inputs, period_s=database.layout.period_s),
+        equipment=equipment,
+        bank=bank or plain_bank(equipment.fleet_inputs, period_s=layout.period_s),
         block_s=BLOCK_S,
         buckets=min(max(wanted, FEWEST_BUCKETS), MOST_BUCKETS),
         fleet=fleet,
@@ -169,13 +140,12 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
     if content is None:
         return None
     try:
-        raw = msgspec.json.decode(content)
-        version = raw.get("schema_version") if isinstance(raw, dict) else None
+        version = msgspec.json.decode(content, type=_Versioned).schema_version
         if version != SCHEMA_VERSION:
             raise FleetError(
                 f"{where}: schema version {version!r}, expected {SCHEMA_VERSION}; summarise the drives again"
             )
-        identity = msgspec.convert(raw, StoreIdentity)
+        identity = msgspec.json.decode(content, type=StoreIdentity)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, DriveError) as error:
         raise FleetError(f"{where}: not a store of summaries: {error}; summarise the drives again") from None
     if database is None:
@@ -189,3 +159,9 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
         if its != mine:
             raise FleetError(f"{where}: made with {what}; summarise the drives again, into another store")
     return identity
+
+
+class _Versioned(msgspec.Struct):
+    """What the files of all versions have."""
+
+    schema_version: int

@@ -169,7 +169,7 @@ def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
         return {**row, "problem": record.problem}
     found, summary = record.found, record.found.summary.shortened(MOST_BLOCKS)
     upper = _upper(summary.moments.shape[1])
-    place = [found.delays.branches.index(name) for name in identity.branches]
+    place = [found.delays.branches.index(name) for name in identity.equipment.branches]
     return {
         **row,
         "duration_s": summary.duration_s,
@@ -261,7 +261,7 @@ def _vehicle(
     row: Mapping[str, Any], numbers: Mapping[str, Array], identity: StoreIdentity, bank: str
 ) -> VehicleSummary:
     """Return the summary in a row; raise ValueError if it has too few or too many numbers."""
-    K, L = len(identity.branches), len(LEVEL_EDGES_A) + 1
+    K, L = len(identity.equipment.branches), len(LEVEL_EDGES_A) + 1
     p = identity.bank.width + K + 1
     noise_a2 = numbers["noise_a2"].reshape(-1, K)
     B, upper = len(noise_a2), _upper(p)
@@ -275,7 +275,7 @@ def _vehicle(
             temperature_c=numbers["temperature_c"].reshape(B),
             starts=numbers["starts"].reshape(B) > 0.0,
         )
-    first = identity.branches.index(row["delay_reference"])
+    first = identity.equipment.branches.index(row["delay_reference"])
     order = [first, *(k for k in range(K) if k != first)]
     delay_s, sd_s = numbers["delay_s"][order], numbers["delay_sd_s"][order]
     return VehicleSummary(
@@ -290,7 +290,10 @@ def _vehicle(
             fit=fit,
         ),
         delays=BranchDelays(
-            branches=tuple(identity.branches[k] for k in order), delay_s=delay_s, sd_s=sd_s, known=np.isfinite(sd_s)
+            branches=tuple(identity.equipment.branches[k] for k in order),
+            delay_s=delay_s,
+            sd_s=sd_s,
+            known=np.isfinite(sd_s),
         ),
         zero_current=ZeroCurrent(offset_a=numbers["zero_offset_a"], sd_a=numbers["zero_sd_a"]),
     )

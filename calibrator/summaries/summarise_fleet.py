@@ -165,48 +165,43 @@ def add_drives(
         What was added and left out. A vehicle whose drives cannot be used gets a record that says why.
     """
     report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
-    read = partial(_read_record, store=store.identity, database=database)
-    tasks = _tasks(store, fleet, owners)
     outcomes = try_many_shown(
-        read,
-        tasks,
+        partial(_read_record, store=store.identity, database=database),
+        _tasks(store, fleet, owners),
         workers,
         limit_s=time_limit_s,
         label="summarise drives",
         size=sum(fleet.sizes.values()),
-        size_of=lambda task: task.size,
+        size_of=lambda task: sum(drive.size for drive in task.drives),
     )
     with closing(outcomes):
         for bucket, group in groupby(outcomes, key=lambda pair: pair[0].bucket):
-            records, versions = list[Record](), dict[str, Mapping[str, str]]()
-            for task, outcome in group:
-                is_read = not isinstance(outcome, Failed)
-                records.append(outcome if is_read else _record(task.drives, problem=outcome.reason))  # type: ignore[union-attr,arg-type]
-                versions[task.drives[0].vehicle] = task.versions
-            _keep(store, bucket, records, versions, report)
+            records = [
+                _record(task.drives, problem=outcome.reason) if isinstance(outcome, Failed) else outcome
+                for task, outcome in group
+            ]
+            store.append(bucket, records)
             for record in records:
                 owners.add(record.vehicle, record.digests)
-    for bucket in store.by_bucket(set().union(*owners.shared.values())):
-        store.change(bucket, owners.without_copies)
-        for records_ in store.read(bucket, whole=False).values():
-            report.left_out.update({r.vehicle: r.problem for r in records_ if r.problem.startswith(COPY)})
+                _report(record, report)
+    for bucket, vehicles in store.by_bucket(set().union(*owners.shared.values())).items():
+        known = store.read(bucket, whole=False)
+        copies = [copy for vehicle in vehicles for copy in owners.without_copies(known[vehicle])]
+        store.append(bucket, copies)
+        report.left_out |= {copy.vehicle: copy.problem for copy in copies}
     return report
 
 
 class _Task(NamedTuple):
     """Unit of work: the drives of one vehicle that are not in the store yet.
 
-    ``digests`` and ``known_s`` (duration [s]) describe the recordings of the vehicle that the store has, ``versions``
-    gives the file version of each of its drives. ``size`` is what the progress bar advances by: the size of this
-    vehicle's drives and of the vehicles skipped since the task before. [byte]
+    ``digests`` and ``known_s`` (duration [s]) describe the recordings of the vehicle that the store has.
     """
 
     bucket: int
     drives: tuple[DriveFile, ...]
     digests: frozenset[str]
     known_s: float
-    versions: Mapping[str, str]
-    size: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,14 +220,13 @@ class _Owners:
             if (other := self.first.setdefault(key, vehicle)) != vehicle:
                 self.shared.setdefault(key, {other}).add(vehicle)
 
-    def without_copies(self, record: Record) -> Record:
-        """Return the record; with a problem in place of its summary if another vehicle has one of its recordings."""
-        sharing = set[str]().union(*(self.shared.get(_key(digest), ()) for digest in record.digests))
-        if not sharing - {record.vehicle}:
-            return record
-        others = ", ".join(sorted(sharing - {record.vehicle}))
-        problem = f"{COPY} {others}; it cannot be told whose it is: remove it where it does not belong"
-        return record if record.problem == problem else replace(record, found=None, problem=problem)
+    def without_copies(self, records: Iterable[Record]) -> Iterator[Record]:
+        """Yield those records of which another vehicle has a recording, with a problem in place of the summary."""
+        for record in records:
+            sharing = set[str]().union(*(self.shared.get(_key(digest), ()) for digest in record.digests))
+            if others := ", ".join(sorted(sharing - {record.vehicle})):
+                problem = f"{COPY} {others}; it cannot be told whose it is: remove it where it does not belong"
+                yield replace(record, found=None, problem=problem)
 
 
 def _key(digest: str) -> int:
@@ -241,7 +235,6 @@ def _key(digest: str) -> int:
 
 def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator[_Task]:
     """Yield the drives to read, bucket by bucket; enter into `owners` the recordings that the store has already."""
-    size = 0
     for bucket, names in store.by_bucket(fleet.vehicles).items():
         records = store.read(bucket, whole=False)
         for name in names:
@@ -250,11 +243,9 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator
             kept = [k for k in records.get(name, ()) if _stays(k, versions) and not k.problem]
             digests = frozenset(digest for record in kept for digest in record.digests)
             owners.add(name, digests)
-            size += fleet.sizes.get(name, 0)
             known = {drive for record in kept for drive in record.drives}
             if wanted := tuple(drive for drive in drives if drive.name not in known):
-                yield _Task(bucket, wanted, digests, sum(r.duration_s for r in kept), versions, size)
-                size = 0
+                yield _Task(bucket, wanted, digests, sum(record.duration_s for record in kept))
 
 
 def _stays(record: Record, versions: Mapping[str, str]) -> bool:
@@ -265,7 +256,7 @@ def _stays(record: Record, versions: Mapping[str, str]) -> bool:
 
 def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase) -> Record:
     """Read the drives of a task and summarise them; a recording that the store has of this vehicle is skipped."""
-    made, drives, digests = dict[str, VehicleSummary](), dict[str, Drive](), list[str]()
+    drives, made, digests = dict[str, Drive](), dict[str, VehicleSummary](), list[str]()
     for entry in task.drives:
         if is_onboard(entry):
             with local_copy(entry.place) as path:
@@ -275,11 +266,9 @@ def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase
             drive = load_drive(entry, database)
             digests.append(recording_digest(drive))
             drives[digests[-1]] = drive
-    new = [drive for digest, drive in drives.items() if digest not in task.digests]
-    parts = []
-    if new:
-        parts.append(summarise_drives(new, store.equipment, database, bank=store.bank, known_s=task.known_s))
-    parts += [summary for digest, summary in made.items() if digest not in task.digests]
+    parts = [summary for digest, summary in made.items() if digest not in task.digests]
+    if new := [drive for digest, drive in drives.items() if digest not in task.digests]:
+        parts.insert(0, summarise_drives(new, store.equipment, database, bank=store.bank, known_s=task.known_s))
     if not parts:
         return _record(task.drives, digests, problem=f"{COPY} one that this vehicle has already; it counts once")
     return _record(task.drives, digests, found=added_summaries(parts))
@@ -299,34 +288,17 @@ def _record(
     )
 
 
-def _keep(
-    store: SummaryStore,
-    bucket: int,
-    new: Sequence[Record],
-    versions: Mapping[str, Mapping[str, str]],
-    report: SummariseReport,
-) -> None:
-    """Put new records into a bucket, keep what other processes have added meanwhile, and report the new ones."""
-    read = {record.vehicle: set(record.drives) for record in new}
-
-    def kept(old: Record) -> Record | None:
-        is_right = old.vehicle not in read or (
-            _stays(old, versions[old.vehicle]) and read[old.vehicle].isdisjoint(old.drives)
+def _report(record: Record, report: SummariseReport) -> None:
+    if record.problem:
+        report.left_out[record.vehicle] = record.problem
+    else:
+        report.vehicles += 1
+        report.drives += len(record.drives)
+    twins = [n for n, d in zip(record.drives, record.digests, strict=False) if record.digests.count(d) > 1]
+    if twins:
+        report.notices.append(
+            f"vehicle {record.vehicle}: drives {', '.join(twins)} hold the same recording, which counts once"
         )
-        return old if is_right else None
-
-    store.change(bucket, kept, new)
-    for record in new:
-        if record.problem:
-            report.left_out[record.vehicle] = record.problem
-        else:
-            report.vehicles += 1
-            report.drives += len(record.drives)
-        twins = [n for n, d in zip(record.drives, record.digests, strict=False) if record.digests.count(d) > 1]
-        if twins:
-            report.notices.append(
-                f"vehicle {record.vehicle}: drives {', '.join(twins)} hold the same recording, which counts once"
-            )
 
 
 # ---- vehicles whose drives are still to be loaded
@@ -380,21 +352,22 @@ def _read_onboard(
         raise DriveError(f"{path}: a record of vehicle {record.vehicle}; move it into the folder of its vehicle")
     if store.bank.poles:
         raise DriveError(f"{path}: made on board of plain inputs; a store with a filter bank needs the log")
-    if lacking := [x for x in (*store.branches, *store.fleet_inputs) if x not in {*record.branches, *record.inputs}]:
+    branches, inputs = store.equipment.branches, store.equipment.fleet_inputs
+    if lacking := [x for x in (*branches, *inputs) if x not in {*record.branches, *record.inputs}]:
         raise DriveError(f"{path}: no {', '.join(lacking)} in it; summarise it with branches that it has")
     try:
         summary = _onboard_summary(record, store.bank.identity)
     except (ValueError, IndexError) as error:
         raise DriveError(f"{path}: damaged: {error}; copy it again from the vehicle") from None
-    place = [record.branches.index(branch) for branch in store.branches]
+    place = [record.branches.index(branch) for branch in branches]
     of_branches = (record.delay_s, record.delay_sd_s, record.zero_offset_a, record.zero_sd_a)
     delay_s, sd_s, zero_a, zero_sd_a = (np.array(values, np.float64)[place] for values in of_branches)  # None is NaN
     sd_s[np.isnan(sd_s)] = np.inf
     return VehicleSummary(
         vehicle=vehicle,
         drives=(name,),
-        summary=summary.take_branches(place, [record.inputs.index(each) for each in store.fleet_inputs]),
-        delays=BranchDelays(branches=store.branches, delay_s=delay_s, sd_s=sd_s, known=np.isfinite(sd_s)),
+        summary=summary.take_branches(place, [record.inputs.index(each) for each in inputs]),
+        delays=BranchDelays(branches=branches, delay_s=delay_s, sd_s=sd_s, known=np.isfinite(sd_s)),
         zero_current=ZeroCurrent(offset_a=zero_a, sd_a=zero_sd_a),
     )
 

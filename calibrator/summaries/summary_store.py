@@ -3,13 +3,12 @@
 Vehicles are spread over a fixed number of buckets by a hash of their names, so that any number of vehicles makes a
 moderate number of files, a vehicle is found without an index, and each bucket is a random sample of the fleet. Each
 addition to a bucket BBBBB is a new file with the next number NNNNN, so its cost depends on its own size, not on that of
-the store. A file ``BBBBB-NNNNN.whole.parquet`` replaces all earlier files of its bucket; these are removed once it is
-written, and are ignored if a run was killed before it removed them.
+the store. Nothing is changed in place: a record replaces the earlier ones of its vehicle with which it shares a drive.
 """
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,9 +33,7 @@ __all__ = [
     "require_store_or_nothing",
 ]
 
-_FILE = re.compile(r"(?P<bucket>[0-9]{5})-(?P<number>[0-9]{5})(?P<whole>\.whole)?\.parquet")
-Records = Mapping[str, Sequence[Record]]
-"""Records by vehicle."""
+_FILE = re.compile(r"[0-9]{5}-[0-9]{5}\.parquet")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,25 +77,20 @@ class SummaryStore:
         Raises
         ------
         FleetError
-            If there is a Parquet file whose name is not that of a file of this store; it would never be read.
+            If there is a file that is not one of this store, by its name; it would never be read.
         """
-        found, count = set[int](), self.identity.buckets
-        for name in self._files.names():
-            if name.endswith(".parquet"):
-                parts = _FILE.fullmatch(name)
-                if parts is None or int(parts["bucket"]) >= count:
-                    raise FleetError(
-                        f"{self._files.url}/{name}: no file of this store, whose buckets are 00000 to {count - 1:05d} "
-                        f"and files BUCKET-NUMBER.parquet; remove it"
-                    )
-                found.add(int(parts["bucket"]))
-        return sorted(found)
+        names, count = self._files.names(), self.identity.buckets
+        for name in names:
+            if not _FILE.fullmatch(name) or int(name[:5]) >= count:
+                raise FleetError(
+                    f"{self._files.url}/{name}: no file of this store, whose buckets are 00000 to {count - 1:05d} "
+                    f"and files BUCKET-NUMBER.parquet; remove it"
+                )
+        return sorted({int(name[:5]) for name in names})
 
-    def files(self, bucket: int) -> tuple[list[str], list[str]]:
-        """Return the files of a bucket that count, and those that have been replaced, each in the order of addition."""
-        names = [name for name in self._files.names(f"{bucket:05d}-") if _FILE.fullmatch(name)]
-        first = max((k for k, name in enumerate(names) if ".whole." in name), default=0)
-        return names[first:], names[:first]
+    def files(self, bucket: int) -> list[str]:
+        """Return the names of the files of a bucket, in the order of addition."""
+        return [name for name in self._files.names(f"{bucket:05d}-") if _FILE.fullmatch(name)]
 
     def versions(self) -> dict[str, str]:
         """Return the version of each file of all buckets by name; it changes when the file does."""
@@ -123,54 +115,41 @@ class SummaryStore:
         UserError
             If the bucket cannot be read, is damaged, or holds vehicles that belong in another one.
         """
-        names, found = self.files(bucket)[0], dict[str, list[Record]]()
-        where = f"{self._files.url}/{names[0] if len(names) == 1 else f'{bucket:05d}-*.parquet'}" if names else ""
-        contents = [self._files.read(name) for name in names]
-        for record in decode_records(contents, self.identity, where, whole=whole):
-            found.setdefault(record.vehicle, []).append(record)
-        for name in found:
-            if (right := self.bucket_of(name)) != bucket:
-                raise FleetError(
-                    f"{where}: vehicle {name} belongs into bucket {right:05d}; this file was renamed or copied: remove "
-                    f"it and summarise again"
-                )
+        found: dict[str, list[Record]] = {}
+        for name in self.files(bucket):
+            where = f"{self._files.url}/{name}"
+            for record in decode_records([self._files.read(name)], self.identity, where, whole=whole):
+                if (right := self.bucket_of(record.vehicle)) != bucket:
+                    raise FleetError(
+                        f"{where}: vehicle {record.vehicle} belongs into bucket {right:05d}; this file was renamed or "
+                        f"copied: remove it and summarise again"
+                    )
+                older = found.get(record.vehicle, [])
+                kept = [each for each in older if set(each.drives).isdisjoint(record.drives)]
+                found[record.vehicle] = [*kept, record]
         return dict(sorted(found.items()))
 
     def outlines(self, bucket: int) -> list[Outline]:
         """Return the outline of each vehicle of a bucket without reading summaries; errors as for :meth:`read`."""
         return [Outline.of(records) for records in self.read(bucket, whole=False).values()]
 
-    def append(self, bucket: int, records: Records, *, whole: bool = False) -> None:
-        """Write records as a new file of a bucket; with `whole` it replaces the bucket. UserError if that fails."""
-        old = [name for names in self.files(bucket)[::-1] for name in names]
-        number = int(old[-1][6:11]) + 1 if old else 0
-        content = encode_records([record for name in sorted(records) for record in records[name]], self.identity)
-        self._files.write(f"{bucket:05d}-{number:05d}{'.whole' * whole}.parquet", content)
-        for name in old if whole else ():
-            self._files.remove(name)
-
-    def change(
-        self, bucket: int, change: Callable[[Record], Record | None], new: Sequence[Record] = (), *, whole: bool = False
-    ) -> None:
-        """Replace each record of a bucket by what a function returns for it (None: remove it), and add new records.
-
-        The function must not look at summaries: it is called without them first. The bucket is rewritten only if the
-        function changes a record, or if `whole` is true. The bucket is locked against other processes of this machine;
-        storage that is not a folder has no locks.
-        """
-        added = {record.vehicle: [record] for record in new}
+    def append(self, bucket: int, records: Iterable[Record]) -> None:
+        """Write records as a new file of a bucket; UserError if that fails."""
         with self.storage.locked():
-            old = [record for records in self.read(bucket, whole=False).values() for record in records]
-            if not whole and all(change(record) is record for record in old):
-                if added:
-                    self.append(bucket, added)
-                return
-            records = {
-                name: [left for record in items if (left := change(record)) is not None]
-                for name, items in self.read(bucket).items()
-            }
-            records |= {name: [*records.get(name, ()), *items] for name, items in added.items()}
-            self.append(bucket, records, whole=True)
+            self._append(bucket, records)
+
+    def _append(self, bucket: int, records: Iterable[Record]) -> None:
+        files = self.files(bucket)
+        number = int(files[-1][6:11]) + 1 if files else 0
+        self._files.write(f"{bucket:05d}-{number:05d}.parquet", encode_records(list(records), self.identity))
+
+    def compact(self, bucket: int) -> None:
+        """Merge the files of a bucket into one; a run that is killed meanwhile leaves both, which count once."""
+        with self.storage.locked():
+            old = self.files(bucket)
+            self._append(bucket, [record for records in self.read(bucket).values() for record in records])
+            for name in old:
+                self._files.remove(name)
 
 
 def require_store_or_nothing(storage: Storage) -> None:
@@ -223,21 +202,26 @@ def open_store(
     FleetError
         If there is a store with another layout, DBC, branches, inputs or filter bank, or the bank has other inputs.
     """
-    identity = read_identity(storage, database)
-    if bank is None and identity is not None and identity.fleet_inputs == equipment.fleet_inputs:
-        bank = identity.bank
     if bank is not None and bank.input_names != equipment.fleet_inputs:
         raise FleetError(
             f"the filter bank is for the inputs {', '.join(bank.input_names)}, this fleet has "
             f"{', '.join(equipment.fleet_inputs)}; choose a bank for it with 'calibrator identify'"
         )
-    wanted = store_identity(equipment, database, bank=bank, vehicles=len(fleet.vehicles), fleet=fleet.name)
+    identity = read_identity(storage, database)
     if identity is None:
-        write_identity(storage, wanted)
-        identity = read_identity(storage, database)  # another process may have just made the store
-        assert identity is not None
-    if difference := identity.difference(wanted):
-        raise FleetError(f"{storage.url}: these drives cannot be added to this store: {difference}; use another store")
+        identity = store_identity(equipment, database, bank=bank, vehicles=len(fleet.vehicles), fleet=fleet.name)
+        write_identity(storage, identity)
+    known, bank = identity.equipment, bank or identity.bank
+    for what, its, wanted in (
+        ("branches", known.branches, equipment.branches),
+        ("inputs", known.fleet_inputs, equipment.fleet_inputs),
+        ("filter bank", [identity.bank.identity], [bank.identity]),
+    ):
+        if its != wanted:
+            raise FleetError(
+                f"{storage.url}: these drives cannot be added to this store: {what} {', '.join(its)} against "
+                f"{', '.join(wanted)}; use another store"
+            )
     return SummaryStore(storage=storage, identity=identity)
 
 
@@ -304,14 +288,12 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
     report = StoreReport(
         store=place,
         layout=about.layout,
-        branches=about.branches,
-        inputs=about.fleet_inputs,
+        branches=about.equipment.branches,
+        inputs=about.equipment.fleet_inputs,
         size_bytes=store.size_bytes(),
     )
     for bucket in shown(buckets, "look at vehicles", len(buckets), "buckets"):
-        current, old = store.files(bucket)
-        report.files += len(current) + len(old)
-        report.faults |= dict.fromkeys(old, "does not count any more, as a run was killed: 'calibrator store compact'")
+        report.files += len(store.files(bucket))
         try:
             found = store.read(bucket, whole=whole)
         except UserError as error:
@@ -323,20 +305,18 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
             report.unusable += bool(outline.problem)
             report.drives += len(outline.drives)
             report.hours += sum(record.duration_s for record in records) / 3600.0
-            for record in records if whole else ():
-                for digest in record.digests if not record.problem else ():
-                    if (other := owners.setdefault(digest, name)) != name:
-                        problem = f"has a recording that {other} has as well; remove it where it is wrong"
-                        report.faults[name] = problem
+            for digest in {digest for record in records if not record.problem for digest in record.digests}:
+                if whole and (other := owners.setdefault(digest, name)) != name:
+                    report.faults[name] = f"has a recording that {other} has as well; remove it where it is wrong"
     return report
 
 
 def compact_store(place: str) -> int:
     """Merge the files of each bucket into one; return how many buckets that changed. FleetError if it is no store."""
     store = existing_store(place)
-    many = [bucket for bucket in store.buckets() if sum(map(len, store.files(bucket))) > 1]
+    many = [bucket for bucket in store.buckets() if len(store.files(bucket)) > 1]
     for bucket in shown(many, "put files together", len(many), "buckets"):
-        store.change(bucket, lambda record: record, whole=True)
+        store.compact(bucket)
     return len(many)
 
 

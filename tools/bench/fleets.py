@@ -85,13 +85,13 @@ def _write_bucket(
     bucket: tuple[int, Sequence[str]], *, store: SummaryStore, summaries: Sequence[VehicleSummary], full_scale_a: float
 ) -> None:
     """Write the vehicles of a bucket: they take the summaries in turn, each with faults of its own."""
-    (number, names), K = bucket, len(store.identity.branches)
+    (number, names), K = bucket, len(store.identity.equipment.branches)
     settings, rng = FaultSettings(sparsity=80.0, balanced=True), np.random.default_rng(number)
     faults = settings.draw(rng, vehicles=len(names), branches=K, full_scale_a=full_scale_a)
-    records = {}
+    records = []
     for j, name in enumerate(names):
         found = _with_faults(replace(summaries[int(name[1:]) % len(summaries)], vehicle=name), faults.take(j))
-        records[name] = [Record(vehicle=name, drives=found.drives, sources=("",), found=found)]
+        records.append(Record(vehicle=name, drives=found.drives, sources=("",), found=found))
     store.append(number, records)
 
 

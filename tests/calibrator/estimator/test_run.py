@@ -102,7 +102,7 @@ def left_out(chunk: bytes) -> dict[str, str]:
 def rewritten(store: SummaryStore, folder: Path, bucket: int, records: Mapping[str, Sequence[Record]]) -> SummaryStore:
     """A store with one bucket of other content."""
     other = SummaryStore(storage=open_storage(folder), identity=store.identity)
-    other.append(bucket, records, whole=True)
+    other.append(bucket, [record for items in records.values() for record in items])
     return other
 
 
@@ -267,8 +267,7 @@ def test_option_since_recalibrates_changed_vehicles_and_detects_moved_sensors(
     (new,) = summaries_of(faults, Conditions(model_error_a=0.5), seed=5)
     shutil.copytree(store.url, tmp_path / "store")
     grown = SummaryStore(storage=open_storage(tmp_path / "store"), identity=store.identity)
-    records = grown.read(bucket := grown.bucket_of("V009"))
-    grown.append(bucket, {**records, "V009": [*records["V009"], record_of("V009", new, ("d2",))]}, whole=True)
+    grown.append(grown.bucket_of("V009"), [record_of("V009", new, ("d2",))])
     said = succeeded(*words(grown.url, tmp_path / "out", "--since", result))
     old, now = contents(result / "params"), contents(tmp_path / "out" / "params")
     assert [name for name in old if old[name] != now[name]] == ["V009.json"]

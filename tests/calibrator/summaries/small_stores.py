@@ -72,6 +72,6 @@ def small_store(
     names = [f"V{first + j:03d}" for j in range(len(faults))]
     summaries = dict(zip(names, summaries_of(faults, CONDITIONS, seed=seed), strict=True))
     for bucket, inside in store.by_bucket(names).items():
-        store.append(bucket, {name: [record_of(name, summaries[name])] for name in inside})
+        store.append(bucket, [record_of(name, summaries[name]) for name in inside])
     assert store.identity.block_s == BLOCK_S
     return store

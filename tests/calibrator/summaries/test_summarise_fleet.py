@@ -87,7 +87,7 @@ def test_drive_is_read_once_and_again_only_if_it_was_changed(tmp_path: Path, dat
     assert (more.vehicles, more.drives) == (1, 1)
     assert drives_in(store) == {"V1": [("a",)], "V2": [("a",), ("b",)]}
     bucket = store.bucket_of("V2")
-    assert store.files(bucket) == ([f"{bucket:05d}-00000.parquet", f"{bucket:05d}-00001.parquet"], [])
+    assert store.files(bucket) == [f"{bucket:05d}-00000.parquet", f"{bucket:05d}-00001.parquet"]
     before = total(store, "V1").total
     write(drives, "V1", "a", database, change=turned_up)
     shutil.rmtree(drives / "drives" / "V2")
