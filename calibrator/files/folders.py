@@ -1,21 +1,19 @@
 """Write files and folders so that they appear only when they are complete, and leave nothing behind on failure."""
 
-import errno
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 
 from calibrator.errors import FleetError
 from calibrator.files.storage import DISK_FULL
+from ecu_node.documents import write_atomically
 from ecu_node.errors import UserError
 
 __all__ = ["require_new_folder", "require_possible_file", "require_possible_folder", "whole_folder", "write_files"]
-
-_MODE = 0o644
 
 
 def require_possible_folder(out: Path) -> None:
@@ -118,43 +116,16 @@ def whole_folder(out: Path) -> Iterator[Path]:
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
-    """Write files that belong together: first hidden beside their places, then, when all are written, rename them.
-
-    Parameters
-    ----------
-    files : mapping of Path to bytes
-        Contents; folders are made if needed, files that exist are replaced.
+    """Write files, each whole or not at all; folders are made if needed, files that exist are replaced.
 
     Raises
     ------
     UserError
-        If one cannot be written; the message names it, and no file has changed, except those that were renamed before
-        a renaming failed.
+        If one cannot be written; the message names it.
     """
-    partial: dict[Path, Path] = {}
-    made: set[Path] = set()
-    path = None
-    try:
-        for path, content in files.items():
-            if path.is_dir():
-                raise IsADirectoryError(errno.EISDIR, "it is a folder")
-            made.update(folder for folder in path.parents if not folder.exists())
+    for path, content in files.items():
+        try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-            partial[path] = Path(name)
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fchmod(handle, _MODE)
-                os.fsync(handle)
-        for path, written in partial.items():
-            written.replace(path)
-    except BaseException as error:
-        for left in partial.values():
-            left.unlink(missing_ok=True)
-        for folder in sorted(made, reverse=True):  # inner ones first
-            with suppress(OSError):
-                folder.rmdir()
-        if isinstance(error, OSError):
+            write_atomically(path, content)
+        except OSError as error:
             raise UserError(f"{path}: cannot be written: {error.strerror}") from None
-        raise

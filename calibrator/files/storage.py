@@ -70,11 +70,6 @@ class Storage:
         """Whether it is a folder of this machine."""
         return not is_url(self.url)
 
-    @property
-    def lasts(self) -> bool:
-        """Whether written files stay when this process ends; those of ``memory://`` do not."""
-        return not self.url.startswith("memory://")
-
     def folder(self, name: str) -> "Storage":
         """Return a folder in this one; it is created when a file is first written into it."""
         return Storage(url=f"{self.url.rstrip('/')}/{name}")
@@ -84,50 +79,52 @@ class Storage:
 
         Hidden ones are left out, and so are names that do not begin with `prefix`.
         """
-        if self.is_local:
-            return self._list_local(prefix)
-        filesystem, root = self._filesystem()
+        folders, files = list[str](), list[Entry]()
         try:
-            if prefix and self.url.startswith(("s3", "gs", "gcs")):  # these list by prefix in one request
-                found = list(filesystem.find(root, prefix=prefix, maxdepth=1, detail=True).values())
-            else:
-                found = filesystem.ls(root, detail=True)
+            for found in self._here(prefix) if self.is_local else self._there(prefix):
+                if isinstance(found, Entry):
+                    files.append(found)
+                else:
+                    folders.append(found)
         except (FileNotFoundError, NotADirectoryError):
             return [], []
+        except StorageError:
+            raise
         except Exception as error:  # noqa: BLE001 (each kind of storage has its own)
             raise self._failed("", "read", error) from None
-        folders, files = list[str](), list[Entry]()
-        for about in found:
-            name = str(about["name"]).rstrip("/").rpartition("/")[2]
-            if name.startswith(".") or not name.startswith(prefix) or str(about["name"]).rstrip("/") == root:
+        return sorted(folders), sorted(files, key=lambda entry: entry.name)
+
+    def _here(self, prefix: str) -> Iterator[Entry | str]:
+        """Yield the files of a folder of this machine, and the names of its folders."""
+        with os.scandir(self.url) as items:
+            for item in items:
+                if item.name.startswith(".") or not item.name.startswith(prefix):
+                    continue
+                if item.is_dir():
+                    yield item.name
+                elif item.is_file():
+                    with suppress(FileNotFoundError):  # another process may have just removed it
+                        status = item.stat()
+                        yield Entry(item.name, status.st_size, f"{status.st_size}-{status.st_mtime_ns}")
+
+    def _there(self, prefix: str) -> Iterator[Entry | str]:
+        """Yield the files of a folder in object storage, and the names of its folders."""
+        filesystem, root = self._filesystem()
+        if prefix and self.url.startswith(("s3", "gs", "gcs")):  # these list by prefix in one request
+            listed = filesystem.find(root, prefix=prefix, maxdepth=1, detail=True).values()
+        else:
+            listed = filesystem.ls(root, detail=True)
+        for about in listed:
+            path = str(about["name"]).rstrip("/")
+            name = path.rpartition("/")[2]
+            if name.startswith(".") or not name.startswith(prefix) or path == root:
                 continue
             if about["type"] == "directory":
-                folders.append(name)
+                yield name
             else:
                 marks = [about[key] for key in ("mtime", "ETag", "etag", "LastModified", "created") if key in about]
                 version = "-".join(map(str, [about["size"], *marks[:1]]))
-                files.append(Entry(name, int(about["size"] or 0), version))
-        return sorted(folders), sorted(files, key=lambda entry: entry.name)
-
-    def _list_local(self, prefix: str) -> tuple[list[str], list[Entry]]:
-        folders, files = list[str](), list[Entry]()
-        try:
-            with os.scandir(self.url) as items:
-                for item in items:
-                    if item.name.startswith(".") or not item.name.startswith(prefix):
-                        continue
-                    if item.is_dir():
-                        folders.append(item.name)
-                    elif item.is_file():
-                        with suppress(FileNotFoundError):  # another process may have just removed it
-                            status = item.stat()
-                            version = f"{status.st_size}-{status.st_mtime_ns}"
-                            files.append(Entry(item.name, status.st_size, version))
-        except (FileNotFoundError, NotADirectoryError):
-            return [], []
-        except OSError as error:
-            raise self._failed("", "read", error) from None
-        return sorted(folders), sorted(files, key=lambda entry: entry.name)
+                yield Entry(name, int(about["size"] or 0), version)
 
     def names(self, prefix: str = "") -> list[str]:
         """Return the names of files and folders that begin with `prefix`, sorted."""

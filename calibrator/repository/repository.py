@@ -128,8 +128,10 @@ class Repository:
         _delegate(targets, roles["targets"])
         write_files(
             {
-                folder / "staged" / "root.json": _encoded(Metadata(root)),
                 folder / "staged" / "targets.json": _encoded(Metadata(targets)),
+                folder / "staged" / "root.json": _encoded(
+                    Metadata(root)
+                ),  # the last one, as it makes a repository of it
             }
         )
         return cls(folder)

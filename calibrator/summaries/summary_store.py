@@ -158,14 +158,10 @@ def require_store_or_nothing(storage: Storage) -> None:
     Raises
     ------
     FleetError
-        If it is a folder with other content, a file, or storage that ends with this process (``memory://``).
+        If it is a folder with other content, or a file.
     """
     if storage.is_local and Path(storage.url).is_file():
         raise FleetError(f"{storage.url}: is a file; name a folder for the summaries, or a URL")
-    if not storage.lasts:
-        raise FleetError(
-            f"{storage.url}: is gone when the command ends; name a folder for the summaries, or another URL"
-        )
     there = storage.names()  # listed before the identity is read, as another machine may be making the store
     if there and read_identity(storage) is None:
         raise FleetError(

@@ -101,19 +101,18 @@ def test_mount_point_is_refused_as_a_new_folder(tmp_path: Path, monkeypatch: pyt
         require_new_folder(tmp_path)
 
 
-def test_several_files_are_written_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "old").write_bytes(b"old")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(UserError, match=f"^{tmp_path}/folder: cannot be written: it is a folder$"):
-        write_files({tmp_path / "old": b"new", tmp_path / "folder": b""})
+    with pytest.raises(UserError, match=f"^{tmp_path}/folder: cannot be written: Is a directory$"):
+        write_files({tmp_path / "folder": b""})
 
     def full(handle: int) -> None:
-        if (tmp_path / "made" / "inner").exists():
-            raise OSError(errno.ENOSPC, "No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("calibrator.files.folders.os.fsync", full)
-    with pytest.raises(UserError, match=f"^{tmp_path}/made/inner/b: cannot be written: No space left on device$"):
-        write_files({tmp_path / "old": b"new", tmp_path / "made/a": b"", tmp_path / "made/inner/b": b""})
+    monkeypatch.setattr("ecu_node.documents.os.fsync", full)
+    with pytest.raises(UserError, match=f"^{tmp_path}/old: cannot be written: No space left on device$"):
+        write_files({tmp_path / "old": b"new"})
     assert sorted(tmp_path.iterdir()) == [tmp_path / "folder", tmp_path / "old"]
     assert (tmp_path / "old").read_bytes() == b"old"
 
