@@ -126,14 +126,8 @@ class Repository:
             _set_keys(root, role, new)
         targets = Targets(version=1, expires=_expiry("targets"))
         _delegate(targets, roles["targets"])
-        write_files(
-            {
-                folder / "staged" / "targets.json": _encoded(Metadata(targets)),
-                folder / "staged" / "root.json": _encoded(
-                    Metadata(root)
-                ),  # the last one, as it makes a repository of it
-            }
-        )
+        files = {"targets": _encoded(Metadata(targets)), "root": _encoded(Metadata(root))}  # the root makes it complete
+        write_files({folder / "staged" / f"{role}.json": content for role, content in files.items()})
         return cls(folder)
 
     def _read(self, path: Path) -> Metadata[Any]:

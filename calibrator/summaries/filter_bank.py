@@ -82,32 +82,15 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return np.array([complex(*pole) for pole in self.poles], np.complex128)
 
     @property
-    def states(self) -> int:
-        """Number of filter states n, over all inputs."""
-        return len(self.input_names) * sum(1 if imag == 0.0 else 2 for _, imag in self.poles)
-
-    @property
     def width(self) -> int:
-        """Number of columns: inputs and states."""
-        return len(self.input_names) + self.states
+        """Number of columns: the inputs, and one state of each for a real pole, two for a complex one."""
+        return len(self.input_names) * (1 + sum(1 if imag == 0.0 else 2 for _, imag in self.poles))
 
     @property
     def settling(self) -> int:
         """Number of samples after a start that are not used, because the filters have not settled yet."""
         slowest = max((float(np.hypot(*pole)) for pole in self.poles), default=0.0)
         return int(np.ceil(np.log(UNSETTLED) / np.log(slowest))) if slowest > 0.0 else 0
-
-    def system(self) -> tuple[Array, Array]:
-        """Return A (n, n) and B (n, M); states have the order of the columns of :meth:`run` after the inputs."""
-        M = len(self.input_names)
-        real, pairs = _by_kind(self.complex_poles)
-        own = np.concatenate([real, pairs.real, pairs.real])
-        A = np.diag(np.repeat(own, M))
-        first, second = len(real) * M, (len(real) + len(pairs)) * M
-        swing = np.diag(np.repeat(pairs.imag, M))
-        A[first:second, second:], A[second:, first:second] = -swing, swing
-        gains = np.concatenate([1.0 - real, 1.0 - pairs.real, -pairs.imag])
-        return A, np.kron(gains[:, None], np.eye(M))
 
     def run(self, inputs: Array, valid: Mask, *, settling: int = 0) -> tuple[Array, Mask]:
         """Filter the inputs of a drive.

@@ -15,7 +15,7 @@ from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError
 from ecu_node.summary import BLOCK_S, LEVELS_A
 
-__all__ = ["BLOCK_S", "LEVEL_EDGES_A", "DriveSummary", "FitSums", "common_bank"]
+__all__ = ["BLOCK_S", "LEVEL_EDGES_A", "DriveSummary", "FitSums", "add_up", "common_bank"]
 
 LEVEL_EDGES_A: Array = np.array([*(-a for a in reversed(LEVELS_A)), *LEVELS_A], np.float64)
 """The 32 edges between the L = 33 levels of a measured current: symmetric, denser near zero, whole amperes. [A]"""
@@ -109,36 +109,6 @@ class DriveSummary:
         """Variance of the measured currents, which does not depend on their offsets, shape (K,). [A^2]"""
         return np.asarray(np.diag(self.mean_product_a2) - self.mean_a**2)
 
-    def __add__(self, other: "DriveSummary") -> "DriveSummary":
-        """Return the summary of the drives of both; the blocks of `other` follow those of this one.
-
-        Raises
-        ------
-        DriveError
-            If they were made with different banks, or with different branches or columns.
-        """
-        common_bank([self, other])
-        shapes = [(part.branches, part.moments.shape[1:]) for part in (self, other)]
-        if shapes[0] != shapes[1]:
-            raise DriveError(
-                f"summaries of {self.branches} and {other.branches} branches with moments of shape "
-                f"{self.moments.shape[1:]} and {other.moments.shape[1:]} do not add up; summarise the drives alike"
-            )
-        fits = None if self.fit is None or other.fit is None else (self.fit, other.fit)
-        return replace(
-            self,
-            moments=np.concatenate([self.moments, other.moments]),
-            noise_a2=np.concatenate([self.noise_a2, other.noise_a2]),
-            fit=fits
-            and FitSums(
-                levels=fits[0].levels + fits[1].levels,
-                **{
-                    name: np.concatenate([getattr(fit, name) for fit in fits])
-                    for name in ("fast_a2", "spikes", "temperature_c", "starts")
-                },
-            ),
-        )
-
     def take_branches(self, order: Sequence[int], inputs: Sequence[int] | None = None) -> "DriveSummary":
         """Return the summary with only the branches of the indices `order`, and the inputs of the indices `inputs`.
 
@@ -186,6 +156,29 @@ class DriveSummary:
                 starts=np.logical_or.reduceat(fit.starts, first),
             ),
         )
+
+
+def add_up(summaries: Sequence[DriveSummary]) -> DriveSummary:
+    """Return the summary of the drives of one or more summaries with the same branches, block after block.
+
+    Raises
+    ------
+    DriveError
+        If they were made with different banks.
+    """
+    common_bank(summaries)
+    fits = [summary.fit for summary in summaries if summary.fit is not None]
+    blocks = ("fast_a2", "spikes", "temperature_c", "starts")
+    fit = None
+    if len(fits) == len(summaries):
+        joined = {name: np.concatenate([getattr(each, name) for each in fits]) for name in blocks}
+        fit = FitSums(levels=np.sum([each.levels for each in fits], axis=0), **joined)
+    return replace(
+        summaries[0],
+        moments=np.concatenate([summary.moments for summary in summaries]),
+        noise_a2=np.concatenate([summary.noise_a2 for summary in summaries]),
+        fit=fit,
+    )
 
 
 def common_bank(summaries: Sequence[DriveSummary]) -> str:

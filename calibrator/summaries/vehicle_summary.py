@@ -2,9 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import pairwise
-from operator import add
 
 import numpy as np
 
@@ -13,7 +11,7 @@ from calibrator.drives.align import align, at_pace, step_seen
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank
-from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.moments import DriveSummary, add_up
 from calibrator.summaries.summariser import summarise_samples
 from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase
@@ -96,7 +94,7 @@ def added_summaries(parts: Sequence[VehicleSummary]) -> VehicleSummary:
     return VehicleSummary(
         vehicle=parts[0].vehicle,
         drives=tuple(name for part in parts for name in part.drives),
-        summary=reduce(add, [part.summary for part in parts]),
+        summary=add_up([part.summary for part in parts]),
         delays=max(delays, key=lambda part: (int(part.known.sum()), -float(part.sd_s[part.known].sum()))),
         zero_current=ZeroCurrent(offset_a=offset_a, sd_a=sd_a),
     )

@@ -6,7 +6,6 @@ from scipy.signal import lfilter
 
 from calibrator.drive import Array
 from calibrator.errors import DriveError
-from calibrator.published.state_space import StateSpaceModel
 from calibrator.summaries import filter_bank
 
 PERIOD_S = 0.1
@@ -33,18 +32,6 @@ def test_columns_are_the_inputs_and_each_input_filtered_by_each_pole() -> None:
     assert columns.shape[1] == bank_of().width
     np.testing.assert_allclose(columns[used], expected[used], atol=1e-12)
     np.testing.assert_array_equal(columns[~used], 0.0)
-
-
-def test_columns_equal_the_states_of_the_state_space_model() -> None:
-    u, bank = inputs_of(1), bank_of()
-    A, B = bank.system()
-    n = bank.states
-    nothing = np.zeros(n)
-    model = StateSpaceModel(
-        A=A, B=B, C=np.eye(n), D=np.zeros((n, len(NAMES))), x0=nothing, offset_a=nothing, snr_db=nothing
-    )
-    columns, used = bank.run(u, np.ones(SAMPLES, bool))
-    np.testing.assert_allclose(columns[used][:, len(NAMES) :], model.simulate(u)[used], atol=1e-11)
 
 
 def test_bank_without_poles_returns_the_inputs_unchanged() -> None:

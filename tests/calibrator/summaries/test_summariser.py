@@ -9,7 +9,7 @@ import pytest
 from calibrator.drive import Array, Channel, Drive, Samples
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank, low_passes
-from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, FitSums
+from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, FitSums, add_up
 from calibrator.summaries.summariser import find_spikes, summarise_samples
 from calibrator.summaries.vehicle_summary import zero_current_offsets
 from ecu_node.database import read_database
@@ -50,7 +50,7 @@ def test_sum_of_summaries_equals_the_summary_of_all_drives() -> None:
         summarise_samples([drive], period_s=PERIOD_S, bank=a_bank(3.0, 8.0), temperatures_c=[warm])
         for drive, warm in zip((first, second), warm_c, strict=True)
     ]
-    both = alone[0] + alone[1]
+    both = add_up(alone)
     assert both.fit is not None
     assert together.fit is not None
     pairs = [(vars(one), vars(other)) for one, other in ((both, together), (both.fit, together.fit))]
@@ -76,13 +76,11 @@ def test_blocks_are_added_up_with_their_means_and_without_unknown_temperatures()
     )
 
 
-def test_summaries_of_different_banks_or_branches_do_not_add_up() -> None:
+def test_summaries_of_different_banks_do_not_add_up() -> None:
     drive = a_drive(2)
     plain, filtered = (summarise_samples([drive], period_s=PERIOD_S, bank=bank) for bank in (None, a_bank(3.0)))
     with pytest.raises(DriveError, match=r"made with 2 filter banks \(.*\); expected one"):
-        plain + filtered
-    with pytest.raises(DriveError, match=r"3 and 2 branches .* do not add up"):
-        plain + plain.take_branches([0, 1])
+        add_up([plain, filtered])
 
 
 def test_filter_bank_with_other_inputs_or_period_is_refused() -> None:
