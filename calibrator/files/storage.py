@@ -180,12 +180,6 @@ class Storage:
         except Exception as error:  # noqa: BLE001
             raise self._failed(name, "write", error) from None
 
-    def require_writable(self) -> None:
-        """Raise StorageError, before any work is done, if a trial file cannot be written; it is removed again."""
-        self.write(".trial", b"")
-        with suppress(StorageError):  # some users may write but not remove
-            self.remove(".trial")
-
     def remove(self, name: str) -> None:
         """Remove a file, if it is there."""
         filesystem, root = self._filesystem()

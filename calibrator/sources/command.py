@@ -8,7 +8,7 @@ import typer
 from calibrator.errors import LogError
 from calibrator.files.folders import require_possible_folder
 from calibrator.files.layout_files import vehicle_database
-from calibrator.files.storage import is_url, open_storage
+from calibrator.files.storage import is_url
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import (
     TIME_LIMIT_S,
@@ -39,9 +39,7 @@ def import_(
         from calibrator.processes.run_many import Workers
         from calibrator.sources.import_logs import import_logs
 
-    if is_url(out):
-        open_storage(out).require_writable()
-    else:
+    if not is_url(out):
         require_possible_folder(Path(out))
     where = Workers(processes=workers, scheduler=scheduler)
     report = import_logs(logs, vehicle_database(layout), out, workers=where, limit_s=time_limit)

@@ -9,7 +9,6 @@ from calibrator.drive import Equipment
 from calibrator.errors import DriveError, FleetError
 from calibrator.files.storage import Storage
 from calibrator.summaries.filter_bank import FilterBank, plain_bank
-from calibrator.summaries.moments import BLOCK_S
 from ecu_node.database import VehicleDatabase
 
 __all__ = [
@@ -44,8 +43,6 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         Branches and inputs of the fleet, and those of the layout that the store does not use.
     bank : FilterBank
         Filters of the fleet inputs.
-    block_s : float
-        Length of a block. [s]
     buckets : int
         Number of parts that the vehicles are spread over.
     fleet : str
@@ -58,7 +55,6 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     dbc_sha256: str
     equipment: Equipment
     bank: FilterBank
-    block_s: float
     buckets: Annotated[int, msgspec.Meta(ge=FEWEST_BUCKETS, le=MOST_BUCKETS)]
     fleet: str
 
@@ -104,7 +100,6 @@ def store_identity(
         dbc_sha256=database.digest,
         equipment=equipment,
         bank=bank or plain_bank(equipment.fleet_inputs, period_s=layout.period_s),
-        block_s=BLOCK_S,
         buckets=min(max(wanted, FEWEST_BUCKETS), MOST_BUCKETS),
         fleet=fleet,
     )
@@ -133,8 +128,7 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
     Raises
     ------
     FleetError
-        If the file is damaged or holds impossible values, or the store has another version, layout, DBC or length of
-        blocks.
+        If the file is damaged or holds impossible values, or the store has another version, layout or DBC.
     """
     content, where = storage.read_if_there(FILE), f"{storage.url}/{FILE}"
     if content is None:
@@ -154,7 +148,6 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
     for what, its, mine in (
         (f"another layout than {layout.path}", identity.layout_sha256, layout.digest),
         (f"another DBC than {layout.dbc_path}", identity.dbc_sha256, database.digest),
-        (f"blocks of {identity.block_s:g} s, not {BLOCK_S:g} s", identity.block_s, BLOCK_S),
     ):
         if its != mine:
             raise FleetError(f"{where}: made with {what}; summarise the drives again, into another store")

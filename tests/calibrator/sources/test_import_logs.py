@@ -4,13 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import fsspec
 import pytest
 
 from calibrator.processes.run_many import Workers
 from calibrator.sources.import_logs import ImportReport, import_logs
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.command_here import calibrator
 from tests.calibrator.conftest import LAYOUT
 
 
@@ -52,18 +50,6 @@ def test_leftover_file_of_a_killed_import_is_removed(
     os.utime(other, (2e9, 2e9))
     imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     assert {path.name for path in folder.iterdir()} == {"drive.parquet", other.name}
-
-
-def test_import_into_an_unwritable_bucket_fails_before_reading_logs(
-    two_vehicles: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def denied(*_: object, **__: object) -> None:
-        raise PermissionError("Access Denied")
-
-    monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "pipe_file", denied)
-    monkeypatch.setattr("calibrator.sources.import_logs.import_logs", denied)
-    done = calibrator("import", two_vehicles / "logs", "--layout", LAYOUT, "--out", "memory://bucket/store")
-    assert "memory://bucket/store/.trial: cannot write it: Access Denied; check the credentials" in done.stderr
 
 
 def write_endless_log(path: Path) -> None:

@@ -12,7 +12,7 @@ from calibrator.faults import Faults
 from calibrator.files.storage import Storage, open_storage
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity, store_identity, write_identity
-from calibrator.summaries.moments import BLOCK_S, DriveSummary
+from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record
 from calibrator.summaries.summary_store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
@@ -73,5 +73,4 @@ def small_store(
     summaries = dict(zip(names, summaries_of(faults, CONDITIONS, seed=seed), strict=True))
     for bucket, inside in store.by_bucket(names).items():
         store.append(bucket, [record_of(name, summaries[name]) for name in inside])
-    assert store.identity.block_s == BLOCK_S
     return store

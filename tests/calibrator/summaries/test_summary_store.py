@@ -201,7 +201,6 @@ def test_store_of_another_layout_version_or_content_is_refused(tmp_path: Path, d
         ((identity.layout_sha256, "0" * 64), "made with another layout than"),
         ((identity.dbc_sha256, "0" * 64), "made with another DBC than"),
         ((f'"schema_version": {SCHEMA_VERSION}', '"schema_version": 99'), "schema version 99, expected"),
-        (('"block_s": 30.0', '"block_s": 60.0'), "made with blocks of 60 s, not 30 s"),
         (("{", "[", 1), "not a store of summaries"),
         (('"branches"', '"branchs"'), "not a store of summaries"),
         (("{", 2000 * "[", 1), "not a store of summaries"),
