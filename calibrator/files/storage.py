@@ -5,7 +5,7 @@ import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -80,18 +80,12 @@ class Storage:
         Hidden ones are left out, and so are names that do not begin with `prefix`.
         """
         folders, files = list[str](), list[Entry]()
-        try:
+        with self._reporting("", "read"), suppress(FileNotFoundError, NotADirectoryError):
             for found in self._here(prefix) if self.is_local else self._there(prefix):
                 if isinstance(found, Entry):
                     files.append(found)
                 else:
                     folders.append(found)
-        except (FileNotFoundError, NotADirectoryError):
-            return [], []
-        except StorageError:
-            raise
-        except Exception as error:  # noqa: BLE001 (each kind of storage has its own)
-            raise self._failed("", "read", error) from None
         return sorted(folders), sorted(files, key=lambda entry: entry.name)
 
     def _here(self, prefix: str) -> Iterator[Entry | str]:
@@ -140,32 +134,25 @@ class Storage:
 
     def read_if_there(self, name: str) -> bytes | None:
         """Return the content of a file, None if there is none; StorageError if it cannot be read."""
-        filesystem, root = self._filesystem()
-        try:
+        with self._reporting(name, "read"), suppress(FileNotFoundError, NotADirectoryError):
+            filesystem, root = self._filesystem()
             content: bytes = filesystem.cat_file(f"{root}/{name}")
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        except Exception as error:  # noqa: BLE001
-            raise self._failed(name, "read", error) from None
-        return content
+            return content
+        return None
 
     @contextmanager
     def opened(self, name: str) -> Iterator[BinaryIO | None]:
         """Open a file to read parts of it; None if there is none, StorageError if it cannot be opened."""
-        filesystem, root = self._filesystem()
-        try:
+        file = None
+        with self._reporting(name, "read"), suppress(FileNotFoundError):
+            filesystem, root = self._filesystem()
             file = filesystem.open(f"{root}/{name}", "rb")
-        except FileNotFoundError:
-            yield None
-            return
-        except Exception as error:  # noqa: BLE001
-            raise self._failed(name, "read", error) from None
-        with file:
-            yield file
+        with file or nullcontext() as opened:
+            yield opened
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file, whole or not at all, in place of any older one; StorageError if it cannot be written."""
-        try:
+        with self._reporting(name, "write"):
             if self.is_local:
                 Path(self.url).mkdir(parents=True, exist_ok=True)
                 write_atomically(Path(self.url) / name, content)
@@ -177,18 +164,12 @@ class Storage:
                 filesystem.makedirs(root, exist_ok=True)
                 filesystem.pipe_file(f"{root}/.{name}", content)
                 filesystem.mv(f"{root}/.{name}", f"{root}/{name}")
-        except Exception as error:  # noqa: BLE001
-            raise self._failed(name, "write", error) from None
 
     def remove(self, name: str) -> None:
         """Remove a file, if it is there."""
-        filesystem, root = self._filesystem()
-        try:
+        with self._reporting(name, "remove"), suppress(FileNotFoundError):
+            filesystem, root = self._filesystem()
             filesystem.rm_file(f"{root}/{name}")
-        except FileNotFoundError:
-            pass
-        except Exception as error:  # noqa: BLE001
-            raise self._failed(name, "remove", error) from None
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -215,16 +196,25 @@ class Storage:
             raise StorageError(f"{self.url}: no way to reach this kind of storage: {first_line}") from None
         return filesystem, str(root).rstrip("/")
 
-    def _failed(self, name: str, what: str, error: Exception) -> StorageError:
-        reason = getattr(error, "strerror", None) or str(error).partition("\n")[0] or type(error).__name__
-        remedy = ""
-        if getattr(error, "errno", None) in DISK_FULL:
-            remedy = "; make room, and run the same command again to go on, or choose another place"
-        elif not self.is_local:
-            remedy = "; check the credentials, the address of the storage, the bucket, and what this user may do there"
-        elif what == "write":
-            remedy = "; choose another folder"
-        return StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}{remedy}")
+    @contextmanager
+    def _reporting(self, name: str, what: str) -> Iterator[None]:
+        """Turn what fails in the block into a StorageError: that a file of this name cannot be read, say, and why."""
+        try:
+            yield
+        except StorageError:
+            raise
+        except Exception as error:  # noqa: BLE001 (each kind of storage has its own)
+            reason = getattr(error, "strerror", None) or str(error).partition("\n")[0] or type(error).__name__
+            remedy = ""
+            if getattr(error, "errno", None) in DISK_FULL:
+                remedy = "; make room, and run the same command again to go on, or choose another place"
+            elif not self.is_local:
+                remedy = (
+                    "; check the credentials, the address of the storage, the bucket, and what this user may do there"
+                )
+            elif what == "write":
+                remedy = "; choose another folder"
+            raise StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}{remedy}") from None
 
 
 def is_url(place: str) -> bool:
@@ -279,12 +269,10 @@ def local_copy(url: str) -> Iterator[Path]:
         return
     folder, _, name = url.rpartition("/")
     storage = Storage(url=folder)
-    filesystem, root = storage._filesystem()
     with tempfile.TemporaryDirectory(prefix="copy-") as temporary:
         copy = Path(temporary) / name
-        try:
+        with storage._reporting(name, "read"):
+            filesystem, root = storage._filesystem()
             filesystem.get_file(f"{root}/{name}", str(copy))
-        except Exception as error:  # noqa: BLE001
-            raise storage._failed(name, "read", error) from None
         with naming(url, copy):
             yield copy
