@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -101,7 +102,7 @@ def left_out(chunk: bytes) -> dict[str, str]:
 
 def rewritten(store: SummaryStore, folder: Path, bucket: int, records: Mapping[str, Sequence[Record]]) -> SummaryStore:
     """A store with one bucket of other content."""
-    other = SummaryStore(storage=open_storage(folder), identity=store.identity)
+    other = SummaryStore(storage=open_storage(Path(mkdtemp(dir=folder))), identity=store.identity)
     other.append(bucket, [record for items in records.values() for record in items])
     return other
 
