@@ -169,7 +169,6 @@ def _require_summaries_enough(storage: Storage, settings: CalibrationSettings, l
     needs = {
         "--method published": settings.method is Method.PUBLISHED,
         "--branches": settings.branches is not None,
-        "--charge": settings.charge_ah,
         "--meter": settings.meter is not None,
         "--trusted with a branch": settings.trusted & set(layout.branch_names),
         "a junction without a fleet": settings.alone,
@@ -189,7 +188,7 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) 
         return calibrate_fleet_published
     of_branches = bool(settings.trusted) and not settings.trusted & fleet.vehicles.keys()
     of_branches = of_branches and settings.trusted <= set(layout.branch_names)
-    alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
+    alone = settings.alone or settings.meter is not None
     if not (alone or of_branches or len(fleet.vehicles) == 1):
         return None
     fleets = {"--hold-out": settings.hold_out, "--expected-faults": settings.expected_faults is not None}
