@@ -28,7 +28,6 @@ from calibrator.estimator.readings import (
     window_readings,
 )
 from calibrator.estimator.results import PARTS, encode_chunk, part_file, read_part
-from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.vehicle_parameters import RunIdentity, impossible, parameters_of
 from calibrator.estimator.vehicle_report import explained_faults
 from calibrator.summaries.record import Record, drives_digest, joined_records
@@ -59,8 +58,6 @@ class FleetTask:
         Reference of the fleet; its branches are those of the vehicles.
     identity : RunIdentity
         Identity of the run, for the parameter files.
-    harm_limit : float
-        A branch is corrected if the probability of harm is below this. [1]
     bench : mapping of (str, str) to BenchReading
         Bench readings that are used, by vehicle and branch.
     believed : frozenset of str
@@ -71,7 +68,6 @@ class FleetTask:
 
     reference: FleetReference
     identity: RunIdentity
-    harm_limit: float
     bench: BenchTable
     believed: frozenset[str]
     fleet_size: int
@@ -89,7 +85,7 @@ class FleetTask:
             self.reference,
             readings=merge_readings(vehicles, self.bench, self.branches)[0],
             trusted=np.array([vehicle.vehicle in self.believed for vehicle in vehicles]),
-            harm_limit=self.harm_limit,
+            harm_limit=self.identity.settings.harm_limit,
             limits=(layout.limits.drift, layout.offset_limit_a),
         )
 
@@ -130,7 +126,6 @@ class FleetTask:
 
 def learn_task(
     vehicles: Sequence[VehicleSummary],
-    settings: CalibrationSettings,
     bench: BenchTable,
     *,
     branches: tuple[str, ...],
@@ -144,14 +139,12 @@ def learn_task(
     vehicles : sequence of VehicleSummary
         Sample of the fleet, with every trusted vehicle and every one that has a bench reading. Those held out are not
         learnt from.
-    settings : CalibrationSettings
-        The user's choices.
     bench : mapping of (str, str) to BenchReading
         Bench readings by vehicle and branch; those that the drives contradict are not used.
     branches : tuple of str
         Names of the K branches.
     identity : RunIdentity
-        Identity of the run.
+        Identity of the run, with the user's choices.
     fleet_size : int
         Number of vehicles of the fleet that can be used.
 
@@ -161,14 +154,9 @@ def learn_task(
         For every vehicle of the fleet.
     notices : list of str
         What the user should know.
-
-    Raises
-    ------
-    FleetError
-        If too few vehicles can be learnt from.
     """
-    layout = identity.database.layout
-    learning = np.array(require_learning([vehicle.vehicle for vehicle in vehicles], settings, {}))
+    layout, settings = identity.database.layout, identity.settings
+    learning = np.array([vehicle.vehicle not in settings.hold_out for vehicle in vehicles])
     learners = list(compress(vehicles, learning))
     trusted = np.array([vehicle.vehicle in settings.trusted for vehicle in learners])
 
@@ -186,7 +174,6 @@ def learn_task(
         task = FleetTask(
             reference=reference,
             identity=identity,
-            harm_limit=settings.harm_limit,
             bench=used,
             believed=settings.trusted - {learners[j].vehicle for j in reference.distrusted},
             fleet_size=fleet_size,
@@ -263,8 +250,8 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
     """
     if previous is not None and not (previous / PARTS).is_dir():
         raise FleetError(
-            f"{previous / PARTS}: the earlier result cannot be reached from here; put it where every worker reaches it "
-            f"by this path"
+            f"{previous / PARTS}: no such folder here; give the whole folder that 'calibrator calibrate' wrote, at a "
+            f"path by which every worker reaches it"
         )
     records, before = store.read(bucket), {} if previous is None else read_part(part_file(previous, bucket))
     digests = {name: drives_digest(items) for name, items in records.items()}

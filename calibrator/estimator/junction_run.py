@@ -18,9 +18,7 @@ from calibrator.estimator.junction import SEEN, JunctionKnowledge, estimate_junc
 from calibrator.estimator.readings import (
     TRUSTED_DRIFT_SD,
     TRUSTED_OFFSET_SD,
-    BenchTable,
     bench_readings,
-    check_bench_table,
     read_bench_table,
     window_readings,
 )
@@ -153,12 +151,7 @@ def _same_error(parameters: VehicleParameters, known: Collection[str]) -> list[s
 
 
 def calibrate_junctions(
-    fleet: FleetSource,
-    identity: RunIdentity,
-    settings: CalibrationSettings,
-    *,
-    trusted: Collection[str],
-    workers: Workers,
+    fleet: FleetSource, identity: RunIdentity, *, workers: Workers
 ) -> tuple[Equipment, bytes, dict[str, object], list[str]]:
     """Calibrate each vehicle by itself; with a meter all together, as they are recordings of one car.
 
@@ -167,11 +160,7 @@ def calibrate_junctions(
     fleet : FleetSource
         The recordings.
     identity : RunIdentity
-        Identity of the run, for the parameter files.
-    settings : CalibrationSettings
-        The user's choices.
-    trusted : collection of str
-        Branches whose sensor is right.
+        Identity of the run, with the user's choices; trusted are branches whose sensor is right.
     workers : Workers
         Processes or cluster that read the drives, if there are many.
 
@@ -192,10 +181,10 @@ def calibrate_junctions(
     UserError
         If no vehicle can be used, or something is given as known of a branch or vehicle that is not there.
     """
-    layout = identity.database.layout
+    layout, settings = identity.database.layout, identity.settings
     equipment, vehicles, left_out = _read(fleet, identity.database, settings, workers)
     branches, load = equipment.branches, settings.load or layout.unmeasured_load
-    read = _known_readings(vehicles, branches, settings, layout, trusted=trusted, left_out=left_out)
+    read = _known_readings(vehicles, branches, settings, layout, left_out=left_out)
     groups = [range(len(vehicles))] if settings.meter is not None else [[j] for j in range(len(vehicles))]
     parameters, junctions, notices = [], dict[str, object](), list[str]()
     for group in groups:
@@ -283,25 +272,22 @@ def _known_readings(
     settings: CalibrationSettings,
     layout: Layout,
     *,
-    trusted: Collection[str],
     left_out: Mapping[str, str],
 ) -> Array:
     """Collect what is known of sensors, see :class:`JunctionKnowledge`; FleetError if one of them is not there."""
     scale_a, names = layout.full_scale_a, [each.vehicle for each in vehicles]
     meter = [settings.meter] if settings.meter else []
-    for option, given in {"--trusted": trusted, "--meter": meter}.items():
+    for option, given in {"--trusted": settings.trusted, "--meter": meter}.items():
         for name in given:
             if name not in branches:
                 raise FleetError(f"{option} {name}: no such branch was recorded; there are {', '.join(branches)}")
     if meter and len(vehicles) < 2:
         raise FleetError(f"--meter {settings.meter}: one folder of recordings; give one for each of its sensors")
-    bench: BenchTable = {}
-    if settings.readings is not None:
-        bench = read_bench_table(settings.readings, branches, full_scale_a=scale_a)
-        check_bench_table(bench, names, left_out=left_out, trusted=(), full_scale_a=scale_a)
+    problems = {**left_out, **dict.fromkeys(names, "")}
+    bench = read_bench_table(settings.readings, branches, problems, trusted=(), full_scale_a=scale_a)
     right = np.full((2, 2, len(names), len(branches)), np.nan)
     for k, name in enumerate(branches):
-        if name in trusted:
+        if name in settings.trusted:
             of = slice(None) if name == settings.meter or not meter else slice(1)  # once for each sensor
             right[0, :, of, k] = 0.0
             right[1, 0, of, k] = max(TRUSTED_DRIFT_SD, layout.find_branch(name).uncertainty)

@@ -18,7 +18,7 @@ from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import align
 from calibrator.estimator.results import encode_chunk
-from calibrator.estimator.settings import CalibrationSettings, require_learning
+from calibrator.estimator.settings import require_learning
 from calibrator.estimator.vehicle_parameters import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.processes.run_many import Workers
 from calibrator.published.classify import classify_by_expected_trees
@@ -51,7 +51,7 @@ def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, datab
 
 
 def calibrate_fleet_published(
-    fleet: FleetSource, identity: RunIdentity, settings: CalibrationSettings, *, workers: Workers
+    fleet: FleetSource, identity: RunIdentity, *, workers: Workers
 ) -> tuple[Equipment, bytes, dict[str, object], tuple[str, ...]]:
     """Calibrate a fleet by the published method.
 
@@ -60,9 +60,7 @@ def calibrate_fleet_published(
     fleet : FleetSource
         The fleet.
     identity : RunIdentity
-        Identity of the run, for the parameter files.
-    settings : CalibrationSettings
-        The user's choices.
+        Identity of the run, with the user's choices.
     workers : Workers
         Processes or cluster that read the drives.
 
@@ -83,13 +81,14 @@ def calibrate_fleet_published(
     FleetError
         If too few vehicles can be used.
     """
-    database, limit_s = identity.database, settings.time_limit_s
+    database, settings, limit_s = identity.database, identity.settings, identity.settings.time_limit_s
     equipment = probe_equipment(fleet, database, settings.branches, limit_s=limit_s)
     branches, layout = equipment.branches, database.layout
     vehicles, left_out = read_vehicles(read_vehicle_model, fleet, equipment, database, workers=workers, limit_s=limit_s)
     vehicles = _without_misfits(vehicles, settings.hold_out, branches, left_out)
     names = [vehicle.vehicle for vehicle in vehicles]
-    learning = require_learning(names, settings, left_out)
+    require_learning(names, settings, left_out)
+    learning = [name not in settings.hold_out for name in names]
     learners = list(compress(vehicles, learning))
     with progress_bar("estimate the faults", None):
         evidence, reference, unity = evidence_of_models(vehicles, learning)

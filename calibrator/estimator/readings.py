@@ -31,7 +31,6 @@ __all__ = [
     "BenchReading",
     "BenchTable",
     "bench_readings",
-    "check_bench_table",
     "merge_readings",
     "read_bench_table",
     "untrusted_vehicles",
@@ -56,7 +55,12 @@ always runs. A fleet may share more (``prior.LARGEST_SHARED``), but trust in a v
 
 PAIRS = (("drift", "drift_sd"), ("offset_a", "offset_sd_a"))
 COLUMNS = ("vehicle", "branch", *PAIRS[0], *PAIRS[1])
-MEANING = {"drift": "a relative gain error; 2 % is 0.02", "drift_sd": "a standard deviation; 0.1 % is 0.001"}
+MEANING = {
+    "drift": "a relative gain error; 2 % is 0.02",
+    "drift_sd": "its standard deviation; 0.1 % is 0.001",
+    "offset_a": "in A",
+    "offset_sd_a": "its standard deviation in A",
+}
 LEAST_SD = 1e-5
 """Least standard deviation of a reading (of offsets: over full scale), as no bench is more exact. [1]"""
 MOST_BYTES = 100_000_000
@@ -72,11 +76,8 @@ class BenchReading(NamedTuple):
     drift_sd: float
     offset_a: float
     offset_sd_a: float
-    place: str
-    """File and line, for messages."""
 
 
-Names = Collection[str]
 BenchTable = Mapping[tuple[str, str], BenchReading]
 """Bench readings by vehicle and branch."""
 
@@ -95,8 +96,8 @@ def bench_readings(bench: BenchTable, vehicles: Sequence[str], branches: Sequenc
     ndarray of shape (2, 2, N, K)
         Value and its standard deviation, each of drift [1] and offset [A]; NaN where a sensor was not read.
     """
-    unread = BenchReading(np.nan, np.nan, np.nan, np.nan, "")
-    read = [[bench.get((vehicle, branch), unread)[:4] for branch in branches] for vehicle in vehicles]
+    unread = BenchReading(np.nan, np.nan, np.nan, np.nan)
+    read = [[bench.get((vehicle, branch), unread) for branch in branches] for vehicle in vehicles]
     return np.array(read).reshape(len(vehicles), len(branches), 2, 2).transpose(3, 2, 0, 1)
 
 
@@ -157,57 +158,79 @@ def _text(path: Path) -> str:
         raise FleetError(f"{path}: not a table of bench readings: the file is not UTF-8 text") from None
 
 
-def read_bench_table(source: Path | str, branches: Names, *, full_scale_a: float) -> BenchTable:
+def read_bench_table(
+    source: Path | str | None,
+    branches: Collection[str],
+    problems: Mapping[str, str],
+    *,
+    trusted: Collection[str],
+    full_scale_a: float,
+) -> BenchTable:
     """Read a table of bench readings from a CSV file or text.
 
     Parameters
     ----------
-    source : Path or str
-        CSV file with a header, or the CSV text of a data frame.
+    source : Path, str or None
+        CSV file with a header, or the CSV text of a data frame; None: no sensor was read.
     branches : collection of str
         Names of the K branches.
+    problems : mapping of str to str
+        Why a vehicle cannot be used, by vehicle; empty if it can.
+    trusted : collection of str
+        Vehicles whose sensors are said to be faultless.
     full_scale_a : float
         Full scale of the junction. [A]
 
     Returns
     -------
     mapping
-        The readings by vehicle and branch; whether the vehicles exist, :func:`check_bench_table` checks.
+        The readings by vehicle and branch.
 
     Raises
     ------
     FleetError
-        If the table cannot be used; the message names file, line and what was expected.
+        If the table cannot be used, a vehicle does not exist or is left out, or a reading contradicts the trust in its
+        vehicle; the message names file, line and what was expected.
     """
+    if source is None:
+        return {}
     bench: dict[tuple[str, str], BenchReading] = {}
     text, where = (source, "readings") if isinstance(source, str) else (_text(source), str(source))
-    lines = csv.reader(text.splitlines(), skipinitialspace=True)
-
-    def place() -> str:
-        if isinstance(source, str):  # rows of a data frame count from 0, without the header
-            return f"{where}: row {lines.line_num - 2}" if lines.line_num > 1 else where
-        return f"{where}: line {lines.line_num or 1}"
-
-    try:
-        header = [cell.strip() for cell in next(lines, [])]
-        complete = {"vehicle", "branch"} <= set(header) <= set(COLUMNS) and len(set(header)) == len(header)
-        if not complete or not any(set(pair) <= set(header) for pair in PAIRS):
+    rows = csv.DictReader(text.splitlines(), skipinitialspace=True, restval="")
+    rows.fieldnames = header = [name.strip() for name in rows.fieldnames or ()]
+    complete = {"vehicle", "branch"} <= set(header) <= set(COLUMNS) and len(set(header)) == len(header)
+    if not complete or not any(set(pair) <= set(header) for pair in PAIRS):
+        raise FleetError(
+            f"{where}: columns {', '.join(header) or 'none'}; expected each of {', '.join(COLUMNS)} once, one pair of "
+            f"the last four may be left out"
+        )
+    for cells in rows:
+        if not any(cells.values()):
+            continue
+        # rows of a data frame count from 0, without the header
+        place = f"{where}: row {rows.line_num - 2}" if isinstance(source, str) else f"{where}: line {rows.line_num}"
+        if None in cells:
+            raise FleetError(f"{place}: more cells than the {len(header)} columns of the header")
+        row = {name: cell.strip() for name, cell in cells.items()}
+        vehicle, branch = row["vehicle"], row["branch"]
+        if vehicle not in problems:
+            known = few(sorted(name for name, why in problems.items() if not why))
+            raise FleetError(f"{place}: no vehicle {vehicle!r} in this fleet; there are, for example, {known}")
+        if problems[vehicle]:
+            raise FleetError(f"{place}: vehicle {vehicle!r} is left out: {problems[vehicle]}")
+        if branch not in branches:
+            raise FleetError(f"{place}: no branch {branch!r} in this fleet; known are {few(sorted(branches))}")
+        if (vehicle, branch) in bench:
+            raise FleetError(f"{place}: the {branch} sensor of {vehicle} stands there twice; give it one line")
+        bench[vehicle, branch] = reading = _reading(row, place, full_scale_a)
+        drift_sd = math.hypot(reading.drift_sd, TRUSTED_DRIFT_SD)
+        offset_sd_a = math.hypot(reading.offset_sd_a, TRUSTED_OFFSET_SD * full_scale_a)
+        apart = abs(reading.drift) / drift_sd, abs(reading.offset_a) / offset_sd_a  # NaN: not read
+        if vehicle in trusted and any(each > CONTRADICTION for each in apart):
             raise FleetError(
-                f"{place()}: columns {', '.join(header) or 'none'}; expected each of {', '.join(COLUMNS)} once, "
-                f"one pair of the last four may be left out"
+                f"{place}: the {branch} sensor of {vehicle} was read as faulty, and {vehicle} is trusted; a trusted "
+                f"vehicle is one whose sensors were all found faultless"
             )
-        for cells in filter(any, lines):
-            if len(cells) > len(header):
-                raise FleetError(f"{place()}: {len(cells)} cells, and the header has {len(header)} columns")
-            row = dict.fromkeys(COLUMNS, "") | dict(zip(header, map(str.strip, cells), strict=False))
-            vehicle, branch = row["vehicle"], row["branch"]
-            if branch not in branches:
-                raise FleetError(f"{place()}: no branch {branch!r} in this fleet; known are {few(sorted(branches))}")
-            if (vehicle, branch) in bench:
-                raise FleetError(f"{place()}: the {branch} sensor of {vehicle} stands there twice; give it one line")
-            bench[vehicle, branch] = _reading(row, place(), full_scale_a)
-    except csv.Error as error:
-        raise FleetError(f"{place()}: not a table of bench readings: {error}") from None
     if not bench:
         raise FleetError(f"{where}: no reading below the header; leave --readings out if there is none")
     return bench
@@ -216,62 +239,15 @@ def read_bench_table(source: Path | str, branches: Names, *, full_scale_a: float
 def _reading(row: Mapping[str, str], place: str, full_scale_a: float) -> BenchReading:
     """Read the numbers of one line; a pair is NaN where both of its cells are empty."""
     numbers = dict.fromkeys(COLUMNS[2:], math.nan)
-    for pair in (pair for pair in PAIRS if any(row[name] for name in pair)):
-        for name in pair:
-            with suppress(ValueError):
-                numbers[name] = float(row[name])
-            if not math.isfinite(numbers[name]):
-                expected = f"a number, and {pair[0]} together with {pair[1]}"
-                raise FleetError(f"{place}: {name} is {row[name]!r}; expected {expected}")
-    if all(map(math.isnan, numbers.values())):
-        raise FleetError(f"{place}: nothing was read; give drift and drift_sd, or offset_a and offset_sd_a")
-    for name in numbers:
+    for name in (name for pair in PAIRS if any(row.get(each) for each in pair) for name in pair):
         unit = full_scale_a if name.startswith("offset") else 1.0
-        value = numbers[name] if "sd" in name else abs(numbers[name])
-        size, low = ("a number", LEAST_SD) if "sd" in name else ("a magnitude", 0.0)
-        if value < low * unit or value > LARGEST * unit:  # both are false for NaN: not read
-            expected = f"{size} from {low * unit:g} to {LARGEST * unit:g}: {MEANING.get(name, 'in A')}"
-            raise FleetError(f"{place}: {name} is {row[name]}; expected {expected}")
-    return BenchReading(**numbers, place=place)
-
-
-def check_bench_table(
-    bench: BenchTable, vehicles: Names, *, left_out: Mapping[str, str], trusted: Names, full_scale_a: float
-) -> None:
-    """Refuse bench readings of vehicles that do not exist, or that contradict the trust in a vehicle.
-
-    Parameters
-    ----------
-    bench : mapping
-        From :func:`read_bench_table`.
-    vehicles : collection of str
-        Vehicles that can be used.
-    left_out : mapping of str to str
-        Vehicles that have no usable drive, and why.
-    trusted : collection of str
-        Vehicles whose sensors are said to be faultless.
-    full_scale_a : float
-        Full scale of the junction. [A]
-
-    Raises
-    ------
-    FleetError
-        If there is such a reading; the message names its file and line.
-    """
-    accuracy_a = TRUSTED_OFFSET_SD * full_scale_a
-    for (vehicle, branch), (drift, drift_sd, offset_a, offset_sd_a, place) in bench.items():
-        if vehicle in left_out and vehicle not in vehicles:
-            raise FleetError(f"{place}: vehicle {vehicle!r} is left out: {left_out[vehicle]}")
-        if vehicle not in vehicles:
-            raise FleetError(
-                f"{place}: no vehicle {vehicle!r} in this fleet; there are, for example, {few(sorted(vehicles))}"
-            )
-        apart = abs(drift) / np.hypot(drift_sd, TRUSTED_DRIFT_SD), abs(offset_a) / np.hypot(offset_sd_a, accuracy_a)
-        if vehicle in trusted and np.nanmax(apart) > CONTRADICTION:
-            raise FleetError(
-                f"{place}: the {branch} sensor of {vehicle} was read as faulty, and {vehicle} is trusted; a trusted "
-                f"vehicle is one whose sensors were all found faultless"
-            )
+        low, high = LEAST_SD * unit if "sd" in name else -LARGEST * unit, LARGEST * unit
+        with suppress(ValueError):
+            numbers[name] = float(row.get(name, ""))
+        if not low <= numbers[name] <= high:
+            expected = f"a number from {low:g} to {high:g}: {MEANING[name]}"
+            raise FleetError(f"{place}: {name} is {row.get(name, '')!r}; expected {expected}")
+    return BenchReading(**numbers)
 
 
 def merge_readings(

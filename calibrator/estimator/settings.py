@@ -106,27 +106,15 @@ class CalibrationSettings:
         }
 
 
-def require_learning(
-    names: Sequence[str],
-    settings: CalibrationSettings,
-    left_out: Mapping[str, str],
-    *,
-    left_out_count: int | None = None,
-) -> list[bool]:
-    """Return for each vehicle whether the fleet learns from it; FleetError if too few remain.
-
-    ``left_out`` says why other vehicles cannot be used. If it lists only the first of many, ``left_out_count`` is
-    their number.
-    """
-    learning = [name not in settings.hold_out for name in names]
-    if sum(learning) < 2:
-        reasons = few_reasons(left_out, count=left_out_count)
+def require_learning(names: Sequence[str], settings: CalibrationSettings, left_out: Mapping[str, str]) -> None:
+    """Raise FleetError if too few usable vehicles may be learnt from; ``left_out``: why others are not usable."""
+    learners = len(set(names) - settings.hold_out)
+    if learners < 2:
         raise FleetError(
-            f"{counted(sum(learning), 'usable vehicle')} to learn from; a fleet that is compared with itself needs "
+            f"{counted(learners, 'usable vehicle')} to learn from; a fleet that is compared with itself needs "
             f"{FEWEST_VEHICLES} or more, the drives of a single vehicle a sensor that is right (--trusted BRANCH)"
-            f"{reasons}"
+            f"{few_reasons(left_out)}"
         )
-    return learning
 
 
 def _named_digest(table: Path | str) -> list[str]:

@@ -13,7 +13,7 @@ from calibrator.drive import Array, Mask
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
 from calibrator.estimator.decision import FleetEstimate
-from calibrator.estimator.settings import CONFIDENT, SUSPECTED, Method
+from calibrator.estimator.settings import CONFIDENT, SUSPECTED, CalibrationSettings
 from calibrator.estimator.vehicle_report import LEAST_RIVAL, REASONS, explained_faults
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node import __version__
@@ -63,14 +63,14 @@ class RunIdentity:
     ----------
     database : VehicleDatabase
         DBC and layout that the parameters belong to.
-    method : Method
-        Method by which they are found.
+    settings : CalibrationSettings
+        The user's choices, such as the method by which they are found.
     fleet, created : str
         Name of the fleet; time of the run, ISO 8601.
     """
 
     database: VehicleDatabase
-    method: Method
+    settings: CalibrationSettings
     fleet: str
     created: str
 
@@ -93,7 +93,7 @@ class RunIdentity:
         """Describe where the parameters of one vehicle come from."""
         return Provenance(
             tool=self.tool,
-            method=self.method.value,
+            method=self.settings.method.value,
             created=self.created,
             fleet=self.fleet,
             fleet_size=fleet_size,

@@ -9,14 +9,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from itertools import count
 from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
-__all__ = ["no_progress", "numbered_passes", "one_pass", "progress_bar", "shown"]
+__all__ = ["no_progress", "one_pass", "progress_bar", "shown"]
 
 LINE_EVERY_S = 10.0
 WORTH_A_LINE_S = 1.0
@@ -45,12 +44,6 @@ def _within(variable: ContextVar[_Item], value: _Item) -> Iterator[None]:
 def no_progress() -> AbstractContextManager[None]:
     """Within the block no progress is shown, as in a library."""
     return _within(_silent, True)
-
-
-def numbered_passes(total: int) -> AbstractContextManager[None]:
-    """Within the block every bar says which of so many passes it is: ``2/3 calibrate``."""
-    numbers = count(1)
-    return _within(_number, lambda: f"{next(numbers)}/{total} ")
 
 
 def one_pass(number: int, total: int) -> AbstractContextManager[None]:

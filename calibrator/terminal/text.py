@@ -102,23 +102,10 @@ def few(names: Sequence[str]) -> str:
     return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
 
 
-def few_reasons(reasons: Mapping[str, str], *, count: int | None = None) -> str:
-    """Format the reasons why vehicles cannot be used, to append to a message.
-
-    Parameters
-    ----------
-    reasons : mapping of str to str
-        Reason of each vehicle; of many it may hold only the first ones.
-    count : int or None
-        How many vehicles there are in all; None: those that are given.
-
-    Returns
-    -------
-    str
-        ``"; NAME: why"`` for each of the first :data:`MOST_REASONS`, and how many more there are; empty for none.
-    """
+def few_reasons(reasons: Mapping[str, str]) -> str:
+    """Return ``"; NAME: why"`` for each of the first :data:`MOST_REASONS`, and how many more there are."""
     text = "".join(f"; {name}: {why}" for name, why in list(reasons.items())[:MOST_REASONS])
-    more = (len(reasons) if count is None else count) - MOST_REASONS
+    more = len(reasons) - MOST_REASONS
     return f"{text}; and {more} more" if more > 0 else text
 
 

@@ -14,7 +14,6 @@ from calibrator.estimator.readings import (
     BenchReading,
     BenchTable,
     bench_readings,
-    check_bench_table,
     merge_readings,
     read_bench_table,
     untrusted_vehicles,
@@ -27,20 +26,16 @@ HEADER = "vehicle,branch,drift,drift_sd,offset_a,offset_sd_a"
 NAN = np.nan
 
 
-def read(folder: Path, *lines: str) -> BenchTable:
+def read(folder: Path, *lines: str, trusted: tuple[str, ...] = ()) -> BenchTable:
     path = folder / "bench.csv"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8-sig")
-    return read_bench_table(path, BRANCHES, full_scale_a=FULL_SCALE_A)
-
-
-def check(bench: BenchTable, *trusted: str) -> None:
-    left_out = {"copy": "same recording as V1"}
-    check_bench_table(bench, VEHICLES, left_out=left_out, trusted=trusted, full_scale_a=FULL_SCALE_A)
+    problems = {"V1": "", "V2": "", "copy": "same recording as V1"}
+    return read_bench_table(path, BRANCHES, problems, trusted=trusted, full_scale_a=FULL_SCALE_A)
 
 
 def bench_of(drift: float, drift_sd: float, offset_a: float, offset_sd_a: float, *sensor: str) -> BenchTable:
     vehicle, branch = sensor or ("V1", "battery")
-    return {(vehicle, branch): BenchReading(drift, drift_sd, offset_a, offset_sd_a, "bench.csv: line 2")}
+    return {(vehicle, branch): BenchReading(drift, drift_sd, offset_a, offset_sd_a)}
 
 
 def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> EvidenceRows:
@@ -56,7 +51,6 @@ def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> Ev
 
 def test_table_of_readings_may_have_any_column_order_and_empty_cells(tmp_path: Path) -> None:
     bench = read(tmp_path, HEADER, "V2, motor, 0.02, 0.001, , ", "", "V1,battery,,,-1.5,0.2")
-    check(bench)
     (drift, offset_a), (drift_sd, offset_sd_a) = bench_readings(bench, VEHICLES, BRANCHES)
     np.testing.assert_array_equal(drift, [[NAN, NAN], [NAN, 0.02]])
     np.testing.assert_array_equal(drift_sd, [[NAN, NAN], [NAN, 0.001]])
@@ -67,33 +61,33 @@ def test_table_of_readings_may_have_any_column_order_and_empty_cells(tmp_path: P
 
 
 @pytest.mark.parametrize(("lines", "message"), [
-    (["vehicle;branch;drift"], r"line 1: columns vehicle;branch;drift; expected each of vehicle, branch, drift"),
-    (["vehicle,branch,drift,drift_sd,drift,drift_sd"], r"line 1: columns .*; expected each of .* once"),
+    (["vehicle;branch;drift"], r"bench.csv: columns vehicle;branch;drift; expected each of vehicle, branch, drift"),
+    (["vehicle,branch,drift,drift_sd,drift,drift_sd"], r"bench.csv: columns .*; expected each of .* once"),
     ([HEADER], r"no reading below the header; leave --readings out"),
     ([HEADER, "V3,motor,0,0.1,,"], r"line 2: no vehicle 'V3' in this fleet; there are, for example, V1, V2"),
     ([HEADER, "copy,motor,0.2,0.1,,"], r"line 2: vehicle 'copy' is left out: same recording as V1"),
     ([HEADER, "V1,engine,0,0.1,,"], r"line 2: no branch 'engine' in this fleet; known are battery, motor"),
     ([HEADER, "V1,motor,2 %,0.1,,"], r"line 2: drift is '2 %'; expected a number"),
-    ([HEADER, "V1,motor,0.02,,,"], r"line 2: drift_sd is ''; expected a number, and drift together with drift_sd"),
-    ([HEADER, "V1,motor,,,1.0,0"], r"line 2: offset_sd_a is 0; expected a number from 0\.004 to 360: in A"),
-    ([HEADER, "V1,motor,2,0.1,,"], r"line 2: drift is 2; expected a magnitude from 0 to 0\.9: .*2 % is 0\.02"),
+    ([HEADER, "V1,motor,0.02,,,"], r"line 2: drift_sd is ''; expected a number from 1e-05 to 0\.9: its"),
+    ([HEADER, "V1,motor,,,1.0,0"], r"line 2: offset_sd_a is '0'; expected a number from 0\.004 to 360: .* in A"),
+    ([HEADER, "V1,motor,2,0.1,,"], r"line 2: drift is '2'; expected a number from -0\.9 to 0\.9: .*2 % is 0\.02"),
     ([HEADER, "V1,motor,0,0.1,,", "V1,motor,0,0.1,,"], r"line 3: the motor sensor of V1 stands there twice"),
-    ([HEADER, "V1,motor,0,0.1,,,,7"], r"line 2: 8 cells, and the header has 6 columns"),
+    ([HEADER, "V1,motor,0,0.1,,,,7"], r"line 2: more cells than the 6 columns of the header"),
 ])  # fmt: skip
 def test_mistake_in_a_table_of_readings_is_reported_with_its_line(
     tmp_path: Path, lines: list[str], message: str
 ) -> None:
     with pytest.raises(FleetError, match=message):
-        check(read(tmp_path, *lines))
+        read(tmp_path, *lines)
 
 
-@pytest.mark.parametrize("reading", [(0.05, 0.002, NAN, NAN), (NAN, NAN, 3.0, 0.2)])
-def test_trusted_vehicle_with_a_faulty_bench_reading_is_refused(reading: tuple[float, float, float, float]) -> None:
-    bench = bench_of(*reading)
+@pytest.mark.parametrize("reading", ["0.05,0.002,,", ",,3.0,0.2"])
+def test_trusted_vehicle_with_a_faulty_bench_reading_is_refused(tmp_path: Path, reading: str) -> None:
+    line = f"V1,battery,{reading}"
     with pytest.raises(FleetError, match=r"line 2: the battery sensor of V1 was read as faulty, and V1 is trusted"):
-        check(bench, "V1")
-    check(bench, "V2")
-    check(bench_of(0.001, 0.002, 0.1, 0.2), "V1")
+        read(tmp_path, HEADER, line, trusted=("V1",))
+    read(tmp_path, HEADER, line, trusted=("V2",))
+    read(tmp_path, HEADER, "V1,battery,0.001,0.002,0.1,0.2", trusted=("V1",))
 
 
 def test_readings_are_combined_or_all_dropped_if_contradictory() -> None:

@@ -17,8 +17,8 @@ from calibrator.errors import FleetError
 from calibrator.estimator import run
 from calibrator.estimator.fleet_task import FleetTask, calibrate_bucket, learn_task
 from calibrator.estimator.results import left_out_of, read_results, read_run
-from calibrator.estimator.run import read_sample, take_census
-from calibrator.estimator.settings import CalibrationSettings, Method
+from calibrator.estimator.run import read_sample
+from calibrator.estimator.settings import CalibrationSettings
 from calibrator.estimator.vehicle_parameters import RunIdentity
 from calibrator.files.storage import open_storage
 from calibrator.processes import run_many
@@ -68,23 +68,21 @@ def result(store: SummaryStore) -> Path:
 
 @pytest.fixture(scope="module")
 def task(store: SummaryStore, database: VehicleDatabase) -> FleetTask:
-    identity = RunIdentity(
-        database=database, method=Method.POSTERIOR, fleet="small", created="2026-01-01T00:00:00+00:00"
-    )
     settings = CalibrationSettings()
-    sample = read_sample(store, take_census(store, ONE), settings, ())
-    return learn_task(sample, settings, {}, branches=BRANCHES, identity=identity, fleet_size=VEHICLES)[0]
+    identity = RunIdentity(database=database, settings=settings, fleet="small", created="2026-01-01T00:00:00+00:00")
+    sample = read_sample(store, settings)
+    return learn_task(sample, {}, branches=BRANCHES, identity=identity, fleet_size=VEHICLES)[0]
 
 
 def test_learning_sample_is_limited_to_the_largest_number_of_blocks(
     store: SummaryStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    census, settings = take_census(store, ONE), CalibrationSettings()
-    whole = read_sample(store, census, settings, ())
+    settings = CalibrationSettings()
+    whole = read_sample(store, settings)
     monkeypatch.setattr(run, "MOST_BLOCKS", sum(len(item.summary.moments) for item in whole[:10]))
-    assert [item.vehicle for item in read_sample(store, census, settings, ())] == [item.vehicle for item in whole[:10]]
+    assert [item.vehicle for item in read_sample(store, settings)] == [item.vehicle for item in whole[:10]]
     trusted = CalibrationSettings(trusted=frozenset([whole[-1].vehicle]))
-    assert read_sample(store, census, trusted, ())[-1].vehicle == whole[-1].vehicle
+    assert read_sample(store, trusted)[-1].vehicle == whole[-1].vehicle
 
 
 def texts(chunk: bytes) -> dict[str, bytes]:
@@ -165,11 +163,8 @@ def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
 
 
 def test_place_without_a_fleet_is_refused(store: SummaryStore, tmp_path: Path) -> None:
-    shutil.copytree(store.url, tmp_path / "both")
-    (tmp_path / "both" / "drives").mkdir()
     shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
     for place, code, message in (
-        (tmp_path / "both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them"),
         (tmp_path / "empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
         ("", 2, "an empty name; give the path"),
     ):
@@ -206,7 +201,7 @@ def test_vehicle_with_impossible_numbers_is_left_out_of_both_passes(
     spoilt = replace(found.summary, moments=np.inf * found.summary.moments)
     records[bad] = [replace(records[bad][0], found=replace(found, summary=spoilt))]
     other = rewritten(store, tmp_path, bucket, records)
-    sample = read_sample(other, take_census(other, ONE), CalibrationSettings(), ())
+    sample = read_sample(other, CalibrationSettings())
     assert {item.vehicle for item in sample} == records.keys() - {bad}
     chunk = calibrate_bucket(bucket, store=other, task=task)
     assert texts(chunk) == {name: text for name, text in expected.items() if name != bad}

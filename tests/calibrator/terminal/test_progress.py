@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from calibrator.terminal.progress import numbered_passes, progress_bar, shown
+from calibrator.terminal.progress import one_pass, progress_bar, shown
 from calibrator.terminal.text import Notice, few_reasons, figure, left_out_text, merged_notices, reasons_text
 from tests.calibrator.screen import Screen
 
@@ -30,9 +30,9 @@ def test_progress_of_several_passes_is_numbered(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("calibrator.terminal.progress.WORTH_A_LINE_S", 0.0)
-    with numbered_passes(2):
-        with progress_bar("learn the fleet", None):
-            pass
+    with one_pass(1, 2), progress_bar("learn the fleet", None):
+        pass
+    with one_pass(2, 2):
         assert list(shown("ab", "calibrate", 2, "vehicles")) == ["a", "b"]
     with progress_bar("import", 1, "logs") as done:
         done(1)
@@ -90,7 +90,7 @@ def test_first_five_reasons_are_listed_and_the_rest_counted() -> None:
     five = "; V0: cut; V1: cut; V2: cut; V3: cut; V4: cut"
     assert few_reasons({}) == ""
     assert few_reasons(dict(list(reasons.items())[:5])) == five
-    assert few_reasons(reasons, count=1000) == f"{five}; and 995 more"
+    assert few_reasons(reasons) == f"{five}; and 2 more"
 
 
 def test_same_reason_of_many_vehicles_is_one_line() -> None:
