@@ -272,7 +272,7 @@ class _Calibrator:
             require(none or is_number(value, 0, 1), name, value, "a number from 0 to 1")
         for name in given.keys() & {"trusted", "hold_out"}:
             names = [given[name]] if isinstance(given[name], str) else () if given[name] is None else given[name]
-            given[name] = frozenset(names_of(names, name, sets=True))
+            given[name] = frozenset(names_of(names, name))
         readings = given["readings"]
         if hasattr(readings, "to_csv"):
             given["readings"] = str(readings.to_csv(index=False))

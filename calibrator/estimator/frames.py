@@ -7,17 +7,16 @@ import hashlib
 import math
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from numbers import Integral, Real
+from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from calibrator.drive import Array, Channel, Drive, Equipment
+from calibrator.drive import Array, Channel, Drive, Equipment, good_values
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import DriveError, FleetError
@@ -25,6 +24,7 @@ from calibrator.estimator.settings import FEWEST_VEHICLES
 from calibrator.files.layout_files import vehicle_database
 from calibrator.files.storage import open_storage
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S
+from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.record import Record
 from calibrator.summaries.summary_store import SummaryStore
@@ -54,8 +54,6 @@ FINEST_PERIOD_S = 0.1
 """Shortest time base of data frames without a layout: that of logs. [s]"""
 LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
 """Currents that never reach the former share of full scale, or go beyond the latter, are in another unit. [1]"""
-OTHER_SPACING = 20.0
-"""Row spacing of a frame over that of the fleet, or the reverse, from which on its time is in another unit. [1]"""
 OTHER_UNIT = 100.0
 """Largest current of the median vehicle over that of this one, from which on the latter is in another unit. [1]"""
 
@@ -78,15 +76,12 @@ def is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
     return isinstance(given, kind) and not isinstance(given, bool) and low <= float(given) <= high
 
 
-def names_of(given: Any, what: str, *, sets: bool = False) -> tuple[str, ...]:
-    """Return names in anything like a list, numbers as strings; FleetError if it is none, or a set without ``sets``."""
-    no_list = (str, bytes, Mapping) if sets else (str, bytes, Mapping, set, frozenset)
-    names: list[Any] = [None]
-    with suppress(TypeError):
-        names = names if isinstance(given, no_list) else [*given]
-    named = (not isinstance(name, bool) and isinstance(name, (str, Integral)) and str(name).strip() for name in names)
-    require(all(named), what, given, "a list of names, such as ['one', 'other']")
-    return tuple(map(str, names))
+def names_of(given: Any, what: str) -> tuple[str, ...]:
+    """Return the names in a list, tuple or the like, numbers as strings; FleetError, naming ``what``, if it is none."""
+    listed = isinstance(given, Collection) and not isinstance(given, (str, bytes, Mapping))
+    names = tuple(map(str, given)) if listed else ("",)
+    require(all(name.strip() for name in names), what, given, "a list of names, such as ['one', 'other']")
+    return names
 
 
 @dataclass(frozen=True)
@@ -201,17 +196,26 @@ def summarise_frames(
     FleetError, DriveError
         If the frames are no recordings of such a fleet.
     """
-    recordings = _recordings(frames, fewest=2)
-    chosen = _chosen_inputs(recordings, junction, inputs)
-    columns = (*junction.branches, *sorted(junction.layout.base_inputs(chosen) if junction.layout else chosen))
+    recordings = _recordings(frames)
+    if len(names := {each.vehicle for each in recordings}) < 2:
+        raise FleetError(
+            f"a single vehicle, {names.pop()}: a fleet that is compared with itself needs {FEWEST_VEHICLES} or more; "
+            f"JunctionCalibrator takes one, with a sensor that you trust"
+        )
+    chosen, columns = _chosen_inputs(recordings, junction, inputs)
     drives, database = _drives(recordings, junction, columns, inputs=chosen)
-    _require_amperes(drives, junction)
+    still = [[not np.ptp(value) for value in _currents_a(mine, junction)] for mine in drives.values()]
+    if (stuck := np.mean(still, axis=0) > 0.5).any():  # in few vehicles a heater is off
+        raise DriveError(
+            f"branch {junction.branches[int(np.argmax(stuck))]} never changes in most vehicles: stuck, or not "
+            f"connected; leave it out if the junction has none"
+        )
     equipment = Equipment(branches=tuple(junction.branches), inputs=chosen, fleet_inputs=chosen, notices=())
     identity = store_identity(equipment, database, vehicles=len(drives), fleet="frames")
     store = SummaryStore(storage=open_storage(folder), identity=identity)
     write_identity(store.storage, identity)
     for bucket, names in store.by_bucket(drives).items():
-        store.append(bucket, [_record(drives[name], store, database) for name in names])
+        store.append(bucket, [_record(drives[name], equipment, database, identity.bank) for name in names])
     return database
 
 
@@ -237,19 +241,13 @@ def store_frames(folder: Path, frames: Mapping[str, Any], junction: Junction) ->
     FleetError, DriveError
         If the frames are no recordings of this junction.
     """
-    recordings = _recordings(frames, fewest=1)
+    recordings = _recordings(frames)
     for each in recordings:
-        try:
-            require_columns(each.frame, junction.branches, each.where)
-        except DriveError as error:
-            raise DriveError(
-                f"{error}; rename its columns, positive into the junction, or name those in Junction(branches=...)"
-            ) from None
+        require_columns(each.frame, junction.branches, each.where)
     contactor = None if junction.layout is None else junction.layout.contactor
     inputs = [] if contactor is None else [contactor.input]
     there = [name for name in inputs if all(name in each.frame.columns for each in recordings)]
-    drives, database = _drives(recordings, junction, (*junction.branches, *there))
-    _require_amperes(drives, junction, alone=True)
+    drives, database = _drives(recordings, junction, [*junction.branches, *there])
     for drive in (drive for mine in drives.values() for drive in mine):
         write_drive(folder, drive, database.layout)
     return database
@@ -267,39 +265,26 @@ class _Recording(NamedTuple):
         return f"vehicle {self.vehicle}, frame {self.number}"
 
 
-def _recordings(frames: Mapping[str, Any], *, fewest: int) -> list[_Recording]:
-    """List the frames of all vehicles; FleetError if there are too few vehicles, or one has no frame."""
+def _recordings(frames: Mapping[str, Any]) -> list[_Recording]:
+    """List the frames of all vehicles."""
     if not isinstance(frames, Mapping) or not frames:
         raise FleetError(f"{type(frames).__name__} without vehicles: expected data frames by vehicle, {{'V1': frame}}")
-    found: dict[str, list[_Recording]] = {}
-    for key, given in frames.items():
-        vehicle, drives = str(key), [given] if isinstance(given, pd.DataFrame) else given
+    found = []
+    for vehicle, given in ((str(key), given) for key, given in frames.items()):
         require_plain_name(vehicle, "vehicle")
-        if vehicle in found:
-            raise FleetError(f"vehicle {vehicle} is there twice; give all of its frames as one list")
-        if not isinstance(drives, Sequence) or not all(isinstance(frame, pd.DataFrame) for frame in drives):
+        drives = [given] if isinstance(given, pd.DataFrame) else given
+        if not isinstance(drives, Sequence) or not drives:
             raise FleetError(f"vehicle {vehicle}: {type(given).__name__} given; expected a DataFrame or a list of them")
-        if not drives:
-            raise FleetError(f"vehicle {vehicle}: no frame in its list; leave the vehicle out")
         named = [named_columns(frame, f"vehicle {vehicle}") for frame in drives]
-        found[vehicle] = [_Recording(vehicle, number, frame) for number, frame in enumerate(named, start=1)]
-    if len(found) < fewest:
-        raise FleetError(
-            f"a single vehicle, {vehicle}: a fleet that is compared with itself needs {FEWEST_VEHICLES} or more; "
-            f"JunctionCalibrator takes one, with a sensor that you trust"
-        )
-    return [each for mine in found.values() for each in mine]
+        found += [_Recording(vehicle, number, frame) for number, frame in enumerate(named, start=1)]
+    return found
 
 
 def _chosen_inputs(
     recordings: Sequence[_Recording], junction: Junction, inputs: Sequence[str] | None
-) -> tuple[str, ...]:
-    """Choose the inputs, and check that every frame has the columns for them."""
+) -> tuple[tuple[str, ...], list[str]]:
+    """Return the inputs of the model, and the columns for these and the branches, which every frame must have."""
     branches, layout, first = list(junction.branches), junction.layout, recordings[0]
-    for each in recordings:
-        require_columns(each.frame, branches, each.where)
-    if both := sorted(set(inputs or ()) & set(branches)):
-        raise FleetError(f"inputs {few(both)}: a branch of the junction cannot be an input of its model")
     if layout is not None:
         known = {item.name for item in layout.input} | {item.name for item in layout.derived}
         if unknown := sorted(set(inputs or ()) - known):
@@ -309,22 +294,21 @@ def _chosen_inputs(
     else:
         usual = tuple(name for name in first.frame.columns if name not in branches)
     chosen = usual if inputs is None else tuple(inputs)
-    needed = [*branches, *(chosen if layout is None else sorted(layout.base_inputs(chosen)))]
+    columns = [*branches, *(chosen if layout is None else sorted(layout.base_inputs(chosen)))]
     for each in recordings:
-        more = sorted(set(each.frame.columns) - set(needed))
+        require_columns(each.frame, columns, each.where)
+        more = sorted(set(each.frame.columns) - set(columns))
         if more and layout is None and inputs is None:
             raise FleetError(
                 f"{each.where}: column {few(more)}, which {first.where} has not; all vehicles need the same columns, "
                 f"or name those to use with inputs=[...]"
             )
-    if not chosen or len(set(chosen)) < len(chosen):
+    if not chosen or len({*chosen, *branches}) < len(chosen) + len(branches):
         raise FleetError(
-            f"inputs {few(chosen) or 'none'}: expected one or more different columns that the currents depend on, such "
-            f"as speed, torque, or the demands of heater and air conditioning"
+            f"inputs {few(chosen) or 'none'}: expected one or more different columns, other than the branches, that "
+            f"the currents depend on, such as speed, torque, or the demands of heater and air conditioning"
         )
-    for each in recordings:
-        require_columns(each.frame, needed, each.where)
-    return chosen
+    return chosen, columns
 
 
 def named_columns(frame: pd.DataFrame, where: str) -> pd.DataFrame:
@@ -353,29 +337,23 @@ def _seconds(frame: pd.DataFrame, where: str) -> Array:
     if len(index) < 2:
         raise DriveError(f"{where}: {len(index)} rows; leave the frame out")
     if isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex)):
-        time_s = np.asarray((index - index.min()).total_seconds(), np.float64)
-    else:
-        time_s = index.to_numpy(np.float64)
-    if not np.isfinite(time_s).all():
-        raise DriveError(f"{where}: {int((~np.isfinite(time_s)).sum())} rows without a time; remove them")
-    step_s = np.diff(time_s)
-    if not (step_s > 0.0).all():
-        row = int(np.argmin(step_s > 0.0))
-        what = "time twice" if step_s[row] == 0.0 else "time runs back"
+        index = (index - index[0]).total_seconds()
+    time_s = index.to_numpy(np.float64)
+    rises = np.diff(time_s) > 0.0  # false for NaN
+    if not rises.all():
+        row = int(np.argmin(rises))
         raise DriveError(
-            f"{where}: {what} at row {row + 1} ({index[row]} -> {index[row + 1]}); expected rising times: sort by "
-            f"time, one row each, or give drives as frames of their own"
+            f"{where}: the time does not rise at row {row + 1} ({index[row]} -> {index[row + 1]}); expected rising "
+            f"times: sort by time, one row each, or give drives as frames of their own"
         )
     return np.asarray(time_s - time_s[0])
 
 
 def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: float) -> float:
-    """Return the time base: that of the layout, or the spacing of rows, which must be similar in all frames. [s]"""
+    """Return the time base: that of the layout, or the usual spacing of rows, which must not be too wide. [s]"""
     layout = junction.layout
     spacing_s = {where: float(np.median(np.diff(time_s))) for where, time_s in times.items()}
-    usual_s = float(np.median([*spacing_s.values()]))
-    unit = "if the index is not in seconds, convert it"
-    most_s, why = coarsest_s, f"expected {coarsest_s:g} s at most; {unit}"
+    most_s, why = coarsest_s, f"expected {coarsest_s:g} s at most; if the index is not in seconds, convert it"
     if layout is not None:
         most_s = min(layout.max_age_s, *(branch.timeout_s for branch in layout.branch))
         why = (
@@ -383,12 +361,11 @@ def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: flo
             f"Junction(branches=..., full_scale_a=...)"
         )
     for where, row_s in spacing_s.items():
-        if row_s > OTHER_SPACING * usual_s or usual_s > OTHER_SPACING * row_s:
-            why = f"and those of the fleet {usual_s:.3g} s; {unit}"
-        elif row_s <= most_s + TIME_RESOLUTION_S:
-            continue
-        raise FleetError(f"{where}: rows are {row_s:.3g} s apart, {why}")
-    return max(round(usual_s, 6), FINEST_PERIOD_S) if layout is None else layout.period_s
+        if row_s > most_s + TIME_RESOLUTION_S:
+            raise FleetError(f"{where}: rows are {row_s:.3g} s apart, {why}")
+    if layout is not None:
+        return layout.period_s
+    return max(round(float(np.median([*spacing_s.values()])), 6), FINEST_PERIOD_S)
 
 
 def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
@@ -430,46 +407,34 @@ def _drives(
         branches = {name: channels.pop(name) for name in junction.branches}
         drive = Drive(vehicle=each.vehicle, name=f"frame {each.number}", branches=branches, inputs=channels)
         found.setdefault(each.vehicle, []).append(drive)
+    _require_amperes(found, junction)
     return found, database
 
 
-def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction, *, alone: bool = False) -> None:
-    """Raise DriveError if values cannot be amperes, or a branch is constant in most vehicles; in few a heater is off.
+def _currents_a(drives: Sequence[Drive], junction: Junction) -> list[Array]:
+    """Return the good values of each branch in all drives of a vehicle. [A]"""
+    return [good_values(drives, name) for name in junction.branches]
 
-    With ``alone`` the vehicles are no fleet, and a branch may be constant.
-    """
-    branches, scale_a = list(junction.branches), float(junction.full_scale_a)
-    largest, constant = np.zeros((len(drives), len(branches))), np.zeros((len(drives), len(branches)), bool)
-    for j, parts in enumerate(drives.values()):
-        for k, name in enumerate(branches):
-            values = np.concatenate([part.branches[name].value[part.branches[name].good] for part in parts])
-            largest[j, k] = np.abs(values).max()
-            constant[j, k] = not np.ptp(values)
-    if not alone and (still := constant.mean(axis=0) > 0.5).any():
+
+def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction) -> None:
+    """Raise DriveError if values cannot be amperes: beyond full scale, or all of a vehicle, or of its branch, tiny."""
+    scale_a = float(junction.full_scale_a)
+    largest_a = np.array([[np.abs(value).max() for value in _currents_a(mine, junction)] for mine in drives.values()])
+    small = largest_a < LEAST_OF_SCALE * scale_a
+    tiny = small & (small.all(axis=1, keepdims=True) | (np.median(largest_a, axis=0) > OTHER_UNIT * largest_a))
+    for j, k in np.argwhere(tiny | (largest_a > MOST_OF_SCALE * scale_a)).tolist():
+        unit = "kA: multiply by 1000" if tiny[j, k] else "mA: divide by 1000"
         raise DriveError(
-            f"branch {branches[int(np.argmax(still))]} never changes in most vehicles: stuck, or not connected; leave "
-            f"it out if the junction has none"
-        )
-    small = largest < LEAST_OF_SCALE * scale_a
-    strange = small & (small.all(axis=1, keepdims=True) | (np.median(largest, axis=0) > OTHER_UNIT * largest))
-    if not alone:
-        strange |= small & small.all(axis=0)
-    strange |= largest > MOST_OF_SCALE * scale_a
-    if strange.any():
-        j, k = (int(place[0]) for place in np.nonzero(strange))
-        unit = "kA: multiply by 1000" if small[j, k] else "mA: divide by 1000"
-        raise DriveError(
-            f"vehicle {list(drives)[j]}: the largest {branches[k]} current is {largest[j, k]:.3g} A, full scale being "
-            f"{scale_a:g} A; expected amperes; perhaps it is in {unit}, or full_scale_a is wrong"
+            f"vehicle {list(drives)[j]}: the largest {junction.branches[k]} current is {largest_a[j, k]:.3g} A, full "
+            f"scale being {scale_a:g} A; expected amperes; perhaps it is in {unit}, or full_scale_a is wrong"
         )
 
 
-def _record(drives: Sequence[Drive], store: SummaryStore, database: VehicleDatabase) -> Record:
+def _record(drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, bank: FilterBank) -> Record:
     """Summarise a vehicle's drives, or record why they cannot be used."""
     found, problem, names = None, "", tuple(drive.name for drive in drives)
     try:
-        found = summarise_drives(drives, store.identity.equipment, database, bank=store.identity.bank)
+        found = summarise_drives(drives, equipment, database, bank=bank)
     except DriveError as error:
         problem = str(error)
-    sources = ("",) * len(names)
-    return Record(vehicle=drives[0].vehicle, drives=names, sources=sources, found=found, problem=problem)
+    return Record(vehicle=drives[0].vehicle, drives=names, sources=("",) * len(names), found=found, problem=problem)
