@@ -16,9 +16,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from calibrator.drive import Array, Equipment, FleetSource, Samples
 from calibrator.errors import DriveError
@@ -179,10 +179,8 @@ class IdentificationReport:
     ----------
     bank : FilterBank
         The bank.
-    branches : tuple of str
-        Names of the K branches.
-    snr_db : mapping of str to mapping of str to float
-        Simulation signal-to-noise ratio on held-out blocks by vehicle and branch; NaN where it is not known. [dB]
+    snr_db : DataFrame
+        Simulation signal-to-noise ratio on held-out blocks, vehicles by branches; NaN where it is not known. [dB]
     left_out : mapping of str to str
         Why other vehicles could not be used.
     notices : tuple of str
@@ -190,22 +188,22 @@ class IdentificationReport:
     """
 
     bank: FilterBank
-    branches: tuple[str, ...]
-    snr_db: Mapping[str, Mapping[str, float]]
+    snr_db: pd.DataFrame
     left_out: Mapping[str, str]
     notices: tuple[str, ...]
 
     def as_json(self) -> str:
         """The report as JSON."""
         bank = {"identity": self.bank.identity, "file": self.bank, "described": self.bank.described()}
-        return dumps({**vars(self), "bank": bank, "branches": self._by_branch()})
+        branches, snr_db = self._by_branch().to_dict("index"), self.snr_db.to_dict("index")
+        return dumps({**vars(self), "bank": bank, "branches": branches, "snr_db": snr_db})
 
     def as_text(self) -> str:
         """The report for people."""
-        rows = []
-        for branch, row in self._by_branch().items():
-            figures = [f"{row[key]:.1f}" if np.isfinite(row[key]) else "-" for key in ("median_db", "worst_db")]
-            rows.append([branch, *figures, row["worst_vehicle"]])
+        rows = [
+            [branch, *(f"{value:.1f}" if np.isfinite(value) else "-" for value in (median_db, worst_db)), vehicle]
+            for branch, median_db, worst_db, vehicle in self._by_branch().itertuples()
+        ]
         parts = [
             f"filter bank {self.bank.identity} of {len(self.bank.input_names)} inputs: {self.bank.described()}",
             table(("simulation SNR [dB]", "median", "worst", "vehicle"), rows),
@@ -215,15 +213,11 @@ class IdentificationReport:
         ]
         return "\n\n".join(part for part in parts if part)
 
-    def _by_branch(self) -> dict[str, dict[str, Any]]:
+    def _by_branch(self) -> pd.DataFrame:
         """Return median over vehicles [dB] and worst vehicle by branch; NaN and "" where no vehicle could be judged."""
-        rows = {}
-        for branch in self.branches:
-            judged = {name: snr_db[branch] for name, snr_db in self.snr_db.items() if np.isfinite(snr_db[branch])}
-            worst = min(judged, key=lambda name: judged[name], default="")
-            median_db = float(np.median(list(judged.values()))) if judged else np.nan
-            rows[branch] = {"median_db": median_db, "worst_db": judged.get(worst, np.nan), "worst_vehicle": worst}
-        return rows
+        judged = self.snr_db.dropna(axis=1, how="all")
+        found = {"median_db": judged.median(), "worst_db": judged.min(), "worst_vehicle": judged.idxmin()}
+        return pd.DataFrame(found).reindex(self.snr_db.columns).fillna({"worst_vehicle": ""})
 
 
 def identify_fleet(path: str | Path, database: VehicleDatabase, *, workers: Workers) -> IdentificationReport:
@@ -253,13 +247,12 @@ def identify_fleet(path: str | Path, database: VehicleDatabase, *, workers: Work
     bank = _chosen_bank(fleet, equipment, database, workers=workers)
     read_one = partial(read_vehicle_summary, bank=bank)
     vehicles, left_out = read_vehicles(read_one, fleet, equipment, database, workers=workers)
-    snr_db = held_out_snr_db([vehicle.summary for vehicle in vehicles]).tolist()
-    named = {
-        one.vehicle: dict(zip(equipment.branches, of, strict=True)) for one, of in zip(vehicles, snr_db, strict=True)
-    }
-    return IdentificationReport(
-        bank=bank, branches=equipment.branches, snr_db=named, left_out=left_out, notices=equipment.notices
+    snr_db = pd.DataFrame(
+        held_out_snr_db([vehicle.summary for vehicle in vehicles]),
+        index=[vehicle.vehicle for vehicle in vehicles],
+        columns=list(equipment.branches),
     )
+    return IdentificationReport(bank=bank, snr_db=snr_db, left_out=left_out, notices=equipment.notices)
 
 
 def _chosen_bank(

@@ -90,12 +90,10 @@ class FleetTask:
         )
 
     def calibrate(self, vehicles: Sequence[VehicleSummary]) -> dict[str, tuple[VehicleParameters, Array] | str]:
-        """Return by name the parameters of some vehicles and the evidence for them, or why a vehicle has none.
+        """Return by name the parameters of one or more vehicles and the evidence for them, or why a vehicle has none.
 
         If they cannot be estimated together, each is estimated by itself: one bad vehicle never stops the others.
         """
-        if not vehicles:
-            return {}
         try:
             with np.errstate(all="ignore"):  # results that are not finite are refused later
                 estimate = self.estimate(vehicles)

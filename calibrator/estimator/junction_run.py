@@ -14,7 +14,7 @@ from calibrator.drive import Array, Drive, DriveFile, Equipment, FleetSource, Sa
 from calibrator.drives.align import align, at_pace
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
 from calibrator.errors import DriveError, FleetError
-from calibrator.estimator.junction import SEEN, JunctionKnowledge, estimate_junction, named_ratios
+from calibrator.estimator.junction import SEEN, JunctionKnowledge, JunctionLaw, estimate_junction, named_ratios
 from calibrator.estimator.readings import (
     TRUSTED_DRIFT_SD,
     TRUSTED_OFFSET_SD,
@@ -24,7 +24,7 @@ from calibrator.estimator.readings import (
 )
 from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
-from calibrator.estimator.vehicle_parameters import RunIdentity, parameters_of
+from calibrator.estimator.vehicle_parameters import RunIdentity, impossible, parameters_of
 from calibrator.estimator.vehicle_report import sensor_texts
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
@@ -184,11 +184,12 @@ def calibrate_junctions(
     layout, settings = identity.database.layout, identity.settings
     equipment, vehicles, left_out = _read(fleet, identity.database, settings, workers)
     branches, load = equipment.branches, settings.load or layout.unmeasured_load
+    expected_a = 0.0 if load is None else load.mean_a
     read = _known_readings(vehicles, branches, settings, layout, left_out=left_out)
-    groups = [range(len(vehicles))] if settings.meter is not None else [[j] for j in range(len(vehicles))]
+    groups = [[j] for j in range(len(vehicles))] if settings.meter is None else [[*range(len(vehicles))]]
     parameters, junctions, notices = [], dict[str, object](), list[str]()
     for group in groups:
-        known = JunctionKnowledge(read[..., list(group), :], load, settings.meter)
+        known = JunctionKnowledge(read[..., group, :], load, settings.meter)
         try:
             found, laws, deciding, contradictions = estimate_junction(
                 [vehicles[j] for j in group], branches, known, layout=layout, harm_limit=settings.harm_limit
@@ -202,15 +203,10 @@ def calibrate_junctions(
             why = "; ".join(contradictions)
             notices.append(f"what is known contradicts itself, so nothing is corrected: {why}")
         for i, j in enumerate(group):
-            name, ratios, constant_a = vehicles[j].vehicle, named_ratios(laws[i], branches), laws[i].constant_a
-            k = int(np.argmax(found.drift[i]))
-            if found.drift[i, k] >= 1.0:  # as in the schema of the parameter file
-                left_out[name] = (
-                    f"sensor {branches[k]} reads {1.0 + found.drift[i, k]:.1f} times the current; check its unit, or "
-                    f"what is known of the other sensors"
-                )
+            name = vehicles[j].vehicle
+            if why := impossible(found, i, branches):
+                left_out[name] = why
                 continue
-            expected_a = 0.0 if load is None else load.mean_a
             mine = parameters_of(
                 vehicles[j],
                 found,
@@ -222,18 +218,24 @@ def calibrate_junctions(
                 decisive=deciding[i],
             )
             parameters.append(mine)
-            junctions[name] = {"gain_ratio": ratios, "constant_a": constant_a}
+            junctions[name] = {"gain_ratio": named_ratios(laws[i], branches), "constant_a": laws[i].constant_a}
             if len(vehicles) <= MOST_SHOWN:
-                said = ", ".join(f"{value:.4f} +- {sd:.4f} ({pair})" for pair, (value, sd) in ratios.items())
-                texts = [f"{branch}: {text}" for branch, text in sensor_texts(mine).items()]
-                texts.append(
-                    f"gain ratios {said}; at zero current the sensors sum to {constant_a[0]:+.2f} +- "
-                    f"{constant_a[1]:.2f} A: their offsets, and loads without a sensor"
-                )
                 gains_known = [branches[k] for k in np.flatnonzero(np.isfinite(read[:, 0, 0, j]).any(axis=0))]
-                notices += [f"{name}: {text}" for text in (*texts, *_same_error(mine, gains_known))]
-    details = {"junction": junctions, "declared_load_a": 0.0 if load is None else load.mean_a}
+                texts = [*_shown_texts(mine, laws[i]), *_same_error(mine, gains_known)]
+                notices += [f"{name}: {text}" for text in texts]
+    details = {"junction": junctions, "declared_load_a": expected_a}
     return equipment, encode_chunk(parameters, left_out), details, notices
+
+
+def _shown_texts(parameters: VehicleParameters, law: JunctionLaw) -> list[str]:
+    """Describe the sensors of a vehicle, its gain ratios and the sum of its sensors at zero current."""
+    ratios = named_ratios(law, list(parameters.branches)).items()
+    said = ", ".join(f"{value:.4f} +- {sd:.4f} ({pair})" for pair, (value, sd) in ratios)
+    return [
+        *(f"{branch}: {text}" for branch, text in sensor_texts(parameters).items()),
+        f"gain ratios {said}; at zero current the sensors sum to {law.constant_a[0]:+.2f} +- "
+        f"{law.constant_a[1]:.2f} A: their offsets, and loads without a sensor",
+    ]
 
 
 def _read(

@@ -97,24 +97,14 @@ def _column(name: str, unit: str | None) -> pa.Field:
 _NAMES = [pa.field(name, pa.string(), nullable=name == "branch") for name in ("vehicle", "branch", "verdict")]
 SCHEMA = pa.schema([*_NAMES, *(_column(name, unit) for name, unit in _UNITS.items())])
 """Schema of ``results.parquet``."""
-_ONCE = {
-    "drives": "digest of the drives' files",
-    "parameters": "text of the parameter file",
-    "evidence_value": "rows named in run.json",
-    "evidence_sd": "standard deviation of the same",
-    "evidence_explained": "what the estimate makes of it",
-}
-_EVIDENCE = [name for name in _ONCE if name.startswith("evidence")]
+_EVIDENCE = ["evidence_value", "evidence_sd", "evidence_explained"]
+_ONCE = ["drives", "parameters", *_EVIDENCE]
+"""Columns that have values only in a vehicle's first row: digest of the drives' files, text of the parameter file, and
+the rows of evidence named in ``run.json``: their values, standard deviations, and what the estimate makes of them."""
 PART_SCHEMA = pa.schema(
-    [
-        *SCHEMA,
-        *(
-            pa.field(name, pa.list_(pa.float32()) if name in _EVIDENCE else pa.string(), metadata={"meaning": meaning})
-            for name, meaning in _ONCE.items()
-        ),
-    ]
+    [*SCHEMA, *(pa.field(name, pa.list_(pa.float32()) if name in _EVIDENCE else pa.string()) for name in _ONCE)]
 )
-"""Schema of a part, the vehicles of one bucket; the last five columns have values only in a vehicle's first row."""
+"""Schema of a part, the vehicles of one bucket."""
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -264,9 +254,11 @@ def join_rows(folder: Path, left_out: Mapping[str, str]) -> int:
         writer.write_table(pa.Table.from_pylist(_left_out_rows(others), schema=SCHEMA))
     if pq.read_metadata(path).num_rows <= MOST_SORTED:
         rows = pq.read_table(path, use_threads=False)
-        keys = pd.DataFrame({"left_out": pc.equal(rows["verdict"], LEFT_OUT), "vehicle": rows["vehicle"]})
-        order = keys.sort_values(["left_out", "vehicle"], kind="stable").index  # branches keep their order
-        path.write_bytes(_parquet(rows.take(order.to_numpy())))
+        keys = pa.table({"left_out": pc.equal(rows["verdict"], LEFT_OUT), "vehicle": rows["vehicle"]})
+        order = pc.sort_indices(
+            keys, [("left_out", "ascending"), ("vehicle", "ascending")]
+        )  # branches keep their order
+        path.write_bytes(_parquet(rows.take(order)))
     return calibrated
 
 
@@ -416,15 +408,8 @@ class CalibrationReport:
 
     def as_text(self) -> str:
         """The report for people."""
-        run, details = self.run, self.run.details
-        load_a = details.get("declared_load_a", 0.0)
+        run, load_a = self.run, self.run.details.get("declared_load_a", 0.0)
         about = (", median" if run.vehicles > 1 else "") + (f" about the {load_a:g} A declared" if load_a else "")
-        spread = details.get("hyperparameters", {}).get("model_spread", {})
-        by_branch = {
-            "simulation SNR, median, {} [dB]": (details.get("simulation_snr_db", {}), "{:.1f}"),
-            "vehicles that agree, {} [%]": (details.get("reference", {}).get("agreeing_share", {}), "{:.0%}"),
-            "faultless vehicles differ by, {} [%]": (spread, "{:.1%}"),
-        }
         rows = [
             ("vehicles calibrated", f"{run.vehicles}"),
             *((f"  {verdict}", f"{count}") for verdict, count in self.verdicts.items()),
@@ -433,11 +418,6 @@ class CalibrationReport:
             *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
             (f"junction sum RMS{about}, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
             (f"junction sum RMS{about}, corrected [A]", f"{self.junction_rms_deployed_a:.2f}"),
-            *(
-                (what.format(name), digits.format(value).rstrip("%"))
-                for what, (values, digits) in by_branch.items()
-                for name, value in values.items()
-            ),
         ]
         parts = [
             table((f"method {run.method}", ""), rows),
@@ -495,12 +475,12 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
         result=str(shown),
         parameters=parameters,
         run=run,
-        verdicts=_counts(vehicles["verdict"]),
+        verdicts=vehicles["verdict"].value_counts(sort=False).to_dict(),
         undecided=said(vehicles[vehicles["verdict"] == "cannot tell"], lambda mine: mine["reason"].fillna("").iloc[0]),
         corrected=said(rows[(rows["verdict"] == "corrected") & rows["applied"]], corrected),
         hardware_suspected=said(suspected, probability),
         hardware_count=len(suspected),
-        held_back=_counts(rows["held_back"].dropna()),
+        held_back=rows["held_back"].value_counts(sort=False).to_dict(),
         moved=said(moved, lambda mine: "; ".join(mine["branch"] + " " + mine["moved"])),
         moved_count=moved["vehicle"].nunique(),
         junction_rms_measured_a=float(np.median(measured_a)),
@@ -508,8 +488,3 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
             np.median(deployed_rms_a(applied, measured_a=measured_a, corrected_a=corrected_a))
         ),
     )
-
-
-def _counts(column: "pd.Series[str]") -> dict[str, int]:
-    """Count how often each text occurs, in order of first occurrence."""
-    return {str(text): len(rows) for text, rows in column.groupby(column, sort=False)}

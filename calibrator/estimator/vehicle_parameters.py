@@ -206,10 +206,11 @@ def impossible(estimate: FleetEstimate, j: int, branches: Sequence[str]) -> str:
     possible = np.abs(estimate.drift[j]) < 1.0  # as in the schema of the parameter file
     if possible.all():
         return ""
-    branch = branches[int(np.argmin(possible))]
-    return next((each.text for each in estimate.findings[j] if each.branch == branch), "") or (
-        f"its {branch} current does not follow its inputs as in the rest of the fleet: parked, stuck, or another kind "
-        f"of vehicle? record a drive in which it is used"
+    k = int(np.argmin(possible))
+    return next((each.text for each in estimate.findings[j] if each.branch == branches[k]), "") or (
+        f"its {branches[k]} sensor reads {1.0 + estimate.drift[j, k]:.1f} times the current: another unit, parked, "
+        f"stuck, or another kind of vehicle? check it, and what is known of other sensors, or record a drive in which "
+        f"it is used"
     )
 
 

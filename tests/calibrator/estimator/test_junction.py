@@ -263,7 +263,7 @@ def test_gain_errors_lie_within_their_standard_deviations() -> None:
 @pytest.mark.parametrize(("change", "known", "match"), [
     (lambda frame: frame.assign(motor=-frame["motor"]), {}, "check sign and unit of branch"),
     (lambda frame: frame.drop(columns="motor"), {}, "no column motor"),
-    (lambda frame: frame.assign(motor=2.4 * frame["motor"]), {"trusted": ["battery"]}, "motor reads 2.5 times"),
+    (lambda frame: frame.assign(motor=2.4 * frame["motor"]), {"trusted": ["battery"]}, "motor sensor reads 2.5 times"),
     (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
     (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
     (lambda frame: frame, {"load": (-3.0, 0.1)}, "a value from 0 with its standard deviation"),

@@ -162,4 +162,4 @@ def test_reported_evidence_without_noise_equals_that_of_the_true_faults() -> Non
 
 def test_gain_error_of_100_percent_or_more_is_impossible() -> None:
     assert impossible(estimate(of(1.0, drift=(0.9, 0))), 0, NAMES) == ""
-    assert "its motor current does not follow its inputs" in impossible(estimate(of(1.0, drift=(0, 1.2))), 0, NAMES)
+    assert "its motor sensor reads 2.2 times the current" in impossible(estimate(of(1.0, drift=(0, 1.2))), 0, NAMES)
