@@ -138,8 +138,8 @@ class _System:
         Of the sensors.
     laws : list of N JunctionLaw
         The junction laws.
-    known : list of (int, str)
-        For each of the last rows: place in x of the unknown that it gives, and what messages call this.
+    known : list of int
+        For each of the last rows: place in x of the unknown that it gives.
     """
 
     def __init__(
@@ -158,8 +158,8 @@ class _System:
             for r, what, j, k in np.argwhere(np.isfinite(known.read[:, 0])).tolist()
         ]
         given += [(2 * S + j, load.mean_a, load.sd_a) for j in range(N) if known.load is not None]
-        self.known = [(p, self._called(p)) for p, _, _ in given]
-        of_gain = np.array([p < S for p, _, _ in given], bool)
+        self.known = [p for p, _, _ in given]
+        of_gain = np.array(self.known) < S
         value, sd = np.array([each[1:] for each in given]).reshape(-1, 2).T
         design = np.zeros((N * K + len(given), 2 * S + N))
         for j, law in enumerate(self.laws):
@@ -169,7 +169,7 @@ class _System:
             design[constant, [S + first, *(S + s for s in others)]] = np.append(1.0, np.exp(law.value[:-1]))
             design[constant, 2 * S + j] = 1.0
             design[constant, first] = load.mean_a / scale_a  # (1 + d_1) l
-        design[range(len(design) - len(given), len(design)), [p for p, _, _ in given]] = 1.0
+        design[range(len(design) - len(given), len(design)), self.known] = 1.0
         self.design = design
         self.y = np.concatenate(
             [
@@ -190,15 +190,6 @@ class _System:
                 design[constant, [first, 2 * S + j]] = gain * load.mean_a / scale_a, gain
                 self.y[constant] = law.value[-1] + design[constant, first] * found[first]
 
-    def _called(self, p: int) -> str:
-        S = self.sensors
-        what = ("gain error of", "offset of")[p // S] if p < 2 * S else ""
-        return f"{what} {self.names[p % S]}" if what else "load that no branch measures"
-
-    def is_known(self, p: int) -> bool:
-        """Check whether a row gives x_p by itself."""
-        return any(place == p for place, _ in self.known)
-
     def condition(self, sd: Array, without: int | None = None) -> tuple[Array, Array, float]:
         """Return mean (P,) and covariance (P, P) of x, and log evidence, for a prior of standard deviations (P,).
 
@@ -213,14 +204,16 @@ class _System:
 
     def contradictions(self) -> list[str]:
         """List known values that all other rows contradict, whatever the faults of the sensors that are not known."""
-        found = []
-        for row, (p, name) in enumerate(self.known, start=len(self.y) - len(self.known)):
+        S, found = self.sensors, []
+        for row, p in enumerate(self.known, start=len(self.y) - len(self.known)):
             mean, covariance, _ = self.condition(self.open_sd, without=row)
             if abs(mean[p] - self.y[row]) > CONTRADICTION * np.sqrt(covariance[p, p] + self.covariance[row, row]):
                 known, rest = (
-                    f"{np.expm1(value):+z.2%}" if p < self.sensors else f"{value * self.scale_a:+.2f} A"
+                    f"{np.expm1(value):+z.2%}" if p < S else f"{value * self.scale_a:+.2f} A"
                     for value in (self.y[row], mean[p])
                 )
+                kind = ("gain error", "offset")[p // S] if p < 2 * S else ""
+                name = f"{kind} of {self.names[p % S]}" if kind else "load that no branch measures"
                 found.append(f"the {name} is known as {known}, the rest makes it {rest}")
         return found
 
@@ -243,7 +236,7 @@ class _Posterior(NamedTuple):
 def _posterior(system: _System) -> _Posterior:
     """Compute the posterior over the explanations: which sensors have an offset, and of which size."""
     S = system.sensors
-    may = [s for s in range(S) if not system.is_known(S + s)]
+    may = [s for s in range(S) if S + s not in system.known]
     found = []
     for size in range(min(len(may), MOST_OFFSETS) + 1):
         for chosen in combinations(may, size):
@@ -333,11 +326,11 @@ def estimate_junction(
     N, K, scale_a = len(vehicles), len(branches), layout.full_scale_a
     system = _System(vehicles, branches, known, scale_a)
     S, places, contradictions = system.sensors, system.places, system.contradictions()
-    scale_known, posterior = any(p < S for p, _ in system.known), _posterior(system)
+    scale_known, posterior = any(p < S for p in system.known), _posterior(system)
     mean, sd, draws, weight = posterior.mean, posterior.sd, posterior.draws, posterior.weight
     gain_fault = _fault_probability(mean[:S], sd[:S], OPEN_GAIN_SD, TRUSTED_DRIFT_SD)
     offset_fault = _fault_probability(mean[S : 2 * S], sd[S : 2 * S], OPEN_OFFSET_SD, TRUSTED_OFFSET_SD)
-    offset_read = [system.is_known(S + s) for s in range(S)]
+    offset_read = [S + s in system.known for s in range(S)]
     offset_fault = np.where(offset_read, offset_fault, posterior.offset_probability)
     fault = (1.0 - (1.0 - gain_fault) * (1.0 - offset_fault))[places]
     drift, offset, gain_sd, offset_sd = np.expm1(mean[places]), mean[S + places], sd[places], sd[S + places]

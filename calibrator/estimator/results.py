@@ -7,7 +7,7 @@ and in the first row of each vehicle the text of its parameter file. Up to :data
 """
 
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -20,11 +20,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from calibrator.drive import Array, Mask
+from calibrator.drive import Array, Equipment, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.settings import CONFIDENT
+from calibrator.estimator.vehicle_parameters import RunIdentity
 from calibrator.estimator.vehicle_report import held_back_lines
 from calibrator.summaries.identity import bucket_of
+from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 from ecu_node.documents import write_atomically
 from ecu_node.errors import ParameterError
@@ -37,19 +39,16 @@ __all__ = [
     "CalibrationReport",
     "RunRecord",
     "WrittenVehicle",
+    "complete_result",
     "deployed_rms_a",
     "encode_chunk",
-    "join_rows",
     "left_out_of",
     "part_file",
     "parts_of",
     "read_part",
     "read_results",
     "read_run",
-    "report_of",
     "result_rows",
-    "write_parameter_files",
-    "write_run",
     "written_of",
 ]
 
@@ -228,6 +227,76 @@ def _parquet(rows: pa.Table) -> bytes:
     return buffer.getvalue()
 
 
+def complete_result(
+    result: Path,
+    out: Path,
+    identity: RunIdentity,
+    equipment: Equipment,
+    *,
+    details: Mapping[str, object],
+    notices: Sequence[str],
+    others: Mapping[str, str] = {},
+    buckets: int = 0,
+) -> "CalibrationReport":
+    """Complete a result folder from its parts, and report.
+
+    Parameters
+    ----------
+    result, out : Path
+        The folder, and how it will be called.
+    identity : RunIdentity
+        Identity of the run.
+    equipment : Equipment
+        Branches and inputs of the fleet, and notices about them.
+    details : mapping of str to JSON values
+        What the method records of its run.
+    notices : sequence of str
+        What the user should know.
+    others : mapping of str to str
+        Why files whose vehicle is unclear are in none of the parts.
+    buckets : int
+        Number of parts that vehicles are spread over; 0: all are in the first.
+
+    Returns
+    -------
+    CalibrationReport
+        Of all vehicles of the result.
+
+    Raises
+    ------
+    FleetError
+        If no vehicle has parameters.
+    """
+    layout = identity.database.layout
+    vehicles, left_out = join_rows(result, others), left_out_of(result)
+    if not vehicles:
+        why = next(iter(left_out.values()), "there is none")
+        raise FleetError(f"{identity.fleet}: no vehicle can be calibrated; the first: {why}")
+    with progress_bar("write the result", None):
+        where = write_parameter_files(result, vehicles=vehicles)
+    run = RunRecord(
+        tool=identity.tool,
+        method=identity.settings.method.value,
+        fleet=identity.fleet,
+        layout=layout.name,
+        branches=list(equipment.branches),
+        model_inputs=list(equipment.inputs),
+        settings=identity.settings.record(),
+        created=identity.created,
+        details=dict(details),
+        vehicles=vehicles,
+        buckets=buckets,
+        left_out=dict(list(left_out.items())[:MOST_NAMED]),
+        left_out_count=len(left_out),
+        full_scale_a=layout.full_scale_a,
+        layout_sha256=layout.digest,
+        dbc_sha256=identity.database.digest,
+        notices=[*equipment.notices, *notices],
+    )
+    write_run(result, run)
+    return report_of(result, run, parameters=where, shown=out)
+
+
 def join_rows(folder: Path, left_out: Mapping[str, str]) -> int:
     """Join the rows of all parts to ``results.parquet``; up to :data:`MOST_SORTED` rows are sorted by vehicle.
 
@@ -236,28 +305,24 @@ def join_rows(folder: Path, left_out: Mapping[str, str]) -> int:
     folder : Path
         Folder of the result, with its parts.
     left_out : mapping of str to str
-        Why vehicles, or files whose vehicle is unclear, were left out; those in a part are not written twice.
+        Why files whose vehicle is unclear were left out.
 
     Returns
     -------
     int
         Number of vehicles that have parameters.
     """
-    path, calibrated, others = folder / ROWS, 0, dict(left_out)
+    path, calibrated = folder / ROWS, 0
     with pq.ParquetWriter(path, SCHEMA, compression="zstd") as writer:
         for part in parts_of(folder).values():
             found = pq.read_table(part, columns=SCHEMA.names, use_threads=False)
             calibrated += len(pc.unique(found.filter(pc.field("branch").is_valid())["vehicle"]))
-            for name in others.keys() & set(found["vehicle"].to_pylist()):
-                del others[name]
             writer.write_table(found)
-        writer.write_table(pa.Table.from_pylist(_left_out_rows(others), schema=SCHEMA))
+        writer.write_table(pa.Table.from_pylist(_left_out_rows(left_out), schema=SCHEMA))
     if pq.read_metadata(path).num_rows <= MOST_SORTED:
         rows = pq.read_table(path, use_threads=False)
         keys = pa.table({"left_out": pc.equal(rows["verdict"], LEFT_OUT), "vehicle": rows["vehicle"]})
-        order = pc.sort_indices(
-            keys, [("left_out", "ascending"), ("vehicle", "ascending")]
-        )  # branches keep their order
+        order = pc.sort_indices(keys, [(name, "ascending") for name in keys.column_names])  # branches keep their order
         path.write_bytes(_parquet(rows.take(order)))
     return calibrated
 

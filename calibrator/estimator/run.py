@@ -22,20 +22,7 @@ from calibrator.drive import Equipment, FleetSource
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
 from calibrator.estimator.readings import read_bench_table
-from calibrator.estimator.results import (
-    MOST_NAMED,
-    PARTS,
-    CalibrationReport,
-    RunRecord,
-    join_rows,
-    left_out_of,
-    part_file,
-    parts_of,
-    read_run,
-    report_of,
-    write_parameter_files,
-    write_run,
-)
+from calibrator.estimator.results import PARTS, CalibrationReport, complete_result, part_file, parts_of, read_run
 from calibrator.estimator.settings import CalibrationSettings, Method, require_learning
 from calibrator.estimator.vehicle_parameters import RunIdentity, time_of_run
 from calibrator.files.folders import require_new_folder, whole_folder
@@ -106,8 +93,6 @@ def calibrate_fleet(
     UserError
         If the fleet as a whole cannot be calibrated.
     """
-    if settings.branches is not None and since is not None:
-        raise ContradictionError("--branches and --since exclude each other: the earlier result has decided on that")
     require_new_folder(out)
     storage = open_storage(place)
     layout, stored = database.layout, require_fleet(storage, place, database)
@@ -131,11 +116,11 @@ def calibrate_fleet(
             if at_once := _at_once(source, settings, layout):
                 equipment, part, details, notices = at_once(source, identity, workers=workers)
                 write_atomically(part_file(result, 0), part)
-                return _finished(result, out, identity, equipment, details=details, notices=notices)
+                return complete_result(result, out, identity, equipment, details=details, notices=notices)
             others = source.left_out
             source = _summarised(source, summaries, identity, workers)
         details, notices = _calibrate_store(source, result, identity, workers, since)
-        return _finished(
+        return complete_result(
             result,
             out,
             identity,
@@ -298,48 +283,6 @@ def read_sample(
                     learners += learns
                     blocks += learns * len(found[-1].summary.moments)
     return found
-
-
-def _finished(
-    result: Path,
-    out: Path,
-    identity: RunIdentity,
-    equipment: Equipment,
-    *,
-    details: Mapping[str, object],
-    notices: Sequence[str],
-    others: Mapping[str, str] = {},
-    buckets: int = 0,
-) -> CalibrationReport:
-    """Complete a result folder, that will be ``out``, from its parts; ``others``: why vehicles are in none of these."""
-    layout = identity.database.layout
-    vehicles, left_out = join_rows(result, others), left_out_of(result)
-    if not vehicles:
-        why = next(iter(left_out.values()), "there is none")
-        raise FleetError(f"{identity.fleet}: no vehicle can be calibrated; the first: {why}")
-    with progress_bar("write the result", None):
-        where = write_parameter_files(result, vehicles=vehicles)
-    run = RunRecord(
-        tool=identity.tool,
-        method=identity.settings.method.value,
-        fleet=identity.fleet,
-        layout=layout.name,
-        branches=list(equipment.branches),
-        model_inputs=list(equipment.inputs),
-        settings=identity.settings.record(),
-        created=identity.created,
-        details=dict(details),
-        vehicles=vehicles,
-        buckets=buckets,
-        left_out=dict(list(left_out.items())[:MOST_NAMED]),
-        left_out_count=len(left_out),
-        full_scale_a=layout.full_scale_a,
-        layout_sha256=layout.digest,
-        dbc_sha256=identity.database.digest,
-        notices=[*equipment.notices, *notices],
-    )
-    write_run(result, run)
-    return report_of(result, run, parameters=where, shown=out)
 
 
 def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:

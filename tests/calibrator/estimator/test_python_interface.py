@@ -340,7 +340,6 @@ def test_wrong_paths_and_parameters_are_refused(tmp_path: Path) -> None:
         ({"readings": bench_rows(["V1"], 0.1).drop(columns="branch")}, "^readings: columns vehicle, drift.*; expected"),
         ({"readings": bench_rows(["V1"], 0.1).assign(branch="x")}, "^readings: row 0: no branch 'x'"),
         ({"trusted": [1]}, "fleet frames: no usable vehicle 1 to trust"),
-        ({"trusted": ["V1"], "hold_out": "V1"}, "vehicle V1 is both held out and trusted"),
         ({"trusted": "V9"}, "fleet frames: no usable vehicle V9 to trust"),
     )
     for parameters, message in wrong:

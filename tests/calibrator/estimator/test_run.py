@@ -148,8 +148,6 @@ def test_small_fleet_is_calibrated_without_worker_processes(
     (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
     (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
     (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
-    (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
-    (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
     (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
     (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
 ])  # fmt: skip
