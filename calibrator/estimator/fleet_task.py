@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrator.drive import Array, Mask
+from calibrator.drive import Mask
 from calibrator.errors import DriveError, FleetError, internal_error
 from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
 from calibrator.estimator.readings import (
@@ -27,7 +27,7 @@ from calibrator.estimator.readings import (
     merge_readings,
     window_readings,
 )
-from calibrator.estimator.results import PARTS, encode_chunk, part_file, read_part
+from calibrator.estimator.results import PARTS, Calibrated, encode_chunk, part_file, read_part
 from calibrator.estimator.vehicle_parameters import RunIdentity, impossible, parameters_of
 from calibrator.estimator.vehicle_report import explained_faults
 from calibrator.summaries.record import Record, drives_digest, joined_records
@@ -89,25 +89,22 @@ class FleetTask:
             limits=(layout.limits.drift, layout.offset_limit_a),
         )
 
-    def calibrate(self, vehicles: Sequence[VehicleSummary]) -> dict[str, tuple[VehicleParameters, Array] | str]:
-        """Return by name the parameters of one or more vehicles and the evidence for them, or why a vehicle has none.
+    def calibrate(self, vehicles: Sequence[VehicleSummary]) -> dict[str, Calibrated | str]:
+        """Return by name what was found for one or more vehicles, or why a vehicle has no parameters.
 
         If they cannot be estimated together, each is estimated by itself: one bad vehicle never stops the others.
         """
         try:
             with np.errstate(all="ignore"):  # results that are not finite are refused later
                 estimate = self.estimate(vehicles)
-            return {vehicle.vehicle: self._written(vehicle, estimate, j) for j, vehicle in enumerate(vehicles)}
+            return {vehicle.vehicle: self._found(vehicle, estimate, j) for j, vehicle in enumerate(vehicles)}
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
             if len(vehicles) > 1:
                 return {name: found for each in vehicles for name, found in self.calibrate([each]).items()}
             advice = f"its evidence cannot be used: {error}; look at its recordings"
             return {vehicles[0].vehicle: advice if isinstance(error, UserError) else internal_error(error)}
 
-    def _written(
-        self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int
-    ) -> tuple[VehicleParameters, Array] | str:
-        """Return the parameters of vehicle j of an estimate and the evidence for them, or why it has none."""
+    def _found(self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int) -> Calibrated | str:
         if why := impossible(estimate, j, self.branches):
             return why
         parameters = parameters_of(
@@ -119,7 +116,7 @@ class FleetTask:
             expected_a=self.reference.expected_a,
             fleet_size=self.fleet_size,
         )
-        return parameters, estimate.evidence[j]
+        return Calibrated(parameters, estimate.evidence[j])
 
 
 def learn_task(
@@ -253,31 +250,30 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
         )
     records, before = store.read(bucket), {} if previous is None else read_part(part_file(previous, bucket))
     digests = {name: drives_digest(items) for name, items in records.items()}
-    parameters, evidence, moved = list[VehicleParameters](), dict[str, Array](), dict[tuple[str, str], str]()
-    left_out, todo = dict.fromkeys(before.keys() - records.keys(), NOT_THERE), list[VehicleSummary]()
+    found: dict[str, Calibrated | str] = dict.fromkeys(before.keys() - records.keys(), NOT_THERE)
+    todo, moved = list[VehicleSummary](), dict[str, dict[str, str]]()
     for name, items in records.items():
         earlier = decode_parameters(before[name].text, f"earlier parameters of {name}") if name in before else None
         if earlier is not None and before[name].drives == digests[name]:
-            parameters.append(earlier)  # its evidence was found against another reference, and is not kept
+            found[name] = Calibrated(earlier)  # its evidence was found against another reference, and is not kept
             continue
         try:
-            summary, changes = _what_holds(items, earlier, task)
+            summary, moved[name] = _what_holds(items, earlier, task)
             todo.append(summary)
-            moved |= {(name, branch): text for branch, text in changes.items()}
         except DriveError as error:
-            left_out[name] = str(error)
+            found[name] = str(error)
         except UserError:
             raise
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
-            left_out[name] = internal_error(error)
+            found[name] = internal_error(error)
     for first in range(0, len(todo), AT_ONCE):
-        for name, found in task.calibrate(todo[first : first + AT_ONCE]).items():
-            if isinstance(found, str):
-                left_out[name] = found
-            else:
-                parameters.append(found[0])
-                evidence[name] = found[1]
-    return encode_chunk(parameters, left_out, moved=moved, drives=digests, evidence=evidence)
+        found |= task.calibrate(todo[first : first + AT_ONCE])
+    return encode_chunk(
+        {
+            name: item if isinstance(item, str) else item._replace(drives=digests[name], moved=moved.get(name, {}))
+            for name, item in found.items()
+        }
+    )
 
 
 def _what_holds(

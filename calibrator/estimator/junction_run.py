@@ -22,7 +22,7 @@ from calibrator.estimator.readings import (
     read_bench_table,
     window_readings,
 )
-from calibrator.estimator.results import encode_chunk
+from calibrator.estimator.results import Calibrated, encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
 from calibrator.estimator.vehicle_parameters import RunIdentity, impossible, parameters_of
 from calibrator.estimator.vehicle_report import sensor_texts
@@ -187,7 +187,7 @@ def calibrate_junctions(
     expected_a = 0.0 if load is None else load.mean_a
     read = _known_readings(vehicles, branches, settings, layout, left_out=left_out)
     groups = [[j] for j in range(len(vehicles))] if settings.meter is None else [[*range(len(vehicles))]]
-    parameters, junctions, notices = [], dict[str, object](), list[str]()
+    calibrated, junctions, notices = dict[str, Calibrated](), dict[str, object](), list[str]()
     for group in groups:
         known = JunctionKnowledge(read[..., group, :], load, settings.meter)
         try:
@@ -217,14 +217,14 @@ def calibrate_junctions(
                 fleet_size=1,
                 decisive=deciding[i],
             )
-            parameters.append(mine)
+            calibrated[name] = Calibrated(mine)
             junctions[name] = {"gain_ratio": named_ratios(laws[i], branches), "constant_a": laws[i].constant_a}
             if len(vehicles) <= MOST_SHOWN:
                 gains_known = [branches[k] for k in np.flatnonzero(np.isfinite(read[:, 0, 0, j]).any(axis=0))]
                 texts = [*_shown_texts(mine, laws[i]), *_same_error(mine, gains_known)]
                 notices += [f"{name}: {text}" for text in texts]
     details = {"junction": junctions, "declared_load_a": expected_a}
-    return equipment, encode_chunk(parameters, left_out), details, notices
+    return equipment, encode_chunk({**left_out, **calibrated}), details, notices
 
 
 def _shown_texts(parameters: VehicleParameters, law: JunctionLaw) -> list[str]:

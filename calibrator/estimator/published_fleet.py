@@ -17,7 +17,7 @@ import numpy as np
 from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import align
-from calibrator.estimator.results import encode_chunk
+from calibrator.estimator.results import Calibrated, encode_chunk
 from calibrator.estimator.settings import require_learning
 from calibrator.estimator.vehicle_parameters import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.processes.run_many import Workers
@@ -102,11 +102,12 @@ def calibrate_fleet_published(
         )
         recovery = recover_fleet(evidence, classes, full_scale_a=layout.full_scale_a)
     left_out |= {names[j]: reason for j, reason in recovery.failed.items()}
-    parameters = [
-        _parameters(vehicle, recovery, j, branches=branches, identity=identity, fleet_size=len(vehicles))
+    size = len(vehicles)
+    calibrated = {
+        names[j]: Calibrated(_parameters(vehicle, recovery, j, branches=branches, identity=identity, fleet_size=size))
         for j, vehicle in enumerate(vehicles)
         if j not in recovery.failed
-    ]
+    }
     details = {
         "unity_vehicle": unity.vehicle,
         "unity_duration_s": layout.period_s * (len(unity.held_out_inputs) - unity.lead_in),
@@ -119,7 +120,7 @@ def calibrate_fleet_published(
             f"truth: with faults of 5 to 25 % in one of five parameters it is off by about "
             f"{SLOPE_SPREAD / len(learners) ** 0.5:.0%}; give it {LEAST_VEHICLES} or more, or leave --method out",
         )
-    return equipment, encode_chunk(parameters, left_out), details, notices
+    return equipment, encode_chunk({**left_out, **calibrated}), details, notices
 
 
 def _without_misfits(

@@ -7,7 +7,7 @@ and in the first row of each vehicle the text of its parameter file. Up to :data
 """
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -36,6 +36,7 @@ __all__ = [
     "MOST_FILES",
     "PARTS",
     "SCHEMA",
+    "Calibrated",
     "CalibrationReport",
     "RunRecord",
     "WrittenVehicle",
@@ -141,62 +142,54 @@ class WrittenVehicle(NamedTuple):
     """Digest of the drives' files; empty: not known."""
     text: bytes
     evidence: Array | None
+    """As in :class:`Calibrated`."""
+
+
+class Calibrated(NamedTuple):
+    """What was found for a vehicle that has parameters."""
+
+    parameters: VehicleParameters
+    evidence: Array | None = None
     """Evidence that they were found from, shape (3, 5K), see :func:`.reported_evidence`; None: not kept."""
+    drives: str = ""
+    """Digest of the drives' files; empty: not known."""
+    moved: Mapping[str, str] = {}
+    """How sensors have moved since an earlier result, by branch."""
 
 
-def encode_chunk(
-    parameters: Iterable[VehicleParameters],
-    left_out: Mapping[str, str],
-    *,
-    moved: Mapping[tuple[str, str], str] = {},
-    drives: Mapping[str, str] = {},
-    evidence: Mapping[str, Array] = {},
-) -> bytes:
-    """Encode the parameters of some vehicles, sorted by name, as the content of a part file of the result.
+def encode_chunk(found: Mapping[str, Calibrated | str]) -> bytes:
+    """Encode what was found for some vehicles as the content of a part file of the result.
 
     Parameters
     ----------
-    parameters : iterable of VehicleParameters
-        One per calibrated vehicle; one whose parameters cannot be written is left out.
-    left_out : mapping of str to str
-        Why the other vehicles have none.
-    moved : mapping of (str, str) to str
-        How sensors have moved since an earlier result, by vehicle and branch.
-    drives : mapping of str to str
-        Digest of the drives' files by vehicle.
-    evidence : mapping of str to ndarray of shape (3, 5K)
-        Evidence that the parameters were found from, by vehicle, see :func:`.reported_evidence`.
+    found : mapping of str to Calibrated or str
+        By vehicle what was found, or why it is left out; one whose parameters cannot be written is left out as well.
 
     Returns
     -------
     bytes
-        Parquet, with the columns of :data:`PART_SCHEMA`.
+        Parquet, with the columns of :data:`PART_SCHEMA`; vehicles are sorted by name, those left out come last.
     """
-    rows: Rows = []
-    reasons = dict(left_out)
-    for item in sorted(parameters, key=lambda item: item.vehicle):
-        name = item.vehicle
-        try:
-            text = encode_parameters(item, f"parameters of {name}").decode()
-        except ParameterError as error:
-            reasons[name] = f"{error}; look at its recordings"
+    rows, left_out = Rows(), dict[str, str]()
+    for name, item in sorted(found.items()):
+        if isinstance(item, str):
+            left_out[name] = item
             continue
-        of_vehicle = _rows_of(item)
-        for row in of_vehicle:
-            row["moved"] = moved.get((name, row["branch"]))
-        of_vehicle[0] |= {"drives": drives.get(name, ""), "parameters": text}
-        of_vehicle[0] |= dict(zip(_EVIDENCE, evidence[name], strict=True)) if name in evidence else {}
-        rows += of_vehicle
-    return _parquet(pa.Table.from_pylist(rows + _left_out_rows(reasons), schema=PART_SCHEMA))
+        try:
+            rows += _rows_of(item)
+        except ParameterError as error:
+            left_out[name] = f"{error}; look at its recordings"
+    return _parquet(pa.Table.from_pylist(rows + _left_out_rows(left_out), schema=PART_SCHEMA))
 
 
-def _rows_of(item: VehicleParameters) -> Rows:
+def _rows_of(found: Calibrated) -> Rows:
     """Return the rows of a vehicle, one per branch; a row may have keys that are no columns, which are not written."""
+    item = found.parameters
     hardware, residual = item.hardware_fault, item.junction_residual
     measured_a, corrected_a = residual.measured_a, residual.corrected_a
     if item.provenance.fleet_size == 1:  # the user declared the expected sum; in a fleet it is estimated
         measured_a, corrected_a = residual.about_expected()
-    return [
+    rows: Rows = [
         {
             **msgspec.structs.asdict(branch),
             "vehicle": item.vehicle,
@@ -212,9 +205,14 @@ def _rows_of(item: VehicleParameters) -> Rows:
             "junction_rms_corrected_a": corrected_a,
             "duration_s": item.provenance.duration_s,
             "reason": item.deciding_evidence or "; ".join(held_back_lines(item)) or None,
+            "moved": found.moved.get(name),
         }
         for name, branch in item.branches.items()
     ]
+    text = encode_parameters(item, f"parameters of {item.vehicle}").decode()
+    rows[0] |= {"drives": found.drives, "parameters": text}
+    rows[0] |= {} if found.evidence is None else dict(zip(_EVIDENCE, found.evidence, strict=True))
+    return rows
 
 
 def _left_out_rows(left_out: Mapping[str, str]) -> Rows:

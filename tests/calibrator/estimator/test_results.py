@@ -32,9 +32,8 @@ def result(request: pytest.FixtureRequest, tmp_path: Path, database: VehicleData
     folder = tmp_path / "result"
     (folder / results.PARTS).mkdir(parents=True)
     for name in ("v1", "v2"):
-        results.part_file(folder, bucket_of(name, BUCKETS)).write_bytes(
-            results.encode_chunk([vehicle(database, name)], {})
-        )
+        found = {name: results.Calibrated(vehicle(database, name))}
+        results.part_file(folder, bucket_of(name, BUCKETS)).write_bytes(results.encode_chunk(found))
     results.join_rows(folder, {})
     where = results.write_parameter_files(folder, vehicles=request.param)
     assert where == ("params" if request.param == 2 else results.PARTS)
@@ -68,7 +67,8 @@ def test_vehicle_with_invalid_parameters_is_left_out(tmp_path: Path, database: V
     good = vehicle(database, "v1")
     bad = replace(good, vehicle="v2", branches={"battery": replace(good.branches["battery"], offset_a=float("nan"))})
     (tmp_path / results.PARTS).mkdir()
-    results.part_file(tmp_path, 0).write_bytes(results.encode_chunk([bad, good], {}))
+    found = {item.vehicle: results.Calibrated(item) for item in (bad, good)}
+    results.part_file(tmp_path, 0).write_bytes(results.encode_chunk(found))
     assert results.join_rows(tmp_path, {}) == 1
     (reason,) = results.left_out_of(tmp_path).values()
     assert reason.endswith("; look at its recordings")

@@ -115,9 +115,11 @@ def write_result(
     (folder / results.PARTS).mkdir(parents=True)
     rows = np.ones((3, len(evidence_names(BRANCHES))))
     rows[:2, [3, 4, 8, 9]] = np.nan  # no bench has seen these sensors
-    told = {item.vehicle: rows for item in vehicles} if evidence else {}
-    part = results.encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
-    results.part_file(folder, 0).write_bytes(part)
+    found: dict[str, results.Calibrated | str] = dict(left_out or {})
+    for item in vehicles:
+        said = {branch: text for (name, branch), text in (moved or {}).items() if name == item.vehicle}
+        found[item.vehicle] = results.Calibrated(item, rows if evidence else None, moved=said)
+    results.part_file(folder, 0).write_bytes(results.encode_chunk(found))
     results.join_rows(folder, {})
     results.write_parameter_files(folder, vehicles=len(vehicles))
     reference = {"agreeing_share": {"battery": 0.8, "motor": 0.75}, "unmeasured_a": 0.3}
