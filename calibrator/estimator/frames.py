@@ -214,8 +214,8 @@ def summarise_frames(
     identity = store_identity(equipment, database, vehicles=len(drives), fleet="frames")
     store = SummaryStore(storage=open_storage(folder), identity=identity)
     write_identity(store.storage, identity)
-    for bucket, names in store.by_bucket(drives).items():
-        store.append(bucket, [_record(drives[name], equipment, database, identity.bank) for name in names])
+    for bucket, vehicles in store.by_bucket(drives).items():
+        store.append(bucket, [_record(drives[name], equipment, database, identity.bank) for name in vehicles])
     return database
 
 
