@@ -31,7 +31,7 @@ from ecu_node.program import say_error, write_output
 
 __all__ = ["calibrate", "identify", "params"]
 
-OF_POSTERIOR = ("harm_limit", "trusted", "readings", "load", "meter", "expected_faults", "scheduler", "since")
+OF_POSTERIOR = ("harm_limit", "trusted", "readings", "load", "charge", "meter", "expected_faults", "scheduler", "since")
 """Options that only the posterior method uses."""
 
 
@@ -65,6 +65,14 @@ def calibrate(
         str | None,
         typer.Option(
             "--load", metavar="A[:SD]", help="Load that no branch measures, and its standard deviation [A] (posterior)."
+        ),
+    ] = None,
+    charge: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--charge",
+            metavar="BRANCH=AH:SD",
+            help="Charge into the junction through a branch over the recordings of one vehicle [Ah] (posterior).",
         ),
     ] = None,
     meter: Annotated[
@@ -114,6 +122,7 @@ def calibrate(
         trusted=_named(trusted),
         readings=readings,
         load=None if load is None else _load(load),
+        charge_ah=dict(_charge(item) for item in charge or ()),
         meter=meter,
         expected_faults=expected_faults,
         branches=tuple(branches.split(",")) if branches else None,
@@ -151,20 +160,40 @@ def _named(values: list[str] | None) -> frozenset[str]:
     return frozenset(name.strip() for value in values or () for name in value.split(","))
 
 
-def _load(text: str) -> UnmeasuredLoad:
-    """Read a load with its standard deviation [A], MEAN:SD; without SD it is exact."""
+def _value(text: str, option: str) -> tuple[float, float]:
+    """Read a number with its standard deviation, MEAN:SD; without SD the number is exact."""
     mean, _, sd = text.partition(":")
     try:
-        load = UnmeasuredLoad(mean_a=float(mean), sd_a=float(sd or 0.0))
+        found = float(mean), float(sd or 0.0)
     except ValueError:
-        load = UnmeasuredLoad(mean_a=math.nan, sd_a=math.nan)
-    if not (0.0 <= load.mean_a < math.inf and 0.0 <= load.sd_a < math.inf):
+        found = math.nan, math.nan
+    if not (math.isfinite(found[0]) and 0.0 <= found[1] < math.inf):
         raise typer.BadParameter(
-            f"{text!r}: expected what flows out of the junction, 0 A or more, and its standard deviation, such as "
-            f"1.5:0.3; a source is a branch of its own",
+            f"{text!r}: expected a number and its standard deviation, such as 1.5:0.3", param_hint=option
+        )
+    return found
+
+
+def _load(text: str) -> UnmeasuredLoad:
+    mean_a, sd_a = _value(text, "--load")
+    if mean_a < 0.0:
+        raise typer.BadParameter(
+            f"{text!r}: expected what flows out of the junction, 0 A or more; a source is a branch of its own",
             param_hint="--load",
         )
-    return load
+    return UnmeasuredLoad(mean_a=mean_a, sd_a=sd_a)
+
+
+def _charge(text: str) -> tuple[str, tuple[float, float]]:
+    branch, equals, value = text.partition("=")
+    if not (equals and branch.strip()):
+        raise typer.BadParameter(
+            f"{text!r}: expected a branch with its charge, such as battery=-12.5:0.2", param_hint="--charge"
+        )
+    mean, sd = _value(value, "--charge")
+    if not sd:
+        raise typer.BadParameter(f"{text!r}: give its standard deviation as well, {text}:0.1", param_hint="--charge")
+    return branch.strip(), (mean, sd)
 
 
 def identify(

@@ -79,9 +79,17 @@ NO_NODE_FILES = (
 )
 
 
+def _with_sd(given: Any, what: str, least: float = -1e6) -> tuple[float, float]:
+    """Return an argument that is a pair (value, standard deviation); FleetError, naming ``what``, if it is none."""
+    good = isinstance(given, Sequence) and len(given) == 2 and is_number(given[0], least, 1e6)
+    above = " from 0" if least == 0.0 else ""
+    require(good and is_number(given[1], 0.0, 1e6), what, given, f"a value{above} with its standard deviation")
+    return float(given[0]), float(given[1])
+
+
 def _in_python(text: str) -> str:
     """Replace options of the command in a message by the names of arguments: --harm-limit by harm_limit."""
-    text = text.replace("another --out", "another folder")
+    text = text.replace("--charge", "charge_ah").replace("another --out", "another folder")
     return re.sub("--([a-z]+)-?([a-z]*)", lambda found: "_".join(filter(None, found.groups())), text)
 
 
@@ -280,12 +288,13 @@ class _Calibrator:
             given["readings"] = path_of(readings, "readings", "a DataFrame or the path of a CSV table")
             require(given["readings"].is_file(), "readings", readings, "a file that exists")
         if alone:
-            meter, load = given["meter"], given["load"]
+            meter, charge_ah, load = given["meter"], given["charge_ah"] or {}, given["load"]
             require(meter is None or isinstance(meter, str), "meter", meter, "the name of a branch")
+            require(isinstance(charge_ah, Mapping), "charge_ah", charge_ah, "charges by branch")
+            given["charge_ah"] = {str(name): _with_sd(pair, "charge_ah") for name, pair in charge_ah.items()}
             if load is not None:
-                pair = isinstance(load, Sequence) and len(load) == 2 and all(is_number(each, 0.0, 1e6) for each in load)
-                require(pair, "load", load, "a value from 0 with its standard deviation")
-                given["load"] = UnmeasuredLoad(mean_a=float(load[0]), sd_a=float(load[1]))
+                mean_a, sd_a = _with_sd(load, "load", least=0.0)
+                given["load"] = UnmeasuredLoad(mean_a=mean_a, sd_a=sd_a)
         used = CalibrationSettings.__dataclass_fields__.keys() & given.keys()
         return CalibrationSettings(alone=alone, **{name: given[name] for name in used})
 
@@ -462,6 +471,8 @@ class JunctionCalibrator(_Calibrator):
         Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
     load : tuple of (float, float), or None
         Load that no branch measures and its standard deviation; None: as the layout says, else not known. [A]
+    charge_ah : mapping of str to (float, float), or None
+        Charge into the junction through a branch over the recordings of one vehicle, and its standard deviation. [Ah]
     meter : str or None
         Branch that has another sensor in each "vehicle": these are recordings of one car, as at different chargers.
     harm_limit : float
@@ -481,6 +492,7 @@ class JunctionCalibrator(_Calibrator):
     trusted: Collection[str] = ()
     readings: str | Path | pd.DataFrame | None = None
     load: tuple[float, float] | None = None
+    charge_ah: Mapping[str, tuple[float, float]] | None = None
     meter: str | None = None
     harm_limit: float = 0.001
 

@@ -5,7 +5,7 @@ No fleet is needed. Every vehicle gives K - 1 gain ratios and one constant of th
     log(-g_k) = lambda_1 - lambda_k,    c = o_1 - sum over k > 1 of g_k o_k + (1 + d_1) l,    lambda = log(1 + d),
 
 with the offsets o and the load l that no branch measures. They are linear in the unknowns (lambda, o, l), except that
-gains multiply a load, where they are linearised again; so recordings of one car with different meters are
+gains multiply a load or a charge, where they are linearised again; so recordings of one car with different meters are
 one system of equations. Ratios do not give the scale of the gains: it comes from sensors that are known. Offsets come
 from known sensors, zero-current windows, a declared load, or a charge balance. As no fleet shows what is usual, the
 gain of a sensor that is not known is open: its prior is a wide Gaussian. Its offset is absent (a narrow Gaussian: no
@@ -13,7 +13,7 @@ zero is exact) or present, of any size; each choice is one explanation. What sta
 deviation, and is not corrected.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -58,7 +58,7 @@ USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
 """Usual misfit, due to curvature of good sensors, and usual residual of the sum, due to noise and switched loads, over
 full scale; and spread between cars of the logarithm of the latter's square. [1]"""
 STEPS = 2
-"""Gauss-Newton steps for the gains that multiply loads: after the first one the ratios tell them."""
+"""Gauss-Newton steps for the gains that multiply charges and loads: after the first one the ratios tell them."""
 STILL = 0.003
 """Standard deviation of all currents, over full scale, up to which the car stands still. [1]"""
 SOUND_GAIN_SD, SOUND_OFFSET_SD = 0.01, 0.0025
@@ -120,6 +120,9 @@ class JunctionKnowledge(NamedTuple):
     [A], shape (3, 2, 2, N, K); NaN where there are none."""
     load: UnmeasuredLoad | None
     """Load that no branch measures; None: not known."""
+    charge_a: Mapping[str, tuple[float, float, float]]
+    """By branch: mean current over all drives as measured, the same by its charge, and standard deviation of the
+    latter. [A]"""
     meter: str | None
     """Branch that has another sensor in each of the N vehicles, which are recordings of one car then."""
 
@@ -127,8 +130,8 @@ class JunctionKnowledge(NamedTuple):
 class _System:
     """Linear equations y = design x + error of N recordings for x = (lambda of S sensors, S offsets, N loads).
 
-    The first rows are the junction laws, the last ones what is known of single x. Offsets and loads are in fractions of
-    full scale. The prior of all x is wide and centred on 0.
+    The first rows are the junction laws, then come the charges, and last what is known of single x. Offsets and loads
+    are in fractions of full scale. The prior of all x is wide and centred on 0.
 
     Attributes
     ----------
@@ -161,7 +164,7 @@ class _System:
         self.known = [p for p, _, _ in given]
         of_gain = np.array(self.known) < S
         value, sd = np.array([each[1:] for each in given]).reshape(-1, 2).T
-        design = np.zeros((N * K + len(given), 2 * S + N))
+        design = np.zeros((N * K + len(known.charge_a) + len(given), 2 * S + N))
         for j, law in enumerate(self.laws):
             first, *others = self.places[j][law.order].tolist()
             ratios, constant = range(j * K, (j + 1) * K - 1), (j + 1) * K - 1
@@ -169,21 +172,31 @@ class _System:
             design[constant, [S + first, *(S + s for s in others)]] = np.append(1.0, np.exp(law.value[:-1]))
             design[constant, 2 * S + j] = 1.0
             design[constant, first] = load.mean_a / scale_a  # (1 + d_1) l
+        charges = np.array([*known.charge_a.values()]).reshape(-1, 3) / scale_a  # mean measured = (1 + d) true + o
+        charged = [branches.index(name) for name in known.charge_a]
+        for i, k in enumerate(charged, start=N * K):
+            design[i, [k, S + k]] = charges[i - N * K, 1], 1.0
         design[range(len(design) - len(given), len(design)), self.known] = 1.0
         self.design = design
         self.y = np.concatenate(
             [
                 *(law.value for law in self.laws),
+                charges[:, 0] - charges[:, 1],
                 np.where(of_gain, np.log1p(np.where(of_gain, value, 0.0)), value / scale_a),
             ]
         )
         self.covariance = block_diag(
             *(law.covariance for law in self.laws),
+            np.diag(charges[:, 2] ** 2 + LAW_OFFSET_SD**2),
             np.diag(np.where(of_gain, sd / (1.0 + value), sd / scale_a) ** 2),
         )
         self.open_sd = np.repeat([OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD], [S, S, N])
         for _ in range(STEPS):  # 1 + d = exp(lambda), linear about the lambda that is found
             found = self.condition(self.open_sd)[0]
+            for i, k in enumerate(charged, start=N * K):
+                measured, true, _ = charges[i - N * K]
+                design[i, k] = true * np.exp(found[k])
+                self.y[i] = measured - design[i, k] * (1.0 - found[k])
             for j, law in enumerate(self.laws):
                 first, constant = int(self.places[j, law.order[0]]), (j + 1) * K - 1
                 gain = np.exp(found[first])

@@ -12,6 +12,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from calibrator.drive import Array, Drive, DriveFile, Equipment, FleetSource, Samples
 from calibrator.drives.align import align, at_pace
+from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.junction import SEEN, JunctionKnowledge, JunctionLaw, estimate_junction, named_ratios
@@ -52,6 +53,8 @@ LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
 outnumber the branches, so that uncertainties can be estimated."""
 FULL_BLOCK = 10
 """Number of samples of a block where there are enough."""
+MOST_MISSING = 0.05
+"""Share of a recording without samples of a branch up to which its charge is integrated. [1]"""
 JUMP = 0.02
 """Change of a current within its largest possible delay, over full scale, that counts as a jump. [1]"""
 MOST_SHOWN = 5
@@ -182,14 +185,15 @@ def calibrate_junctions(
         If no vehicle can be used, or something is given as known of a branch or vehicle that is not there.
     """
     layout, settings = identity.database.layout, identity.settings
-    equipment, vehicles, left_out = _read(fleet, identity.database, settings, workers)
+    equipment, vehicles, left_out, drives = _read(fleet, identity.database, settings, workers)
     branches, load = equipment.branches, settings.load or layout.unmeasured_load
     expected_a = 0.0 if load is None else load.mean_a
     read = _known_readings(vehicles, branches, settings, layout, left_out=left_out)
+    charge_a = _charges(drives, settings, fleet)
     groups = [[j] for j in range(len(vehicles))] if settings.meter is None else [[*range(len(vehicles))]]
     calibrated, junctions, notices = dict[str, Calibrated](), dict[str, object](), list[str]()
     for group in groups:
-        known = JunctionKnowledge(read[..., group, :], load, settings.meter)
+        known = JunctionKnowledge(read[..., group, :], load, charge_a, settings.meter)
         try:
             found, laws, deciding, contradictions = estimate_junction(
                 [vehicles[j] for j in group], branches, known, layout=layout, harm_limit=settings.harm_limit
@@ -240,12 +244,13 @@ def _shown_texts(parameters: VehicleParameters, law: JunctionLaw) -> list[str]:
 
 def _read(
     fleet: FleetSource, database: VehicleDatabase, settings: CalibrationSettings, workers: Workers
-) -> tuple[Equipment, list[VehicleSummary], dict[str, str]]:
-    """Return equipment, summaries of usable vehicles, and why others are not; few vehicles are read in this process."""
+) -> tuple[Equipment, list[VehicleSummary], dict[str, str], list[Sequence[Drive]]]:
+    """Return equipment, summaries of usable vehicles, why others are not, and each one's drives if they are few."""
     branches, limit_s = settings.branches, settings.time_limit_s
     if len(fleet.vehicles) > MOST_READ_HERE:
         equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False)
-        return equipment, *read_vehicles(read_junction, fleet, equipment, database, workers=workers, limit_s=limit_s)
+        found = read_vehicles(read_junction, fleet, equipment, database, workers=workers, limit_s=limit_s)
+        return equipment, *found, []
     left_out = dict(fleet.left_out)
 
     def usable(make: Callable[[Any], _Made], items: Iterable[tuple[str, Any]]) -> dict[str, _Made]:
@@ -265,7 +270,7 @@ def _read(
     first = [mine[0] for mine in drives.values()]
     equipment = probe_equipment(fleet, database, branches, limit_s=limit_s, modelled=False, drives=first)
     vehicles = usable(lambda mine: summarise_junction(mine, equipment.branches, database), drives.items())
-    return equipment, list(vehicles.values()), left_out
+    return equipment, list(vehicles.values()), left_out, list(drives.values())
 
 
 def _known_readings(
@@ -279,7 +284,7 @@ def _known_readings(
     """Collect what is known of sensors, see :class:`JunctionKnowledge`; FleetError if one of them is not there."""
     scale_a, names = layout.full_scale_a, [each.vehicle for each in vehicles]
     meter = [settings.meter] if settings.meter else []
-    for option, given in {"--trusted": settings.trusted, "--meter": meter}.items():
+    for option, given in {"--trusted": settings.trusted, "--charge": settings.charge_ah, "--meter": meter}.items():
         for name in given:
             if name not in branches:
                 raise FleetError(f"{option} {name}: no such branch was recorded; there are {', '.join(branches)}")
@@ -295,3 +300,33 @@ def _known_readings(
             right[1, 0, of, k] = max(TRUSTED_DRIFT_SD, layout.find_branch(name).uncertainty)
             right[1, 1, of, k] = TRUSTED_OFFSET_SD * scale_a
     return np.stack([window_readings(vehicles), bench_readings(bench, names, branches), right])
+
+
+def _charges(
+    drives: Sequence[Sequence[Drive]], settings: CalibrationSettings, fleet: FleetSource
+) -> dict[str, tuple[float, float, float]]:
+    """Return :attr:`JunctionKnowledge.charge_a`, empty if no charge is given; FleetError if it cannot be used. [A]"""
+    if not settings.charge_ah:
+        return {}
+    if len(drives) != 1:
+        raise FleetError(
+            f"--charge is of the recordings of one vehicle, and there are {len(fleet.vehicles)}; give those of one"
+        )
+    found, duration_s = {}, sum(drive.duration_s for drive in drives[0])
+    for branch, (charge_ah, sd_ah) in settings.charge_ah.items():
+        measured_as = span_s = missing_s = 0.0
+        for drive in drives[0]:
+            channel = drive.branches[branch]
+            time_s, value_a = channel.time_s[channel.good], channel.value[channel.good]
+            step_s = np.diff(time_s)
+            usual = step_s <= GAP_PERIODS * np.median(step_s) if step_s.size else step_s > 0.0
+            measured_as += float(np.trapezoid(value_a, time_s))
+            span_s += float(step_s.sum())
+            missing_s += drive.duration_s - float(step_s[usual].sum())
+        if missing_s > MOST_MISSING * duration_s:
+            raise FleetError(
+                f"--charge {branch}: {missing_s:.0f} s of {duration_s:.0f} s have no samples of it, so its charge is "
+                f"not known; leave the option out"
+            )
+        found[branch] = measured_as / span_s, charge_ah * 3600.0 / span_s, sd_ah * 3600.0 / span_s
+    return found

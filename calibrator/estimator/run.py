@@ -147,6 +147,7 @@ def _require_summaries_enough(place: str | Path, settings: CalibrationSettings, 
     needs = {
         "--method published": settings.method is Method.PUBLISHED,
         "--branches": settings.branches is not None,
+        "--charge": settings.charge_ah,
         "--meter": settings.meter is not None,
         "--trusted with a branch": settings.trusted & set(layout.branch_names),
         "a junction without a fleet": settings.alone,
@@ -167,7 +168,8 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) 
         return calibrate_fleet_published
     names_branches = bool(settings.trusted) and not settings.trusted & fleet.vehicles.keys()
     names_branches = names_branches and settings.trusted <= set(layout.branch_names)
-    if not (settings.alone or settings.meter is not None or names_branches or len(fleet.vehicles) == 1):
+    alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
+    if not (alone or names_branches or len(fleet.vehicles) == 1):
         return None
     fleets = {"--hold-out": settings.hold_out, "--expected-faults": settings.expected_faults is not None}
     for option in (option for option, given in fleets.items() if given):

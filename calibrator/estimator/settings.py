@@ -58,6 +58,9 @@ class CalibrationSettings:
         Whether each vehicle is calibrated by itself in any case.
     load : UnmeasuredLoad or None
         Load that no branch measures; None: that of the layout, if it states one.
+    charge_ah : mapping of str to (float, float)
+        For single junctions: charge into the junction through a branch during the recordings, and its standard
+        deviation. [Ah]
     meter : str or None
         For single junctions: branch that has another sensor in each folder of recordings of one car.
     harm_limit : float
@@ -75,6 +78,7 @@ class CalibrationSettings:
     readings: Path | str | None = None
     alone: bool = False
     load: UnmeasuredLoad | None = None
+    charge_ah: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     meter: str | None = None
     harm_limit: float = HARM_LIMIT
     expected_faults: float | None = None
@@ -91,6 +95,7 @@ class CalibrationSettings:
             "readings": None if self.readings is None else _named_digest(self.readings),
             "expected_faults": self.expected_faults,
             "load": None if self.load is None else [self.load.mean_a, self.load.sd_a],
+            "charge_ah": dict(self.charge_ah),
             "meter": self.meter,
         }
 

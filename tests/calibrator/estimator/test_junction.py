@@ -1,4 +1,4 @@
-"""A single junction: gains from a trusted sensor, offsets from a load, and what stays undetermined."""
+"""A single junction: gains from a trusted sensor, offsets from load or charge balance, and what stays undetermined."""
 
 import re
 from pathlib import Path
@@ -69,6 +69,17 @@ def test_faults_are_estimated_within_their_deviations_and_corrected(
     assert rows.gain_error_sd.max() < 0.01
     assert set(rows.index[rows.corrected]) == corrected
     assert (np.abs(rows.offset_a - offset_a) < 3.0 * rows.offset_sd_a).all()
+
+
+@pytest.mark.parametrize(("missing", "gain"), [(0.0, 0.1), (25.0, 0.1), (0.0, 0.4)])
+def test_charge_balance_determines_an_offset(missing: float, gain: float) -> None:
+    """Also of a sensor with a gain error, and where a tenth of the samples of another branch are missing."""
+    frame = recording(offset_a=(5.0, 0.0, 0.0), gain=(gain, 0.0, 0.0), load_a=30.0)
+    true_ah = float((frame["battery"] - 5.0).mean()) / (1.0 + gain) * SECONDS / 3600.0
+    frame.loc[100.0 : 100.0 + missing, "heater"] = np.nan
+    row = found(frame, trusted=["motor"], charge_ah={"battery": (true_ah, 0.01)}).loc["vehicle", "battery"]
+    assert row.offset_a == pytest.approx(5.0, abs=0.5)
+    assert row.offset_sd_a < 0.5
 
 
 def test_several_junctions_are_calibrated_independently() -> None:
@@ -267,7 +278,17 @@ def test_gain_errors_lie_within_their_standard_deviations() -> None:
     (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
     (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
     (lambda frame: frame, {"load": (-3.0, 0.1)}, "a value from 0 with its standard deviation"),
+    (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
     (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
+    (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
+    *(
+        (
+            lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
+            {"charge_ah": {"battery": (1.0, 0.1)}},
+            "have no samples of it",
+        )
+        for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
+    ),
 ])  # fmt: skip
 def test_mistake_in_calling_the_junction_calibrator_is_one_line(
     motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str

@@ -142,9 +142,12 @@ def test_small_fleet_is_calibrated_without_worker_processes(
 @pytest.mark.parametrize(("options", "code", "message"), [
     (("--method", "published"), 1, "a store of summaries, and --method published needs the drives"),
     (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
+    (("--charge", "battery=3:0.1"), 1, "a store of summaries, and --charge needs the drives"),
     (("--meter", "motor"), 1, "a store of summaries, and --meter needs the drives"),
-    (("--load", "much"), 2, "and its standard deviation, such as 1.5:0.3"),
+    (("--load", "much"), 2, "expected a number and its standard deviation"),
     (("--load=-3:0.1",), 2, "expected what flows out of the junction"),
+    (("--charge", "battery"), 2, "expected a branch with its charge"),
+    (("--charge", "battery=3"), 2, "give its standard deviation"),
     (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
     (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
     (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
