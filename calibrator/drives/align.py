@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inner
+from calibrator.compiled import compiled
 from calibrator.drive import Array, Channel, Drive, Mask, Samples
 from calibrator.errors import DriveError
 from ecu_node.formulas import FUNCTIONS, formula_value, parse_formula
@@ -29,6 +29,7 @@ __all__ = [
     "at_pace",
     "choose_inputs",
     "evaluate_formula",
+    "good_samples",
     "step_seen",
 ]
 
@@ -242,11 +243,24 @@ def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:
     return np.arange(first, last + 1) * period_s
 
 
+def good_samples(channel: Channel) -> tuple[Array, Array]:
+    """Return the instants [s] of a channel's good samples, strictly increasing, and their values, shape (n,) each.
+
+    Of several samples at one instant the last counts.
+    """
+    time_s, value = channel.time_s, channel.value
+    if not channel.good.all():
+        time_s, value = time_s[channel.good], value[channel.good]
+    last = np.diff(time_s, append=np.inf) > 0.0
+    return (time_s, value) if last.all() else (time_s[last], value[last])
+
+
 def _interpolated(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, NDArray[np.uint8]]:
     """Return the values at the instants, and labels: 0, or ``_FAR`` or ``_SPOILT`` as :func:`_interpolate` says."""
     value, label = np.empty(len(time_s)), np.zeros(len(time_s), np.uint8)
-    samples = (np.ascontiguousarray(channel.time_s), np.ascontiguousarray(channel.value), channel.good)
-    _interpolate(samples, time_s, limit_s + TIME_RESOLUTION_S, value, label)
+    known_s, known = map(np.ascontiguousarray, good_samples(channel))
+    bad_s = channel.time_s[~channel.good]
+    _interpolate((known_s, known), bad_s, time_s, limit_s + TIME_RESOLUTION_S, value, label)
     return value, label
 
 
@@ -254,54 +268,29 @@ _FAR, _SPOILT = 1, 2
 
 
 @compiled
-def _interpolate(
-    samples: tuple[Array, Array, Mask], time_s: Array, limit_s: float, value: Array, label: NDArray[np.uint8]
+def _interpolate(  # noqa: PLR0917 (compiled: no keywords)
+    samples: tuple[Array, Array], bad_s: Array, time_s: Array, limit_s: float, value: Array, label: NDArray[np.uint8]
 ) -> None:
     """Fill `value` and `label` at increasing instants from the good samples before (or at) and after (or at) each.
 
-    Of several samples at one instant the last counts. Before the first and after the last sample, that sample's value
-    is held. If the two samples are farther apart than the limit, the label is ``_SPOILT`` with bad samples between
-    them, else ``_FAR``.
+    Before the first and after the last sample, that sample's value is held. If the two samples are farther apart than
+    the limit, the label is ``_SPOILT`` if a bad sample lies between them or beside one, else ``_FAR``.
     """
-    known_s, known, good = samples
-    before, after = -1, _next_good(known_s, good, -1)
+    known_s, known = samples
+    after, bad = 0, 0
     for j in range(len(time_s)):
         while after < len(known_s) and known_s[after] <= time_s[j]:
-            before, after = after, _next_good(known_s, good, after)
-        first, last = before, after
-        if first < 0:
-            first = last
-        if last == len(known_s) or known_s[first] == time_s[j]:
+            after += 1
+        first, last = max(after - 1, 0), min(after, len(known_s) - 1)
+        if known_s[first] == time_s[j]:
             last = first
         gap_s = known_s[last] - known_s[first]
         share = min(max((time_s[j] - known_s[first]) / gap_s, 0.0), 1.0) if gap_s > 0.0 else 0.0
         value[j] = (1.0 - share) * known[first] + share * known[last]
         if gap_s > limit_s:
-            label[j] = _FAR
-            k = first
-            while k > 0 and known_s[k - 1] == known_s[first]:
-                k -= 1
-            while k < len(known_s) and known_s[k] <= known_s[last]:
-                if not good[k]:
-                    label[j] = _SPOILT
-                k += 1
-
-
-@inner
-def _next_good(known_s: Array, good: Mask, at: int) -> int:
-    """Return the index of the next good sample after `at`; the number of samples if there is none.
-
-    Of several good samples at one instant it is the last.
-    """
-    at += 1
-    while at < len(good) and not good[at]:
-        at += 1
-    k = at + 1
-    while k < len(good) and known_s[k] == known_s[at]:
-        if good[k]:
-            at = k
-        k += 1
-    return at
+            while bad < len(bad_s) and bad_s[bad] < known_s[first]:
+                bad += 1
+            label[j] = _SPOILT if bad < len(bad_s) and bad_s[bad] <= known_s[last] else _FAR
 
 
 def step_seen(channel: Channel, otherwise_a: float) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 
 from calibrator.compiled import compiled
 from calibrator.drive import Array, Channel, Mask
+from calibrator.drives.align import good_samples
 
 __all__ = ["Band", "ChargeCurve", "charge_curve", "covered"]
 
@@ -130,12 +131,12 @@ def charge_curve(channel: Channel) -> ChargeCurve | None:
         The curve; None for fewer than two good samples at different instants. Of several at one instant the last
         counts.
     """
-    time_s, pieces = np.empty(len(channel.time_s)), np.zeros((4, len(channel.time_s)))
-    samples = (np.ascontiguousarray(channel.time_s), np.ascontiguousarray(channel.value), channel.good)
-    count = _integrate(samples, time_s, pieces)
-    if count < 2:
+    time_s, value = good_samples(channel)
+    if len(time_s) < 2:
         return None
-    time_s = time_s[:count]
+    pieces = np.zeros((4, len(time_s)))
+    pieces[2] = value
+    _integrate(time_s, pieces)
     h = np.diff(time_s)
     period_s = float(np.median(h))
     gap_s = np.concatenate([[0.0], np.cumsum(np.where(h > GAP_PERIODS * period_s, h, 0.0))])
@@ -143,20 +144,11 @@ def charge_curve(channel: Channel) -> ChargeCurve | None:
 
 
 @compiled
-def _integrate(samples: tuple[Array, Array, Mask], time_s: Array, pieces: Array) -> int:
-    """Fill `time_s` and `pieces` of a :class:`ChargeCurve`, and return its number of samples n."""
-    known_s, value, good = samples
-    integral, charge, current = pieces[0], pieces[1], pieces[2]
-    count = 0
-    for j in range(len(known_s)):
-        if good[j]:
-            if count > 0 and known_s[j] <= time_s[count - 1]:
-                count -= 1
-            time_s[count], current[count] = known_s[j], value[j]
-            count += 1
-    for k in range(count - 1):
+def _integrate(time_s: Array, pieces: Array) -> None:
+    """Fill `pieces` of a :class:`ChargeCurve`, of which the current is given."""
+    integral, charge, current, slope = pieces
+    for k in range(len(time_s) - 1):
         h = time_s[k + 1] - time_s[k]
-        pieces[3, k] = (current[k + 1] - current[k]) / h
+        slope[k] = (current[k + 1] - current[k]) / h
         charge[k + 1] = charge[k] + h * (current[k + 1] + current[k]) / 2.0
-        integral[k + 1] = integral[k] + h * (charge[k] + h * (current[k] / 2.0 + h * pieces[3, k] / 6.0))
-    return count
+        integral[k + 1] = integral[k] + h * (charge[k] + h * (current[k] / 2.0 + h * slope[k] / 6.0))
