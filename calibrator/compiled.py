@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numba as _numba
 
-__all__ = ["compiled", "inner", "is_compiled"]
+__all__ = ["compiled", "inlined", "inner", "is_compiled"]
 
 numba: Any = _numba  # its type hints leave out options
 
@@ -71,6 +71,11 @@ def compiled(function: _Function) -> _Function:
 def inner(function: _Function) -> _Function:
     """Compile a function that only other compiled functions call."""
     return cast("_Function", _dispatcher(function, no_cpython_wrapper=True))
+
+
+def inlined(function: _Function) -> _Function:
+    """Compile a small function into those that call it: a call would count references to its arrays."""
+    return cast("_Function", _dispatcher(function, inline="always"))
 
 
 def is_compiled(module: str) -> bool:

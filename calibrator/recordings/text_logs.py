@@ -30,7 +30,7 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inner
+from calibrator.compiled import compiled, inlined, inner
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import (
     CLASSIC_BYTES,
@@ -295,104 +295,81 @@ def _parse_plain_asc(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
     """Parse lines of an ASC file with hexadecimal numbers; return frames in their order, and each line's kind."""
     if b"CANFD" in text:
         raise _CanFdError
-    columns = FrameColumns.of(text.count(b"\n") + (not text.endswith(b"\n")), fd=False)
+    text = text if text.endswith(b"\n") else text + b"\n"
+    columns = FrameColumns.of(text.count(b"\n"), fd=False)
     _parse_asc(np.frombuffer(text, np.uint8), HEX, columns)
     return columns.frames(), columns.kind
 
 
 @compiled
-def _parse_candump(  # noqa: PLR0912, PLR0915 (a line is judged from left to right)
-    text: _Text, digits: _Text, names: NDArray[np.int64], columns: FrameColumns
-) -> int:
+def _parse_candump(text: _Text, digits: _Text, names: NDArray[np.int64], columns: FrameColumns) -> int:
     """Parse line by line into `columns`, and return the number of different channels.
 
     The text must end with a line end. `names` receives where each channel's name starts and ends in it. The result
-    is -1 if a payload does not fit into the columns. One loop without calls is three times as fast as a function per
-    line. No step passes a line end, so parsing goes on safely after a fault in a line.
+    is -1 if a payload does not fit into the columns.
     """
     kind, time_ns, key, channel, length, data = columns
-    row, at, channels = 0, 0, 0
-    while at < len(text):
-        start, seconds, fraction, identifier, size = at, 0, 0, 0, 0
-        at += text[at] == ord("(")
-        while ord("0") <= text[at] <= ord("9"):
-            seconds = 10 * seconds + (text[at] - ord("0"))
-            at += 1
-        sound = text[start] == ord("(") and 2 <= at - start <= 11 and seconds < 9 * 10**9 and text[at] == ord(".")
-        at += sound
-        point = at
-        while ord("0") <= text[at] <= ord("9"):
-            fraction = 10 * fraction + (text[at] - ord("0"))
-            at += 1
-        nanoseconds = at - point == 9
-        sound = sound and (nanoseconds or at - point == 6) and text[at] == ord(")") and text[at + 1] == ord(" ")
-        at += 2 * sound
-        first = at
-        while text[at] > ord(" "):
-            at += 1
-        last = at
-        while text[at] == ord(" "):
-            at += 1
-        begin = at
-        while digits[text[at]] != _NOT_HEX and at - begin <= 8:
-            identifier = 16 * identifier + digits[text[at]]
-            at += 1
-        extended = at - begin == 8
-        sound = sound and (extended or at - begin == 3) and text[at] == ord("#")
-        sound = sound and identifier <= ((_ERROR_BIT | LARGEST_IDENTIFIER) if extended else 0x7FF)
-        at += sound
-        fd = text[at] == ord("#")
+    row, start, channels = 0, 0, 0
+    while start < len(text):
+        at, end = _word(text, start)
+        is_blank = at == end
+        stamp_ns, fraction, last = _time(text, at + (text[at] == ord("(")))
+        sound = stamp_ns >= 0 and (fraction == 6 or fraction == 9)  # noqa: PLR1714 (compiled)
+        sound = sound and text[at] == ord("(") and text[last] == ord(")") and last == end - 1
+        name_at, name_end = _word(text, end)
+        at, end = _word(text, name_end)
+        mark = at
+        while mark < end and text[mark] != ord("#"):
+            mark += 1
+        identifier, extended = _hexadecimal(text, at, mark, digits), mark - at == 8
+        sound = sound and mark < end and (extended or mark - at == 3)
+        sound = sound and 0 <= identifier <= ((_ERROR_BIT | LARGEST_IDENTIFIER) if extended else 0x7FF)
         what = ERROR if identifier & _ERROR_BIT else DATA
+        at = min(mark + 1, end)
+        fd = text[at] == ord("#")
         if fd:  # a digit of flags follows
-            at += 1
-            sound = sound and digits[text[at]] != _NOT_HEX
-            at += sound
-        elif text[at] & 0xDF == ord("R"):  # upper case
-            what = REMOTE
-            while text[at] > ord(" "):
-                at += 1
-        while digits[text[at]] != _NOT_HEX and digits[text[at + 1]] != _NOT_HEX:
-            if size < data.shape[1]:
-                data[row, size] = 16 * digits[text[at]] + digits[text[at + 1]]
-            size, at = size + 1, at + 2
-        if text[at] == ord(" ") and (text[at + 1] & 0xDF == ord("R") or text[at + 1] & 0xDF == ord("T")):
+            sound = sound and digits[text[at + 1]] != _NOT_HEX
             at += 2
-        at += text[at] == ord("\r")
-        sound = sound and size <= (FD_BYTES if fd else CLASSIC_BYTES) and text[at] == ord("\n")
+        elif text[at] & 0xDF == ord("R"):  # upper case
+            what, at = REMOTE, end
+        size = (end - at) // 2
+        sound = sound and end - at == 2 * size and 0 <= size <= (FD_BYTES if fd else CLASSIC_BYTES)
+        last = end
+        while text[end] != ord("\n"):
+            end += 1
+        rest = end - last - (text[end - 1] == ord("\r"))  # the direction may follow
+        is_direction = rest == 2 and (text[last + 1] & 0xDF == ord("R") or text[last + 1] & 0xDF == ord("T"))
+        sound = sound and (rest == 0 or is_direction)
         if sound and what == DATA:
             if size > data.shape[1]:
                 return -1
+            for k in range(size):
+                high, low = digits[text[at + 2 * k]], digits[text[at + 2 * k + 1]]
+                sound = sound and high < 16 and low < 16
+                data[row, k] = 16 * high + low
             number = 0
-            while number < channels and not _is_same(text, names[number, 0], names[number, 1], first, last):
+            while number < channels and not _is_same(text, names[number, 0], names[number, 1], name_at, name_end):
                 number += 1
             if number == channels and channels < len(names):
-                names[number, 0], names[number, 1] = first, last
+                names[number, 0], names[number, 1] = name_at, name_end
                 channels += 1
-            sound = number < len(names)
-            time_ns[row], channel[row], length[row] = (
-                seconds * 10**9 + fraction * (1 if nanoseconds else 1000),
-                number,
-                size,
-            )
+            sound = sound and number < len(names)
+            time_ns[row], channel[row], length[row] = stamp_ns, number, size
             key[row] = identifier | EXTENDED_BIT if extended else identifier
-        is_blank = text[start] == ord("\n") or (text[start] == ord("\r") and text[start + 1] == ord("\n"))
-        kind[row] = what if sound else NOTHING if is_blank else DAMAGED
-        while text[at] != ord("\n"):
-            at += 1
-        row, at = row + 1, at + 1
+        kind[row] = NOTHING if is_blank else what if sound else DAMAGED
+        row, start = row + 1, end + 1
     return channels
 
 
 @compiled
 def _parse_asc(text: _Text, digits: _Text, columns: FrameColumns) -> None:
-    """Parse line by line into `columns`."""
+    """Parse line by line into `columns`; the text must end with a line end."""
     row, start = 0, 0
     while start < len(text):
-        end = start
-        while end < len(text) and text[end] != ord("\n"):
-            end += 1
-        columns.kind[row] = _asc_line(text[:end], start, digits, row, columns)
-        row, start = row + 1, end + 1
+        columns.kind[row] = _asc_line(text, start, digits, row, columns)
+        while text[start] != ord("\n"):
+            start += 1
+        row, start = row + 1, start + 1
 
 
 @inner
@@ -410,7 +387,7 @@ def _is_same(text: _Text, first: int, last: int, first_too: int, last_too: int) 
 def _asc_line(  # noqa: PLR0911 (as above)
     text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns
 ) -> int:
-    """Parse the line from `at` to the end of the text into a row of `columns`; return what kind of line it is."""
+    """Parse the line that starts at `at` into a row of `columns`; return what kind of line it is."""
     at, end = _word(text, at)
     time_ns, fraction, at = _time(text, at)
     if fraction < 0 or at != end:
@@ -424,7 +401,7 @@ def _asc_line(  # noqa: PLR0911 (as above)
             return NOTHING  # another event
         channel = 10 * channel + (text[k] - ord("0"))
     identifier_at, identifier_end = _word(text, end)
-    if identifier_at < len(text) and text[identifier_at] == ord("E") and identifier_end - identifier_at == 10:
+    if text[identifier_at] == ord("E") and identifier_end - identifier_at == 10:
         return ERROR
     at, end = _word(text, identifier_end)
     if end - at != 2 or text[at + 1] != ord("x") or not (text[at] == ord("R") or text[at] == ord("T")):
@@ -451,40 +428,38 @@ def _asc_line(  # noqa: PLR0911 (as above)
     return DATA
 
 
-@inner
+@inlined
 def _word(text: _Text, at: int) -> tuple[int, int]:
-    """Return where the next word starts, and one past its end; the end of the text for both if there is none."""
-    while at < len(text) and text[at] <= ord(" "):
+    """Return where the next word of the line starts, and one past its end; the line's end for both if there is none."""
+    while text[at] <= ord(" ") and text[at] != ord("\n"):
         at += 1
     end = at
-    while end < len(text) and text[end] > ord(" "):
+    while text[end] > ord(" "):
         end += 1
     return at, end
 
 
-@inner
+@inlined
 def _time(text: _Text, at: int) -> tuple[int, int, int]:
     """Parse seconds with a fraction; return the time [ns], the number of fraction digits, and where the number ends.
 
     The time is -1 if it has no fraction, too many digits or too many seconds; the digits are -1 if there is no point.
     """
     time_ns, seconds, point = 0, 0, -1
-    start = at
-    while at < len(text) and (ord("0") <= text[at] <= ord("9") or (text[at] == ord(".") and point < 0)):
+    while ord("0") <= text[at] <= ord("9") or (text[at] == ord(".") and point < 0):
         if text[at] == ord("."):
             point, seconds, time_ns = at, time_ns, 0
         elif time_ns < 10**11:
             time_ns = 10 * time_ns + (text[at] - ord("0"))
         at += 1
-    digits = at - point - 1 if point >= start else -1
-    if digits < 0 or digits > _NANOSECOND_DIGITS or seconds >= 9 * 10**9:
-        return -1, digits, at
+    digits = at - point - 1 if point >= 0 else -1
     for _ in range(digits, _NANOSECOND_DIGITS):
         time_ns *= 10
-    return seconds * 10**9 + time_ns, digits, at
+    possible = 0 <= digits <= _NANOSECOND_DIGITS and seconds < 9 * 10**9
+    return seconds * 10**9 + time_ns if possible else -1, digits, at
 
 
-@inner
+@inlined
 def _hexadecimal(text: _Text, at: int, end: int, digits: _Text) -> int:
     """Parse a number of up to 8 hexadecimal digits; return -1 for anything else."""
     value = 0 if 0 < end - at <= 8 else -1
