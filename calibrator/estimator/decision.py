@@ -1,7 +1,7 @@
 """Find the estimate for each vehicle, the confidence in it, and the probability that correction makes a branch worse.
 
-:func:`estimate_rows` does it for N vehicles: fault models of the fleet -> weighted draws (:class:`Explained`) -> one
-posterior per vehicle (:class:`Points`) -> :class:`RowsEstimate`.
+:func:`estimate_rows` does it for N vehicles: fault models of the fleet -> weighted draws -> one posterior per vehicle
+(:class:`FleetPoints`) -> :class:`RowsEstimate`.
 
 The estimate is the point that has most of the posterior within the tolerance of "recovered"; that share is the
 confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
@@ -13,8 +13,8 @@ Equations (M18) and (M19) are those of docs/method.md.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from itertools import starmap
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +26,15 @@ from calibrator.score import TOLERANCE
 from ecu_node.parameters import Explanation, SensorFinding
 
 __all__ = [
-    "Explained",
     "FleetEstimate",
+    "FleetPoints",
     "Points",
     "RowsEstimate",
     "SensorEstimate",
     "best_estimate",
     "decided",
     "estimate_rows",
+    "group_centres",
     "harm_probability",
     "posterior_points",
     "recovery_probability",
@@ -60,28 +61,8 @@ LIKE_ESTIMATE = (0.1, 0.001)
 largest fault, plus this drift [1] or offset over full scale. [1]"""
 
 
-class Explained(NamedTuple):
-    """Weighted draws of N vehicles under one fault model of the fleet: M draws of each of Q explanations, g groups.
-
-    Attributes
-    ----------
-    probability : float
-        Probability of this fault model.
-    draws : Draws
-        Draws from the explanations of the vehicles.
-    weight : ndarray of shape (N, Q, M, 1 + g)
-        Weights of the draws, see :func:`calibrator.estimator.posterior.weigh`.
-    group_centre : ndarray of shape (g,)
-        Offset or load of the feeding branch that the vehicles of each group share, in fractions of full scale.
-    """
-
-    probability: float
-    draws: Draws
-    weight: Array
-    group_centre: Array
-
-
-class Points(NamedTuple):
+@dataclass(frozen=True)
+class Points:
     """Posterior of one vehicle as weighted points.
 
     Attributes
@@ -91,48 +72,76 @@ class Points(NamedTuple):
     weight : ndarray of shape (n,)
         Weights of the points; they sum to 1, apart from negligible draws that are left out.
     explanation : ndarray of int of shape (n,)
-        Number of the explanation that a point comes from.
-    model, fit : ndarray of int of shape (e,)
-        Fault model of each explanation, and its place among the fits of the vehicle.
+        Number of the explanation that a point comes from, from 0 on.
     """
 
     faults: Array
     weight: Array
     explanation: NDArray[np.int64]
-    model: NDArray[np.int64]
-    fit: NDArray[np.int64]
 
 
-def posterior_points(models: Sequence[Explained]) -> list[Points]:
-    """Return the posterior of each of N vehicles as weighted points, over all fault models that explain their fleet."""
-    faults, weight, number, vehicle = [], [], [], []
-    for i, model in enumerate(models):
-        shared, feed, K = model.draws.shared, model.draws.feed, model.draws.values.shape[3] // 3
-        j, q, m, g = np.nonzero(model.weight > NEGLIGIBLE)
-        x = model.draws.values[j, q, m]
-        gain = np.exp(x[:, 1 : K + 1] + shared[K : 2 * K])
-        offset = x[:, 2 * K : 3 * K] * gain
+@dataclass(frozen=True)
+class FleetPoints(Points):
+    """Posterior of a vehicle of a fleet.
+
+    Attributes
+    ----------
+    hardware : ndarray of shape (n, 1 + K)
+        Drift [1] and offsets, in fractions of full scale, of the hardware fault of the point's explanation.
+    load : ndarray of shape (n,)
+        Load without a sensor beside what a group shares, in fractions of full scale.
+    group : ndarray of int of shape (n,)
+        0, or from 1 on the number of the group of :func:`group_centres` that the vehicle belongs to.
+    """
+
+    hardware: Array
+    load: Array
+    group: NDArray[np.int64]
+
+
+def group_centres(models: Sequence[FaultModel]) -> Array:
+    """Return what the vehicles of each group share in the feeding branch, over full scale: of the model with most."""
+    return max((model.prior.group_centre for model in models), key=len)
+
+
+def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]]) -> list[FleetPoints]:
+    """Return the posterior of each of N vehicles as weighted points, over all fault models that explain their fleet.
+
+    Each model comes with the draws of the vehicles under it, and their weights (N, Q, M, 1 + g) as :func:`.weigh`
+    returns them.
+    """
+    centres, parts = group_centres([model for model, _, _ in models]), []
+    for i, (model, draws, weights) in enumerate(models):
+        K = draws.values.shape[3] // 3
+        at, shared, feed, fitted = ParameterPlaces(K), draws.shared, draws.feed, draws.fits.theta
+        j, q, m, g = np.nonzero(weights > NEGLIGIBLE)
+        x = draws.values[j, q, m]
+        gain, omega = np.exp(x[:, at.gains] + shared[K : 2 * K]), x[:, at.offsets]
+        offset = omega * gain
         # An offset that a group shares belongs to the sensor; a load that it shares does not, and is taken out.
-        alone, of_group = offset[:, feed] == 0.0, np.append(0.0, model.group_centre)[g]
+        alone, of_group = offset[:, feed] == 0.0, np.append(0.0, model.prior.group_centre)[g]
         if shared[-1]:
             offset[:, feed] += np.where(alone, of_group, 0.0)
         else:
             offset[:, feed] -= np.where(alone, 0.0, of_group * gain[:, feed])
         total = offset + shared[:K]
-        cancel = (x[:, 2 * K : 3 * K] == 0.0) & (np.abs(total) <= SAME)  # shares of a group and of all sensors
-        faults.append(np.hstack([gain - 1.0, np.where(cancel, 0.0, total)]))
-        weight.append(model.weight[j, q, m, g] * model.probability)
-        number.append((q * model.weight.shape[3] + g) * len(models) + i)
-        vehicle.append(j)
-    order = np.argsort(np.concatenate(vehicle), kind="stable")
-    ends = np.cumsum(np.bincount(np.concatenate(vehicle), minlength=len(models[0].weight)))[:-1]
-    parts = [np.split(np.concatenate(each)[order], ends) for each in (faults, weight, number)]
-    groups, found = np.array([model.weight.shape[3] for model in models]), []
-    for some, w, which in zip(*parts, strict=True):
-        kinds, explanation = np.unique(which, return_inverse=True)
-        of_model = kinds % len(models)
-        found.append(Points(some, w, explanation, of_model, kinds // len(models) // groups[of_model]))
-    return found
+        cancel = (omega == 0.0) & (np.abs(total) <= SAME)  # shares of a group and of all sensors
+        hardware = fitted[j, q, at.hardware_offsets]
+        same = [1 + np.argmin(np.abs(centres - centre)) for centre in model.prior.group_centre]
+        part = FleetPoints(
+            faults=np.hstack([gain - 1.0, np.where(cancel, 0.0, total)]),
+            weight=weights[j, q, m, g] * model.probability,
+            explanation=(q * weights.shape[3] + g) * len(models) + i,
+            hardware=np.column_stack([np.expm1(fitted[j, q, at.eta]), hardware, -hardware.sum(axis=1)]),
+            load=np.where(g == 0, x[:, at.load], 0.0),
+            group=np.array([0, *same])[g],
+        )
+        parts.append((j, *vars(part).values()))
+    vehicle, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(vehicle, kind="stable")
+    ends = np.cumsum(np.bincount(vehicle, minlength=len(models[0][2])))[:-1]
+    found = starmap(FleetPoints, zip(*(np.split(column[order], ends) for column in columns), strict=True))
+    return [replace(each, explanation=np.unique(each.explanation, return_inverse=True)[1]) for each in found]
 
 
 def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
@@ -287,19 +296,14 @@ class RowsEstimate(SensorEstimate):
 
     Attributes
     ----------
-    load_probability, load_a : ndarray of shape (N,)
-        Probability that the feeding branch carries a load without a sensor in this vehicle alone [1], and its expected
-        size [A].
-    group_probability : ndarray of shape (N, g)
-        Probability that the vehicle belongs to each group that shares a constant of the feeding branch. [1]
-    supports : sequence of N sequences of (float, ndarray of shape (4, K))
-        Explanations by falling probability, each as its probability and four rows: hardware drift (first column only),
-        hardware offsets, drifts, and offsets; branches and units are those of the points.
+    points : sequence of N FleetPoints
+        The posterior.
+    supports : sequence of N sequences of (float, ndarray of shape (3K + 1,))
+        Explanations by falling probability, each as its probability, hardware drift, K hardware offsets, K drifts and K
+        offsets; branches and units are those of the points.
     """
 
-    load_probability: Array
-    load_a: Array
-    group_probability: Array
+    points: Sequence[FleetPoints]
     supports: Sequence[Sequence[tuple[float, Array]]]
 
 
@@ -372,11 +376,13 @@ def estimate_rows(
     explained = []
     for model in models:
         draws = explain(rows, model, feed=feed)
-        weight = np.sum([share * weigh(draws, prior)[0] for share, prior in model.priors], axis=0)
-        explained.append(Explained(model.probability, draws, weight, model.prior.group_centre))
+        explained.append(
+            (model, draws, np.sum([share * weigh(draws, prior)[0] for share, prior in model.priors], axis=0))
+        )
     smallest = np.array([models[0].prior.gain.smallest, models[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
-    fault, hardware, points, supports = np.zeros((N, K)), np.zeros(N), posterior_points(explained), []
+    fault, hardware, points, supports = np.zeros((N, K)), np.zeros((N, 1 + K)), posterior_points(explained), []
+    hardware_probability = np.zeros(N)
     for j, found in enumerate(points):
         estimate[j], confidence[j] = best_estimate(found, smallest)
         drift, offset = estimate[j, :K], estimate[j, K:]
@@ -390,56 +396,27 @@ def estimate_rows(
         sd[j, all_shared] = RESOLUTION
         faulty = found.faults != 0.0
         fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
-        supports.append(_supports(explained, found, j))
-        hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
+        supports.append(_supports(found))
+        hardware[j] = _nearest(supports[j], estimate[j])[: 1 + K]
+        hardware_probability[j] = min(sum(share for share, values in supports[j] if values[: 1 + K].any()), 1.0)
     confidence[~rows.known.any(axis=1)] = 0.0  # nothing is known of these: a prior is no evidence
-    first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])
-    load_probability, load, group_probability = _unmeasured(explained)
     return RowsEstimate(
         drift=estimate[:, place],
         offset_a=estimate[:, K + place] * full_scale_a,
         drift_sd=sd[:, place],
         offset_sd_a=sd[:, K + place] * full_scale_a,
-        hardware_drift=first[:, 0, 0],
-        hardware_offset_a=first[:, 1, place] * full_scale_a,
-        hardware_probability=np.minimum(hardware, 1.0),
+        hardware_drift=hardware[:, 0],
+        hardware_offset_a=hardware[:, 1 + place] * full_scale_a,
+        hardware_probability=hardware_probability,
         confidence=confidence,
         fault_probability=fault[:, place],
         harm_probability=harm[:, place],
         identifiable=_identifiable(rows)[:, place],
-        load_probability=load_probability,
-        load_a=load * full_scale_a,
-        group_probability=group_probability,
         supports=supports,
         points=points,
         order=order,
         full_scale_a=full_scale_a,
     )
-
-
-def _unmeasured(models: Sequence[Explained]) -> tuple[Array, Array, Array]:
-    """Return probability (N,) and size over full scale (N,) of a load without a sensor, and probability of each group.
-
-    The latter has shape (N, g).
-    """
-    own, size = [], []
-    centres = max((model.group_centre for model in models), key=len)  # the first model's, if it has any
-    groups = np.zeros((len(models[0].weight), len(centres)))
-    for model in models:
-        place = ParameterPlaces(model.draws.values.shape[3] // 3).load
-        alone = model.weight[..., 0] * model.draws.fits.support[:, :, None, place]
-        own.append(model.probability * _total(alone))
-        size.append(model.probability * _total(alone * model.draws.values[..., place]))
-        for centre, share in zip(model.group_centre, _total(model.weight[..., 1:]).T, strict=True):
-            groups[:, np.argmin(np.abs(centres - centre))] += model.probability * share
-    load = np.sum(own, axis=0)
-    return load, np.sum(size, axis=0) / np.maximum(load, 1e-300), groups
-
-
-def _total(values: Array) -> Array:
-    """Sum over draws (N, Q, M, ...) one by one, so that other vehicles have no effect to the last bit."""
-    N, Q, M = values.shape[:3]
-    return np.asarray(np.cumsum(values.reshape(N, Q * M, *values.shape[3:]), axis=1)[:, -1])
 
 
 def _central_sd(points: Points, estimate: Array) -> Array:
@@ -454,35 +431,29 @@ def _central_sd(points: Points, estimate: Array) -> Array:
     return sd
 
 
-def _supports(models: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
-    """List :attr:`RowsEstimate.supports` of vehicle j; explanations whose parameters have the same signs are merged."""
-    K = points.faults.shape[1] // 2
-    at, share = ParameterPlaces(K), np.bincount(points.explanation, points.weight)
-    order = np.argsort(-share, kind="stable")
-    order = order[share[order] >= LEAST_EXPLANATION]
-    theta = np.array([models[points.model[i]].draws.fits.theta[j, points.fit[i]] for i in order.tolist()])
-    values = np.zeros((len(order), 4, K))
-    values[:, 0, 0] = np.expm1(theta[:, at.eta])
-    values[:, 1, :-1] = theta[:, at.hardware_offsets]
-    values[:, 1, -1] = -theta[:, at.hardware_offsets].sum(axis=1)
-    for i in range(2 * K):
-        total = np.bincount(points.explanation, points.weight * points.faults[:, i])
-        values[:, 2 + i // K, i % K] = total[order] / share[order]
-    signs = np.sign(np.where(np.abs(values) < 1e-9, 0.0, values))
+def _supports(points: FleetPoints) -> list[tuple[float, Array]]:
+    """List :attr:`RowsEstimate.supports` of a vehicle; explanations whose parameters have the same signs are merged."""
+    share = np.bincount(points.explanation, points.weight)
+    parameters = np.hstack([points.hardware, points.faults])
+    total = np.zeros((len(share), parameters.shape[1]))
+    np.add.at(total, points.explanation, points.weight[:, None] * parameters)
     found: dict[bytes, tuple[float, Array]] = {}
-    for each, sign, part in zip(values, signs, share[order].tolist(), strict=True):
-        before, kept = found.get(sign.tobytes(), (0.0, each))
-        found[sign.tobytes()] = (before + part, kept)
+    for i in np.argsort(-share, kind="stable"):
+        if share[i] >= LEAST_EXPLANATION:
+            values = total[i] / share[i]
+            signs = np.sign(np.where(np.abs(values) < 1e-9, 0.0, values)).tobytes()
+            before, kept = found.get(signs, (0.0, values))
+            found[signs] = (before + float(share[i]), kept)
     return sorted(found.values(), key=lambda item: -item[0])
 
 
 def _nearest(supports: list[tuple[float, Array]], estimate: Array) -> Array:
-    """Return the (4, K) values of the most probable of the supports whose sensor faults are like the estimate's."""
-    K = len(estimate) // 2
-    apart = [float(np.abs(np.concatenate(values[2:]) - estimate).max()) for _, values in supports]
+    """Return the values of the most probable support whose sensor faults are like the estimate's; zeros without one."""
     share, least = LIKE_ESTIMATE
-    near = [i for i, distance in enumerate(apart) if distance < share * np.abs(estimate).max() + least]
-    return supports[near[0]][1] if near else np.zeros((4, K))
+    for _, values in supports:
+        if np.abs(values[-len(estimate) :] - estimate).max() < share * np.abs(estimate).max() + least:
+            return values
+    return np.zeros(len(estimate) // 2 * 3 + 1)
 
 
 def _identifiable(rows: EvidenceRows) -> Mask:

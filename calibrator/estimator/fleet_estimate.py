@@ -7,7 +7,7 @@ The estimate of a vehicle does not depend on which others are estimated in the s
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from itertools import compress
 
 import numpy as np
@@ -15,7 +15,14 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.checks import UsualMisfits, find_misfits, learn_usual_misfits
-from calibrator.estimator.decision import FleetEstimate, RowsEstimate, SensorEstimate, decided, estimate_rows
+from calibrator.estimator.decision import (
+    FleetEstimate,
+    RowsEstimate,
+    SensorEstimate,
+    decided,
+    estimate_rows,
+    group_centres,
+)
 from calibrator.estimator.evidence import (
     EvidenceRows,
     FleetMoments,
@@ -109,7 +116,7 @@ class FleetReference:
     agreeing: tuple[float, ...]
     variants: tuple[float, ...]
     distrusted: Mapping[int, str]
-    unbalanced: int = 0
+    unbalanced: int
 
     @property
     def ordered(self) -> list[str]:
@@ -238,32 +245,20 @@ def learn_fleet(
     """
     if not summaries:
         raise FleetError("no vehicle to learn the fleet's reference from")
+    given, trusted = len(summaries), np.zeros(len(summaries), bool) if trusted is None else trusted
     plain = stack_summaries(summaries)
     order = tuple(np.argsort(-np.median(plain.variance_a2, axis=0), kind="stable").tolist())
-    fleet, ordered = stack_summaries(summaries, order), [branches[k] for k in order]
-    balanced = _balanced(fleet, ordered)
-    if not balanced.all():
-        found = learn_fleet(
-            list(compress(summaries, balanced)),
-            full_scale_a=full_scale_a,
-            branches=branches,
-            readings=None if readings is None else readings[:, :, balanced],
-            trusted=None if trusted is None else trusted[balanced],
-            load=load,
-            expected_faults=expected_faults,
-            known=known,
-        )
-        used = np.flatnonzero(balanced).tolist()
-        distrusted = {used[j]: why for j, why in found.distrusted.items()}
-        if trusted is not None:
-            distrusted |= dict.fromkeys(np.flatnonzero(trusted & ~balanced).tolist(), "its currents do not balance")
-        return replace(found, distrusted=distrusted, unbalanced=found.unbalanced + int((~balanced).sum()))
+    ordered = [branches[k] for k in order]
+    balanced = _balanced(stack_summaries(summaries, order), ordered)
+    used, summaries = np.flatnonzero(balanced).tolist(), list(compress(summaries, balanced))
+    readings = None if readings is None else readings[:, :, balanced]
+    fleet = stack_summaries(summaries, order)
     feed = int(np.argmax(np.median(fleet.mean_a, axis=0)))
     read_out = fit_fleet_model(fleet)
     measured, usual_correlation = collect_rows(fleet, read_out, full_scale_a=full_scale_a)
-    carriers = np.zeros(len(fleet), bool) if trusted is None else trusted.copy()
-    distrusted = untrusted_vehicles(measured, carriers, ordered, full_scale_a=full_scale_a, load=load)
-    carriers[list(distrusted)] = False
+    carriers = trusted[used]
+    broken = untrusted_vehicles(measured, carriers, ordered, full_scale_a=full_scale_a, load=load)
+    carriers[list(broken)] = False
     rows = with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load)
 
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
@@ -297,7 +292,9 @@ def learn_fleet(
         carried=int(carriers.sum()) >= FEWEST_TRUSTED,
         agreeing=tuple(_agreeing(rows, int(p)) for p in place),
         variants=_variants(everyone.hardware_drift),
-        distrusted=distrusted,
+        distrusted={used[j]: why for j, why in broken.items()}
+        | dict.fromkeys(np.flatnonzero(trusted & ~balanced).tolist(), "its currents do not balance"),
+        unbalanced=given - len(used),
     )
 
 
@@ -460,21 +457,23 @@ def estimate_vehicles(
 
 def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
     """Return for each vehicle findings of loads without a sensor, batches and variants: reported, not corrected."""
-    feed, findings = reference.ordered[reference.feed], list[list[SensorFinding]]()
+    feed, findings, scale_a = reference.ordered[reference.feed], list[list[SensorFinding]](), reference.full_scale_a
     sensor = sum(model.probability for model in reference.models if model.spread.shared[-1])
     cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
     what = {"load": "a load without a sensor", "batch": "an offset of a batch of sensors"}
-    groups = max((model.prior.group_centre for model in reference.models), key=len)  # the first model's, if it has any
-    for j, supports in enumerate(found.supports):
+    groups = group_centres(reference.models)
+    for points, supports in zip(found.points, found.supports, strict=True):
         others = f"A in branch {feed} as in other vehicles: {what[cause]}, or {what[rival]}"
+        of_group = np.bincount(points.group, points.weight, minlength=1 + len(groups))[1:]
         said: list[tuple[str | None, str, float, str]] = [
-            (feed, cause, found.group_probability[j, g], f"{centre * reference.full_scale_a:+.1f} {others}")
-            for g, centre in enumerate(groups)
+            (feed, cause, p, f"{centre * scale_a:+.1f} {others}") for p, centre in zip(of_group, groups, strict=True)
         ]
-        load = f"a load without a sensor of {found.load_a[j]:.1f} A, or an offset of the {feed} sensor"
-        said.append((feed, "load", found.load_probability[j], load))
+        alone = points.weight @ (points.load != 0.0)
+        load_a = points.weight @ points.load / max(alone, 1e-300) * scale_a
+        load = f"a load without a sensor of {load_a:.1f} A, or an offset of the {feed} sensor"
+        said.append((feed, "load", alone, load))
         if reference.variants:
-            eta = [(p, float(np.log1p(values[0, 0]))) for p, values in supports]
+            eta = [(p, float(np.log1p(values[0]))) for p, values in supports]
             of = [sum(p for p, each in eta if abs(each - centre) < VARIANT_SPREAD) for centre in reference.variants]
             size, than = f"{np.expm1(np.ptp(reference.variants)):.1%}", "larger" if of[1] > of[0] else "smaller"
             text = f"all its currents are {than} by {size} than those of some other vehicles: one of two variants?"
@@ -496,15 +495,17 @@ def _unfit(findings: Sequence[SensorFinding], branches: Sequence[str]) -> list[b
 
 
 def _explanation(share: float, values: Array, reference: FleetReference) -> Explanation:
-    names = reference.ordered
+    """Return an explanation with the names of the branches; ``values`` as in :attr:`.RowsEstimate.supports`."""
 
-    def nonzero(row: Array, unit: float = reference.full_scale_a) -> dict[str, float]:
-        return {name: float(value * unit) for name, value in zip(names, row, strict=True) if abs(value) > 1e-9}
+    def nonzero(row: Array, unit: float) -> dict[str, float]:
+        named = zip(reference.ordered, row.tolist(), strict=True)
+        return {name: value * unit for name, value in named if abs(value) > 1e-9}
 
+    hardware_offset, drift, offset = values[1:].reshape(3, -1)
     return Explanation(
         probability=min(share, 1.0),
-        drift=nonzero(values[2], 1.0),
-        offset_a=nonzero(values[3]),
-        hardware_drift=float(values[0, 0]),
-        hardware_offset_a=nonzero(values[1]),
+        drift=nonzero(drift, 1.0),
+        offset_a=nonzero(offset, reference.full_scale_a),
+        hardware_drift=float(values[0]),
+        hardware_offset_a=nonzero(hardware_offset, reference.full_scale_a),
     )

@@ -348,10 +348,9 @@ def estimate_junction(
     fault = (1.0 - (1.0 - gain_fault) * (1.0 - offset_fault))[places]
     drift, offset, gain_sd, offset_sd = np.expm1(mean[places]), mean[S + places], sd[places], sd[S + places]
     harm, harm_of_gain, confidence, points = np.zeros((N, K)), np.zeros((N, K)), np.zeros(N), []
-    kinds = np.arange(posterior.explanation[-1] + 1)
     for j, vehicle in enumerate(vehicles):
         faults = np.concatenate([np.expm1(draws[:, places[j]]), draws[:, S + places[j]]], axis=1)
-        points.append(Points(faults, weight, posterior.explanation, np.zeros_like(kinds), kinds))
+        points.append(Points(faults, weight, posterior.explanation))
         own = (vehicle.summary.mean_a / scale_a - offset[j]) / (1.0 + drift[j])
         spread = vehicle.summary.variance_a2 / scale_a**2 / (1.0 + drift[j]) ** 2
         estimate, true = np.append(drift[j], offset[j]), (own[None], (own**2 + spread)[None])
@@ -442,7 +441,7 @@ def _explanations(points: Points, branches: Sequence[str], scale_a: float) -> li
     Explanations in which the same faults are that clear are merged.
     """
     K, found = len(branches), dict[bytes, tuple[float, Array, Mask]]()
-    for number in range(len(points.fit)):
+    for number in range(points.explanation[-1] + 1):
         own = points.explanation == number
         share, faults = float(points.weight[own].sum()), points.faults[own]
         mean = points.weight[own] @ faults / share

@@ -8,7 +8,6 @@ import pytest
 
 from calibrator.drive import Array, Mask
 from calibrator.estimator.decision import (
-    Explained,
     Points,
     RowsEstimate,
     best_estimate,
@@ -19,7 +18,7 @@ from calibrator.estimator.decision import (
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT
 from calibrator.estimator.learning import learn_fault_models
-from calibrator.estimator.posterior import draw_explanations, fit_explanations, weigh
+from calibrator.estimator.posterior import Draws, FaultModel, Spread, draw_explanations, fit_explanations, weigh
 from calibrator.estimator.prior import Prior, Slab, first_prior
 from calibrator.faults import Faults
 from calibrator.score import harmed, recovered
@@ -33,7 +32,7 @@ TWO_EXPLANATIONS = [(0.7, [0.12, 0.0, 0.0, 0.0]), (0.3, [0.0, -0.11, 0.1, 0.1])]
 
 def points(explanations: list[tuple[float, list[float]]], *, sd: float = 0.0, draws: int = 4000) -> Points:
     """Posterior of explanations (probability, faults), each nonzero fault with this standard deviation."""
-    rng, count = np.random.default_rng(0), len(explanations)
+    rng = np.random.default_rng(0)
     faults = np.concatenate(
         [
             np.array(values) + sd * rng.normal(size=(draws, 2 * K)) * (np.array(values) != 0.0)
@@ -41,8 +40,8 @@ def points(explanations: list[tuple[float, list[float]]], *, sd: float = 0.0, dr
         ]
     )
     weight = np.repeat([share / draws for share, _ in explanations], draws)
-    number = np.repeat(np.arange(count), draws)
-    return Points(faults, weight, number, np.zeros(count, np.int64), np.arange(count))
+    number = np.repeat(np.arange(len(explanations)), draws)
+    return Points(faults, weight, number)
 
 
 def as_faults(values: Array) -> Faults:
@@ -98,26 +97,38 @@ def test_harm_counts_once_over_several_drives_and_needs_a_correction() -> None:
     assert both[1] == 0.0
 
 
-def explained(truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0) -> Explained:
-    """One model's draws of a fleet."""
-    alike = model_of_equals(K, shared).spread
-    evidence = plain_evidence(rows_of(truth, seed=2, load=load), centre=alike.mean, shared=alike.shared)
+def explained(
+    truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0, probability: float = 1.0
+) -> tuple[FaultModel, Draws, Array]:
+    """One model with its draws of a fleet, and their weights."""
+    shared = np.zeros(2 * K + 1) if shared is None else shared
+    centre = np.zeros(5 * K)
+    centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
+    evidence = plain_evidence(rows_of(truth, seed=2, load=load), centre=centre, shared=shared)
     log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
     draws = draw_explanations(fit_explanations(evidence, prior.log_supports + 1.0, log_load), evidence)
-    return Explained(1.0, draws, weigh(draws, prior)[0], prior.group_centre)
+    spread = Spread(mean=centre, covariance=np.zeros((5 * K, 5 * K)), dispersion=np.ones(K), shared=shared)
+    model = FaultModel(probability=probability, spread=spread, priors=((1.0, prior),))
+    return model, draws, weigh(draws, prior)[0]
 
 
 def test_fault_models_are_averaged_by_their_probabilities() -> None:
     truth = random_faults(3, vehicles=2, branches=K)
     shared = np.array([0.0, 0.01, 0.0, 0.02, 0.0])
-    models = [
-        explained(truth, first_prior(K))._replace(probability=0.7),
-        explained(truth, first_prior(K), shared=shared)._replace(probability=0.3),
-    ]
-    both, single = posterior_points(models)[0], [posterior_points([m._replace(probability=1.0)])[0] for m in models]
-    mean = 0.7 * single[0].weight @ single[0].faults + 0.3 * single[1].weight @ single[1].faults
-    np.testing.assert_allclose(both.weight @ both.faults, mean, atol=1e-12)
-    assert np.bincount(both.model, np.bincount(both.explanation, both.weight)) == pytest.approx([0.7, 0.3], abs=1e-4)
+
+    def models(first: float, second: float) -> list[tuple[FaultModel, Draws, Array]]:
+        prior = first_prior(K)
+        return [explained(truth, prior, probability=first), explained(truth, prior, shared=shared, probability=second)]
+
+    mean, of_first, of_second = (
+        found.weight @ found.faults
+        for found in (
+            posterior_points(models(0.7, 0.3))[0],
+            posterior_points(models(1.0, 0.0)[:1])[0],
+            posterior_points(models(0.0, 1.0)[1:])[0],
+        )
+    )
+    np.testing.assert_allclose(mean, 0.7 * of_first + 0.3 * of_second, atol=1e-12)
 
 
 def group_prior() -> Prior:
@@ -132,10 +143,9 @@ def test_estimated_offset_includes_the_group_constant_only_if_of_sensors(of_sens
     truth = no_faults(1, K)
     truth.offset_a[0, 0], truth.drift[0, 0] = (0.18 if of_sensor else 0.15), 0.1
     prior, shared = group_prior(), np.append(np.zeros(4), of_sensor)
-    model = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
-    of_group = model.weight.copy()
-    of_group[..., 0] = 0.0  # only draws in which the vehicle belongs to the group
-    found = posterior_points([model._replace(weight=of_group / of_group.sum())])[0]
+    model, draws, weight = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
+    weight[..., 0] = 0.0  # only draws in which the vehicle belongs to the group
+    found = posterior_points([(model, draws, weight / weight.sum())])[0]
     np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)
 
 
