@@ -62,7 +62,6 @@ __all__ = [
     "ratios_in_doubt",
     "regress_on_fleet",
     "regress_vehicles",
-    "reported_evidence",
     "row_design",
     "stack_summaries",
 ]  # fmt: skip
@@ -82,7 +81,8 @@ TINY = np.finfo(float).tiny
 LEAST_PRIOR = 100.0 * SINGULAR
 """Least share of the prior in the diagonal of the normal equations, for a z that stands still, as the constant does."""
 GAIN_SD = 0.4
-"""Prior deviation of a gain ratio from -1: no running sensor is farther off. [1]"""
+"""Prior deviation of a gain ratio from -1, and of a slope from 1: no running sensor is farther off, and a branch that
+hardly moves counts as faultless. [1]"""
 NOISE_ROUNDS = 3
 """Rounds of the junction regression: the noise taken out depends on the gains, and they on it; three suffice. [1]"""
 MOST_NOISE = 0.9
@@ -96,8 +96,6 @@ MODEL_ROUNDS = 12
 """Rounds of alternating least squares; slopes change by less than 1e-4 after eight on all fleets tried. [1]"""
 RIDGE = 1e-9
 """Added to the diagonal of the normalised moments of the inputs: an input that hardly varies gets no read-out."""
-SLOPE_SD = 0.4
-"""Prior deviation of a slope from 1: a branch that hardly moves counts as faultless. [1]"""
 LEAST_SLOPE_SD = 1e-5
 """Least standard deviation of slopes and intercepts, where a model fits exactly. [1], [A]"""
 MOST_VARIATION = 100.0
@@ -286,7 +284,7 @@ class VehicleRegressions:
 
 
 def regress_vehicles(
-    gram: Array, right: Array, power: Array, blocks: Blocks, *, prior_mean: Array, prior_precision: Array
+    gram: Array, right: Array, power: Array, blocks: Blocks, *, prior_gain: float
 ) -> VehicleRegressions:
     """Regress y on z in each of N vehicles, by least squares with a weak prior (M9).
 
@@ -300,8 +298,9 @@ def regress_vehicles(
         Mean square of y over all blocks of a vehicle: the scale below which a residual is rounding.
     blocks : Blocks
         Which blocks belong to which vehicle.
-    prior_mean, prior_precision : ndarray of shape (p,)
-        Independent Gaussian prior; precision zero where there is none.
+    prior_gain : float
+        Mean of the Gaussian prior of all coefficients but the last, the constant, which has none; its standard
+        deviation is :data:`GAIN_SD`. [1]
 
     Returns
     -------
@@ -309,6 +308,7 @@ def regress_vehicles(
         In the units of y over z.
     """
     count, p = blocks.count, right.shape[1]
+    prior_precision = np.append(np.full(p - 1, GAIN_SD**-2), 0.0)
     Z, y = blocks.total(gram), blocks.total(right)
     least = np.maximum(LEAST_RHO * power, LEAST_VARIANCE)
     still = np.diagonal(covariances(Z / Z[:, -1:, -1:]), axis1=1, axis2=2) == 0.0  # only the prior sets these
@@ -321,7 +321,7 @@ def regress_vehicles(
         scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), np.finfo(float).tiny))
         square = scale[:, :, None] * scale[:, None, :]
         inverse = np.linalg.pinv(matrix * square, rcond=SINGULAR, hermitian=True) * square
-        estimate = products(inverse, y + prior * prior_mean)
+        estimate = products(inverse, y + prior * prior_gain * (prior_precision > 0.0))
         scores = right - products(gram, estimate[blocks.vehicle])
         influence = products(inverse[blocks.vehicle], scores)
         # long-run variance of the residual: its variance times the number of neighbouring samples that are alike
@@ -374,8 +374,7 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
             right,
             currents[:, 0, 0],
             fleet.blocks,
-            prior_mean=np.append(-np.ones(K - 1), 0.0),
-            prior_precision=np.append(np.full(K - 1, GAIN_SD**-2), 0.0),
+            prior_gain=-1.0,
         )
         sums = np.concatenate([np.ones((N, 1)), -fit.estimate], axis=1)  # i_m,1 - sum g_k i_m,k - c, as weights
         residual_a2 = np.maximum(np.sum(sums * products(currents, sums), axis=1), 0.0)
@@ -506,8 +505,7 @@ def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegres
                 products(np.broadcast_to(z, (len(gram), 2, M + 1)), fleet.moments[:, u, M + k]),
                 fleet.mean[:, M + k, M + k],
                 fleet.blocks,
-                prior_mean=np.array([1.0, 0.0]),
-                prior_precision=np.array([SLOPE_SD**-2, 0.0]),
+                prior_gain=1.0,
             )
         )
     return fits
@@ -888,52 +886,3 @@ def evidence_names(branches: Sequence[str]) -> list[str]:
         "junction constant",
         *(f"offset read {name}" for name in branches),
     ]
-
-
-def reported_evidence(
-    rows: EvidenceRows,
-    *,
-    centre: Array,
-    covariance: Array,
-    drift: Array,
-    offset_a: Array,
-    hardware_drift: Array,
-    hardware_offset_a: Array,
-    full_scale_a: float,
-) -> Array:
-    """Return the evidence rows in the units of the sensors, and what the estimates predict for them, for a report.
-
-    Parameters
-    ----------
-    rows : EvidenceRows
-        Of N vehicles with K branches; all other arguments have its order of branches.
-    centre : ndarray of shape (5K,)
-        Rows of vehicles without faults; that of the junction constant includes the load without a sensor. [1]
-    covariance : ndarray of shape (N, 5K, 5K)
-        Covariance of the rows' sampling errors plus that of the differences between faultless vehicles. [1]
-    drift, offset_a, hardware_offset_a : ndarray of shape (N, K)
-        Estimates. [1], [A], [A]
-    hardware_drift : ndarray of shape (N,)
-        Estimates. [1]
-    full_scale_a : float
-        Full scale of the junction. [A]
-
-    Returns
-    -------
-    ndarray of shape (N, 3, 5K)
-        Measured value, its standard deviation, and what the estimate predicts; NaN for the first two where a row is
-        unknown. ``evidence`` in the details of ``run.json`` names the rows: ratios [1], then constants [A].
-    """
-    gain, first = 1.0 + drift, 1.0 + drift[:, :1]
-    ratios = np.exp(rows.relative)
-    seen = np.concatenate([gain, first, np.ones_like(gain)], axis=1) * full_scale_a  # constants are stored over 1 + d
-    value = np.concatenate([ratios, rows.constant * full_scale_a], axis=1)
-    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * np.concatenate([ratios, seen], axis=1)
-    # a_k = (1 + d_k)(1 + d_h); -g_k = (1 + d_1) / (1 + d_k); b_k = o_k + (1 + d_k) o_h,k; c = (1 + d_1) sum o/(1 + d)
-    relative = np.concatenate([gain * (1.0 + hardware_drift[:, None]), first / gain[:, 1:], gain], axis=1)
-    junction = first * (offset_a / gain).sum(axis=1, keepdims=True)
-    constant = np.concatenate([offset_a + gain * hardware_offset_a, junction, offset_a], axis=1)
-    at = rows.places
-    made = np.concatenate([relative * np.exp(centre[at.relative]), constant + seen * centre[at.constant]], axis=1)
-    value[~rows.known], sd[~rows.known] = np.nan, np.nan
-    return np.stack([value, sd, made], axis=1)

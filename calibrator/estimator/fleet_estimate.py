@@ -32,11 +32,10 @@ from calibrator.estimator.evidence import (
     evidence_names,
     fit_fleet_model,
     ratios_in_doubt,
-    reported_evidence,
     stack_summaries,
 )
 from calibrator.estimator.learning import LEAST_SHARED, centre_rows, learn_fault_models
-from calibrator.estimator.posterior import FaultModel
+from calibrator.estimator.posterior import FaultModel, Spread
 from calibrator.estimator.prior import Prior
 from calibrator.estimator.readings import FEWEST_TRUSTED, untrusted_vehicles, with_knowledge
 from calibrator.estimator.settings import CONFIDENT, FEWEST_VEHICLES, HARM_LIMIT, SUSPECTED
@@ -45,7 +44,7 @@ from calibrator.terminal.text import counted
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.parameters import Explanation, SensorFinding
 
-__all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "estimate_vehicles", "learn_fleet"]
+__all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "estimate_vehicles", "learn_fleet", "reported_evidence"]
 
 MOST_RATIO, SURE = 3.0, 0.9
 """Gain ratio that no two sensors have, and partial correlation from which on a ratio is not due to noise. [1]"""
@@ -433,7 +432,6 @@ def estimate_vehicles(
     linear = [
         1.0 - max((each.probability for each in mine if each.cause not in LINEAR_CAUSES), default=0.0) for mine in unfit
     ]
-    spread = reference.models[0].spread
     estimate = {each.name: getattr(found, each.name) for each in fields(SensorEstimate)}
     return FleetEstimate(
         **{**estimate, "confidence": found.confidence * linear},
@@ -442,17 +440,46 @@ def estimate_vehicles(
         verdicts=verdicts,
         explanations=[[_explanation(*each, reference) for each in mine] for mine in found.supports],
         findings=[(*each, *others) for each, others in zip(unfit, _shared_findings(found, reference), strict=True)],
-        evidence=reported_evidence(
-            rows,
-            centre=spread.mean,
-            covariance=rows.dispersed(spread.dispersion)[0] + spread.covariance,
-            drift=found.drift[:, order],
-            offset_a=found.offset_a[:, order],
-            hardware_drift=found.hardware_drift,
-            hardware_offset_a=found.hardware_offset_a[:, order],
-            full_scale_a=scale_a,
-        ),
+        evidence=reported_evidence(rows, found, reference.models[0].spread),
     )
+
+
+def reported_evidence(rows: EvidenceRows, found: SensorEstimate, spread: Spread) -> Array:
+    """Return the evidence rows in the units of the sensors, and what the estimates predict for them, for a report.
+
+    Parameters
+    ----------
+    rows : EvidenceRows
+        Of N vehicles with K branches.
+    found : SensorEstimate
+        Of the same vehicles.
+    spread : Spread
+        Model spread of their fleet; the centre of the junction constant includes the load without a sensor.
+
+    Returns
+    -------
+    ndarray of shape (N, 3, 5K)
+        Measured value, its standard deviation, and what the estimate predicts; NaN for the first two where a row is
+        unknown. ``evidence`` in the details of ``run.json`` names the rows: ratios [1], then constants [A].
+    """
+    order, scale_a, at = list(found.order), found.full_scale_a, rows.places
+    gain, offset_a, hardware_a = (
+        1.0 + found.drift[:, order],
+        found.offset_a[:, order],
+        found.hardware_offset_a[:, order],
+    )
+    first, ratios = gain[:, :1], np.exp(rows.relative)
+    seen = np.concatenate([gain, first, np.ones_like(gain)], axis=1) * scale_a  # constants are stored over 1 + d
+    value = np.concatenate([ratios, rows.constant * scale_a], axis=1)
+    sd = np.sqrt(np.diagonal(spread.of_rows(rows), axis1=1, axis2=2)) * np.concatenate([ratios, seen], axis=1)
+    # a_k = (1 + d_k)(1 + d_h); -g_k = (1 + d_1) / (1 + d_k); b_k = o_k + (1 + d_k) o_h,k; c = (1 + d_1) sum o/(1 + d)
+    relative = np.concatenate([gain * (1.0 + found.hardware_drift[:, None]), first / gain[:, 1:], gain], axis=1)
+    junction = first * (offset_a / gain).sum(axis=1, keepdims=True)
+    constant = np.concatenate([offset_a + gain * hardware_a, junction, offset_a], axis=1)
+    centre = spread.mean
+    made = np.concatenate([relative * np.exp(centre[at.relative]), constant + seen * centre[at.constant]], axis=1)
+    value[~rows.known], sd[~rows.known] = np.nan, np.nan
+    return np.stack([value, sd, made], axis=1)
 
 
 def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[SensorFinding]]:

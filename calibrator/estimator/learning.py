@@ -29,8 +29,8 @@ from calibrator.estimator.posterior import (
     Spread,
     evidence_of,
     explain,
+    fault_sizes,
     row_residuals,
-    size_evidence,
     weigh,
 )
 from calibrator.estimator.prior import (
@@ -634,7 +634,7 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
     """
     slabs = [prior.gain, prior.offset]
     for kind in (GAIN, OFFSET):
-        best, odds, least = slabs[kind], {}, LEAST_RANGE[kind]
+        best, odds, least, sizes = slabs[kind], {}, LEAST_RANGE[kind], fault_sizes(draws, prior, kind)
         for again in (False, True):
             for name in ("high", "low", "tail"):
                 grid: Sequence[float] | Array = TAILS
@@ -644,8 +644,7 @@ def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
                 tried = [replace(best, **{name: float(value)}, density=np.zeros(0)) for value in grid]
                 tried = [slab for slab in tried if slab.high > least * slab.low and slab.low > TAIL_RANGE[0]] or [best]
                 densities = np.stack([slab.density for slab in tried])
-                evidence = size_evidence(draws, prior, kind, densities)
-                evidence += SIZE_FAULTS * np.log(densities) @ ANY_SIZE
+                evidence = sizes.evidence(densities) + SIZE_FAULTS * np.log(densities) @ ANY_SIZE
                 best = tried[int(np.argmax(evidence))]
                 weight = np.exp(evidence - evidence.max())
                 odds[name] = [(getattr(slab, name), w) for slab, w in zip(tried, weight / weight.sum(), strict=True)]

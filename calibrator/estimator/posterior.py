@@ -51,15 +51,16 @@ __all__ = [
     "Draws",
     "Evidence",
     "FaultModel",
+    "FaultSizes",
     "Fits",
     "Spread",
     "draw_explanations",
     "evidence_of",
     "explain",
+    "fault_sizes",
     "fit_explanations",
     "residual",
     "row_residuals",
-    "size_evidence",
     "weigh",
 ]
 
@@ -89,6 +90,10 @@ LOAD_GIVES_NONE = 100.0
 """Logarithm of the odds against a load that would supply current: finite, so that every vehicle has an explanation."""
 GAIN, OFFSET, LOAD = 0, 1, 2
 """Rows of ``Prior.log_density``."""
+NO_SIZE = len(GRID)
+"""Place of the size of a parameter that is zero."""
+NEGLIGIBLE = 1e-15
+"""Weight of a draw below which no density of the sizes makes it matter. [1]"""
 LOG_FIRST, LOG_STEP = float(np.log(GRID[0])), float(np.log(GRID[1] / GRID[0]))
 LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
 
@@ -423,7 +428,8 @@ class Draws(NamedTuple):
     values : ndarray of shape (N, Q, M, P)
         Parameters; 0 where the support lacks them. [1]
     place : ndarray of int of shape (N, Q, M, P)
-        Index of the size of each fault and load in :data:`~calibrator.estimator.prior.GRID`.
+        Index of the size of each fault and load in :data:`~calibrator.estimator.prior.GRID`; :data:`NO_SIZE` where the
+        support lacks it.
     base : ndarray of shape (N, Q, M)
         Logarithm of p(rows | draw) / q(draw), with the probability of the signs and the change of variables to sizes.
     feed : int
@@ -450,7 +456,7 @@ def _normal_draws(dimensions: int) -> Array:
 def draw_explanations(fits: Fits, evidence: Evidence) -> Draws:
     """Draw :data:`DRAWS` sets of parameters from each explanation of N vehicles."""
     N, Q, P = fits.theta.shape
-    values, place = np.zeros((N, Q, DRAWS, P)), np.zeros((N, Q, DRAWS, P), np.int16)
+    values, place = np.zeros((N, Q, DRAWS, P)), np.full((N, Q, DRAWS, P), NO_SIZE, np.int16)
     base = np.full((N, Q, DRAWS), -np.inf)
     _draw(fits, evidence, _normal_draws(P), values, place, base)
     return Draws(fits=fits, values=values, place=place, base=base, feed=evidence.feed, shared=evidence.shared)
@@ -594,15 +600,20 @@ def weigh(draws: Draws, prior: Prior) -> tuple[Array, Array]:
     log_evidence : ndarray of shape (N,)
         Logarithm of the probability density of each vehicle's rows.
     """
+    return _weighed(draws, prior)[:2]
+
+
+def _weighed(draws: Draws, prior: Prior) -> tuple[Array, Array, NDArray[np.int16]]:
+    """Return what :func:`weigh` does, and the place of the feeding sensor's offset, shape (N, Q, M, 1 + g)."""
     weight = np.zeros((*draws.base.shape, 1 + len(prior.group_share)))
-    log_evidence = np.empty(len(weight))
-    _weigh(draws, _tables(prior), weight, log_evidence)
-    return weight, log_evidence
+    log_evidence, place = np.empty(len(weight)), np.full(weight.shape, NO_SIZE, np.int16)
+    _weigh(draws, _tables(prior), weight, log_evidence, place)
+    return weight, log_evidence, place
 
 
 @compiled
-def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array) -> None:
-    """Fill ``weight`` and ``log_evidence`` with what :func:`weigh` returns."""
+def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array, feeding: NDArray[np.int16]) -> None:
+    """Fill the last three arguments with what :func:`_weighed` returns."""
     N, _, M, G = weight.shape
     P = draws.values.shape[3]
     places, kinds = np.empty(P, np.int64), np.empty(P, np.int64)
@@ -616,6 +627,8 @@ def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array) -> 
                     value += common
                     for i in range(last):
                         value += prior.log_density[kinds[i], places[i]]
+                    if last > n and kinds[n] == OFFSET:
+                        feeding[j, q, m, g] = places[n]
                     weight[j, q, m, g] = value
                     best = max(best, value)
         weight[j, :count] = np.exp(weight[j, :count] - best)
@@ -624,65 +637,61 @@ def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array) -> 
         log_evidence[j] = best + log(total / M)
 
 
-def size_evidence(draws: Draws, prior: Prior, kind: int, candidates: Array, *, every: int = 4) -> Array:
-    """Compute the log evidence of a fleet for other densities of the sizes of one kind of fault.
+class FaultSizes(NamedTuple):
+    """Sizes of the faults of one kind in the D weighted draws of a fleet that matter, vehicle after vehicle.
+
+    Attributes
+    ----------
+    place : ndarray of int of shape (D, n)
+        Places of the sizes in :data:`~calibrator.estimator.prior.GRID`, filled up with :data:`NO_SIZE`.
+    weight : ndarray of shape (D,)
+        Weights of the draws.
+    first : ndarray of int
+        First draw of each vehicle.
+    log_density : ndarray of shape (G,)
+        Logarithm of the density of sizes that the weights are for.
+    """
+
+    place: Integers
+    weight: Array
+    first: Integers
+    log_density: Array
+
+    def evidence(self, densities: Array) -> Array:
+        """Return the log evidence of the fleet for other densities (C, G) of these sizes, up to a constant, (C,)."""
+        change = np.pad((np.log(densities) - self.log_density).T, ((0, 1), (0, 0)))
+        log_factor = sum(change[place] for place in self.place.T)
+        return np.asarray(np.log(np.add.reduceat(self.weight[:, None] * np.exp(log_factor), self.first)).sum(axis=0))
+
+
+def fault_sizes(draws: Draws, prior: Prior, kind: int, *, every: int = 4) -> FaultSizes:
+    """Collect the sizes of drifts or offsets in the draws of a fleet, and their weights by a prior.
 
     Parameters
     ----------
-    draws : Draws
-        Of N vehicles.
-    prior : Prior
-        Prior of their fleet in all other respects.
+    draws, prior : Draws, Prior
+        Of the fleet.
     kind : int
         :data:`GAIN` or :data:`OFFSET`.
-    candidates : ndarray of shape (C, G)
-        Densities at the grid of the prior.
     every : int
         Only every n-th draw of an explanation is used, for n = ``every``.
 
     Returns
     -------
-    ndarray of shape (C,)
-        Log evidence with each candidate, summed over the vehicles, up to a constant that all candidates share.
+    FaultSizes
+        Of draws that are not negligible with any density.
     """
-    evidence = np.zeros(len(candidates))
-    _size_evidence(draws, _tables(prior), kind, np.ascontiguousarray(np.log(candidates).T), every, evidence)
-    return evidence
-
-
-@compiled
-def _size_evidence(draws: Draws, prior: _Tables, kind: int, candidates: Array, every: int, evidence: Array) -> None:
-    """Add to ``evidence`` what :func:`size_evidence` returns; ``candidates`` (G, C) are logarithms."""
-    N, _, M, P = draws.values.shape
-    G, C = 1 + len(prior.group_centre), len(evidence)
-    places, kinds = np.empty(P, np.int64), np.empty(P, np.int64)
-    peak, total, value = np.empty(C), np.empty(C), np.empty(C)
-    for j in range(N):
-        peak[:], total[:] = -np.inf, 0.0
-        for q in range(draws.fits.number[j]):
-            for m in range(0, M, every):
-                common, n = _terms(draws, prior, j, q, m, places, kinds)
-                for g in range(G):
-                    fixed, last = _feeding(draws, prior, j, q, m, g, places, kinds, n)
-                    if fixed == -np.inf:
-                        continue
-                    fixed += common
-                    for i in range(last):
-                        if kinds[i] != kind:
-                            fixed += prior.log_density[kinds[i], places[i]]
-                    value[:] = fixed
-                    for i in range(last):
-                        if kinds[i] == kind:
-                            for c in range(C):
-                                value[c] += candidates[places[i], c]
-                    for c in range(C):
-                        if value[c] > peak[c]:
-                            total[c] = total[c] * exp(peak[c] - value[c]) + 1.0
-                            peak[c] = value[c]
-                        elif value[c] > peak[c] - 25.0:
-                            total[c] += exp(value[c] - peak[c])
-        for c in range(C):
-            evidence[c] += peak[c] + log(total[c])
+    weight, _, feeding = _weighed(draws, prior)
+    at = ParameterPlaces(prior.branches)
+    vehicle, q, m, g = np.nonzero(weight[:, :, ::every] > NEGLIGIBLE)
+    m *= every
+    place = draws.place[vehicle, q, m].astype(np.int64)
+    place[:, at.offset(draws.feed)] = feeding[vehicle, q, m, g]
+    of_kind = place[:, : at.hardware_offsets.start] if kind == GAIN else place[:, at.hardware_offsets.start : at.load]
+    of_kind = np.sort(of_kind, axis=1)
+    most = int((of_kind < NO_SIZE).sum(axis=1).max(initial=1))
+    first = np.flatnonzero(np.diff(vehicle, prepend=-1))
+    return FaultSizes(of_kind[:, :most], weight[vehicle, q, m, g], first, prior.log_density[kind])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -706,6 +715,10 @@ class Spread:
     covariance: Array
     dispersion: Array
     shared: Array
+
+    def of_rows(self, rows: EvidenceRows) -> Array:
+        """Return the covariance of rows of vehicles without faults, sampling errors included, shape (N, 5K, 5K)."""
+        return rows.dispersed(self.dispersion)[0] + self.covariance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -745,7 +758,7 @@ def explain(rows: EvidenceRows, model: FaultModel, *, feed: int) -> Draws:
     n_h, n_s = np.indices(prior.counts.shape)
     rough = prior.log_supports + 0.5 * (n_h + n_s)  # a slab is about that much denser than the wide Gaussian
     log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
-    covariance = rows.dispersed(spread.dispersion)[0] + spread.covariance
+    covariance = spread.of_rows(rows)
 
     def fitted(covariance: Array) -> Draws:
         evidence = evidence_of(rows.values, covariance, rows.means, centre=spread.mean, shared=spread.shared, feed=feed)

@@ -216,6 +216,19 @@ def test_posterior_weights_equal_integration_on_a_grid() -> None:
                 np.testing.assert_allclose(found[on][1], mean, atol=0.004)
 
 
+@pytest.mark.parametrize("kind", [posterior.GAIN, posterior.OFFSET])
+@pytest.mark.parametrize("every", [1, 4])
+def test_evidence_of_fault_sizes_equals_that_of_the_weights(kind: int, every: int) -> None:
+    prior = paper_prior(2, 0, 1, 2)
+    draws = drawn(rows_of(random_faults(9, vehicles=20, branches=2, sparsity=70.0), seed=9), prior)
+    slabs = [Slab(low=low, high=high, tail=0.02) for low, high in ((0.02, 0.3), (0.05, 0.25), (0.1, 0.5))]
+    found = posterior.fault_sizes(draws, prior, kind, every=every).evidence(np.stack([slab.density for slab in slabs]))
+    of = [replace(prior, gain=slab) if kind == posterior.GAIN else replace(prior, offset=slab) for slab in slabs]
+    exact = np.array([posterior.weigh(draws, each)[1].sum() for each in of])
+    np.testing.assert_allclose(found - found[0], exact - exact[0], atol=1e-6 if every == 1 else 3.0)
+    assert np.argmax(found) == np.argmax(exact) == 1
+
+
 def test_posterior_of_a_load_equals_a_grid_and_is_never_negative() -> None:
     prior = Prior(
         counts=paper_prior(2, 0, 1).counts,

@@ -1,14 +1,17 @@
 """Reports on a vehicle: evidence that would decide, findings in words, evidence in the units of its sensors."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from msgspec.structs import replace as changed
 
 from calibrator.drive import Array
-from calibrator.estimator.evidence import evidence_names, reported_evidence
-from calibrator.estimator.fleet_estimate import FleetEstimate
+from calibrator.estimator.evidence import evidence_names
+from calibrator.estimator.fleet_estimate import FleetEstimate, reported_evidence
+from calibrator.estimator.posterior import Spread
 from calibrator.estimator.vehicle_parameters import deciding_evidence, impossible
 from calibrator.estimator.vehicle_report import explained
 from ecu_node.database import VehicleDatabase
@@ -137,16 +140,16 @@ def test_reported_evidence_without_noise_equals_that_of_the_true_faults() -> Non
     rows = rows_of(faults, noise=0.0, errors=Errors(offset_read=0.001))
     centre = np.zeros(10)
     centre[7] = 2.0 / scale  # a load that no branch measures, in the junction constant
-    value, sd, made = reported_evidence(
-        rows,
-        centre=centre,
-        covariance=rows.covariance,
+    found: Any = SimpleNamespace(
         drift=faults.drift,
         offset_a=faults.offset_a * scale,
         hardware_drift=faults.hardware_drift,
         hardware_offset_a=faults.hardware_offset_a * scale,
+        order=(0, 1),
         full_scale_a=scale,
-    ).transpose(1, 2, 0)
+    )
+    spread = Spread(mean=centre, covariance=np.zeros((10, 10)), dispersion=np.ones(2), shared=np.zeros(5))
+    value, sd, made = reported_evidence(rows, found, spread).transpose(1, 2, 0)
     names, gain = evidence_names(NAMES), 1.0 + faults.drift.T
     for name, measured, explained_by in zip(names, value, made, strict=True):
         if name.startswith("gain read"):
