@@ -1,5 +1,6 @@
 """Posterior of a vehicle: residuals, fits and weights of its explanations equal a direct computation."""
 
+from dataclasses import replace
 from math import comb
 
 import numpy as np
