@@ -14,7 +14,7 @@ sensors of a branch: each is a model of its own.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -176,19 +176,19 @@ def learn_fault_models(
         fixed[rows.places.junction] = load
     order = np.lexsort(rows.values.T[::-1])  # the same whatever the order of the vehicles
 
-    def learner_of(most: int) -> _Learner:
-        some = order[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
-        return _Learner(
-            rows.take(np.sort(some)),
-            feed,
-            fixed=fixed,
-            known=known,
-            expected_faults=expected_faults,
-            doubtful=doubtful,
-            declared=load is not None,
-        )
+    def some_rows(most: int) -> EvidenceRows:
+        return rows.take(np.sort(order[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]))
 
-    learner, starter = learner_of(MOST_LEARNT), learner_of(MOST_STARTED)
+    learner = _Learner(
+        rows=some_rows(MOST_LEARNT),
+        feed=feed,
+        fixed=fixed,
+        free=centre_rows(rows.branches, doubtful) & np.isnan(fixed),
+        known=known,
+        expected_faults=expected_faults,
+        declared=load is not None,
+    )
+    starter = replace(learner, rows=some_rows(MOST_STARTED))
     starts = [
         starter.initial_model(centre, spread) for centre, spread in product(learner.initial_centres(), COMMON_SPREADS)
     ]
@@ -198,33 +198,29 @@ def learn_fault_models(
     return [learner.with_modes(model) for model in sorted(models, key=lambda model: -model.probability)]
 
 
+@dataclass(kw_only=True)
 class _Learner:
-    """Expectation maximisation on the evidence of one fleet; parameters as in :func:`learn_fault_models`.
+    """Expectation maximisation on the evidence of one fleet.
 
-    ``fixed`` has the declared load, too, and ``declared`` says whether there is one.
+    The parameters are as in :func:`learn_fault_models`, but ``fixed`` has the declared load, too, and ``declared`` says
+    whether there is one; ``free`` (5K,) says for which rows the centre is learnt.
     """
 
-    def __init__(
-        self,
-        rows: EvidenceRows,
-        feed: int,
-        *,
-        fixed: Array,
-        known: Prior | None,
-        expected_faults: float | None,
-        doubtful: Mask | None,
-        declared: bool,
-    ) -> None:
-        K = rows.branches
-        self.rows, self.feed, self.fixed, self.known = rows, feed, fixed, known
-        self.at, self.parameters = rows.places, ParameterPlaces(K)
-        self.expected_faults, self.declared = expected_faults, declared
-        self.free = centre_rows(K, doubtful) & np.isnan(fixed)
+    rows: EvidenceRows
+    feed: int
+    fixed: Array
+    free: Mask
+    known: Prior | None
+    expected_faults: float | None
+    declared: bool
+
+    def __post_init__(self) -> None:
+        K = self.rows.branches
+        self.at, self.parameters, self.design = self.rows.places, ParameterPlaces(K), row_design(K, self.feed)
         least_sd = np.empty(5 * K)
         least_sd[self.at.relative], least_sd[self.at.constant] = LEAST_SPREAD
         self.least = np.diag(least_sd**2)
         self.guess = self._guessed_spread()
-        self.design = row_design(K, feed)
 
     def _guessed_spread(self) -> Array:
         """Return a guess of the model spread (5K, 5K): diagonal, from the usual sampling variance of each row."""
