@@ -28,7 +28,8 @@ from calibrator.estimator.readings import (
     window_readings,
 )
 from calibrator.estimator.results import PARTS, Calibrated, encode_chunk, part_file, read_part
-from calibrator.estimator.vehicle_parameters import RunIdentity, impossible, parameters_of
+from calibrator.estimator.settings import RunIdentity
+from calibrator.estimator.vehicle_parameters import impossible, parameters_of
 from calibrator.estimator.vehicle_report import explained_faults
 from calibrator.summaries.record import Record, drives_digest, joined_records
 from calibrator.summaries.summary_store import SummaryStore

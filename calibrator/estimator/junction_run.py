@@ -24,8 +24,8 @@ from calibrator.estimator.readings import (
     window_readings,
 )
 from calibrator.estimator.results import Calibrated, encode_chunk
-from calibrator.estimator.settings import CalibrationSettings
-from calibrator.estimator.vehicle_parameters import RunIdentity, impossible, parameters_of
+from calibrator.estimator.settings import CalibrationSettings, RunIdentity
+from calibrator.estimator.vehicle_parameters import impossible, parameters_of
 from calibrator.estimator.vehicle_report import sensor_texts
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles

@@ -18,8 +18,8 @@ from calibrator.artificial.random_fleet import FaultSettings
 from calibrator.drive import Array, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import align
 from calibrator.estimator.results import Calibrated, encode_chunk
-from calibrator.estimator.settings import require_learning
-from calibrator.estimator.vehicle_parameters import RunIdentity, by_branch, current_moments, junction_residual
+from calibrator.estimator.settings import RunIdentity, require_learning
+from calibrator.estimator.vehicle_parameters import by_branch, current_moments, junction_residual
 from calibrator.processes.run_many import Workers
 from calibrator.published.classify import classify_by_expected_trees
 from calibrator.published.recovery import Recovery, recover_fleet

@@ -22,8 +22,7 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Equipment, Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.settings import CONFIDENT
-from calibrator.estimator.vehicle_parameters import RunIdentity
+from calibrator.estimator.settings import CONFIDENT, RunIdentity
 from calibrator.estimator.vehicle_report import held_back_lines
 from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.progress import progress_bar

@@ -23,8 +23,8 @@ from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
 from calibrator.estimator.readings import read_bench_table
 from calibrator.estimator.results import PARTS, CalibrationReport, complete_result, part_file, parts_of, read_run
-from calibrator.estimator.settings import CalibrationSettings, Method, require_learning
-from calibrator.estimator.vehicle_parameters import RunIdentity, time_of_run
+from calibrator.estimator.settings import CalibrationSettings, Method, RunIdentity, require_learning
+from calibrator.estimator.vehicle_parameters import time_of_run
 from calibrator.files.folders import require_new_folder, whole_folder
 from calibrator.files.storage import Storage, open_storage
 from calibrator.processes.run_many import Workers, run_many

@@ -1,4 +1,4 @@
-"""The user's choices of how a fleet, or single junctions, are calibrated."""
+"""The user's choices of how a fleet, or single junctions, are calibrated, and the identity of a run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,8 +9,11 @@ from typing import Any
 from calibrator.errors import FleetError
 from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few_reasons
+from ecu_node import __version__
+from ecu_node.database import VehicleDatabase
 from ecu_node.documents import text_digest
 from ecu_node.layout import UnmeasuredLoad, file_digest
+from ecu_node.parameters import FileReference, Provenance
 
 __all__ = [
     "CONFIDENT",
@@ -19,6 +22,7 @@ __all__ = [
     "SUSPECTED",
     "CalibrationSettings",
     "Method",
+    "RunIdentity",
     "require_learning",
 ]
 
@@ -98,6 +102,53 @@ class CalibrationSettings:
             "charge_ah": dict(self.charge_ah),
             "meter": self.meter,
         }
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunIdentity:
+    """Identity of one run of the calibrator, as parameter files record it.
+
+    Attributes
+    ----------
+    database : VehicleDatabase
+        DBC and layout that the parameters belong to.
+    settings : CalibrationSettings
+        The user's choices, such as the method by which they are found.
+    fleet, created : str
+        Name of the fleet; time of the run, ISO 8601.
+    """
+
+    database: VehicleDatabase
+    settings: CalibrationSettings
+    fleet: str
+    created: str
+
+    @property
+    def tool(self) -> str:
+        """Name and version of the program."""
+        return f"calibrator {__version__}"
+
+    @property
+    def layout(self) -> FileReference:
+        """The layout file."""
+        return FileReference(name=self.database.layout.name, sha256=self.database.layout.digest)
+
+    @property
+    def dbc(self) -> FileReference:
+        """The DBC file."""
+        return FileReference(name=self.database.layout.dbc_path.name, sha256=self.database.digest)
+
+    def provenance(self, *, fleet_size: int, drives: Sequence[str], duration_s: float) -> Provenance:
+        """Describe where the parameters of one vehicle come from."""
+        return Provenance(
+            tool=self.tool,
+            method=self.settings.method.value,
+            created=self.created,
+            fleet=self.fleet,
+            fleet_size=fleet_size,
+            drives=list(drives),
+            duration_s=round(duration_s, 3),
+        )
 
 
 def require_learning(names: Sequence[str], settings: CalibrationSettings, left_out: Mapping[str, str]) -> None:

@@ -3,7 +3,6 @@
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, cast
 
@@ -13,25 +12,20 @@ from calibrator.drive import Array, Mask
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
 from calibrator.estimator.decision import FleetEstimate
-from calibrator.estimator.settings import CONFIDENT, SUSPECTED, CalibrationSettings
+from calibrator.estimator.settings import CONFIDENT, SUSPECTED, RunIdentity
 from calibrator.estimator.vehicle_report import LEAST_RIVAL, REASONS, explained_faults
 from calibrator.summaries.vehicle_summary import VehicleSummary
-from ecu_node import __version__
-from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import (
     BranchParameters,
     Explanation,
-    FileReference,
     HardwareFault,
     HeldBack,
     JunctionResidual,
-    Provenance,
     VehicleParameters,
     Verdict,
 )
 
 __all__ = [
-    "RunIdentity",
     "by_branch",
     "current_moments",
     "deciding_evidence",
@@ -53,53 +47,6 @@ STABILITY = 0.01
 """Least change of gains with temperature between drives that is assumed: the node must not take it for a fault. [1]"""
 TINY_A2 = 1e-12
 """Least squared throughput, so that it can be divided by. [A^2]"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunIdentity:
-    """Identity of one run of the calibrator, as parameter files record it.
-
-    Attributes
-    ----------
-    database : VehicleDatabase
-        DBC and layout that the parameters belong to.
-    settings : CalibrationSettings
-        The user's choices, such as the method by which they are found.
-    fleet, created : str
-        Name of the fleet; time of the run, ISO 8601.
-    """
-
-    database: VehicleDatabase
-    settings: CalibrationSettings
-    fleet: str
-    created: str
-
-    @property
-    def tool(self) -> str:
-        """Name and version of the program."""
-        return f"calibrator {__version__}"
-
-    @property
-    def layout(self) -> FileReference:
-        """The layout file."""
-        return FileReference(name=self.database.layout.name, sha256=self.database.layout.digest)
-
-    @property
-    def dbc(self) -> FileReference:
-        """The DBC file."""
-        return FileReference(name=self.database.layout.dbc_path.name, sha256=self.database.digest)
-
-    def provenance(self, *, fleet_size: int, drives: Sequence[str], duration_s: float) -> Provenance:
-        """Describe where the parameters of one vehicle come from."""
-        return Provenance(
-            tool=self.tool,
-            method=self.settings.method.value,
-            created=self.created,
-            fleet=self.fleet,
-            fleet_size=fleet_size,
-            drives=list(drives),
-            duration_s=round(duration_s, 3),
-        )
 
 
 def time_of_run() -> str:

@@ -18,8 +18,7 @@ from calibrator.estimator import run
 from calibrator.estimator.fleet_task import FleetTask, calibrate_bucket, learn_task
 from calibrator.estimator.results import left_out_of, read_results, read_run
 from calibrator.estimator.run import read_sample
-from calibrator.estimator.settings import CalibrationSettings
-from calibrator.estimator.vehicle_parameters import RunIdentity
+from calibrator.estimator.settings import CalibrationSettings, RunIdentity
 from calibrator.files.storage import open_storage
 from calibrator.processes import run_many
 from calibrator.processes.run_many import Workers
