@@ -11,7 +11,6 @@ from typer.main import get_command
 from calibrator.cli import COMMANDS as ALL
 from calibrator.cli import app as calibrator_app
 from calibrator.errors import ContradictionError, FleetError
-from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.command_line import command_app, run_app, run_tool
 from ecu_node.program import write_output
 
@@ -121,17 +120,3 @@ def test_ctrl_c_ends_a_tool_with_one_line(monkeypatch: pytest.MonkeyPatch, capsy
         run_tool(tool, "tool")
     assert end.value.code == 130
     assert capsys.readouterr().err == "tool: interrupted\n"
-
-
-@app.command()
-def work() -> None:
-    """Fail in a worker process."""
-    list(run_many(int, ["1", "one"], Workers(processes=2)))
-
-
-def test_internal_error_in_a_worker_process_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
-    assert run_app(app, "prog", ["work"]) == 70
-    (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith("prog: internal error: ValueError: invalid literal for int() with base 10: 'one'")
-    assert run_app(app, "prog", ["work", "--debug"]) == 70
-    assert "Traceback (most recent call last)" in capfd.readouterr().err
