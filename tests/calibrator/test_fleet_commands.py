@@ -1,4 +1,4 @@
-"""The commands of the calibrator as a user types them, on one small artificial fleet."""
+"""The commands of the calibrator as a user types them, on two small artificial fleets."""
 
 import gzip
 import json
@@ -10,13 +10,12 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from calibrator.estimator.results import read_results
-from ecu_node.database import read_database
-from ecu_node.layout import read_layout
-from ecu_node.parameters import check_fit, read_parameters
-from tests.calibrator.command_here import calibrator, made_once
-
-LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+from calibrator.estimator.results import read_results, read_run
+from calibrator.fleet_truth import read_truth
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
+from tests.calibrator.command_here import calibrator, made_once, refused, reported, succeeded
+from tests.calibrator.conftest import LAYOUT
 
 
 @pytest.fixture(scope="session")
@@ -33,8 +32,7 @@ def result(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_symmetric_fleet_is_recovered(fleet: Path, result: Path) -> None:
-    run = calibrator("score", result, "--truth", fleet / "truth.json", "--json")
-    figures = json.loads(run.stdout)
+    figures = reported("score", result, "--truth", fleet / "truth.json")
     assert figures["vehicles"] == 12
     assert figures["recovery_rate"] == figures["recovery_rate_25"] == figures["hardware_f2"] == 1.0
     assert figures["deployed_rate"] > 0.0
@@ -43,8 +41,8 @@ def test_symmetric_fleet_is_recovered(fleet: Path, result: Path) -> None:
     assert all(row["junction_rms_corrected_a"] < 0.5 * row["junction_rms_measured_a"] for row in corrected)
 
 
-def test_parameter_files_fit_their_vehicle_and_equal_the_results_table(result: Path) -> None:
-    database, table = read_database(read_layout(LAYOUT)), pq.read_table(result / "results.parquet")
+def test_parameter_files_fit_their_vehicle_and_equal_the_results_table(result: Path, database: VehicleDatabase) -> None:
+    table = pq.read_table(result / "results.parquet")
     assert table.num_rows == 24
     assert table.schema.field("offset_a").metadata == {b"unit": b"A"}
     for row in table.to_pylist():
@@ -63,8 +61,7 @@ def test_nothing_is_learnt_from_a_held_out_vehicle(fleet: Path, tmp_path: Path) 
     found = []
     for k, logs in enumerate((fleet / "logs", other)):
         out = tmp_path / f"result{k}"
-        run = calibrator("calibrate", logs, "--layout", LAYOUT, "--out", out, "--hold-out", "V001", "--workers", 1)
-        assert run.returncode == 0, run.stderr
+        succeeded("calibrate", logs, "--layout", LAYOUT, "--out", out, "--hold-out", "V001", "--workers", 1)
         found.append({(row["vehicle"], row["branch"]): row for row in read_results(out)})
     assert found[0]["V001", "battery"] != found[1]["V001", "battery"]
     assert all(found[0][key] == found[1][key] for key in found[0] if key[0] != "V001")
@@ -102,10 +99,8 @@ def calibrator_lines(fleet: Path) -> list[bytes]:
 
 def test_unusable_vehicles_are_left_out_and_named(broken_fleet: Path, tmp_path: Path) -> None:
     out = tmp_path / "result"
-    run = calibrator("calibrate", broken_fleet, "--layout", LAYOUT, "--out", out, "--json", "--workers", 1)
-    assert run.returncode == 0, run.stderr
-    assert "Traceback" not in run.stderr
-    left_out = json.loads(run.stdout)["run"]["left_out"]
+    report = reported("calibrate", broken_fleet, "--layout", LAYOUT, "--out", out, "--workers", 1)
+    left_out = report["run"]["left_out"]
     for vehicle, reason in {
         "short": "at least 120 s are needed",
         "empty": "drive.log: the log is empty",
@@ -122,23 +117,9 @@ def test_unusable_vehicles_are_left_out_and_named(broken_fleet: Path, tmp_path: 
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
 
 
-def test_option_since_recalibrates_a_single_vehicle_with_new_drives(fleet: Path, tmp_path: Path) -> None:
-    layout, store, one = ("--layout", LAYOUT), tmp_path / "store", ("--workers", 1)
-    assert calibrator("summarise", fleet / "logs", *layout, "--out", store, *one).returncode == 0
-    first = calibrator("calibrate", store, *layout, "--out", tmp_path / "first", *one)
-    assert first.returncode == 0, first.stderr
-    new = sorted((fleet / "unseen").iterdir())[0]
-    shutil.copytree(new, tmp_path / "new" / new.name)
-    second = ("--out", tmp_path / "second", "--since", tmp_path / "first", *one)
-    run = calibrator("calibrate", tmp_path / "new", *layout, *second)
-    assert run.returncode == 1
-    assert "drives, and --since goes on with summaries; add the new drives to the store" in run.stderr
-    assert calibrator("summarise", tmp_path / "new", *layout, "--out", store, *one).returncode == 0
-    run = calibrator("calibrate", store, *layout, *second)
-    assert run.returncode == 0, run.stderr
-    assert {row["vehicle"] for row in read_results(tmp_path / "second")} == {
-        row["vehicle"] for row in read_results(tmp_path / "first")
-    }
+def test_option_since_needs_summaries(fleet: Path, result: Path, tmp_path: Path) -> None:
+    line = ("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "x", "--since", result)
+    assert "drives, and --since goes on with summaries; add the new drives to the store" in refused(*line)
 
 
 def test_single_vehicle_or_copies_of_one_are_not_a_fleet(fleet: Path, tmp_path: Path) -> None:
@@ -164,5 +145,84 @@ def test_score_refuses_the_truth_of_other_vehicles_or_branches(
 ) -> None:
     truth = json.loads((fleet / "truth.json").read_text())
     (tmp_path / "truth.json").write_text(json.dumps({**truth, key: change(truth[key])}))
-    run = calibrator("score", result, "--truth", tmp_path / "truth.json")
-    assert (run.returncode, message in run.stderr) == (1, True), run.stderr
+    assert message in refused("score", result, "--truth", tmp_path / "truth.json")
+
+
+# A fleet with delays, and a load that no sensor measures
+
+DELAY_TOLERANCE_S = 0.005
+
+
+@pytest.fixture(scope="session")
+def delayed_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = ("--vehicles", 12, "--currents", 2, "--sparsity", 80, "--delay", 150, "--unmeasured", 3, 1)
+    length = ("--minutes", 3, "--unseen-minutes", 0.1, "--seed", 5)
+    return made_once(tmp_path_factory, "asymmetric_fleet", "simulate", *options, *length)
+
+
+@pytest.fixture(scope="session")
+def summaries(delayed_fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once(tmp_path_factory, "asymmetric_summaries", "summarise", delayed_fleet)
+
+
+@pytest.fixture(scope="session")
+def delayed_result(summaries: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once(tmp_path_factory, "asymmetric_result", "calibrate", summaries)
+
+
+@pytest.fixture(scope="module")
+def parameters(delayed_result: Path) -> list[VehicleParameters]:
+    return [read_parameters(path) for path in sorted((delayed_result / "params").iterdir())]
+
+
+def test_asymmetric_fleet_with_delays_and_load_is_recovered_without_harm(
+    delayed_fleet: Path, delayed_result: Path
+) -> None:
+    figures = reported("score", delayed_result, "--truth", delayed_fleet / "truth.json")
+    assert figures["recovery_rate"] >= 0.9
+    assert figures["harmed_rate"] == 0.0
+
+
+def test_delay_of_the_motor_is_in_the_parameter_file(delayed_fleet: Path, parameters: list[VehicleParameters]) -> None:
+    truth = read_truth(delayed_fleet / "truth.json").vehicles
+    for item in parameters:
+        delays = {name: branch.delay_s for name, branch in item.branches.items()}
+        assert all(delay is not None for delay in delays.values())
+        found = (delays["motor"] or 0.0) - (delays["battery"] or 0.0)
+        actual = truth[item.vehicle].delay_s["motor"] - truth[item.vehicle].delay_s["battery"]
+        assert abs(found - actual) < DELAY_TOLERANCE_S
+
+
+def test_parameter_files_apply_only_corrections_below_the_harm_limit(parameters: list[VehicleParameters]) -> None:
+    for item in parameters:
+        for branch in item.branches.values():
+            assert branch.harm_probability is not None
+            assert not branch.apply or branch.harm_probability < 0.001
+
+
+def test_unmeasured_load_is_estimated_from_the_fleet_and_reported(delayed_fleet: Path, delayed_result: Path) -> None:
+    run = read_run(delayed_result)
+    truth = [vehicle.unmeasured_a for vehicle in read_truth(delayed_fleet / "truth.json").vehicles.values()]
+    assert run.details["reference"]["unmeasured_a"] == pytest.approx(sum(truth) / len(truth), abs=1.0)
+    assert any("load without a sensor" in notice for notice in run.notices)
+
+
+@pytest.fixture(scope="session")
+def strict(summaries: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Result with a harm limit of zero: nothing is corrected, and faulty vehicles stay undecided."""
+    return made_once(tmp_path_factory, "strict_result", "calibrate", summaries, "--harm-limit", 0)
+
+
+def test_harm_limit_of_zero_corrects_nothing_and_reasons_are_given(delayed_result: Path, strict: Path) -> None:
+    chosen, rows, usual = read_run(strict).settings, read_results(strict), read_results(delayed_result)
+    assert (chosen["harm_limit"], chosen["trusted"], chosen["hold_out"]) == (0.0, [], [])
+    assert not any(row["applied"] for row in rows)
+    assert {row["held_back"] for row in usual if row["applied"]} == {None}
+    for row in rows:
+        assert row["held_back"] == ("harm limit" if row["drift"] or row["offset_a"] else None)
+        assert 0.0 <= row["fault_probability"] <= 1.0
+        assert min(row["drift_sd"], row["offset_sd_a"]) >= 0.0
+    parameters = [read_parameters(path) for path in sorted((strict / "params").iterdir())]
+    unknown = [item for item in parameters if item.verdict == "cannot tell"]
+    assert unknown
+    assert all(item.explanations and item.deciding_evidence for item in unknown)

@@ -78,9 +78,3 @@ def test_slopes_and_intercepts_reproduce_the_measured_currents() -> None:
     for j in range(2):
         measured = measured_currents(true_currents(i_s, FAULTS.take(j)), FAULTS.take(j))
         np.testing.assert_allclose(measured, a[j] * i_s + b[j])
-
-
-def test_hardware_and_sensor_faults_are_distinguished() -> None:
-    assert FAULTS.has_hardware_fault.tolist() == [True, False]
-    assert FAULTS.has_sensor_fault.tolist() == [True, False]
-    assert len(FAULTS) == 2

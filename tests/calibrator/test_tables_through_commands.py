@@ -1,6 +1,5 @@
 """A fleet whose recordings are tables, through every command that takes recordings or what is made of them."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 
 from calibrator.drive import Array
 from calibrator.estimator.results import read_results
-from tests.calibrator.command_here import calibrator
+from tests.calibrator.command_here import reported, succeeded
 from tests.calibrator.estimator.test_junction import recording
 
 GAIN = {"V1": 0.08, "V4": -0.06}
@@ -48,14 +47,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(place: Path, *words: str | Path) -> str:
     """Output of a command with the layout of the tables."""
-    done = calibrator(*words, "--layout", place / "car.toml")
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return succeeded(*words, "--layout", place / "car.toml", "--workers", 1)
 
 
 @pytest.fixture(scope="module")
 def result(place: Path) -> Path:
-    run(place, "calibrate", place / "logs", "--out", place / "result", "--workers", "1")
+    run(place, "calibrate", place / "logs", "--out", place / "result")
     return place / "result"
 
 
@@ -67,22 +64,15 @@ def test_faults_of_a_fleet_recorded_as_tables_are_found(result: Path) -> None:
 
 
 def test_calibration_from_drives_or_summaries_of_tables_is_the_same(place: Path, result: Path, tmp_path: Path) -> None:
-    run(place, "import", place / "logs", "--out", tmp_path / "drives", "--workers", "1")
-    run(place, "summarise", tmp_path / "drives", "--out", tmp_path / "summaries", "--workers", "1")
-    run(place, "calibrate", tmp_path / "summaries", "--out", tmp_path / "result", "--workers", "1")
+    run(place, "import", place / "logs", "--out", tmp_path / "drives")
+    run(place, "summarise", tmp_path / "drives", "--out", tmp_path / "summaries")
+    run(place, "calibrate", tmp_path / "summaries", "--out", tmp_path / "result")
     for row, expected in zip(read_results(tmp_path / "result"), read_results(result), strict=True):
         assert row["drift"] == pytest.approx(expected["drift"], abs=1e-6)
 
 
-def test_doctor_finds_no_error_in_a_good_table(place: Path) -> None:
-    drive = place / "logs" / "V2" / "drive.csv"
-    findings = json.loads(run(place, "doctor", "--log", drive, "--json"))
-    assert not [each for each in findings["findings"] if each["severity"] == "error"]
-    assert "battery" in run(place, "kirchhoff", drive)
-
-
 def test_filter_bank_is_chosen_for_tables(place: Path) -> None:
-    assert "vehicles: 8" in run(place, "identify", place / "logs", "--workers", "1")
+    assert "vehicles: 8" in run(place, "identify", place / "logs")
 
 
 def solar_plant(folder: Path) -> Path:
@@ -104,23 +94,23 @@ def solar_plant(folder: Path) -> Path:
 def test_rows_a_minute_apart_go_through_every_command(tmp_path: Path) -> None:
     table, layout = solar_plant(tmp_path), tmp_path / "solar.toml"
     branches = ("--branches", "battery=Ibat,string1=I1,string2=I2,-inverter=Iinv")
-    found = json.loads(calibrator("kirchhoff", table, *branches, "--json").stdout)
+    found = reported("kirchhoff", table, *branches)
     assert found["expected"]["parts_a"]["noise"] == pytest.approx(2.0 * 0.02, rel=0.15)
-    done = calibrator("layout", "init", table, *branches, "--out", layout)
-    assert (done.returncode, layout.read_text().count("timeout_s = 300")) == (0, 4), done.stderr
+    succeeded("layout", "init", table, *branches, "--out", layout)
+    assert layout.read_text().count("timeout_s = 300") == 4
     assert f"full_scale_a = {found['full_scale_a']:g}" in layout.read_text()
-    found = json.loads(calibrator("doctor", "--layout", layout, "--log", table, "--json").stdout)
+    found = reported("doctor", "--layout", layout, "--log", table)
     assert "calibrate --trusted" in found["ready"]
     assert [each["code"] for each in found["findings"]] == ["gain"]
     options = ["--trusted", "battery", "--load", "0:0.05", "--out", tmp_path / "result"]
-    assert calibrator("calibrate", table, "--layout", layout, *options).returncode == 0
+    succeeded("calibrate", table, "--layout", layout, *options)
     results = pd.DataFrame(read_results(tmp_path / "result")).set_index("branch")
     assert results.drift["string1"] == pytest.approx(0.05, abs=0.01)
     assert results.index[results.applied].to_list() == ["string1"]
 
 
 def test_two_currents_that_together_close_the_sum_are_branches(tmp_path: Path) -> None:
-    found = json.loads(calibrator("layout", "init", solar_plant(tmp_path), "--json").stdout)
+    found = reported("layout", "init", solar_plant(tmp_path))
     taken = {each["signal"]: (each["branch"], each["sign"]) for each in found["candidates"]}
     wanted = {"Ibat": ("battery", 1), "Iinv": ("motor", -1), "I1": ("auxiliary", 1), "I2": ("auxiliary_3", 1)}
     assert taken == wanted
