@@ -143,6 +143,11 @@ def test_column_of_times_takes_precedence_over_the_index(tmp_path: Path, index: 
     assert table.columns["Ibat [A]"] == pytest.approx(BATTERY_A)
 
 
+def test_headers_that_differ_only_in_blanks_are_numbered(tmp_path: Path) -> None:
+    frame(**{"Ibat [A] ": BATTERY_A}).to_parquet(tmp_path / "x.parquet")
+    assert list(read_table(tmp_path / "x.parquet").columns) == ["Ibat.1 [A]", "Imot (A)", "Iheat_A", "Ibat.2 [A]"]
+
+
 def test_row_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     frame(time=np.where(TIME_S == 0.0, 1e300, TIME_S)).to_csv(tmp_path / "x.csv", index=False)
     table = read_table(tmp_path / "x.csv")
