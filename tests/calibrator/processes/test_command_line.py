@@ -98,3 +98,10 @@ def test_previous_handler_of_ctrl_c_is_restored_after_imports(before: "Callable[
         assert handler() is before
     finally:
         signal.signal(signal.SIGINT, of_pytest)
+
+
+def test_message_on_interruption_tells_whether_the_command_can_resume() -> None:
+    goes_on = "; it goes on with what it had read"
+    for arguments, kept in ((["--debug", "import", "x"], goes_on), (["simulate", "--out", "import"], ""), ([], "")):
+        assert interrupted_message(arguments) == f"calibrator: interrupted; run the same command again{kept}"
+    assert interrupted_message([], ENDED) == "calibrator: ended by SIGTERM; run the same command again"
