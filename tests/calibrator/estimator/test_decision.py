@@ -92,9 +92,11 @@ def test_harm_counts_once_over_several_drives_and_needs_a_correction() -> None:
     found, estimate = points(TWO_EXPLANATIONS, sd=0.05), np.array([0.12, 0.0, 0.0, 0.0])
     still = np.zeros((1, K)), np.full((1, K), 1e-4)
     one, other = (harm_probability(found, estimate, *drive) for drive in ((MEAN, SQUARE), still))
-    both = harm_probability(found, estimate, np.concatenate([MEAN, still[0]]), np.concatenate([SQUARE, still[1]]))
-    assert max(one[0], other[0]) <= both[0] <= min(one[0] + other[0], 1.0)
-    assert both[1] == 0.0
+    mean, square = np.concatenate([MEAN, still[0]]), np.concatenate([SQUARE, still[1]])
+    for order in ([0, 1], [1, 0]):
+        both = harm_probability(found, estimate, mean[order], square[order])
+        assert max(one[0], other[0]) <= both[0] <= min(one[0] + other[0], 1.0)
+        assert both[1] == 0.0
 
 
 def explained(
