@@ -127,6 +127,8 @@ class DriveFile:
         Names of the vehicle and of the drive.
     place : str
         Path of the file, possibly inside an archive, or its URL.
+    size : int
+        Size of the file; 0 where it is not known, as in an archive. [byte]
     version : str
         Text that changes when the file changes; empty where it is not known.
     """
@@ -134,6 +136,7 @@ class DriveFile:
     vehicle: str
     name: str
     place: str
+    size: int = 0
     version: str = ""
 
 
@@ -167,11 +170,14 @@ class FleetSource:
         Files of the drives by name of the vehicle; vehicles and drives are sorted by name.
     left_out : mapping of str to str
         Reasons: why a vehicle was left out, by its name; why a file or folder was, by ``problem 1``, ``problem 2`` ...
+    sizes : mapping of str to int
+        Size of all drives together, by name of the vehicle. [byte]
     """
 
     place: str
     vehicles: Mapping[str, tuple[DriveFile, ...]]
     left_out: Mapping[str, str] = field(default_factory=dict)
+    sizes: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def name(self) -> str:

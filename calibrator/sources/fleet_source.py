@@ -6,11 +6,12 @@ at any depth; an archive counts as a folder of its name. Logs that lie beside th
 two folders of the same name, and drives for which there are two files, are left out, and the report names them.
 """
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,17 +20,17 @@ from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import (
     DRIVES_FOLDER,
     is_drive_file,
+    is_plain_name,
     name_problem,
     read_drive_file,
     read_onboard_record,
 )
 from calibrator.errors import DriveError, FleetError, LogError
 from calibrator.files.storage import Entry, Storage, is_url, local_copy, open_storage, walk
-from calibrator.processes.run_many import Failed, Workers, try_many
+from calibrator.processes.run_many import Failed, Workers, try_many, try_many_shown
 from calibrator.recordings.log_formats import LOG_SUFFIXES, is_log, logs_in
 from calibrator.recordings.readers import read_recording
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.progress import shown
 from calibrator.terminal.text import few, few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
@@ -49,6 +50,33 @@ _Vehicle = TypeVar("_Vehicle")
 LOGS_FOLDER = "logs"
 PROBED_VEHICLES = 7
 """So many readable vehicles are looked at to find out which branches and inputs the fleet has. [1]"""
+
+
+_Place = Storage | list[DriveFile]
+"""Where the drives of a vehicle are: a folder, which is listed again when they are needed, or single files."""
+
+
+class _Vehicles(Mapping[str, tuple[DriveFile, ...]]):
+    """Drives by vehicle. Folders are listed on access, so of a large fleet only names and folders are in memory."""
+
+    def __init__(self, places: Mapping[str, _Place]) -> None:
+        self._places = dict(sorted(places.items()))
+
+    def __getitem__(self, vehicle: str) -> tuple[DriveFile, ...]:
+        place = self._places[vehicle]
+        if isinstance(place, Storage):
+            logs = [entry for entry in place.contents()[1] if _is_log(place, entry.name)]
+            place = _drives(vehicle, place.url, logs)
+        return tuple(twins[0] for _, twins in sorted(_by_name(place).items()) if len(twins) == 1)
+
+    def __contains__(self, vehicle: object) -> bool:
+        return vehicle in self._places
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
 
 
 def find_fleet(place: str | Path) -> FleetSource:
@@ -73,8 +101,10 @@ def find_fleet(place: str | Path) -> FleetSource:
     storage = open_storage(place)
     if storage.is_local and not Path(storage.url).exists():
         raise FleetError(f"{place}: no such file or folder; give a log, a drive store, or a folder with logs")
-    inside = storage.contents()[0]
-    folder = next((storage.folder(name) for name in (DRIVES_FOLDER, LOGS_FOLDER) if name in inside), storage)
+    folder = storage
+    if not (storage.is_local and Path(storage.url).is_file()):
+        inside = storage.contents()[0]
+        folder = next((storage.folder(name) for name in (DRIVES_FOLDER, LOGS_FOLDER) if name in inside), storage)
     fleet = find_logs([folder.url])
     if not fleet.vehicles:
         raise FleetError(f"{place}: no drive in it{few_reasons(fleet.left_out)}")
@@ -94,90 +124,106 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     FleetSource
         The drives, possibly none, and what is left out; the drives are not read yet.
     """
-    folders: dict[str, dict[str, Entry]] = {}
-    strays: dict[str, dict[str, Entry]] = {}
-    problems: list[str] = []
+    places: dict[str, dict[str, _Place]] = {}
+    usable, sizes = dict[str, bool](), Counter[str]()
+    strays, problems = dict[str, str](), list[str]()
+
+    def add(url: str, logs: Sequence[Entry], folder: Storage | None) -> None:
+        vehicle = _without_suffix(_folder_name(url), ".zip")
+        what = [name_problem(vehicle, f"{url}: the folder's name, which names the vehicle,")]
+        what += [
+            name_problem(_drive_name(entry.name), f"{url}/{entry.name}: the file's name, which names the drive,")
+            for entry in logs
+        ]
+        problems.extend(filter(None, what))
+        if what[0]:
+            return
+        mine, drives = places.setdefault(vehicle, {}), _drives(vehicle, url, logs)
+        known = mine.get(url, [])
+        if isinstance(known, Storage):
+            return  # the whole folder was given as well
+        mine[url] = folder or list(dict.fromkeys([*known, *drives]))
+        sizes[vehicle] += sum(entry.size for entry in logs)
+        by_name = _by_name(drives if folder else [*known, *drives])
+        usable[vehicle] = any(len(set(twins)) == 1 for twins in by_name.values())
+        for name, twins in by_name.items():
+            if len(set(twins)) > 1:
+                where = " and ".join(item.place for item in twins)
+                problems.append(f"vehicle {vehicle}: drive {name} is in {where}; remove or rename one")
+
     for argument in arguments:
         try:
-            top, logs = open_storage(argument).url, defaultdict[str, dict[str, Entry]](dict)
-            for folder, entry in _logs_in(argument, problems):
-                logs[folder][entry.name] = entry
-            if not logs:
-                raise LogError(f"{argument}: no logs in it; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
-            if len(logs) > 1 and top in logs:
-                strays[top] = logs.pop(top)
-            for folder, entries in logs.items():
-                folders.setdefault(folder, {}).update(entries)
+            storage, beside, is_found = open_storage(argument), list[Entry](), False
+            for url, logs, folder in _logs_in(storage, str(argument), problems):
+                if folder is not None and url == storage.url:
+                    beside = logs
+                else:
+                    add(url, logs, folder)
+                    is_found = True
+            if beside and not is_found:
+                add(storage.url, beside, storage)
+            elif not is_found:
+                what = "no logs in it" if storage.is_local else "nothing is there, or no logs in it"
+                raise LogError(f"{argument}: {what}; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
+            for entry in beside if is_found else ():
+                strays[f"{storage.url}/{entry.name}"] = (
+                    f"{storage.url}/{entry.name}: lies beside folders with logs; move it into that of its vehicle, or "
+                    f"name the file itself if it is of the vehicle {_folder_name(storage.url)}"
+                )
         except UserError as error:
             problems.append(str(error))
+    single = [place for mine in places.values() for place in mine.values() if isinstance(place, list)]
+    given = {item.place for place in single for item in place}
+    problems += [text for place, text in strays.items() if place not in given]
     problems += [
-        f"{folder}/{name}: lies beside folders with logs; move it into that of its vehicle, or name the file itself if "
-        f"it is of the vehicle {_folder_name(folder)}"
-        for folder, entries in strays.items()
-        for name in entries
-        if name not in folders.get(folder, {})
+        f"two vehicles with one name: {vehicle} is in {' and in '.join(mine)}; rename one folder, or move the logs "
+        f"into one if it is the same vehicle"
+        for vehicle, mine in places.items()
+        if len(mine) > 1
     ]
-    vehicles = _vehicles(folders, problems)
-    left_out = {f"problem {k}": text for k, text in enumerate(dict.fromkeys(problems), start=1)}
-    return FleetSource(place="", vehicles=vehicles, left_out=left_out)
+    vehicles = {
+        vehicle: next(iter(mine.values())) for vehicle, mine in places.items() if len(mine) == 1 and usable[vehicle]
+    }
+    left_out = {f"problem {k + 1}": text for k, text in enumerate(dict.fromkeys(problems))}
+    sizes_ = {vehicle: sizes[vehicle] for vehicle in vehicles}
+    return FleetSource(place="", vehicles=_Vehicles(vehicles), left_out=left_out, sizes=sizes_)
 
 
-def _logs_in(place: str | Path, problems: list[str]) -> Iterator[tuple[str, Entry]]:
-    """Yield each log in a folder or archive, or a single one, with the folder that it is in (path or URL).
+def _logs_in(storage: Storage, shown: str, problems: list[str]) -> Iterator[tuple[str, list[Entry], Storage | None]]:
+    """Yield each folder with logs that is in a folder or an archive, or the folder of a single log.
 
-    An inner folder or archive that cannot be read is added to `problems`.
+    Each is given as (path or URL, logs, storage); the storage is None for an archive or a single log. An inner folder
+    or archive that cannot be read is added to `problems`; `shown` is the place as the user named it.
     """
-    storage = open_storage(place)
-    if storage.is_local and not Path(storage.url).exists():
-        raise LogError(f"{place}: no such file or folder; give logs that are there")
-    parent, _, file = storage.url.rpartition("/")
-    is_single = Path(storage.url).is_file() if storage.is_local else _is_log(storage, file)
-    found = walk(storage, problems)
-    if is_single:
-        above = Storage(url=parent or "/")
-        found = iter([(above, [entry for entry in above.contents(file)[1] if entry.name == file])])
-    for folder, entries in found:
-        for entry in entries:
+    path = Path(storage.url)
+    if storage.is_local and not path.exists():
+        raise LogError(f"{shown}: no such file or folder; give logs that are there")
+    if storage.is_local and path.is_file():
+        yield from _in_archive(path) if path.suffix.lower() == ".zip" else [(str(path.parent), [_entry(path)], None)]
+        return
+    folder_url, _, name = storage.url.rpartition("/")
+    if not storage.is_local and _is_log(storage, name):
+        yield from ((folder_url, [log], None) for log in open_storage(folder_url).contents(name)[1] if log.name == name)
+    for folder, files in walk(storage, problems):
+        if logs := [entry for entry in files if _is_log(folder, entry.name)]:
+            yield folder.url, logs, folder
+        for entry in files:
             if folder.is_local and entry.name.lower().endswith(".zip"):
                 try:
-                    for log in logs_in(Path(folder.url) / entry.name):
-                        yield str(log.parent), Entry(log.name, 0, entry.version)
+                    yield from _in_archive(Path(folder.url) / entry.name)
                 except LogError as error:
                     problems.append(str(error))
-            elif is_single or _is_log(folder, entry.name):
-                yield folder.url, entry
 
 
-def _vehicles(folders: Mapping[str, Mapping[str, Entry]], problems: list[str]) -> dict[str, tuple[DriveFile, ...]]:
-    """Return the drives of each vehicle that has usable ones, and add what is wrong with others to `problems`."""
-    folders_of, drives_of = defaultdict[str, list[str]](list), dict[str, tuple[DriveFile, ...]]()
-    for folder in folders:
-        vehicle = _without_suffix(_folder_name(folder), ".zip")
-        if problem := name_problem(vehicle, f"{folder}: the folder's name, which names the vehicle,"):
-            problems.append(problem)
-        else:
-            folders_of[vehicle].append(folder)
-    for vehicle, its in sorted(folders_of.items()):
-        if len(its) > 1:
-            problems.append(
-                f"two vehicles with one name: {vehicle} is in {' and in '.join(its)}; rename one folder, or move the "
-                f"logs into one if it is the same vehicle"
-            )
-            continue
-        files = defaultdict[str, list[DriveFile]](list)
-        for entry in folders[its[0]].values():
-            name, place = Path(_without_suffix(entry.name, ".gz")).stem, f"{its[0]}/{entry.name}"
-            if problem := name_problem(name, f"{place}: the file's name, which names the drive,"):
-                problems.append(problem)
-            else:
-                files[name].append(DriveFile(vehicle=vehicle, name=name, place=place, version=entry.version))
-        for name, twins in files.items():
-            if len(twins) > 1:
-                where = " and ".join(sorted(item.place for item in twins))
-                problems.append(f"vehicle {vehicle}: drive {name} is in {where}; remove or rename one")
-        if drives := tuple(twins[0] for _, twins in sorted(files.items()) if len(twins) == 1):
-            drives_of[vehicle] = drives
-    return drives_of
+def _in_archive(path: Path) -> Iterator[tuple[str, list[Entry], None]]:
+    version = _entry(path).version
+    for folder, logs in groupby(logs_in(path), key=lambda inner: inner.parent):
+        yield str(folder), [Entry(log.name, 0, version) for log in logs], None
+
+
+def _entry(path: Path) -> Entry:
+    status = path.stat()
+    return Entry(path.name, status.st_size, f"{status.st_size}-{status.st_mtime_ns}")
 
 
 def _is_log(folder: Storage, name: str) -> bool:
@@ -191,9 +237,36 @@ def _folder_name(url: str) -> str:
     return url.rstrip("/").rpartition("/")[2] if is_url(url) else Path(url).resolve().name
 
 
+def _drive_name(file: str) -> str:
+    return Path(_without_suffix(file, ".gz")).stem
+
+
 def _without_suffix(name: str, suffix: str) -> str:
     """Return a name without a suffix, which may be in lower or upper case."""
     return name[: -len(suffix)] if name.lower().endswith(suffix) else name
+
+
+def _drives(vehicle: str, folder: str, logs: Iterable[Entry]) -> list[DriveFile]:
+    """Return the drives of a vehicle whose logs are in a folder; logs with unusable names are skipped."""
+    return [
+        DriveFile(
+            vehicle=vehicle,
+            name=_drive_name(entry.name),
+            place=f"{folder}/{entry.name}",
+            size=entry.size,
+            version=entry.version,
+        )
+        for entry in logs
+        if is_plain_name(_drive_name(entry.name))
+    ]
+
+
+def _by_name(drives: Iterable[DriveFile]) -> dict[str, list[DriveFile]]:
+    """Group drives by name, as several files may have the same drive name."""
+    found: dict[str, list[DriveFile]] = {}
+    for drive in sorted(drives, key=lambda item: item.place):
+        found.setdefault(drive.name, []).append(drive)
+    return found
 
 
 def is_onboard(entry: DriveFile) -> bool:
@@ -254,17 +327,24 @@ def read_vehicles(
     """
     chosen = list(fleet.vehicles) if names is None else names
     read_one = partial(read, equipment=equipment, database=database)
-    found, reasons = list[_Vehicle](), dict[str, str]()
-    with closing(try_many(read_one, map(fleet.vehicles.__getitem__, chosen), workers, limit_s=limit_s)) as outcomes:
-        going = shown(outcomes, label, len(chosen), "vehicles")
-        for name, (_, outcome) in zip(chosen, going, strict=True):
+    found, left_out = list[_Vehicle](), dict(fleet.left_out)
+    outcomes = try_many_shown(
+        read_one,
+        (fleet.vehicles[name] for name in chosen),
+        workers,
+        limit_s=limit_s,
+        label=label,
+        size=sum(fleet.sizes.get(name, 0) for name in chosen),
+        size_of=lambda drives: sum(drive.size for drive in drives),
+    )
+    with closing(outcomes):
+        for name, (_, outcome) in zip(chosen, outcomes, strict=True):
             if isinstance(outcome, Failed):
-                reasons[name] = outcome.reason
+                left_out[name] = outcome.reason
             else:
                 found.append(outcome)
-    left_out = {**fleet.left_out, **reasons}
     if not found:
-        reason = next(iter([*reasons.values(), *left_out.values()]), "")
+        reason = next((left_out[name] for name in chosen if name in left_out), next(iter(left_out.values()), ""))
         raise FleetError(f"{fleet.place}: no vehicle has enough usable data; the first says: {reason}")
     return found, left_out
 
@@ -290,7 +370,7 @@ def probe_equipment(
     database : VehicleDatabase
         DBC and layout.
     branches : sequence of str, optional
-        Branches to use instead of those found.
+        Branches to use instead of those found, each named once.
     limit_s : float
         Longest time for one drive. [s]
     modelled : bool
@@ -306,25 +386,44 @@ def probe_equipment(
     Raises
     ------
     FleetError
-        If no vehicle can be read, or there are too few branches or inputs.
+        If no vehicle can be read, there are too few branches or inputs, or a branch is named twice.
     LayoutError
         If a branch is named that the layout does not have.
     """
     layout = database.layout
-    names = [_names_in(drive) for drive in drives] or _probed_names(fleet, database, limit_s)
+    names, errors = [_names_in(drive) for drive in drives], list[str]()
+    if not names:
+        first = (entries[0] for entries in fleet.vehicles.values() if entries)
+        with closing(try_many(partial(_names, database=database), first, Workers(), limit_s=limit_s)) as read:
+            for _, outcome in read:
+                if isinstance(outcome, Failed):
+                    errors.append(outcome.reason)
+                else:
+                    names.append(outcome)
+                if len(names) == PROBED_VEHICLES:
+                    break
+    if not names:
+        raise FleetError(
+            f"{fleet.place}: none of the first {len(errors)} vehicles can be read; the first says: {errors[0]}"
+        )
     seen = Counter(name for has, _ in names for name in has)
-    found = tuple(name for name in layout.branch_names if 2 * seen[name] > len(names))
-    chosen = found if branches is None else tuple(branches)
+    found = [name for name in layout.branch_names if 2 * seen[name] > len(names)]
+    chosen = tuple(found if branches is None else branches)
+    if branches is not None and len(branches) < 2:
+        raise FleetError(
+            f"--branches {','.join(branches)}: a junction has two branches or more; name all that are measured, or "
+            f"leave --branches out"
+        )
     for name in chosen:
         layout.find_branch(name)
-    if len(chosen) < 2:
-        given = f"{fleet.place}: branches found: " if branches is None else "--branches "
-        raise FleetError(
-            f"{given}{', '.join(chosen) or 'none'}; a junction needs two branches or more that are measured"
-        )
+    if twice := sorted({name for name in chosen if chosen.count(name) > 1}):
+        raise FleetError(f"branch {', '.join(twice)} is asked for twice; name each branch once")
     available = {name for _, inputs in names for name in inputs}
     inputs, missing_inputs = choose_inputs(layout, available) if modelled else ((), ())
-    fleet_inputs, _ = choose_inputs(layout, available, names=layout.fleet_inputs or layout.model_inputs)
+    wanted = layout.fleet_inputs or layout.model_inputs
+    fleet_inputs = choose_inputs(layout, available, names=wanted)[0] if modelled else ()
+    if len(chosen) < 2:
+        raise FleetError(f"{fleet.place}: branches found: {', '.join(chosen) or 'none'}; a junction needs two or more")
     if modelled and not inputs:
         named = few(layout.model_inputs)
         why = f"none of the model_inputs of {{}} was recorded: {named}" if named else "no model_inputs in {}"
@@ -338,33 +437,11 @@ def probe_equipment(
         "model inputs not recorded, left out": missing_inputs,
     }
     notices = tuple(f"{text}: {', '.join(names)}" for text, names in texts.items() if names)
-    return Equipment(branches=chosen, inputs=inputs, fleet_inputs=fleet_inputs if modelled else (), notices=notices)
+    return Equipment(branches=chosen, inputs=inputs, fleet_inputs=fleet_inputs, notices=notices)
 
 
-_Names = tuple[tuple[str, ...], tuple[str, ...]]
-"""Names of the branches and of the inputs that a drive has."""
-
-
-def _probed_names(fleet: FleetSource, database: VehicleDatabase, limit_s: float) -> list[_Names]:
-    """Read the names in the first drive of each of the first vehicles that can be read; FleetError if none can."""
-    found, errors = list[_Names](), list[str]()
-    first = (drives[0] for drives in fleet.vehicles.values())
-    with closing(try_many(partial(_names, database=database), first, Workers(), limit_s=limit_s)) as outcomes:
-        for _, outcome in outcomes:
-            if isinstance(outcome, Failed):
-                errors.append(outcome.reason)
-            else:
-                found.append(outcome)
-            if len(found) == PROBED_VEHICLES:
-                break
-    if not found:
-        raise FleetError(
-            f"{fleet.place}: none of the first {len(errors)} vehicles can be read; the first says: {errors[0]}"
-        )
-    return found
-
-
-def _names(entry: DriveFile, database: VehicleDatabase) -> _Names:
+def _names(entry: DriveFile, database: VehicleDatabase) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Read the names of the branches and inputs that a drive has."""
     if not is_onboard(entry):
         return _names_in(load_drive(entry, database))
     with local_copy(entry.place) as path:
@@ -372,5 +449,5 @@ def _names(entry: DriveFile, database: VehicleDatabase) -> _Names:
     return tuple(record.branches), tuple(record.recorded)
 
 
-def _names_in(drive: Drive) -> _Names:
+def _names_in(drive: Drive) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return tuple(drive.branches), tuple(drive.inputs)

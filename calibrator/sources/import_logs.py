@@ -10,11 +10,10 @@ from pathlib import Path
 from calibrator.drive import DriveFile
 from calibrator.drives.store import has_drive, remove_leftovers, write_drive
 from calibrator.files.storage import StorageError, local_copy, open_storage
-from calibrator.processes.run_many import Failed, Workers, try_many
+from calibrator.processes.run_many import Failed, Workers, try_many_shown
 from calibrator.recordings.readers import read_recording
 from calibrator.sources.fleet_source import find_logs
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.progress import shown
 from calibrator.terminal.text import Notice, counted, dumps, left_out_text, merged_notices, table
 from ecu_node.database import VehicleDatabase
 
@@ -97,9 +96,13 @@ def import_logs(
     found, start_s = find_logs(logs), time.time()
     left_out, drives, already_there = dict(found.left_out), list[ImportedDrive](), list[str]()
     read = partial(_import_one, database=database, store=open_storage(store).url)
-    entries = [log for drives_of in found.vehicles.values() for log in drives_of]
-    with closing(try_many(read, entries, workers, limit_s=limit_s)) as outcomes:
-        for log, outcome in shown(outcomes, "import", len(entries), "logs"):
+    entries = (log for vehicle in found.vehicles for log in found.vehicles[vehicle])
+    size = sum(found.sizes.values())
+    outcomes = try_many_shown(
+        read, entries, workers, limit_s=limit_s, label="import", size=size, size_of=lambda log: log.size
+    )
+    with closing(outcomes):
+        for log, outcome in outcomes:
             if isinstance(outcome, StorageError):
                 raise outcome
             if isinstance(outcome, ImportedDrive):

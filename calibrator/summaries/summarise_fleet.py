@@ -21,7 +21,7 @@ from calibrator.drives.delays import BranchDelays
 from calibrator.drives.store import read_onboard_record, recording_digest
 from calibrator.errors import DriveError
 from calibrator.files.storage import local_copy, open_storage
-from calibrator.processes.run_many import Failed, Workers, try_many
+from calibrator.processes.run_many import Failed, Workers, try_many_shown
 from calibrator.sources.fleet_source import find_fleet, is_onboard, load_drive, probe_equipment
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity
@@ -36,7 +36,6 @@ from calibrator.summaries.vehicle_summary import (
     summarise_drives,
 )
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.progress import shown
 from calibrator.terminal.text import counted, dumps, left_out_text
 from ecu_node.database import VehicleDatabase
 from ecu_node.summary import SummaryFile, unpacked
@@ -166,10 +165,17 @@ def add_drives(
         What was added and left out. A vehicle whose drives cannot be used gets a record that says why.
     """
     report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
-    read = partial(_read_record, store=store.identity, database=database)
-    with closing(try_many(read, _tasks(store, fleet, owners), workers, limit_s=time_limit_s)) as outcomes:
-        going = shown(outcomes, "summarise drives", len(fleet.vehicles), "vehicles")
-        for bucket, group in groupby(going, key=lambda pair: pair[0].bucket):
+    outcomes = try_many_shown(
+        partial(_read_record, store=store.identity, database=database),
+        _tasks(store, fleet, owners),
+        workers,
+        limit_s=time_limit_s,
+        label="summarise drives",
+        size=sum(fleet.sizes.values()),
+        size_of=lambda task: sum(drive.size for drive in task.drives),
+    )
+    with closing(outcomes):
+        for bucket, group in groupby(outcomes, key=lambda pair: pair[0].bucket):
             records = [
                 _record(task.drives, problem=outcome.reason) if isinstance(outcome, Failed) else outcome
                 for task, outcome in group

@@ -57,7 +57,7 @@ def test_log_at_a_url_is_assigned_to_the_vehicle_of_its_folder() -> None:
     assert drives(find_logs(["memory://logs/V1/a.log.gz"])) == ["V1/a"]
     assert drives(find_fleet("memory://logs/V1/b.log.gz")) == ["V1/b"]
     (problem,) = find_logs(["memory://logs/V1/c.log.gz"]).left_out.values()
-    assert problem.startswith("memory://logs/V1/c.log.gz: no logs in it")
+    assert problem.startswith("memory://logs/V1/c.log.gz: nothing is there, or no logs in it")
 
 
 def test_archive_counts_as_a_vehicle_folder_and_a_damaged_one_is_reported(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_branches_not_recorded_or_not_requested_are_named(
 
 
 @pytest.mark.parametrize(("branches", "words"), [
-    (["battery"], "--branches battery; a junction needs two branches or more that are measured"),
+    (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
     (["pack", "battery"], "no branch 'pack'; known are battery, motor"),
 ])  # fmt: skip
 def test_wrong_branches_are_refused(store: Path, database: VehicleDatabase, branches: list[str], words: str) -> None:
