@@ -7,7 +7,7 @@ import hashlib
 import math
 import os
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import Path
@@ -77,9 +77,9 @@ def is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
 
 
 def names_of(given: Any, what: str) -> tuple[str, ...]:
-    """Return the names in a list, tuple or the like, numbers as strings; FleetError, naming ``what``, if it is none."""
+    """Return the names in a list, a set (sorted) or the like, numbers as strings; FleetError, naming ``what``, if it is none."""
     listed = isinstance(given, Collection) and not isinstance(given, (str, bytes, Mapping))
-    names = tuple(map(str, given)) if listed else ("",)
+    names = tuple(map(str, sorted(given) if isinstance(given, Set) else given)) if listed else ("",)
     require(all(name.strip() for name in names), what, given, "a list of names, such as ['one', 'other']")
     return names
 
