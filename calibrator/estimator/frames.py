@@ -77,7 +77,7 @@ def is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
 
 
 def names_of(given: Any, what: str) -> tuple[str, ...]:
-    """Return the names in a list, a set (sorted) or the like, numbers as strings; FleetError, naming ``what``, if it is none."""
+    """Return the names in a list or the like (a set is sorted), numbers as strings; FleetError on anything else."""
     listed = isinstance(given, Collection) and not isinstance(given, (str, bytes, Mapping))
     names = tuple(map(str, sorted(given) if isinstance(given, Set) else given)) if listed else ("",)
     require(all(name.strip() for name in names), what, given, "a list of names, such as ['one', 'other']")

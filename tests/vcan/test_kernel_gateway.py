@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from statistics import median
 
 import pytest
 
@@ -75,6 +76,15 @@ def noise(count: int) -> Iterator[None]:
             process.kill()
 
 
+def delays_s(identifier: int, sent: Recording, arrived: Recording) -> list[float]:
+    """How long frames of one identifier took from one bus to the other, by the kernel's time stamps. [s]"""
+    stamps = [
+        [float(line.split()[0][1:-1]) for line in side.log.read_text().splitlines() if f" {identifier:X}#" in line]
+        for side in (sent, arrived)
+    ]
+    return [after - before for before, after in zip(*stamps, strict=True)]
+
+
 def wait_for_state(here: Recording, state: State, reason: Reason) -> None:
     wait_until(lambda: state_of(here.data_of(STATUS)[-1]) == (state, reason), f"the state {state.name}")
 
@@ -95,6 +105,8 @@ def test_frames_pass_while_the_gateway_is_killed(start_gateway: StartNode, here:
             numbers = [int.from_bytes(data, "little") for data in here.data_of(identifier)]
             assert numbers == list(range(400)), "none lost, none twice"
             assert there.data_of(identifier) == here.data_of(identifier)
+        delays = delays_s(NOISE, here, there)
+        assert median(delays[while_killed : while_killed + 150]) < 2e-3, "by the kernel alone"
     assert len(at_work) == len(set(at_work)) == RULES
     assert again.process.returncode is not None
 
