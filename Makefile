@@ -77,7 +77,7 @@ bench: setup             ## how long each step takes, beside its peers; also bui
 bench-quick: setup       ## the same at small sizes, within five minutes
 	PYTHONPATH=tools $(BIN)/python -m bench --quick
 
-experiments: setup       ## docs/results anew, ten repetitions from SEED on; TRIPS=folder of the recorded BMW i3 trips (hours)
+experiments: setup       ## docs/results anew, the repetitions of each from SEED on; TRIPS=folder of the recorded BMW i3 trips (half an hour)
 	$(BIN)/python tools/import_bmw_i3.py $(TRIPS) --layout dbc/hv_powertrain.toml --out build/i3
 	$(BIN)/calibrator experiment all --seed $(SEED) --drives build/i3 --layout dbc/hv_powertrain.toml --out docs/results
 

@@ -1,16 +1,14 @@
 """Truth of an artificial fleet: ``truth.json``, written by ``calibrator simulate`` and read by ``calibrator score``."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
-import numpy as np
 
 from calibrator.errors import FleetError
-from calibrator.faults import Faults
 from ecu_node.documents import write_atomically
 
-__all__ = ["TRUTH_FILE", "FleetTruth", "VehicleTruth", "faults_of", "read_truth", "write_truth"]
+__all__ = ["TRUTH_FILE", "FleetTruth", "VehicleTruth", "read_truth", "write_truth"]
 
 TRUTH_FILE = "truth.json"
 
@@ -73,38 +71,3 @@ def read_truth(path: Path) -> FleetTruth:
         raise FleetError(f"{path}: cannot read the truth: {error.strerror}; {_REMEDY}") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise FleetError(f"{path}: not a truth.json of 'calibrator simulate': {error}; {_REMEDY}") from None
-
-
-def faults_of(truth: FleetTruth, vehicles: list[str]) -> Faults:
-    """Return the true fault parameters of some vehicles as arrays.
-
-    Parameters
-    ----------
-    truth : FleetTruth
-        The fleet.
-    vehicles : list of str
-        N names.
-
-    Returns
-    -------
-    Faults
-        Of these vehicles in this order, branches in the order of ``truth.branches``.
-
-    Raises
-    ------
-    FleetError
-        If one of the names is no vehicle of the fleet.
-    """
-    unknown = [name for name in vehicles if name not in truth.vehicles]
-    if unknown:
-        raise FleetError(f"the truth knows no vehicle {', '.join(unknown[:5])}; is it the truth of another fleet?")
-
-    def rows(field: str) -> Any:
-        return np.array([[getattr(truth.vehicles[v], field)[b] for b in truth.branches] for v in vehicles])
-
-    return Faults(
-        hardware_drift=np.array([truth.vehicles[v].hardware_drift for v in vehicles]),
-        hardware_offset_a=rows("hardware_offset_a"),
-        drift=rows("drift"),
-        offset_a=rows("offset_a"),
-    )

@@ -110,6 +110,11 @@ class UnseenDrive:
         )
         return np.asarray(np.sqrt(np.maximum(square, 0.0)) / np.abs(1.0 + drift))
 
+    def worsening_a(self, drift: Array, offset_a: Array) -> Array:
+        """By how much such a correction raises the root mean square error, (N, K): negative where it helps. [A]"""
+        zero = np.zeros_like(drift)
+        return self.rms_a(drift, offset_a) - self.rms_a(zero, zero)
+
 
 def harmed(estimate: Faults, truth: Faults, *, mean_a: Array, mean_square_a2: Array) -> Mask:
     """Whether the correction makes any branch of a vehicle worse.
@@ -126,8 +131,8 @@ def harmed(estimate: Faults, truth: Faults, *, mean_a: Array, mean_square_a2: Ar
     ndarray of bool of shape (N,)
         True where the corrected current of some branch is strictly farther from the true one than the measured.
     """
-    unseen, zero = UnseenDrive.of_linear_sensors(mean_a, mean_square_a2, truth), np.zeros_like(truth.drift)
-    return np.asarray(np.any(unseen.rms_a(estimate.drift, estimate.offset_a) > unseen.rms_a(zero, zero), axis=-1))
+    unseen = UnseenDrive.of_linear_sensors(mean_a, mean_square_a2, truth)
+    return np.asarray(np.any(unseen.worsening_a(estimate.drift, estimate.offset_a) > 0.0, axis=-1))
 
 
 def _close(estimate: Array, truth: Array, smallest: float, tolerance: float) -> Mask:

@@ -6,7 +6,6 @@ delay and noise, sampled by its own message at its own instants, quantised by th
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,19 +21,19 @@ from calibrator.artificial.trips import (
     choose_branches,
     with_branches,
 )
-from calibrator.drive import Array, Channel, Drive
+from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.files.folders import whole_folder
 from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, write_truth
 from calibrator.processes.run_many import Workers, run_many
-from calibrator.recordings.write_logs import FrameSeries, encode_message, sent_values, write_candump
+from calibrator.recordings.write_logs import FrameSeries, encode_message, write_candump
 from calibrator.terminal.progress import shown
 from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch, Layout, split_signal
 
-__all__ = ["FleetPlan", "Vehicle", "simulate_fleet", "vehicle_drive", "vehicle_frames"]
+__all__ = ["FleetPlan", "Vehicle", "branch_frame_times", "simulate_fleet", "vehicle_frames"]
 
 WRITTEN_DOWN = ("seed", "sparsity", "magnitude", "balanced", "symmetric", "common_drive", "noise")
 """Fields of the plan that are also written into the truth."""
@@ -93,62 +92,26 @@ def vehicle_frames(
     list of FrameSeries
         One series per message of the DBC that carries a branch of the vehicle or an input.
     """
-    return [
-        encode_message(database, message, time_s, {signal: value for signal, _, value, _ in sent})
-        for message, time_s, sent in _sent_messages(rng, database, vehicle, trip)
-    ]
-
-
-def vehicle_drive(rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth) -> Drive:
-    """Make the drive that reading the frames of a vehicle would give, without making the frames.
-
-    Parameters
-    ----------
-    rng, database, vehicle, trip
-        As in :func:`vehicle_frames`; a generator in the same state gives the same values.
-
-    Returns
-    -------
-    Drive
-        Channels at the instants of their frames, in steps of their signals; named after vehicle and trip.
-    """
-    channels = {}
-    for message, time_s, sent in _sent_messages(rng, database, vehicle, trip):
-        for signal, name, value, unit in sent:
-            seen = unit * sent_values(database.signal(f"{message}.{signal}")[1], value)
-            channels[name] = Channel(time_s=time_s, value=seen, good=np.isfinite(seen))
-    branches = {name: channels.pop(name) for name in vehicle.branches}
-    return Drive(vehicle=vehicle.name, name=trip.name, branches=branches, inputs=channels)
-
-
-def _sent_messages(
-    rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth
-) -> Iterator[tuple[str, Array, list[tuple[str, str, Array, float]]]]:
-    """Yield what a vehicle puts into each message on one trip, before it is encoded.
-
-    An item holds the message's name, its instants [s], and for each signal its name, the name of the branch or input,
-    the values in the unit of the DBC, and the factor that turns these into A into the junction (1 for inputs).
-    """
     i, layout = _true_currents(vehicle, trip), database.layout
     messages: dict[str, list[tuple[str, str]]] = {}
     names = [(_current_signal(layout.find_branch(name)), name) for name in vehicle.branches]
     names += [(item.signal, item.name) for item in layout.input if item.name in trip.inputs]
     for place, name in names:
         messages.setdefault(split_signal(place)[0], []).append((split_signal(place)[1], name))
+    series = []
     for message, own in messages.items():
-        time_s = _frame_times(rng, database, message, trip)
-        sent: list[tuple[str, str, Array, float]] = []
+        time_s, values = _frame_times(rng, database, message, trip), {}
         for signal, name in own:
             if name in vehicle.branches:
                 k, definition = vehicle.branches.index(name), database.signal(f"{message}.{signal}")[1]
                 unit = layout.find_branch(name).sign * unit_factor(definition, AMPERE, f"branch {name}")
                 seen = np.interp(time_s - vehicle.delay_s[k], trip.time_s, i[:, k])
                 value = measured_currents(seen[:, None], vehicle.faults)[:, k]
-                value = (value + rng.normal(0.0, vehicle.noise_a, size=len(time_s))) / unit
+                values[signal] = (value + rng.normal(0.0, vehicle.noise_a, size=len(time_s))) / unit
             else:
-                value, unit = np.interp(time_s, trip.time_s, trip.inputs[name]), 1.0
-            sent.append((signal, name, value, unit))
-        yield message, time_s, sent
+                values[signal] = np.interp(time_s, trip.time_s, trip.inputs[name])
+        series.append(encode_message(database, message, time_s, values))
+    return series
 
 
 def _write_vehicle(
@@ -184,6 +147,11 @@ def _true_currents(vehicle: Vehicle, trip: GroundTruth) -> Array:
     i = true_currents(trip.matrix_a(), vehicle.faults)
     i[:, 0] += vehicle.unmeasured_a
     return i
+
+
+def branch_frame_times(rng: np.random.Generator, database: VehicleDatabase, branch: str, trip: GroundTruth) -> Array:
+    """Return the instants at which a branch's own message is sent on a trip, shape (n,). [s]"""
+    return _frame_times(rng, database, split_signal(_current_signal(database.layout.find_branch(branch)))[0], trip)
 
 
 def _frame_times(rng: np.random.Generator, database: VehicleDatabase, message_name: str, trip: GroundTruth) -> Array:

@@ -50,24 +50,25 @@ LEAST_WEIGHT = 0.2
 
 def best_subset(trial: Trial) -> Faults:
     """Return the faults of the support that has the least Bayesian information criterion of all supports."""
-    linear = _Linear(trial)
-    N, P = len(linear.rows), linear.design.shape[1]
+    linear = _LeastSquares(trial)
+    P = linear.design.shape[1]
     supports = np.array([bits for bits in itertools.product((False, True), repeat=P) if sum(bits) < P], bool)
-    chi2 = np.stack([linear.fit(np.tile(support, (N, 1)))[1] for support in supports])
-    return linear.faults(supports[np.argmin(chi2 + PENALTY * supports.sum(axis=1)[:, None], axis=0)])
+    fits = [linear.fit(support) for support in supports]
+    price = np.stack([chi2 + PENALTY * support.sum() for (_, chi2), support in zip(fits, supports, strict=True)])
+    return linear.faults(np.array([fits[number][0][j] for j, number in enumerate(np.argmin(price, axis=0))]))
 
 
 def lasso(trial: Trial) -> Faults:
     """Return the faults, without shrinkage, of the LASSO path's support of least Bayesian information criterion."""
-    linear = _Linear(trial)
-    y = linear.values(np.zeros((len(linear.rows), linear.design.shape[1])))
-    support = np.zeros((len(y), linear.design.shape[1]), bool)
-    for j, whiten in enumerate(linear.whiten):
+    linear = _LeastSquares(trial)
+    y = linear.whitened(np.zeros((len(linear.whiten), linear.design.shape[1])))
+    support = np.zeros(y.shape, bool)
+    for j, design in enumerate(linear.whiten @ linear.design):
         path = LassoLarsIC(criterion="bic", fit_intercept=False, noise_variance=1.0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a common factor of gains is open
-            support[j] = path.fit(whiten @ linear.design, whiten @ y[j]).coef_ != 0.0
-    return linear.faults(support)
+            support[j] = path.fit(design, y[j]).coef_ != 0.0
+    return linear.faults(linear.fit(support)[0])
 
 
 def fleet_median(trial: Trial) -> Faults:
@@ -149,49 +150,46 @@ def _evidence_rows(trial: Trial) -> tuple[EvidenceRows, NDArray[np.int64]]:
     return rows, order
 
 
-class _Linear:
+class _LeastSquares:
     """Measured evidence rows as a linear model: 3K rows over the 3K parameters without a load, see docs/method.md.
 
     The densest cluster of each row over the fleet says what vehicles without faults show, and how much they differ.
     """
 
     def __init__(self, trial: Trial) -> None:
-        self.rows, self.order = _evidence_rows(trial)
+        rows, self.order = _evidence_rows(trial)
         self.full_scale_a = trial.full_scale_a
-        K = self.rows.branches
-        measured = self.rows.places.measured
-        self.design = row_design(K, feed=0)[measured, : ParameterPlaces(K).load]
-        covariance = self.rows.covariance[:, measured[:, None], measured]
+        K, self.measured = rows.branches, rows.places.measured
+        self.design = row_design(K, feed=0)[self.measured, : ParameterPlaces(K).load]
+        covariance = rows.covariance[:, self.measured[:, None], self.measured]
         sd = np.sqrt(np.einsum("nii->ni", covariance))
-        clusters = [densest_clusters(self.rows.values[:, row], sd[:, i])[0] for i, row in enumerate(measured)]
+        clusters = [densest_clusters(rows.values[:, row], sd[:, i])[0] for i, row in enumerate(self.measured)]
         centre = np.zeros(5 * K)
-        centre[measured] = [cluster.centre for cluster in clusters]
+        centre[self.measured] = [cluster.centre for cluster in clusters]
         self.evidence = evidence_of(
-            self.rows.values, self.rows.covariance, self.rows.means, centre=centre, shared=np.zeros(2 * K + 1), feed=0
+            rows.values, rows.covariance, rows.means, centre=centre, shared=np.zeros(2 * K + 1), feed=0
         )
-        whole = WIDER * (covariance + np.diag([cluster.spread**2 for cluster in clusters]))
-        self.whiten = np.linalg.inv(np.linalg.cholesky(whole))
-
-    def values(self, theta: Array) -> Array:
-        """Return rows minus their centre, shape (N, 3K); their constants depend on the gains in theta (N, 3K)."""
-        without_load = np.pad(theta, ((0, 0), (0, 1)))
-        left = row_residuals(self.evidence, without_load[:, None])[:, 0, self.rows.places.measured]
-        return np.asarray(left + theta @ self.design.T)
+        self.whiten = np.linalg.inv(
+            np.linalg.cholesky(WIDER * (covariance + np.diag([cluster.spread**2 for cluster in clusters])))
+        )
 
     def fit(self, support: Mask) -> tuple[Array, Array]:
-        """Fit the parameters in a support (N, 3K) by least squares; return them (N, 3K), 0 elsewhere, and chi2 (N,)."""
-        theta = np.zeros(support.shape)
-        design = (self.whiten @ self.design) * support[:, None, :]
-        solve = np.linalg.pinv(design, rcond=1e-9)
+        """Fit the parameters in a support (3K,) or (N, 3K); return them (N, 3K), exactly 0 elsewhere, and chi2 (N,)."""
+        design = (self.whiten @ self.design) * np.atleast_2d(support)[:, None, :]
+        solve, theta = np.linalg.pinv(design, rcond=1e-9), np.zeros(design.shape[::2])
         for _ in range(ROUNDS):
-            y = np.einsum("nij,nj->ni", self.whiten, self.values(theta))
-            theta = np.clip(np.einsum("npi,ni->np", solve, y), -2.0, 2.0) * support
-        y = np.einsum("nij,nj->ni", self.whiten, self.values(theta))
-        return theta, np.sum((y - np.einsum("nip,np->ni", design, theta)) ** 2, axis=1)
+            theta = np.clip(np.einsum("npi,ni->np", solve, self.whitened(theta)), -2.0, 2.0) * support
+        return theta, np.sum((self.whitened(theta) - np.einsum("nip,np->ni", design, theta)) ** 2, axis=1)
 
-    def faults(self, support: Mask) -> Faults:
-        """Return the faults fitted with a support (N, 3K), branches in the vehicles' own order."""
-        at, own, theta = ParameterPlaces(self.rows.branches), np.argsort(self.order), self.fit(support)[0]
+    def whitened(self, theta: Array) -> Array:
+        """Return whitened rows minus their centre (N, 3K); their constants depend on the gains in theta (N, 3K)."""
+        without_load = np.pad(theta, ((0, 0), (0, 1)))
+        left = row_residuals(self.evidence, without_load[:, None])[:, 0, self.measured]
+        return np.asarray(np.einsum("nij,nj->ni", self.whiten, left + theta @ self.design.T))
+
+    def faults(self, theta: Array) -> Faults:
+        """Return the faults of parameters (N, 3K), branches in the vehicles' own order."""
+        at, own = ParameterPlaces(len(self.order)), np.argsort(self.order)
         gain, hardware = np.exp(theta[:, at.gains]), theta[:, at.hardware_offsets]
         hardware = np.column_stack([hardware, -hardware.sum(axis=1)])
         return Faults(

@@ -16,7 +16,7 @@ from ecu_node.program import write_output
 
 __all__ = ["experiment", "score"]
 
-REPETITIONS, QUICK_REPETITIONS, MAX_REPETITIONS = 10, 2, 1000
+MAX_REPETITIONS = 1000
 
 
 def experiment(
@@ -30,7 +30,12 @@ def experiment(
     ] = None,
     repetitions: Annotated[
         int | None,
-        whole_option("--repetitions", 1, MAX_REPETITIONS, "Trials per setting (without it 10, with --quick 2)"),
+        whole_option(
+            "--repetitions",
+            1,
+            MAX_REPETITIONS,
+            "Trials per setting; without it those of the experiment, with --quick 2",
+        ),
     ] = None,
     seed: SeedOption = 0,
     drives: Annotated[
@@ -50,19 +55,12 @@ def experiment(
 ) -> None:
     """Run an experiment and print the paper's figures, the published method and the default side by side.
 
-    'calibration' runs nothing: it pools the confidences of the experiments that were recorded in --out before. Options
-    that an experiment does not heed are refused.
+    Options that an experiment does not heed are refused.
     """
     with importing():
-        from calibrator.experiments.experiments import (
-            CALIBRATION,
-            EXPERIMENTS,
-            ExperimentResult,
-            fleet_for,
-            read_records,
-        )
+        from calibrator.experiments.experiments import EXPERIMENTS, fleet_for
         from calibrator.experiments.pages import result_table, write_page
-        from calibrator.experiments.runner import made_now, pool_confidences, run_experiment
+        from calibrator.experiments.runner import made_now, run_experiment
 
     if name is None:
         write_output("\n".join(f"{row.name:<12} {row.title}" for row in EXPERIMENTS.values()))
@@ -71,39 +69,28 @@ def experiment(
         raise typer.BadParameter(f"{name}: expected one of {', '.join(EXPERIMENTS)} or all", param_hint="NAME")
     rows = list(EXPERIMENTS.values()) if name == "all" else [EXPERIMENTS[name]]
     recorded = [row for row in rows if row.recorded]
-    names = ", ".join(row.name for row in EXPERIMENTS.values() if row.recorded)
-    unheeded, reason = ["drives", "layout"], f"{name} takes the built-in vehicle; this is only for {names}"
-    if rows == [CALIBRATION]:
-        unheeded += ["quick", "only", "repetitions", "seed", "workers"]
-        reason = "calibration runs nothing, it pools what is recorded in --out"
-    if not recorded and (given := given_options(context, unheeded)):
-        raise typer.BadParameter(reason, param_hint=given[0])
+    if not recorded and (given := given_options(context, ["drives", "layout"])):
+        names = ", ".join(row.name for row in EXPERIMENTS.values() if row.recorded)
+        raise typer.BadParameter(f"{name} takes the built-in vehicle; this is only for {names}", param_hint=given[0])
     rows = [row.only(only) for row in rows] if only else rows
-    if rows == [CALIBRATION] and out is None:
-        first = "first run 'calibrator experiment all --out FOLDER', or some experiments by their names"
-        raise typer.BadParameter(f"calibration pools what is recorded there; {first}", param_hint="--out")
+    rows = [row.small() for row in rows] if quick else rows
     if out is not None:
         require_possible_folder(out)
         require_possible_folder(out.absolute().parent)
     # recorded trips are read only once, before anything is run
     trips = fleet_for(recorded[0], quick=quick, drives=drives, layout=layout) if recorded else None
-    count = repetitions or (QUICK_REPETITIONS if quick else REPETITIONS)
-    done: dict[str, ExperimentResult] = {}
+    texts = []
     for number, row in enumerate(rows, start=1):
+        fleet = trips if row.recorded and trips is not None else fleet_for(row, quick=quick)
         with one_pass(number, len(rows)):
-            if row is CALIBRATION:
-                result = pool_confidences(read_records(out, EXPERIMENTS) if out else [*done.values()])
-            else:
-                fleet = trips if row.recorded and trips is not None else fleet_for(row, quick=quick)
-                small = row.small() if quick else row
-                result = run_experiment(small, fleet, repetitions=count, seed=seed, workers=workers)
-        done[row.name] = result = replace(result, made=made_now())
+            result = run_experiment(row, fleet, repetitions=repetitions, seed=seed, workers=workers)
+        result = replace(result, made=made_now())
+        texts.append(result.to_json())
         if not json:
             Console().print(result_table(result))
         if out is not None:
             write_page(out, result)
     if json:
-        texts = [result.to_json() for result in done.values()]
         write_output(texts[0] if len(texts) == 1 else f"[{','.join(texts)}]")
 
 

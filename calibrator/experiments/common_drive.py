@@ -13,18 +13,19 @@ branch, (.)_r the others and M the covariance of the measured currents, g = M_rr
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, builtin_trip
 from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
+from calibrator.artificial.trips import with_branches
 from calibrator.drive import Array
-from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, densest_clusters
 from calibrator.experiments.trial import CommonEvidence, Trial, drawn_distribution
 from calibrator.faults import Faults, slopes_and_intercepts
+from calibrator.published.classify import TRAINING_VEHICLES
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.published.state_space import choose_order, identify_model
 from calibrator.score import UnseenDrive
@@ -67,31 +68,6 @@ class CommonDrive:
     full_scale_a: float
     unseen: Array
 
-    def __post_init__(self) -> None:
-        if self.i_s.ndim != 2 or len(self.i_s) != len(self.inputs):
-            raise DriveError(f"drive {self.name}: {self.i_s.shape} currents do not fit {self.inputs.shape} inputs")
-        worst = float(np.abs(self.i_s.sum(axis=1)).max(initial=0.0))
-        if not worst <= 1e-6 * self.full_scale_a:
-            raise DriveError(f"drive {self.name}: ideal currents must sum to zero; the worst sum is {worst:.3g} A")
-
-    def with_branches(self, count: int) -> "CommonDrive":
-        """Return the drive with its first ``count`` branches; the second, the motor, is minus the sum of the others.
-
-        Raises
-        ------
-        FleetError
-            If it has fewer branches.
-        """
-        K = self.i_s.shape[1]
-        if not 2 <= count <= K:
-            raise FleetError(f"{count} branches: drive {self.name} has 2 to {K}")
-        if count == K:
-            return self
-        i_s, unseen = (currents[:, :count].copy() for currents in (self.i_s, self.unseen))
-        for currents in (i_s, unseen):
-            currents[:, 1] = -np.sum(np.delete(currents, 1, axis=1), axis=1)
-        return replace(self, i_s=i_s, unseen=unseen)
-
     @property
     def unity_start(self) -> int:
         """Number of the first sample of the unity drive, T_1 of section IV-C."""
@@ -113,21 +89,29 @@ class CommonDrive:
         }
 
 
-def builtin_common_drive(duration_s: float) -> CommonDrive:
-    """Make the common drive with the built-in vehicle, all its branches and inputs as in ``dbc/hv_powertrain.toml``.
+def builtin_common_drive(duration_s: float, branches: int = 2) -> CommonDrive:
+    """Make the common drive with the built-in vehicle, all its inputs as in ``dbc/hv_powertrain.toml``.
 
     Parameters
     ----------
     duration_s : float
         Least duration. [s]
+    branches : int
+        Number of branches K, 2 to 5; the second, the motor, is minus the sum of the others.
 
     Raises
     ------
     FleetError
         If fastsim is not installed.
     """
-    trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, 0), duration_s=duration_s, name="builtin-0")
-    unseen = builtin_trip(random_stream(Purpose.UNSEEN_TRIP, 0), duration_s=duration_s, name="unseen")
+    trip, unseen = (
+        with_branches(
+            builtin_trip(random_stream(purpose, 0), duration_s=duration_s, name="builtin-0"),
+            BUILTIN_BRANCHES[:branches],
+            "motor",
+        )
+        for purpose in (Purpose.COMMON_DRIVE, Purpose.UNSEEN_TRIP)
+    )
     x = trip.inputs
     power, demands = x["torque"] * x["speed"], [x[f"{name}_demand"] for name in ("heater", "aircon", "low_voltage")]
     inputs = [np.maximum(power, 0.0), np.minimum(power, 0.0), x["torque"] ** 2, *demands]
@@ -146,21 +130,15 @@ class CommonCase(FaultSettings):
 
     Attributes
     ----------
-    branches : int
-        Number of branches K.
     vehicles : int
         Fleet size N, a multiple of 4 for a symmetric fleet.
-    training_vehicles : int
-        Size of the artificial fleet that trees learn from; 3,000 in section V-B.
     snr_db : float
         Signal-to-noise ratio of the artificial simulation (26). [dB]
     state_space : bool
         Whether vehicles are simulated by state-space models (2) trained on 80 % of the drive; else artificially (23).
     """
 
-    branches: int = 2
     vehicles: int = 1000
-    training_vehicles: int = 3000
     sparsity: float = 60.0
     snr_db: float = 20.0
     balanced: bool = True
@@ -170,8 +148,7 @@ class CommonCase(FaultSettings):
 
 def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
     """Make the trial of N vehicles on the unity drive; the same seed gives the same trial."""
-    drive = drive.with_branches(case.branches)
-    junction: dict[str, Any] = {"branches": case.branches, "full_scale_a": drive.full_scale_a}
+    junction: dict[str, Any] = {"branches": drive.i_s.shape[1], "full_scale_a": drive.full_scale_a}
     truth = case.draw(random_stream(Purpose.FAULTS, seed), vehicles=case.vehicles, **junction)
     simulate = _simulation(drive, truth, case, Purpose.SIMULATION_ERROR, seed)
     if case.state_space:
@@ -186,7 +163,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
 
     def training() -> tuple[FleetEvidence, Faults]:
         """Return evidence and true faults of another fleet, from which the trees learn."""
-        other = case.draw(random_stream(Purpose.TRAINING_FAULTS, seed), vehicles=case.training_vehicles, **junction)
+        other = case.draw(random_stream(Purpose.TRAINING_FAULTS, seed), vehicles=TRAINING_VEHICLES, **junction)
         simulate_other = _simulation(drive, other, case, Purpose.TRAINING_ERROR, seed)
         return collect_evidence(simulate_other(), fleet_mean(simulate_other()), _junction_a2(drive, other)), other
 
@@ -197,7 +174,7 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
         unseen=_unseen(drive.unseen, truth),
         record=record,
         collect=lambda: evidence,
-        drawn_from=drawn_distribution(case, case.branches),
+        drawn_from=drawn_distribution(case, drive.i_s.shape[1]),
         training=training,
     )
 

@@ -8,34 +8,30 @@ in the tables), the methods that are compared, and how the result is shown. To a
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
-import msgspec
 import pandas as pd
 
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS
 from calibrator.experiments.common_drive import CommonCase, CommonDrive, builtin_common_drive
-from calibrator.experiments.figures import TENTH_COLUMNS
-from calibrator.experiments.methods import BASELINES, CEILING, LEFT_IN, PERFECT, POSTERIOR, THRESHOLD, TREE
+from calibrator.experiments.methods import BASELINES, CEILING, PERFECT, POSTERIOR, THRESHOLD, TREE
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, builtin_fleet, read_fleet
 from calibrator.experiments.trial import ComparedMethod
 from calibrator.files.layout_files import vehicle_database
 
-__all__ = [
-    "CALIBRATION", "COVERAGE", "EXPERIMENTS", "KEYS", "REAL", "Experiment", "ExperimentResult", "Setting", "fleet_for",
-    "read_records",
-]  # fmt: skip
+__all__ = ["ALL", "EXPERIMENTS", "KEYS", "REAL", "Experiment", "ExperimentResult", "Setting", "fleet_for"]
 
 KEYS = ["series", "x", "method"]
 """Columns of a result that say to which setting and method a row belongs."""
+ALL = "all together"
+"""Series of the rows of a result in which all settings count together; their x is NaN."""
 
 BUILTIN_TRIPS, BUILTIN_DURATION_S = 27, 1500.0
 """As many trips as a summer of recordings has [1], each as long as recorded ones are in the median [s]."""
-QUICK_VEHICLES, QUICK_TRAINING_VEHICLES, QUICK_TRIPS, QUICK_DURATION_S = 20, 400, 8, 300.0
+QUICK_VEHICLES, QUICK_TRIPS, QUICK_DURATION_S, QUICK_REPETITIONS = 20, 8, 300.0, 2
 DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
 """Layout of the examples that come with the source; it fits the built-in vehicle."""
 
@@ -52,14 +48,11 @@ class Setting:
         Value of what else it varies, as text, such as ``K=2, 5-25 %``.
     case : CommonCase or RecordedCase
         How the fleets are made.
-    methods : tuple of ComparedMethod
-        Methods that are run instead of those of the experiment; empty: those of the experiment.
     """
 
     x: float
     series: str = ""
     case: CommonCase | RecordedCase
-    methods: tuple[ComparedMethod, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,25 +68,20 @@ class Experiment:
     methods : tuple of ComparedMethod
         Methods that it compares.
     settings : tuple of Setting
-        All on the common drive, or all on recorded trips; none for an experiment that pools the results of others.
-    quick : mapping of str to collection of float
-        Values of x by series that ``--quick`` keeps, such as ``{"3 of 6": (60.0,)}``; empty: all.
+        All on the common drive, or all on recorded trips.
+    repetitions : int
+        Trials per setting, if a run does not say how many.
     drive_s : float
         Length of the common drive; an hour has 7,200 samples of unity drive at 10 Hz, the paper does not say. [s]
     paper : mapping
         What the paper prints: ``{(60.0, "published/tree"): {"f2": 0.84}}`` by (x, method), then figure.
     note : str
         Remark on the settings.
-    picture : str
-        Kind of its picture, see :mod:`calibrator.experiments.pages`.
     shown : tuple of str
         Figures of the default that stand beside the recovery rates of all methods, by the names of
         :data:`calibrator.experiments.figures.FIGURES`.
     panels : tuple of str
         Figures that its picture shows.
-    pooled : bool
-        Whether ``calibration`` pools its confidences; it does not where a world is one that the estimator does not
-        expect.
     """
 
     name: str
@@ -102,18 +90,12 @@ class Experiment:
     series_label: str = ""
     methods: tuple[ComparedMethod, ...]
     settings: tuple[Setting, ...]
-    quick: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    repetitions: int = 2
     drive_s: float = 3600.0
     paper: Mapping[tuple[float, str], Mapping[str, float]] = field(default_factory=dict)
     note: str = ""
-    picture: Literal["lines", "dots", "map", "reliability"] = "lines"
     shown: tuple[str, ...] = ("confidence", "sure_wrong", "ece", "ece_by_chance", "deployed", "harmed", "delay_rmse_ms")
     panels: tuple[str, ...] = ("recovery_rate", "confidence")
-    pooled: bool = True
-
-    def __post_init__(self) -> None:
-        if self.settings and (unknown := self.quick.keys() - {setting.series for setting in self.settings}):
-            raise FleetError(f"{self.name}: --quick keeps {', '.join(sorted(unknown))}, which no setting is called")
 
     @property
     def recorded(self) -> bool:
@@ -121,16 +103,19 @@ class Experiment:
         return any(isinstance(setting.case, RecordedCase) for setting in self.settings)
 
     def small(self, vehicles: int = QUICK_VEHICLES) -> "Experiment":
-        """Return the experiment with few settings, and small fleets on the common drive, only to show that it runs."""
-        kept = []
-        for each in self.settings:
-            case = each.case
-            if isinstance(case, CommonCase):
-                fewer = min(case.vehicles, vehicles)
-                case = replace(case, vehicles=fewer, training_vehicles=QUICK_TRAINING_VEHICLES)
-            if not self.quick or each.x in self.quick.get(each.series, ()):
-                kept.append(replace(each, case=case))
-        return replace(self, settings=tuple(kept), quick={})  # all that is left
+        """Return the experiment with its first and last setting, and small fleets, only to show that it runs."""
+        settings = []
+        for setting in (self.settings[0], *self.settings[1:][-1:]):
+            case = setting.case
+            if case.vehicles is not None:
+                case = replace(case, vehicles=min(case.vehicles, vehicles))
+            if isinstance(case, RecordedCase) and case.minutes is not None:
+                case = replace(case, minutes=min(case.minutes, QUICK_DURATION_S / 60.0))
+            settings.append(replace(setting, case=case))
+        note = (
+            f"Small fleets, at most {vehicles} vehicles or {QUICK_TRIPS} trips, and short drives: no figures to quote."
+        )
+        return replace(self, settings=tuple(settings), repetitions=QUICK_REPETITIONS, note=note)
 
     def only(self, text: str) -> "Experiment":
         """Return the experiment with those settings whose series has a text in it; FleetError if there are none."""
@@ -138,7 +123,7 @@ class Experiment:
         if not kept:
             names = ", ".join(dict.fromkeys(setting.series or "(without a name)" for setting in self.settings))
             raise FleetError(f"{self.name}: no setting has {text!r} in its name; there are {names}")
-        return replace(self, settings=kept, quick={})
+        return replace(self, settings=kept)
 
 
 READINGS = (("", 60.0), ("3 of 6", 50.0))
@@ -151,7 +136,6 @@ TWO_READINGS = (
 )
 SPARSITY, READING = "sparsity S [%]", "reading of S"
 BALANCED = "Half of the vehicles have no hardware fault; where 'any vehicle' is said, each may have one."
-QUICK_LEVELS = {"": (60.0, 80.0), "3 of 6": (60.0,)}
 
 
 def _paper(method: ComparedMethod, names: str, *rows: tuple[float, ...]) -> dict[tuple[float, str], dict[str, float]]:
@@ -187,7 +171,6 @@ REAL = tuple(
     )
 )
 """Settings on recorded trips: the main four, balanced and with any vehicle; other sizes of faults; with a load."""
-COVERAGE = ("gain_within_1", "gain_beyond_3", "offset_within_1", "offset_beyond_3")
 
 TABLE = (
     Experiment(
@@ -195,34 +178,35 @@ TABLE = (
         title="Effect of the classifier (table 1)",
         x_label=SPARSITY,
         series_label=READING,
+        repetitions=3,
         methods=(THRESHOLD, TREE, PERFECT, POSTERIOR),
         settings=tuple(Setting(x=60.0, series=series, case=CommonCase(sparsity=S)) for series, S in READINGS),
         paper=_paper(THRESHOLD, "f2 recovery_rate complexity", (60.0, 0.68, 0.84, 0.93))
         | _paper(TREE, "f2 recovery_rate complexity", (60.0, 0.84, 0.86, 0.41))
         | _paper(PERFECT, "f2 recovery_rate complexity", (60.0, 1.00, 0.91, 0.40)),
         note=TWO_READINGS,
-        picture="dots",
     ),
     Experiment(
         name="snr",
         title="Effect of the simulation noise (figure 7)",
         x_label="SNR [dB]",
+        repetitions=2,
         methods=(PERFECT, POSTERIOR),
         settings=tuple(
             Setting(x=x, case=CommonCase(snr_db=x))
             for x in (-20.0, -10.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
         ),
-        quick={"": (0.0, 20.0)},
         paper=_paper(PERFECT, "recovery_rate", (15.0, 0.80), (20.0, 0.91)),
+        note="K = 2, S = 60.",
     ),
     Experiment(
         name="sparsity",
         title="Effect of the sparsity level (figure 8)",
         x_label=SPARSITY,
         series_label=READING,
+        repetitions=3,
         methods=(TREE, PERFECT, POSTERIOR),
         settings=tuple(Setting(x=x, series=series, case=CommonCase(sparsity=S)) for x, series, S in LEVELS),
-        quick=QUICK_LEVELS,
         paper=_paper(TREE, "recovery_rate", (20.0, 0.47), (40.0, 0.49), (60.0, 0.86), (80.0, 0.96)),
         note=TWO_READINGS,
     ),
@@ -231,12 +215,12 @@ TABLE = (
         title="End to end with state-space models (table 2)",
         x_label=SPARSITY,
         series_label=READING,
+        repetitions=2,
         methods=(TREE, POSTERIOR),
         settings=tuple(
             Setting(x=x, series=series, case=CommonCase(vehicles=500, state_space=True, sparsity=S))
             for x, series, S in LEVELS
         ),
-        quick=QUICK_LEVELS,
         drive_s=1200.0,  # the models are exact there: a longer drive shows the same and takes three times as long
         paper=_paper(
             TREE,
@@ -253,89 +237,87 @@ TABLE = (
         title="Fleets that are not symmetric",
         x_label="vehicles",
         series_label="sign bias",
+        repetitions=3,
         methods=(PERFECT, POSTERIOR),
         settings=tuple(
             Setting(x=N, series=f"{bias:g}", case=CommonCase(vehicles=N, symmetric=False, sign_bias=bias))
             for bias in (0.0, 0.2, 0.4, 0.5)
             for N in (20, 100, 400, 2000)
         ),
-        quick={"0": (20,), "0.4": (20,)},
+        note="K = 2, S = 60.",
     ),
     Experiment(
         name="real",
         title="Each trip a vehicle with faults of its own",
         x_label=SPARSITY,
         series_label="branches, faults",
+        repetitions=4,
         methods=(PERFECT, *BASELINES, POSTERIOR, CEILING),
         settings=REAL,
-        quick={"K=2, 5-25 %, load 3+-1 A": (80.0,)},
         note=BALANCED,
-        picture="dots",
     ),
     Experiment(
         name="delay",
         title="Delays between the branches",
         x_label="largest delay [ms]",
+        series_label="delays",
+        repetitions=2,
         methods=(PERFECT, POSTERIOR),
         settings=tuple(
-            Setting(
-                x=x,
-                case=RecordedCase(delay_max_s=x / 1e3, delays_left_in=left_in),
-                methods=(LEFT_IN,) if left_in else (),
-            )
+            Setting(x=x, series=series, case=RecordedCase(delay_max_s=x / 1e3, delays_left_in=left_in))
+            for series, left_in in (("left in", True), ("taken out", False))
             for x in (0.0, 100.0, 200.0, 300.0)
-            for left_in in (False, True)
         ),
-        quick={"": (0.0, 300.0)},
+        note="K = 2, S = 80.",
     ),
     Experiment(
         name="data",
         title="How much must be recorded",
         x_label="minutes per vehicle",
         series_label="vehicles",
+        repetitions=2,
         methods=(PERFECT, POSTERIOR),
         settings=tuple(
             Setting(x=minutes, series=f"{N}", case=RecordedCase(sparsity=60.0, vehicles=N, minutes=minutes))
             for N in (10, 30, 100)
             for minutes in (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
         ),
-        quick={"10": (2.0, 5.0)},
+        note="K = 2, S = 60.",
     ),
     Experiment(
         name="phase",
         title="Phase diagram: success over sparsity and size of the faults",
         x_label=SPARSITY,
         series_label="faults [% of full scale]",
+        repetitions=2,
         methods=(PERFECT, POSTERIOR),
         settings=tuple(  # with two branches 5, 4, 3, 2 and 1 of 6 parameters are not zero
             Setting(x=S, series=_sizes(magnitude), case=RecordedCase(sparsity=S, magnitude=magnitude))
             for magnitude in ((0.005, 0.02), (0.01, 0.05), (0.02, 0.10), (0.05, 0.25))
             for S in (20.0, 40.0, 50.0, 60.0, 80.0)
         ),
-        quick={"5-25": (60.0, 80.0)},
-        picture="map",
+        note="K = 2.",
     ),
     Experiment(
         name="attacks",
         title="Attacks: what the estimator does not expect",
         x_label="K",
         series_label="world",
+        repetitions=2,
         methods=(POSTERIOR,),
         settings=tuple(
             Setting(x=K, series=world, case=RecordedCase(branches=K, world=world)) for world in WORLDS for K in (2, 3)
         ),
-        quick={"load 5 A in 30%": (2,), "quadratic 5-20 %": (2,)},
         note="S = 80; where no share is named, 30 % of the vehicles have what the world does.",
-        picture="dots",
         shown=("corrected", "harmed", "worst_a", "named", "misnamed", "sure_wrong"),
         panels=("harmed", "named"),
-        pooled=False,
     ),
     Experiment(
         name="small",
         title="Small fleets",
         x_label="vehicles",
         series_label="branches, world",
+        repetitions=10,
         methods=(POSTERIOR, CEILING),
         settings=tuple(
             Setting(
@@ -347,40 +329,25 @@ TABLE = (
             for world in ("", "battery +12 A in 60%", "load 10 A in 15%", "second variant x1.10 in 50%")
             for N in (6, 12)
         ),
-        quick={"K=2": (6,)},
         note="S = 80, hardware faults in any vehicle.",
-        picture="dots",
         shown=("confidence", "deployed", "harmed", "worst_a", "sure_wrong"),
         panels=("recovery_rate", "harmed"),
-        pooled=False,
     ),
     Experiment(
         name="coverage",
         title="Coverage: standard deviations of the parameters",
         x_label=SPARSITY,
         series_label="branches, faults",
+        repetitions=3,
         methods=(POSTERIOR,),
         settings=(*REAL, *(_named(replace(case, own_prior=POSTERIOR)) for case in MAIN)),
-        quick={"K=2, 5-25 %": (80.0,), "K=2, own prior": (80.0,)},
         note="Of a normal distribution 0.683 are within 1 standard deviation, and 0.0027 beyond 3. 'own prior': faults "
         f"drawn from what the default has learnt of the balanced fleet with this K and S. {BALANCED}",
-        picture="dots",
-        shown=COVERAGE,
+        shown=("gain_within_1", "gain_beyond_3", "offset_within_1", "offset_beyond_3"),
         panels=("gain_within_1", "offset_within_1"),
     ),
 )
-CALIBRATION = Experiment(
-    name="calibration",
-    title="Reliability of the confidence",
-    x_label="vehicles",
-    series_label="experiment",
-    methods=(POSTERIOR,),
-    settings=(),
-    picture="reliability",
-    pooled=False,
-)
-"""Of the vehicles with a confidence of 0.9, is a share of 0.9 recovered? Pools the results of the other experiments."""
-EXPERIMENTS = {experiment.name: experiment for experiment in (*TABLE, CALIBRATION)}
+EXPERIMENTS = {experiment.name: experiment for experiment in TABLE}
 """The table by name."""
 
 
@@ -429,19 +396,19 @@ class ExperimentResult:
     experiment : Experiment
         The row that was run.
     settings : mapping
-        By name: seed, repetitions, facts of the drives, and what the cases of all settings have in common.
+        By name: seed, repetitions, and facts of the drives.
     figures : DataFrame
         A row per setting (columns ``series``, ``x``), ``method`` and ``figure``, with the columns of
-        :func:`~calibrator.experiments.figures.figure_rows`.
+        :func:`~calibrator.experiments.figures.figure_rows`; of several settings also those of :data:`ALL`.
     tenths : DataFrame
-        Rows of :func:`~calibrator.experiments.figures.tenths_of` for each setting and method.
+        Rows of :func:`~calibrator.experiments.figures.tenths_of` for the same settings and methods.
     made : str
         Version, machine and day, as :func:`~calibrator.experiments.runner.made_now` says; empty for an experiment that
         was called as a function.
     """
 
     experiment: Experiment
-    settings: Mapping[str, bool | int | float | str]
+    settings: Mapping[str, int | float | str]
     figures: pd.DataFrame
     tenths: pd.DataFrame
     made: str = ""
@@ -463,40 +430,3 @@ class ExperimentResult:
         }
         named = {name: getattr(self.experiment, name) for name in ("name", "title", "x_label", "series_label")}
         return json.dumps({**named, "settings": dict(self.settings), "made": self.made, **tables}, ensure_ascii=False)
-
-
-class _Record(msgspec.Struct):
-    """The parts of NAME.json that are read back; its titles and labels are for other readers."""
-
-    settings: dict[str, bool | int | float | str]
-    made: str
-    figures: list[dict[str, str | float | None]]
-    tenths: list[dict[str, str | float | None]]
-
-
-def read_records(folder: Path, names: Iterable[str]) -> list[ExperimentResult]:
-    """Read the records ``NAME.json`` of a folder in the given order; those that are not there are left out.
-
-    Raises
-    ------
-    FleetError
-        If one is no record of an experiment.
-    """
-    found = []
-    for path in (path for name in names if (path := folder / f"{name}.json").is_file()):
-        try:
-            record = msgspec.json.decode(path.read_bytes(), type=_Record)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise FleetError(
-                f"{path}: not a record of an experiment: {error}; expected what 'calibrator experiment --out' writes; "
-                "remove it, or run the experiment again"
-            ) from None
-        result = ExperimentResult(
-            experiment=EXPERIMENTS[path.stem],
-            settings=record.settings,
-            figures=pd.DataFrame(record.figures).astype({"value": float, "low": float, "high": float}),
-            tenths=pd.DataFrame(record.tenths, columns=[*KEYS, *TENTH_COLUMNS]),
-            made=record.made,
-        )
-        found.append(result)
-    return found

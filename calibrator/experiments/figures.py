@@ -14,27 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import beta, norm
+from scipy.stats import binomtest, norm
 
 from calibrator.drive import Array
 from calibrator.experiments.trial import Estimate, Trial
 from calibrator.score import f2_score, recovered
 
-__all__ = [
-    "ALL", "FIGURES", "TENTH_COLUMNS", "calibration_errors", "figure_rows", "judge", "pool_figures", "pool_tenths",
-    "tenths_of",
-]  # fmt: skip
+__all__ = ["FIGURES", "calibration_errors", "figure_rows", "judge", "tenths_of"]
 
-ALL = "all together"
-"""Name of the series that pools several experiments."""
 SURE = 0.95
 """A vehicle counts as sure if its confidence is above this. [1]"""
 LEAST_GAIN = 1e-9
 """Least magnitude of 1 + d, by which corrections divide; nearer to zero there is no correction. [1]"""
-TAIL = 0.025
-"""Probability on either side of the 95 % intervals. [1]"""
 TENTHS = np.arange(10) / 10.0
-TENTH_COLUMNS = ("low", "vehicles", "confidence", "recovered", "pit")
 
 Values = Mapping[str, NDArray[Any]]
 """Values of one or several trials, an array by name of the figure; those of a share are true or false."""
@@ -146,8 +138,8 @@ def _worsening_a(estimate: Estimate, trial: Trial) -> Array:
     It is negative where correction helps, 0 where nothing is corrected, and full scale where 1 + d is 0.
     """
     drift, offset_a = (np.where(estimate.corrected, x, 0.0) for x in (estimate.faults.drift, estimate.faults.offset_a))
-    impossible, zero = np.abs(1.0 + drift) < LEAST_GAIN, np.zeros_like(drift)
-    worsening = trial.unseen.rms_a(np.where(impossible, 0.0, drift), offset_a) - trial.unseen.rms_a(zero, zero)
+    impossible = np.abs(1.0 + drift) < LEAST_GAIN
+    worsening = trial.unseen.worsening_a(np.where(impossible, 0.0, drift), offset_a)
     return np.where(impossible, trial.full_scale_a, np.where(estimate.corrected, worsening, 0.0))
 
 
@@ -173,63 +165,38 @@ def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
     rows = []
     for name, kind in FIGURES.items():
         if name in together:
-            singly, values = [kind.merged(own) for own in parts[name]], together[name]
-            sd = np.std(singly, ddof=1) if len(singly) > 1 else 0.0
-            share = values.ndim == 1 and values.dtype == bool
-            rows.append((name, float(kind.merged(values)), float(sd), len(values), share))
-    figures = pd.DataFrame(rows, columns=["figure", "value", "sd", "of", "share"])
-    return _with_intervals(figures), tenths_of(together)
+            values, singly = together[name], [kind.merged(own) for own in parts[name]]
+            sd = float(np.std(singly, ddof=1)) if len(singly) > 1 else 0.0
+            rows.append((name, float(kind.merged(values)), sd, len(values), *_interval(values)))
+    return pd.DataFrame(rows, columns=["figure", "value", "sd", "of", "low", "high"]), tenths_of(together)
 
 
-def _with_intervals(figures: pd.DataFrame) -> pd.DataFrame:
-    """Add columns ``low`` and ``high``, the 95 % intervals of those figures that are shares; drop column ``share``."""
-    hits, share = np.rint(figures["value"] * figures["of"]), figures["share"].astype(bool)
-    misses = figures["of"] - hits
-    low = np.nan_to_num(beta.ppf(TAIL, hits, misses + 1), nan=0.0)  # beta needs hits and misses above 0
-    high = np.nan_to_num(beta.ppf(1.0 - TAIL, hits + 1, misses), nan=1.0)
-    return figures.assign(low=np.where(share, low, np.nan), high=np.where(share, high, np.nan)).drop(columns="share")
+def _interval(values: NDArray[Any]) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of a share, whose values are true or false; NaN for other figures."""
+    if values.dtype != bool or values.ndim > 1:
+        return float("nan"), float("nan")
+    interval = binomtest(int(values.sum()), len(values)).proportion_ci(0.95, method="exact")
+    return float(interval.low), float(interval.high)
 
 
 def tenths_of(values: Values) -> pd.DataFrame:
     """Count vehicles by tenths of their confidence, and deployed parameters by tenths of their integral transforms.
 
     Returns a row per tenth: its lower end ``low``; number of ``vehicles`` in it, their mean ``confidence`` and the
-    share of them that is ``recovered`` (NaN of none); number of parameters in it, ``pit``. No rows if there
-    are neither vehicles nor parameters.
+    share of them that is ``recovered`` (NaN of none); number of parameters in it, ``pit``.
     """
     pairs, pit = (values.get(name, np.zeros((0, 2))) for name in ("ece", "pit"))
-    if not len(pairs) and not len(pit):
-        return pd.DataFrame(columns=TENTH_COLUMNS, dtype=float)
     number = np.minimum((pairs[:, 0] * len(TENTHS)).astype(int), len(TENTHS) - 1)
     grouped = pd.DataFrame(pairs, columns=["confidence", "recovered"], dtype=float).groupby(number)
     tenths = grouped.mean().assign(vehicles=grouped.size()).reindex(range(len(TENTHS)))
     counts, _ = np.histogram(pit, bins=len(TENTHS), range=(0.0, 1.0))
-    return tenths.assign(low=TENTHS, pit=counts).fillna({"vehicles": 0})[[*TENTH_COLUMNS]]
-
-
-def pool_tenths(tenths: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per tenth for several settings together, without ``pit``, and without tenths of no vehicle."""
-    means = ["confidence", "recovered"]
-    weighed = tenths[["low", "vehicles", *means]].astype(float)
-    weighed[means] = weighed[means].mul(weighed["vehicles"], axis=0)
-    summed = weighed.groupby("low", as_index=False).sum().query("vehicles > 0")
-    summed[means] = summed[means].div(summed["vehicles"], axis=0)
-    return summed
+    tenths = tenths.assign(low=TENTHS, pit=counts).fillna({"vehicles": 0})
+    return tenths[["low", "vehicles", "confidence", "recovered", "pit"]]
 
 
 def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
-    """Return the expected calibration error [1], and what it is by chance of exact confidences; NaN of no vehicle."""
+    """Return the expected calibration error of vehicles by tenths [1], and what it is by chance if they are exact."""
     vehicles, confidence = tenths["vehicles"].to_numpy(float), tenths["confidence"].to_numpy(float)
-    if not vehicles.sum():
-        return float("nan"), float("nan")
     error = vehicles * np.abs(confidence - tenths["recovered"].to_numpy(float))
     chance = np.sqrt(2.0 / np.pi * vehicles * confidence * (1.0 - confidence))
     return float(np.nansum(error) / vehicles.sum()), float(np.nansum(chance) / vehicles.sum())
-
-
-def pool_figures(figures: pd.DataFrame) -> pd.DataFrame:
-    """Return the figures of several settings together, only those that are means of their values; ``sd`` is 0."""
-    means = figures[[FIGURES[name].merged is np.mean for name in figures["figure"]]]
-    weighed = means.assign(value=means["value"] * means["of"], share=means["low"].notna())
-    pooled = weighed.groupby("figure", sort=False)[["value", "of", "share"]].sum().reset_index()
-    return _with_intervals(pooled.assign(value=pooled["value"] / pooled["of"], sd=0.0))

@@ -22,8 +22,7 @@ from calibrator.published.classify import Classification, classify_by_threshold,
 from calibrator.published.recovery import recover_fleet
 
 __all__ = [
-    "BASELINES", "CEILING", "LEFT_IN", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "MethodRow",
-    "require_estimate",
+    "BASELINES", "CEILING", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "MethodRow", "require_estimate",
 ]  # fmt: skip
 
 ROUNDING = 1e-9
@@ -135,43 +134,35 @@ TREE = MethodRow("published/tree", partial(_published, classify=_by_tree))
 PERFECT = MethodRow("published/perfect", partial(_published, classify=_by_truth))
 POSTERIOR = MethodRow("posterior", _posterior)
 CEILING = MethodRow("posterior/prior known", partial(_posterior, known=True))
-LEFT_IN = MethodRow("posterior, delays left in", _posterior)
 BASELINES = tuple(MethodRow(name, partial(_baseline, solve=solve)) for name, solve in SOLVERS.items())
 
 
-def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
+def require_estimate(method: str, estimate: Estimate, truth: Faults) -> Estimate:
     """Check that what a method returned for N vehicles with K branches can be judged, and return it.
 
     Raises
     ------
     FleetError
-        If it is no estimate, or an array has another shape or type, or values that are not finite or out of range.
+        If it is no estimate, an array has another shape or type, or values that are not finite, a
+        confidence is outside 0 to 1, or there are findings of another number of vehicles.
     """
-    N, K = truth.drift.shape
-
-    def wrong(what: str, given: object, expected: str) -> FleetError:
-        kind = f"{given.dtype} of shape {given.shape}" if isinstance(given, np.ndarray) else type(given).__name__
-        return FleetError(
-            f"method '{method}': {what} is {kind}, expected {expected}; see Estimate of {Trial.__module__}"
-        )
-
     if not isinstance(estimate, Estimate):
-        raise wrong("what estimate() returned", estimate, "an Estimate")
-    if not isinstance(estimate.faults, Faults):
-        raise wrong("faults", estimate.faults, "Faults of calibrator.faults")
-    given = {f"faults.{name}": value for name, value in vars(estimate.faults).items()}
-    given |= {name: getattr(estimate, name) for name in ("hardware", "corrected")}
+        raise FleetError(f"method '{method}': estimate() returned {type(estimate).__name__}, expected an Estimate")
+    N, K = truth.drift.shape
     optional = {name: getattr(estimate, name) for name in ("confidence", "drift_sd", "offset_sd_a")}
-    given |= {name: value for name, value in optional.items() if value is not None}
-    for what, values in given.items():
-        shape = (N,) if what in {"faults.hardware_drift", "hardware", "confidence"} else (N, K)
-        kinds, elements = ("b", "bool") if what in {"hardware", "corrected"} else ("fiu", "finite numbers")
-        fits = isinstance(values, np.ndarray) and values.shape == shape and values.dtype.kind in kinds
-        if not fits or not np.isfinite(values).all():
-            raise wrong(what, values, f"{elements} of shape {shape} (vehicles, branches), 0 where no fault is found")
-    confidence = estimate.confidence
-    if confidence is not None and (confidence.min() < -ROUNDING or confidence.max() > 1.0 + ROUNDING):
-        raise wrong("confidence", confidence, "probabilities from 0 to 1")
-    if len(estimate.findings) not in {0, N}:
-        raise wrong(f"findings of {len(estimate.findings)} vehicles", estimate.findings, f"those of {N}, or none")
+    arrays = {**vars(estimate.faults), "hardware": estimate.hardware, "corrected": estimate.corrected}
+    arrays |= {name: values for name, values in optional.items() if values is not None}
+    for name, values in arrays.items():
+        given, shape = np.asarray(values), (N,) if name in {"hardware_drift", "hardware", "confidence"} else (N, K)
+        kinds, elements = ("b", "bool") if name in {"hardware", "corrected"} else ("fiu", "finite numbers")
+        if given.shape != shape or given.dtype.kind not in kinds or not np.isfinite(given).all():
+            raise FleetError(
+                f"method '{method}': {name} is {given.dtype} of shape {given.shape}, expected {elements} of shape "
+                f"{shape} (vehicles, branches), 0 where no fault is found"
+            )
+    sure, found = optional["confidence"], len(estimate.findings)
+    if sure is not None and (np.min(sure) < -ROUNDING or np.max(sure) > 1.0 + ROUNDING):
+        raise FleetError(f"method '{method}': confidence is {np.min(sure):g} to {np.max(sure):g}, expected 0 to 1")
+    if found not in {0, N}:
+        raise FleetError(f"method '{method}': findings of {found} vehicles, expected those of {N}, or none")
     return estimate

@@ -1,20 +1,19 @@
 """Results of experiments as tables on the console, and as pages with their pictures in a folder."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib import color_sequences
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from calibrator.experiments.experiments import COVERAGE, EXPERIMENTS, KEYS, Experiment, ExperimentResult, read_records
-from calibrator.experiments.figures import ALL, FIGURES, calibration_errors, pool_tenths
+from calibrator.experiments.experiments import ALL, EXPERIMENTS, KEYS, Experiment, ExperimentResult
+from calibrator.experiments.figures import FIGURES
 from calibrator.experiments.methods import POSTERIOR
 from calibrator.terminal.text import counted
 from ecu_node.documents import write_atomically
@@ -23,6 +22,9 @@ __all__ = ["draw_result", "figure_table", "headline", "result_markdown", "result
 
 CONSOLE = {"recovery_rate", "confidence", "harmed"}
 """Figures for which a console of 80 columns has room, besides those of the picture."""
+SHARES = (-0.03, 1.03)
+"""Axis of a share: 0 to 1, with room for the markers at its ends. [1]"""
+COLOURS, MARKERS = (*color_sequences["tab10"], "black", "grey"), "os^DvPp<h>Xd"
 
 
 def headline(result: ExperimentResult) -> pd.DataFrame:
@@ -36,9 +38,9 @@ def headline(result: ExperimentResult) -> pd.DataFrame:
     shown = [name for name in experiment.shown if (figures.loc[own, "figure"] == name).any()]
     settings = pd.MultiIndex.from_frame(figures[["series", "x"]].drop_duplicates())
     parts = [
-        figures[rates].pivot(index=["series", "x"], columns="method", values="text").reindex(columns=result.methods)
+        figures[rates].pivot(index=["series", "x"], columns="method", values="text").reindex(columns=result.methods),
+        figures[own].pivot(index=["series", "x"], columns="figure", values="text")[shown],
     ]
-    parts += [figures[own].pivot(index=["series", "x"], columns="figure", values="text")[shown]]
     table = pd.concat(parts, axis=1).reindex(settings)
     if experiment.paper:  # the paper's best figure, whichever methods were run
         best = dict(sorted((x, found["recovery_rate"]) for (x, _), found in experiment.paper.items()))
@@ -74,7 +76,7 @@ def _of_paper(experiment: Experiment, row: Any) -> float:
 def _labelled(table: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
     """Turn the index of a table (series, x) into columns with the experiment's labels; drop series without a label."""
     table = table.astype(object).fillna("-").reset_index()
-    table["x"] = ["" if np.isnan(x) else f"{x:g}" for x in table["x"]]
+    table["x"] = ["all" if np.isnan(x) else f"{x:g}" for x in table["x"]]
     table = table if experiment.series_label else table.drop(columns="series")
     labels = {name: name.replace("_", " ") for name in FIGURES}
     return table.rename(columns=labels | {"series": experiment.series_label, "x": experiment.x_label})
@@ -92,18 +94,11 @@ def _names(result: ExperimentResult) -> list[str]:
     return [name for name in FIGURES if (there == name).any()]
 
 
-def _notes(result: ExperimentResult) -> str:
-    """Return the experiment's note, and which branch is minus the sum of the others."""
-    branch = result.settings.get("balance_branch")
-    balance = f"In every trip the current of {branch} is minus the sum of the others, so it depends on their sensors."
-    return f"{result.experiment.note} {balance if branch else ''}".strip()
-
-
 def _effort(result: ExperimentResult) -> str:
-    settings = result.settings
-    count = settings["repetitions"]
-    times = counted(count, "repetition") if isinstance(count, int) else f"{count} repetitions"
-    return f"{times}, seed {settings['seed']}, drive {settings['drive']}"
+    """Return repetitions, seed and drive, and what made the result, as a sentence."""
+    settings, made = result.settings, f"; {result.made}" if result.made else ""
+    times = counted(int(settings["repetitions"]), "repetition")
+    return f"{times}, seed {settings['seed']}, drive {settings['drive']}{made}."
 
 
 def _explained(names: Iterable[str]) -> str:
@@ -119,7 +114,7 @@ def result_table(result: ExperimentResult) -> Group:
         table.add_column(Text(heading), justify="left" if text else "right", no_wrap=text, overflow="fold")
     for row in cells.to_numpy():
         table.add_row(*map(Text, row))
-    caption = f"{_explained(names)}. {_notes(result)} {_effort(result)}."
+    caption = f"{_explained(names)}. {result.experiment.note} {_effort(result)}"
     return Group(Text(result.experiment.title, style="bold"), table, Text(caption, style="dim"), Text())
 
 
@@ -134,33 +129,33 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
         Link to the file of its picture; empty: there is none.
     """
     experiment, names, owner = result.experiment, _names(result), _owner(result)
-    also = f"; then figures of {owner}" if owner else ""
-    written = f"Written by `calibrator experiment {experiment.name} --out FOLDER`." if result.made else ""
     sections = [
         f"# {experiment.title}",
-        f"{written} {_notes(result)}".strip(),
-        f"Share of vehicles recovered within 10 %, by method, with 95 % intervals{also}:",
+        f"`calibrator experiment {experiment.name}`: {_effort(result)}",
         _markdown(headline(result)),
         f"![{experiment.title}]({picture})" if picture else "",
+        "The table shows the share of vehicles recovered within 10 %, by method, with 95 % intervals"
+        + (f"; then figures of {owner}." if owner else "."),
+        experiment.note,
         f"All figures{'; after a stroke the paper' if experiment.paper else ''}. {_explained(names)}.",
         _markdown(figure_table(result, names)),
     ]
-    tenths = result.tenths[result.tenths["method"] == owner]
-    whole = pool_tenths(tenths[tenths["series"] == ALL] if (tenths["series"] == ALL).any() else tenths)
-    if len(whole):
-        ece, chance = calibration_errors(whole)
-        formats = {"low": "{:.1f}", "vehicles": "{:.0f}", "confidence": "{:.3f}", "recovered": "{:.3f}"}
-        cells = pd.DataFrame({name: whole[name].map(text.format) for name, text in formats.items()})
-        sections += [f"Tenths of the confidence of {owner}, ECE {ece:.3f}, by chance {chance:.3f}:", _markdown(cells)]
-    if experiment.shown == COVERAGE and len(tenths):
-        pit = tenths.pivot_table(index=["series", "x"], columns="low", values="pit", sort=False, aggfunc="sum")
-        pit.loc[(ALL, np.nan), :] = pit.sum()
+    tenths = result.tenths[result.tenths["method"] == owner].tail(10)  # the last ten are those of all settings
+    if len(tenths):
+        formats = {
+            "low": "{:.1f}",
+            "vehicles": "{:.0f}",
+            "confidence": "{:.3f}",
+            "recovered": "{:.3f}",
+            "pit": "{:.0f}",
+        }
+        cells = pd.DataFrame({name: tenths[name].map(text.format) for name, text in formats.items()})
         sections += [
-            "Deployed parameters by tenths of their probability integral transform, equal if the posterior is right:",
-            _markdown(_labelled(pit.astype(int), experiment)),
+            f"Tenths of the confidence of {owner}, all settings together; pit: deployed parameters by tenths of their "
+            "probability integral transform, equally many if the posterior is right:",
+            _markdown(cells),
         ]
-    made = f" Made by {result.made}." if result.made else ""
-    sections.append(f"Settings: {', '.join(f'{name} {value}' for name, value in result.settings.items())}.{made}")
+    sections.append(f"Settings: {', '.join(f'{name} {value}' for name, value in result.settings.items())}.")
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
@@ -170,13 +165,7 @@ def _markdown(table: pd.DataFrame) -> str:
 
 
 def write_page(folder: Path, result: ExperimentResult) -> None:
-    """Write NAME.json, NAME.md and NAME.png into a folder, and beside it the index ``FOLDER.md`` of all its results.
-
-    Raises
-    ------
-    FleetError
-        If another record of the folder is damaged.
-    """
+    """Write NAME.json, NAME.md and NAME.png into a folder, and beside it ``FOLDER.md``, the heads of all its pages."""
     name = result.experiment.name
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / f"{name}.json", f"{result.to_json()}\n".encode())
@@ -187,141 +176,47 @@ def write_page(folder: Path, result: ExperimentResult) -> None:
         "Written by `calibrator experiment`. Share of vehicles recovered within 10 %, by method, with 95 % intervals; "
         "then figures of the default. Each page says what its columns are.",
     ]
-    for each in [*read_records(folder, EXPERIMENTS), *([] if name in EXPERIMENTS else [result])]:
-        row, made = each.experiment, f"; {each.made}" if each.made else ""
-        index += [
-            f"## [{row.title}]({folder.name}/{row.name}.md)",
-            f"`calibrator experiment {row.name}`: {_effort(each)}{made}.",
-            _markdown(headline(each)),
-        ]
+    for other in dict.fromkeys([*EXPERIMENTS, name]):
+        if (page := folder / f"{other}.md").is_file():
+            head, _, _ = page.read_text().partition("\n\n![")  # all above the picture
+            title, _, rest = head.removeprefix("# ").partition("\n\n")
+            index += [f"## [{title}]({folder.name}/{other}.md)", rest]
     write_atomically(folder.parent / f"{folder.name}.md", ("\n\n".join(index) + "\n").encode())
 
 
-# ---- pictures: one function per kind; bars are 95 % intervals, rings the paper's figures
-
-SHARES = (-0.03, 1.03)
-"""Axis of a share: 0 to 1, with room for the markers at its ends. [1]"""
-FEW = 30
-"""With fewer vehicles the share recovered is uncertain by more than about 0.1."""
-COLOURS = (*color_sequences["tab10"], "black", "grey")
-MARKERS, LINES = "os^DvPp<h>Xd", ("-", "--", "-.", ":")
-
-
 def draw_result(result: ExperimentResult) -> Figure:
-    """Draw a result of an experiment as its row in the table says, with one legend below all axes."""
-    kinds = {"lines": _draw_lines, "dots": _draw_dots, "map": _draw_map, "reliability": _draw_reliability}
-    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
-    figure.suptitle(result.experiment.title)
-    kinds[result.experiment.picture](figure, result)
-    found = {label: item for axes in figure.axes for item, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    if found:
-        figure.legend(
-            found.values(), found.keys(), loc="outside lower center", ncols=min(len(found), 6), fontsize="small"
-        )
-    return figure
+    """Draw a panel per figure of a result: a line per setting, with a dot per method in it.
 
-
-def _style(number: int) -> dict[str, Any]:
-    """Return colour and marker of a curve; it differs from others without colours, too."""
-    return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
-
-
-def _draw_points(
-    axes: Axes, experiment: Experiment, rows: pd.DataFrame, places: Sequence[float], *, label: str, number: int, of: int
-) -> None:
-    """Draw curve ``number`` of ``of``, shifted to stand beside the others at the places of its settings.
-
-    In a picture of dots the settings go from top to bottom and values to the right; else settings go to the right.
+    Bars are 95 % intervals, rings the paper's figures.
     """
-    across = experiment.picture == "dots"
-    place = np.array(places) + (0.6 if across else 0.2) * ((number + 0.5) / of - 0.5)
-    lengths = np.maximum(np.nan_to_num([rows["value"] - rows["low"], rows["high"] - rows["value"]]), 0.0)
-    paper = np.array([_of_paper(experiment, row) for row in rows.itertuples()])
-    ring: dict[str, Any] = {"s": 110.0, "facecolors": "none", "edgecolors": _style(number)["color"], "zorder": 4}
-    if across:
-        axes.errorbar(rows["value"], place, xerr=lengths, label=label, linestyle="", **_style(number))
-    else:
-        line = LINES[number % len(LINES)]
-        axes.errorbar(place, rows["value"], yerr=lengths, label=label, linestyle=line, capsize=2.5, **_style(number))
-    if np.isfinite(paper).any():
-        axes.scatter(*((paper, place) if across else (place, paper)), label=f"paper, {label}", **ring)
-
-
-def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
-    """Draw a panel per figure, with a line per setting and a dot per method in it."""
     table, experiment = result.figures, result.experiment
-    keys = list(dict.fromkeys(zip(table["series"], table["x"], strict=True)))
-    figure.set_size_inches(11.0, 2.0 + max(3.0, 0.3 * len(keys)))
+    settings = table[["series", "x"]].drop_duplicates().itertuples(index=False)
+    labels = [_setting_label(experiment, *setting) for setting in settings]
+    figure = Figure(figsize=(11.0, 2.0 + max(3.0, 0.3 * len(labels))), layout="constrained")
+    figure.suptitle(experiment.title)
     all_axes = figure.subplots(1, len(experiment.panels), sharey=True)
+    handles = {}
     for axes, name in zip(all_axes, experiment.panels, strict=True):
         for number, method in enumerate(result.methods):
             rows = table[(table["method"] == method) & (table["figure"] == name)]
-            places = [keys.index(key) for key in zip(rows["series"], rows["x"], strict=True)]
-            if places:
-                _draw_points(axes, experiment, rows, places, label=method, number=number, of=len(result.methods))
+            beside = 0.6 * ((number + 0.5) / len(result.methods) - 0.5)  # the methods of a setting stand side by side
+            place = [labels.index(_setting_label(experiment, row.series, row.x)) + beside for row in rows.itertuples()]
+            lengths = np.maximum(np.nan_to_num([rows["value"] - rows["low"], rows["high"] - rows["value"]]), 0.0)
+            style: dict[str, Any] = {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
+            handles[method] = axes.errorbar(rows["value"], place, xerr=lengths, linestyle="", **style)
+            paper = np.array([_of_paper(experiment, row) for row in rows.itertuples()])
+            if np.isfinite(paper).any():
+                ring = {"s": 110.0, "facecolors": "none", "edgecolors": style["color"], "zorder": 4}
+                handles[f"paper, {method}"] = axes.scatter(paper, place, **ring)
         axes.set(title=name.replace("_", " "), xlim=SHARES)
         axes.grid(visible=True, alpha=0.3)
-    ticks = [f"{series}, {experiment.x_label.split()[0]} {x:g}".removeprefix(", ") for series, x in keys]
-    all_axes[0].set_yticks(range(len(keys)), ticks, fontsize="small")
+    all_axes[0].set_yticks(range(len(labels)), labels, fontsize="small")
     all_axes[0].invert_yaxis()
+    columns = min(len(handles), 6)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize="small")
+    return figure
 
 
-def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
-    """Draw figures over what is varied: a curve per method, or for several series a panel per method."""
-    table, experiment = result.figures, result.experiment
-    several, values = table["series"].nunique() > 1, sorted(set(table["x"]))
-    groups = [[method] for method in result.methods] if several else [list(result.methods)]
-    curves = list(dict.fromkeys(table["series"])) if several else result.methods
-    panels = {
-        (name, group[0]): table[(table["figure"] == name) & table["method"].isin(group)]
-        for name in experiment.panels
-        for group in groups
-    }
-    panels = {key: panel for key, panel in panels.items() if len(panel)}
-    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, ((name, method), panel) in zip(all_axes, panels.items(), strict=True):
-        for number, one in enumerate(curves):
-            rows = panel[panel["series" if several else "method"] == one]
-            if places := [values.index(x) for x in rows["x"]]:
-                label = f"{experiment.series_label} {one or 'as S says'}" if several else one
-                _draw_points(axes, experiment, rows, places, label=label, number=number, of=len(curves))
-        title = name.replace("_", " ")
-        axes.set(title=f"{title}, {method}" if several else title, xlabel=experiment.x_label, ylim=SHARES)
-        axes.set_xticks(range(len(values)), [f"{value:g}" for value in values])
-        axes.grid(visible=True, alpha=0.3)
-    all_axes[0].set_ylabel("share of vehicles; bars: 95 % intervals")
-
-
-def _draw_map(figure: Figure, result: ExperimentResult) -> None:
-    """Draw a map of the recovery rate for each method."""
-    table, experiment = result.figures, result.experiment
-    all_axes = np.atleast_1d(figure.subplots(1, len(result.methods)))
-    for axes, method in zip(all_axes, result.methods, strict=True):
-        rates = table[(table["method"] == method) & (table["figure"] == "recovery_rate")]
-        grid = rates.pivot_table(index="series", columns="x", values="value", sort=False).sort_index(axis=1)
-        axes.imshow(grid, vmin=0.0, vmax=1.0, origin="lower", aspect="auto", cmap="viridis")
-        for (i, j), rate in np.ndenumerate(grid.to_numpy()):
-            axes.text(j, i, f"{rate:.2f}", ha="center", va="center", color="black" if rate > 0.6 else "white")
-        axes.set_xticks(range(grid.shape[1]), [f"{x:g}" for x in grid.columns])
-        axes.set_yticks(range(len(grid)), grid.index)
-        axes.set(title=f"recovery rate, {method}", xlabel=experiment.x_label, ylabel=experiment.series_label)
-
-
-def _draw_reliability(figure: Figure, result: ExperimentResult) -> None:
-    """Draw the share recovered over the confidence, by experiment and all together, with the numbers of vehicles."""
-    reliability, counts = figure.subplots(1, 2)
-    reliability.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=1.0)
-    errors = result.figures[result.figures["figure"] == "ece"].set_index("series")["value"]
-    for number, (series, tenths) in enumerate(result.tenths.groupby("series", sort=False)):
-        known, style = tenths[tenths["vehicles"] >= FEW], {**_style(number), "linestyle": ""}
-        if series == ALL:
-            style = {"color": "black", "marker": ".", "linestyle": "-"}
-            bars = counts.bar(tenths["low"] + 0.05, tenths["vehicles"], width=0.09, color="0.6")
-            counts.bar_label(bars, fontsize="x-small")
-            counts.set_ylim(0.8, 3.0 * tenths["vehicles"].max())
-        label = f"{series}, ECE {errors[series]:.3f}"
-        reliability.plot(known["confidence"], known["recovered"], label=label, **style)
-    reliability.set(xlabel=f"confidence, tenths with at least {FEW} vehicles", ylabel="share recovered")
-    reliability.set(xlim=SHARES, ylim=SHARES)
-    reliability.grid(visible=True, alpha=0.3)
-    counts.set(xlabel="confidence", ylabel=f"vehicles, {ALL}", yscale="log", xlim=SHARES)
+def _setting_label(experiment: Experiment, series: str, x: float) -> str:
+    """Return what a picture calls a setting, such as ``K=2, 5-25 %, sparsity 80``."""
+    return ALL if np.isnan(x) else f"{series}, {experiment.x_label.split()[0]} {x:g}".removeprefix(", ")

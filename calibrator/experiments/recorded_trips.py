@@ -13,10 +13,10 @@ import numpy as np
 
 from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
-from calibrator.artificial.simulate import Vehicle, vehicle_drive
+from calibrator.artificial.simulate import branch_frame_times
 from calibrator.artificial.trips import GroundTruth, balance_branch, choose_branches, read_recorded_trips, with_branches
-from calibrator.drive import Array, Samples
-from calibrator.drives.align import align, choose_inputs, evaluate_formula
+from calibrator.drive import Array, Channel, Drive, Samples
+from calibrator.drives.align import align, evaluate_formula
 from calibrator.drives.delays import estimate_delays, without_delays
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
@@ -65,7 +65,7 @@ class RecordedFleet:
                 f"{self.name}: {len(self.trips)} usable trips, at least {FEWEST_TRIPS} are needed, as each is a "
                 "vehicle; import more drives"
             )
-        if not self.input_names(self.trips[0].inputs):
+        if not self.inputs(self.trips[0]):
             layout = self.database.layout
             raise FleetError(
                 f"{layout.path}: {self.name} have none of its model inputs {', '.join(layout.model_inputs)}; they have "
@@ -85,13 +85,14 @@ class RecordedFleet:
     @property
     def record(self) -> dict[str, int | float | str]:
         """Origin, number and length of the trips, full scale and noise, for the record of a result."""
+        balance = balance_branch(self.database.layout, tuple(self.trips[0].currents_a))
         return {
             "drive": self.name,
             "trips": len(self.trips),
             "driving_minutes": round(sum(map(len, self.trips)) * self.period_s / 60.0, 1),
             "full_scale_a": self.full_scale_a,
             "noise_a": NOISE * self.full_scale_a,
-            "balance_branch": balance_branch(self.database.layout, tuple(self.trips[0].currents_a)),
+            "balance_branch": f"{balance}, in every trip minus the sum of the others, so it depends on their sensors",
         }
 
     def take(self, trips: int, *, duration_s: float) -> "RecordedFleet":
@@ -111,19 +112,14 @@ class RecordedFleet:
         names = choose_branches(self.database.layout, tuple(self.trips[0].currents_a), count)
         return tuple(with_branches(trip, names, balance_branch(self.database.layout, names)) for trip in self.trips)
 
-    def input_names(self, available: Mapping[str, object]) -> tuple[str, ...]:
-        """Return the inputs of the vehicle model and the fleet model that can be made from the available inputs."""
-        layout = self.database.layout
-        names = tuple(dict.fromkeys([*layout.model_inputs, *layout.fleet_inputs]))
-        return choose_inputs(layout, tuple(available), names=names)[0]
-
     def inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
-        """Return the inputs :meth:`input_names` of a trip by name, computed ones included, each of shape (T,)."""
+        """Return the inputs of vehicle model and fleet model that a trip has or can give, by name, each shape (T,)."""
         layout, values = self.database.layout, dict(trip.inputs)
         for item in layout.derived:
             if layout.base_inputs([item.name]) <= values.keys():
                 values[item.name] = evaluate_formula(item.formula, values)
-        return {name: values[name] for name in self.input_names(trip.inputs)}
+        wanted = dict.fromkeys([*layout.model_inputs, *layout.fleet_inputs])
+        return {name: values[name] for name in wanted if name in values}
 
 
 def read_fleet(store: Path, database: VehicleDatabase) -> RecordedFleet:
@@ -183,8 +179,8 @@ class RecordedCase(FaultSettings):
         Number of vehicles and length of their drives, each of which starts at a random instant of the trips and goes
         on from trip to trip. Without minutes each trip is a vehicle; without vehicles there are as many as trips.
     delay_max_s : float or None
-        Largest delay: each branch is late by a uniform delay of 0 to this, and comes in frames with times of their own.
-        None: all branches are sampled at the same instants, without delay. [s]
+        Largest delay: each branch is late by a uniform delay of 0 to this, and is sampled at instants of its own. None:
+        all branches are sampled at the same instants, without delay. [s]
     delays_left_in : bool
         Whether these delays stay; else they are estimated and taken out.
     """
@@ -334,51 +330,59 @@ def record_vehicles(
         unmeasured_a=np.maximum(random_stream(Purpose.FRAMES, seed).normal(*case.unmeasured_a, size=N), 0.0),
         attack=attack,
     )
-    if case.delay_max_s is not None:
-        pairs = [_through_frames(fleet, case, vehicles, trip, (seed, j)) for j, trip in enumerate(trips)]
-        errors_s = None if case.delays_left_in else np.stack([error_s for _, error_s in pairs])
-        return replace(vehicles, samples=[samples for samples, _ in pairs], delay_error_s=errors_s)
-    return replace(vehicles, samples=[_sampled(fleet, vehicles, trip, (seed, j)) for j, trip in enumerate(trips)])
+    measured = [
+        (trip, vehicles.currents_a(j, trip.matrix_a())[1], random_stream(Purpose.FRAMES, seed, j))
+        for j, trip in enumerate(trips)
+    ]
+    if case.delay_max_s is None:
+        return replace(vehicles, samples=[_sampled(fleet, *each) for each in measured])
+    samples, errors_s = zip(*(_delayed(fleet, case, *each) for each in measured), strict=True)
+    return replace(vehicles, samples=samples, delay_error_s=None if case.delays_left_in else np.stack(errors_s))
 
 
-def _sampled(fleet: RecordedFleet, vehicles: VehicleSamples, trip: GroundTruth, seed: tuple[int, int]) -> Samples:
-    """Return what vehicle number seed[1] records at the instants of its trip: with noise, in steps of its signals."""
-    _, i_m = vehicles.currents_a(seed[1], trip.matrix_a())
-    seen = i_m + NOISE * fleet.full_scale_a * random_stream(Purpose.FRAMES, *seed).standard_normal(i_m.shape)
-    steps_a = np.array([fleet.database.current_step_a(name) for name in trip.currents_a])  # 0: no step
-    safe, inputs = np.where(steps_a > 0.0, steps_a, 1.0), fleet.inputs(trip)
+def _sampled(fleet: RecordedFleet, trip: GroundTruth, i_m: Array, rng: np.random.Generator) -> Samples:
+    """Return what a vehicle with measured currents i_m (T, K) records at the instants of its trip."""
+    names, inputs = tuple(trip.currents_a), fleet.inputs(trip)
     return Samples(
-        branch_names=tuple(trip.currents_a),
+        branch_names=names,
         input_names=tuple(inputs),
         time_s=trip.time_s,
-        currents_a=np.where(steps_a > 0.0, np.rint(seen / safe) * safe, seen),
+        currents_a=_shown_a(fleet, names, i_m, rng),
         inputs=np.column_stack(list(inputs.values())),
         valid=np.ones(len(trip), dtype=bool),
     )
 
 
-def _through_frames(
-    fleet: RecordedFleet, case: RecordedCase, vehicles: VehicleSamples, trip: GroundTruth, seed: tuple[int, int]
+def _delayed(
+    fleet: RecordedFleet, case: RecordedCase, trip: GroundTruth, i_m: Array, rng: np.random.Generator
 ) -> tuple[Samples, Array]:
-    """Return aligned samples of vehicle number seed[1] with late branches, and its ``delay_error_s``, (K - 1,). [s]"""
-    assert case.delay_max_s is not None
-    rng, j = random_stream(Purpose.FRAMES, *seed), seed[1]
-    delay_s = rng.uniform(0.0, 1.0, size=case.branches) * case.delay_max_s
-    vehicle = Vehicle(
-        name=trip.name,
-        branches=tuple(trip.currents_a),
-        faults=vehicles.truth.take(j),
-        noise_a=NOISE * fleet.full_scale_a,
-        delay_s=delay_s,
-        unmeasured_a=float(vehicles.unmeasured_a[j]),
-    )
-    drive = vehicle_drive(rng, fleet.database, vehicle, trip)
-    found_s: Array = np.zeros(len(delay_s))
+    """Return aligned samples of a vehicle whose branches are late, and its ``delay_error_s``, shape (K - 1,). [s]"""
+    names, layout = tuple(trip.currents_a), fleet.database.layout
+    delay_s = rng.uniform(0.0, case.delay_max_s or 0.0, size=len(names))
+    inputs = {name: _channel(trip.time_s, x) for name, x in trip.inputs.items()}
+    branches: dict[str, Channel] = {}
+    found_s: Array = np.zeros(len(names))
+    for k, name in enumerate(names):
+        time_s = branch_frame_times(rng, fleet.database, name, trip)
+        late_a = np.interp(time_s - delay_s[k], trip.time_s, i_m[:, k])
+        branches[name] = _channel(time_s, _shown_a(fleet, (name,), late_a[:, None], rng)[:, 0])
+    drive = Drive(vehicle=trip.name, name=trip.name, branches=branches, inputs=inputs)
     if not case.delays_left_in:
-        delays = estimate_delays([drive], vehicle.branches)
+        delays = estimate_delays([drive], names)
         drive, found_s = without_delays(drive, delays.by_branch()), delays.delay_s
-    samples = align(drive, fleet.database.layout, vehicle.branches, inputs=fleet.input_names(drive.inputs))
-    return samples, (found_s - delay_s + delay_s[0])[1:]
+    return align(drive, layout, names, inputs=tuple(fleet.inputs(trip))), (found_s - delay_s + delay_s[0])[1:]
+
+
+def _channel(time_s: Array, value: Array) -> Channel:
+    return Channel(time_s=time_s, value=value, good=np.isfinite(value))
+
+
+def _shown_a(fleet: RecordedFleet, names: Sequence[str], i_m: Array, rng: np.random.Generator) -> Array:
+    """Return what the sensors of branches show of measured currents (T, K): with noise, in steps of the signals. [A]"""
+    seen = i_m + NOISE * fleet.full_scale_a * rng.standard_normal(i_m.shape)
+    steps_a = np.array([fleet.database.current_step_a(name) for name in names])  # 0: no step
+    safe = np.where(steps_a > 0.0, steps_a, 1.0)
+    return np.where(steps_a > 0.0, np.rint(seen / safe) * safe, seen)
 
 
 def _summaries(samples: Sequence[Samples], fleet: RecordedFleet) -> list[DriveSummary]:

@@ -1,5 +1,6 @@
 """Compare a result with the truth of its artificial fleet, for ``calibrator score``."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.estimator.results import read_results, read_run
 from calibrator.faults import Faults
-from calibrator.fleet_truth import faults_of, read_truth
+from calibrator.fleet_truth import read_truth
 from calibrator.score import f2_score, harmed, recovered
 
 __all__ = ["WORDS", "score_result"]
@@ -63,25 +64,30 @@ def score_result(result: Path, truth_file: Path) -> dict[str, float]:
             "is it the truth of another fleet?"
         )
 
-    def column(name: str) -> Array:
+    def found(name: str) -> Array:
         """A column of the result, shape (N, K)."""
         return np.asarray(rows[name].unstack("branch").loc[known, truth.branches].to_numpy(dtype=float))
 
-    def moment(field: str) -> Array:
-        """A moment of the true currents on the unseen drive, shape (N, K)."""
-        return np.array([[getattr(truth.vehicles[name], field)[b] for b in truth.branches] for name in known])
+    def true(name: str) -> Array:
+        """A field of the true vehicles, shape (N, K)."""
+        return np.array([[getattr(truth.vehicles[v], name)[branch] for branch in truth.branches] for v in known])
 
-    drift, offset_a, applied, actual = column("drift"), column("offset_a"), column("applied"), faults_of(truth, known)
-    hardware = {"hardware_drift": column("hardware_drift")[:, 0], "hardware_offset_a": column("hardware_offset_a")}
-    estimate = Faults(**hardware, drift=drift, offset_a=offset_a)
-    deployed = Faults(**hardware, drift=np.where(applied, drift, 0.0), offset_a=np.where(applied, offset_a, 0.0))
+    by_branch, applied = ("hardware_offset_a", "drift", "offset_a"), found("applied")
+    drift_h = found("hardware_drift")[:, 0], np.array([truth.vehicles[v].hardware_drift for v in known])
+    estimate = Faults(hardware_drift=drift_h[0], **{name: found(name) for name in by_branch})
+    actual = Faults(hardware_drift=drift_h[1], **{name: true(name) for name in by_branch})
+    deployed = replace(
+        estimate,
+        drift=np.where(applied, estimate.drift, 0.0),
+        offset_a=np.where(applied, estimate.offset_a, 0.0),
+    )
     within_10, within_25 = (  # those of the paper's table 2
         recovered(estimate, actual, full_scale_a=truth.full_scale_a, smallest_fault=truth.magnitude[0], tolerance=t)
         for t in (0.10, 0.25)
     )
-    worse = harmed(deployed, actual, mean_a=moment("unseen_mean_a"), mean_square_a2=moment("unseen_mean_square_a2"))
+    worse = harmed(deployed, actual, mean_a=true("unseen_mean_a"), mean_square_a2=true("unseen_mean_square_a2"))
     counted = (within_10, within_25, worse, applied.any(axis=1))
     N = len(truth.vehicles)
-    f2 = f2_score(column("hardware_fault")[:, 0].astype(bool), actual.has_hardware_fault)
+    f2 = f2_score(found("hardware_fault")[:, 0].astype(bool), actual.has_hardware_fault)
     figures = (N, N - len(known), *(float(mask.sum()) / N for mask in counted), f2)
     return dict(zip(WORDS, figures, strict=True))

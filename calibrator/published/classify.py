@@ -18,8 +18,8 @@ from calibrator.drive import Array, Mask
 from calibrator.faults import Faults, slopes_and_intercepts
 
 __all__ = [
-    "Classification", "classify_by_expected_trees", "classify_by_threshold", "classify_by_trees", "classify_by_truth",
-    "decision_criterion", "expected_features",
+    "TRAINING_VEHICLES", "Classification", "classify_by_expected_trees", "classify_by_threshold", "classify_by_trees",
+    "classify_by_truth", "decision_criterion", "expected_features",
 ]  # fmt: skip
 
 TRAINING_VEHICLES = 3000
@@ -65,7 +65,7 @@ def decision_criterion(features: Array) -> Array:
     return np.asarray(features[:, :K].sum(axis=1) - features[:, K] / K)
 
 
-def classify_by_threshold(features: Array, in_reference: Mask | None = None) -> Classification:
+def classify_by_threshold(features: Array) -> Classification:
     """Classify vehicles by a threshold on the criterion, (7) with delta_h of (27).
 
     The paper gives no threshold for sensor faults, so every vehicle is taken to have some: their sizes are then
@@ -75,8 +75,6 @@ def classify_by_threshold(features: Array, in_reference: Mask | None = None) -> 
     ----------
     features : ndarray of shape (N, K + 1)
         Features of the whole fleet, (5) and (6). [A^2]
-    in_reference : ndarray of bool of shape (N,), optional
-        Vehicles whose spread sets the threshold; all by default.
 
     Returns
     -------
@@ -84,9 +82,7 @@ def classify_by_threshold(features: Array, in_reference: Mask | None = None) -> 
         Hardware faults where the criterion is above a third of its standard deviation.
     """
     eta = decision_criterion(features)
-    learnt = eta if in_reference is None else eta[in_reference]
-    threshold = THRESHOLD_SHARE * learnt.std(ddof=1) if len(learnt) > 1 else 0.0
-    return Classification(hardware=eta > threshold, sensor=np.ones(len(eta), bool))
+    return Classification(hardware=eta > THRESHOLD_SHARE * eta.std(ddof=1), sensor=np.ones(len(eta), bool))
 
 
 def classify_by_truth(faults: Faults) -> Classification:
@@ -115,9 +111,7 @@ def classify_by_trees(learnt: Array, truth: Faults, features: Array) -> Classifi
     return Classification(hardware=found(truth.has_hardware_fault), sensor=found(truth.has_sensor_fault))
 
 
-def expected_features(
-    faults: Faults, i_s: Array, simulation_error_a: Array, *, reference_vehicles: int | None
-) -> Array:
+def expected_features(faults: Faults, i_s: Array, simulation_error_a: Array, *, reference_vehicles: int) -> Array:
     """Compute the features (5) and (6) of vehicles with given faults, from the moments of the ideal currents.
 
     Parameters
@@ -128,8 +122,8 @@ def expected_features(
         Ideal currents on the unity drive. [A]
     simulation_error_a : ndarray of shape (K,)
         Standard deviation of the simulation error. [A]
-    reference_vehicles : int or None
-        Each group of so many consecutive vehicles has its mean as reference (3); None: all have the ideal current.
+    reference_vehicles : int
+        Each group of so many consecutive vehicles has its mean as reference (3).
 
     Returns
     -------
@@ -140,10 +134,7 @@ def expected_features(
     mean, moment = np.mean(i_s, axis=0), i_s.T @ i_s / len(i_s)
     constant = b.sum(axis=1)
     junction = np.einsum("nk,kl,nl->n", a, moment, a) + 2.0 * constant * (a @ mean) + constant**2
-    if reference_vehicles is None:
-        slope, intercept = a - 1.0, b
-    else:
-        slope, intercept = a - _mean_of_groups(a, reference_vehicles), b - _mean_of_groups(b, reference_vehicles)
+    slope, intercept = (values - _mean_of_groups(values, reference_vehicles) for values in (a, b))
     deviation = slope**2 * np.diag(moment) + 2.0 * slope * intercept * mean + intercept**2 + simulation_error_a**2
     return np.column_stack([deviation, junction])
 
@@ -161,7 +152,7 @@ def classify_by_expected_trees(
     *,
     full_scale_a: float,
     expected: FaultSettings,
-    reference_vehicles: int | None,
+    reference_vehicles: int,
 ) -> Classification:
     """Classify a real fleet by decision trees that learn from an artificial fleet with the expected faults.
 
@@ -177,8 +168,8 @@ def classify_by_expected_trees(
         Full scale of the junction. [A]
     expected : FaultSettings
         How the faults of the artificial fleet are drawn.
-    reference_vehicles : int or None
-        Number of vehicles whose mean is the reference; None: the fleet is symmetric, so its mean is the ideal vehicle.
+    reference_vehicles : int
+        Number of vehicles whose mean is the reference.
     """
     i_s, rng = reference - reference.mean(axis=1, keepdims=True), random_stream(Purpose.TRAINING_FAULTS, 0)
     K = reference.shape[1]

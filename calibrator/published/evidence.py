@@ -13,7 +13,6 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.errors import FleetError
-from calibrator.faults import Index
 
 __all__ = ["FleetEvidence", "collect_evidence", "fleet_mean"]
 
@@ -47,10 +46,6 @@ class FleetEvidence:
     def features(self) -> Array:
         """f_1 to f_K+1 of each vehicle, (5) and (6), shape (N, K + 1). [A^2]"""
         return np.column_stack([self.deviation_a2, self.junction_a2])
-
-    def take(self, index: Index) -> "FleetEvidence":
-        """Return the evidence of some of the vehicles; of a single one, by its number, arrays without the leading N."""
-        return FleetEvidence(**{name: values[index] for name, values in vars(self).items()})
 
 
 def fleet_mean(simulated: Iterable[Array]) -> Array:

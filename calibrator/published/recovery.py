@@ -28,7 +28,7 @@ from calibrator.faults import Faults
 from calibrator.published.classify import Classification
 from calibrator.published.evidence import FleetEvidence
 
-__all__ = ["BasisPursuit", "BasisPursuitError", "Recovery", "quadratic_forms", "recover_fleet", "refit_support"]
+__all__ = ["BasisPursuit", "BasisPursuitError", "Recovery", "quadratic_forms", "recover_fleet"]
 
 cp: Any = cvxpy  # its type hints leave out the atoms
 
@@ -85,23 +85,22 @@ class BasisPursuit:
     """
 
     def __init__(self, branches: int) -> None:
-        size = 3 * branches + 1
-        forms = quadratic_forms(branches).reshape(2 * branches, -1)
+        self.forms = quadratic_forms(branches)
         self._y = cp.Parameter(2 * branches)
         self._radius = cp.Parameter(nonneg=True)
-        self._X = cp.Variable((size, size), PSD=True)
-        residual = forms @ cp.vec(self._X, order="C") - self._y
+        self._X = cp.Variable(self.forms.shape[1:], PSD=True)
+        residual = self.forms.reshape(2 * branches, -1) @ cp.vec(self._X, order="C") - self._y
         objective = cp.trace(self._X) + L1_WEIGHT * cp.sum(cp.abs(self._X))
         constraints = [cp.norm(residual) <= self._radius, self._X[-1, -1] == 1.0]
         self._problem = cp.Problem(cp.Minimize(objective), constraints)
 
-    def solve(self, slopes: Array, intercepts: Array, *, epsilon: float) -> Array:
+    def solve(self, y: Array, *, epsilon: float) -> Array:
         """Return the sparsest fault parameters that explain slopes and intercepts of one vehicle.
 
         Parameters
         ----------
-        slopes, intercepts : ndarray of shape (K,)
-            a [1], and b in fractions of full scale [1].
+        y : ndarray of shape (2K,)
+            Slopes a [1], then intercepts b in fractions of full scale [1].
         epsilon : float
             Sum of squared residuals of (15) that is allowed. [1]
 
@@ -115,7 +114,6 @@ class BasisPursuit:
         BasisPursuitError
             If slopes or intercepts are not finite, or the solver reports anything but an optimum.
         """
-        y = np.concatenate([slopes, intercepts])
         if not np.isfinite(y).all():
             raise BasisPursuitError("basis pursuit has nothing to solve: slopes or intercepts are not finite")
         self._y.value = y
@@ -129,56 +127,40 @@ class BasisPursuit:
         return np.asarray(self._X.value[:-1, -1], np.float64)
 
 
-def refit_support(x: Array, slopes: Array, intercepts: Array, deviations: Array) -> Array:
-    """Fit the nonzero parameters of one vehicle to its slopes and intercepts by Gauss-Newton.
+def _refit(forms: Array, x: Array, y: Array, deviations: Array) -> Array:
+    """Fit the nonzero parameters of one vehicle to its slopes and intercepts by Gauss-Newton, without shrinkage.
 
     Parameters
     ----------
+    forms : ndarray of shape (2K, 3K + 1, 3K + 1)
+        The matrices Q_i.
     x : ndarray of shape (3K,)
         Start values. Those of magnitude above :data:`SMALLEST_PARAMETER`, at most the 2K largest, are refitted.
-    slopes, intercepts : ndarray of shape (K,)
-        a [1], and b in fractions of full scale [1].
-    deviations : ndarray of shape (2K,)
-        Standard deviations of slopes and intercepts, positive. [1]
+    y, deviations : ndarray of shape (2K,)
+        Slopes and intercepts as in :meth:`BasisPursuit.solve`, and their standard deviations, positive. [1]
 
     Returns
     -------
     ndarray of shape (3K,)
         Refitted parameters; if the refit diverges (a magnitude exceeds 1), their start values; zeros for the others.
     """
-    largest = np.argsort(np.argsort(-np.abs(x), kind="stable")) < len(deviations)  # there are 2K equations
+    largest = np.argsort(np.argsort(-np.abs(x), kind="stable")) < len(y)  # there are 2K equations
     support = largest & (np.abs(x) > SMALLEST_PARAMETER)
     start = np.where(support, x, 0.0)
-    target = np.concatenate([slopes, intercepts])
     fitted = start.copy()
     for _ in range(STEPS):
-        value, jacobian = _model(fitted)
-        weighted = jacobian[:, support] / deviations[:, None]
-        fitted[support] += np.linalg.lstsq(weighted, (target - value) / deviations, rcond=None)[0]
+        with_one = np.append(fitted, 1.0)
+        half_gradients = forms @ with_one  # of x' Q_i x, which is symmetric
+        jacobian = 2.0 * half_gradients[:, :-1][:, support] / deviations[:, None]
+        fitted[support] += np.linalg.lstsq(jacobian, (y - half_gradients @ with_one) / deviations, rcond=None)[0]
         if not np.isfinite(fitted).all() or np.abs(fitted).max() > 1.0:
             return start
     return fitted
 
 
-def _model(x: Array) -> tuple[Array, Array]:
-    """Return slopes and intercepts (2K,) by (15) for parameters x (3K,), and their derivatives by x (2K, 3K)."""
-    K = len(x) // 3
-    scale, drift, offset = 1.0 + x[0], 1.0 + x[K : 2 * K], x[2 * K :]
-    hardware = np.append(x[1:K], -x[1:K].sum())
-    k = np.arange(K)
-    J = np.zeros((2 * K, 3 * K))
-    J[k, 0] = drift
-    J[k, K + k] = scale
-    J[K + k[:-1], 1 + k[:-1]] = drift[:-1]
-    J[2 * K - 1, 1:K] = -drift[-1]
-    J[K + k, K + k] = hardware
-    J[K + k, 2 * K + k] = 1.0
-    return np.concatenate([drift * scale, drift * hardware + offset]), J
-
-
 @dataclass(frozen=True, kw_only=True)
 class Recovery:
-    """What a method found for N vehicles.
+    """What the method found for N vehicles.
 
     Attributes
     ----------
@@ -213,23 +195,17 @@ def recover_fleet(evidence: FleetEvidence, classification: Classification, *, fu
         Estimates of all vehicles; those whose optimisation failed are listed in it and do not stop the others.
     """
     N, K = evidence.slopes.shape
+    y = np.hstack([evidence.slopes, evidence.intercepts_a / full_scale_a])
+    variances = np.hstack([evidence.slope_variances, evidence.intercept_variances_a2 / full_scale_a**2])
     x = np.zeros((N, 3 * K))
     regressed = classification.sensor & ~classification.hardware
-    x[regressed, K : 2 * K] = evidence.slopes[regressed] - 1.0
-    x[regressed, 2 * K :] = evidence.intercepts_a[regressed] / full_scale_a
+    x[regressed, K:] = y[regressed] - np.repeat([1.0, 0.0], K)
     failed: dict[int, str] = {}
-    both, pursuit = classification.sensor & classification.hardware, BasisPursuit(K)
-    for j in np.flatnonzero(both).tolist():
+    pursuit = BasisPursuit(K)
+    for j in np.flatnonzero(classification.sensor & classification.hardware).tolist():
         try:
-            x[j] = _pursue(pursuit, evidence.take(j), full_scale_a)
+            sparse = pursuit.solve(y[j], epsilon=EPSILON_SHARE * float(variances[j].sum()))
+            x[j] = _refit(pursuit.forms, sparse, y[j], np.maximum(np.sqrt(variances[j]), LEAST_DEVIATION))
         except BasisPursuitError as error:
             failed[j] = str(error)
     return Recovery(faults=Faults.of_parameters(x, full_scale_a), classification=classification, failed=failed)
-
-
-def _pursue(pursuit: BasisPursuit, vehicle: FleetEvidence, full_scale_a: float) -> Array:
-    """Return the parameters of a vehicle of case 4, shape (3K,), offsets in fractions of full scale."""
-    slopes, intercepts = vehicle.slopes, vehicle.intercepts_a / full_scale_a
-    variances = np.concatenate([vehicle.slope_variances, vehicle.intercept_variances_a2 / full_scale_a**2])
-    x = pursuit.solve(slopes, intercepts, epsilon=EPSILON_SHARE * float(variances.sum()))
-    return refit_support(x, slopes, intercepts, np.maximum(np.sqrt(variances), LEAST_DEVIATION))

@@ -16,7 +16,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.documents import write_atomically
 from ecu_node.errors import DatabaseError
 
-__all__ = ["FrameSeries", "encode_message", "sent_values", "write_candump"]
+__all__ = ["FrameSeries", "encode_message", "write_candump"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,24 +74,6 @@ def encode_message(
     return FrameSeries(
         arbitration_id=message.frame_id, extended=message.is_extended_frame, time_s=np.asarray(time_s), data=data
     )
-
-
-def sent_values(signal: Signal, values: Array) -> Array:
-    """Return the values of a signal as a reader of its frames decodes them.
-
-    Parameters
-    ----------
-    signal : Signal
-        A signal of the DBC.
-    values : ndarray of shape (n,)
-        Finite physical values in the unit of the DBC.
-
-    Returns
-    -------
-    ndarray of shape (n,)
-        The values rounded to steps of the signal and limited to its range.
-    """
-    return np.asarray(_raw_codes(signal, values) * float(signal.scale) + float(signal.offset))
 
 
 def write_candump(path: Path, series: Iterable[FrameSeries]) -> int:

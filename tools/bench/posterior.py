@@ -68,9 +68,9 @@ def _basis_pursuit_s(fleet: EvidenceRows, vehicles: int) -> float:
     """Return the processor time that basis pursuit takes per vehicle. [s]"""
     K = fleet.branches
     slopes, intercepts = np.exp(fleet.values[:, fleet.places.slopes]), fleet.values[:, fleet.places.intercepts]
-    pairs = list(zip(slopes, intercepts, strict=True))[:vehicles]
+    lines = np.hstack([slopes, intercepts])[:vehicles]
     epsilon, problem = RESIDUAL * K * (SLOPE_SD**2 + INTERCEPT_SD**2), BasisPursuit(K)
-    return _best_s(lambda: [problem.solve(a, b, epsilon=epsilon) for a, b in pairs]) / len(pairs)
+    return _best_s(lambda: [problem.solve(y, epsilon=epsilon) for y in lines]) / len(lines)
 
 
 def _estimate(fleet: EvidenceRows, models: Sequence[FaultModel]) -> None:

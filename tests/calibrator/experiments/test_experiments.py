@@ -4,42 +4,27 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.container import ErrorbarContainer
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from rich.console import Console
 from typer.testing import CliRunner
 
 from calibrator.cli import app
 from calibrator.errors import FleetError
 from calibrator.experiments.common_drive import CommonCase
-from calibrator.experiments.experiments import (
-    CALIBRATION,
-    EXPERIMENTS,
-    Experiment,
-    ExperimentResult,
-    Setting,
-    fleet_for,
-    read_records,
-)
-from calibrator.experiments.figures import ALL, figure_rows
-from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR, MethodRow
-from calibrator.experiments.pages import draw_result, headline, result_markdown, result_table, write_page
+from calibrator.experiments.experiments import ALL, EXPERIMENTS, Experiment, ExperimentResult, Setting, fleet_for
+from calibrator.experiments.methods import PERFECT, POSTERIOR, MethodRow
+from calibrator.experiments.pages import headline, result_markdown, result_table, write_page
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
-from calibrator.experiments.runner import pool_confidences, run_experiment
+from calibrator.experiments.runner import run_experiment
 from calibrator.experiments.trial import ComparedMethod, Estimate, Trial
 from calibrator.faults import Faults
 from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.experiments.small_trials import small_fleet, smooth_drive
-
-RUN = [name for name in EXPERIMENTS if name != CALIBRATION.name]
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +61,7 @@ def test_new_experiment_needs_one_table_row_and_is_checked_before_it_runs(fleet:
     )
     result = run_experiment(row, fleet, repetitions=1)
     write_page(tmp_path / "results", result)
-    assert result.figures["x"].unique().tolist() == [0.0, 5.0]
-    assert result.settings["sparsity"] == 80.0
-    assert "unmeasured_a" not in result.settings
+    assert result.figures["x"].dropna().unique().tolist() == [0.0, 5.0]
     page = (tmp_path / "results" / "loads.md").read_text()
     assert "| load [A] | posterior |" in page
     assert re.search(r"\| 5 \| [01]\.\d{3} \([01]\.\d{3} to [01]\.\d{3}\)", page), "each rate with its interval"
@@ -89,38 +72,40 @@ def test_new_experiment_needs_one_table_row_and_is_checked_before_it_runs(fleet:
 
 
 @pytest.mark.parametrize(
-    "name", ["delay", *(pytest.param(n, marks=pytest.mark.long) for n in RUN if n not in {"delay", "snr"})]
+    "name", ["delay", *(pytest.param(n, marks=pytest.mark.long) for n in EXPERIMENTS if n not in {"delay", "snr"})]
 )
 def test_experiments_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
     row = EXPERIMENTS[name].small()
     result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")
     write_page(tmp_path / "results", result)
-    found = dict.fromkeys(zip(result.figures["series"], result.figures["x"], result.figures["method"], strict=True))
-    assert list(found) == [(s.series, s.x, method.name) for s in row.settings for method in s.methods or row.methods]
-    (read,) = read_records(tmp_path / "results", EXPERIMENTS)
+    single = result.figures[result.figures["series"] != ALL]
+    found = dict.fromkeys(zip(single["series"], single["x"], single["method"], strict=True))
+    assert list(found) == [(s.series, s.x, method.name) for s in row.settings for method in row.methods]
+    record = json.loads((tmp_path / "results" / f"{name}.json").read_text())
     for name_, table in (("figures", result.figures), ("tenths", result.tenths)):
-        pd.testing.assert_frame_equal(getattr(read, name_), table, check_dtype=False)
-    assert (read.settings, read.made) == (result.settings, result.made)
+        read = pd.DataFrame(record[name_], columns=table.columns).astype({"x": float})
+        pd.testing.assert_frame_equal(read, table, check_dtype=False)
+    assert (record["settings"], record["made"]) == (result.settings, result.made)
     page = (tmp_path / "results" / f"{name}.md").read_text()
-    assert f"`calibrator experiment {name} --out FOLDER`" in page
+    assert f"`calibrator experiment {name}`: 1 repetition, seed 0, drive" in page
     assert ("minus the sum of the others" in page) == row.recorded
     assert (tmp_path / "results" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     for line in printed(result, width=80).splitlines():
         assert len(line) <= 80
         assert "…" not in line
     if name == "delay":
-        assert LEFT_IN.name in result.methods
-        assert result.value("delay_rmse_ms", x=300.0, method=POSTERIOR.name) < 5.0
+        estimated = result.figures.loc[result.figures["figure"] == "delay_rmse_ms", "series"]
+        assert {*estimated} == {"taken out", ALL}
+        assert result.value("delay_rmse_ms", x=300.0, series="taken out", method=POSTERIOR.name) < 5.0
     if name == "coverage":
         counts = result.figures[result.figures["figure"].str.endswith("beyond_3")].groupby("series")["of"].sum()
         assert result.tenths.groupby("series")["pit"].sum().to_dict() == counts.to_dict()
-        assert "by tenths of their probability integral transform" in page
 
 
 def test_results_depend_on_the_seed_but_not_on_the_number_of_processes(snr: ExperimentResult) -> None:
-    row = replace(snr.experiment, methods=(PERFECT,))
-    again = run_experiment(row, smooth_drive(), repetitions=1, workers=2)
+    row = replace(snr.experiment, methods=(PERFECT,), repetitions=1)
+    again = run_experiment(row, smooth_drive(), workers=2)
     before = only(snr, "method", PERFECT.name).figures.reset_index(drop=True)
     pd.testing.assert_frame_equal(again.figures, before)
     other = run_experiment(row, smooth_drive(), repetitions=2, seed=100)
@@ -131,7 +116,7 @@ def test_results_depend_on_the_seed_but_not_on_the_number_of_processes(snr: Expe
 def test_tables_compare_the_paper_with_methods_and_explain_columns(snr: ExperimentResult) -> None:
     table = headline(snr)
     assert list(table.columns[:5]) == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
-    assert table[["SNR [dB]", "paper"]].to_numpy().tolist() == [["10", "-"], ["20", "0.91"]]
+    assert table[["SNR [dB]", "paper"]].to_numpy().tolist() == [["10", "-"], ["20", "0.91"], ["all", "-"]]
     rate = snr.value("recovery_rate", x=20.0, method=POSTERIOR.name)
     assert re.fullmatch(rf"{rate:.3f} \(\d\.\d{{3}} to \d\.\d{{3}}\)", table[POSTERIOR.name].iloc[1])
     only_published = only(snr, "method", PERFECT.name)
@@ -141,25 +126,13 @@ def test_tables_compare_the_paper_with_methods_and_explain_columns(snr: Experime
         assert not any(absent in text for absent in ("confidence", "calibration error", "delays", "failed:"))
 
 
-def test_damaged_experiment_record_is_named(tmp_path: Path) -> None:
-    (tmp_path / "snr.json").write_bytes(b'{"name": 3}')
-    with pytest.raises(FleetError, match=r"snr\.json: not a record of an experiment: .*run the experiment again"):
-        read_records(tmp_path, ["real", "snr"])
-
-
-def test_pooled_confidences_count_shared_trials_once(snr: ExperimentResult) -> None:
-    shared = replace(only(snr, "x", 20.0), experiment=EXPERIMENTS["classifier"])
-    other = replace(snr, experiment=EXPERIMENTS["sparsity"], settings={**snr.settings, "seed": 100})
-    result = pool_confidences([shared, snr, other])
-    rows = result.figures.set_index(["series", "figure"])
-    vehicles = {"classifier": 16.0, "snr": 32.0, "sparsity": 32.0, ALL: 64.0}
-    assert result.figures.groupby("series", sort=False)["x"].first().to_dict() == vehicles
-    assert rows.loc[(ALL, "ece"), "value"] == pytest.approx(rows.loc[("snr", "ece"), "value"])
+def test_trials_of_all_settings_count_together(snr: ExperimentResult) -> None:
+    rows = snr.figures[snr.figures["method"] == POSTERIOR.name].set_index(["series", "figure"])
     rates = [snr.value("recovery_rate", x=x, method=POSTERIOR.name) for x in (10.0, 20.0)]
-    assert rows.loc[("snr", "recovery_rate"), "value"] == pytest.approx(np.mean(rates))
-    assert (result.tenths.groupby("series")["vehicles"].sum().to_dict()) == vehicles
-    with pytest.raises(FleetError, match="no experiment has a confidence"):
-        pool_confidences([])
+    assert rows.loc[(ALL, "recovery_rate"), "value"] == pytest.approx(np.mean(rates))
+    assert rows.loc[(ALL, "recovery_rate"), "of"] == 32
+    tenths = snr.tenths[snr.tenths["method"] == POSTERIOR.name]
+    assert tenths.groupby("series")["vehicles"].sum().to_dict() == {"": 32.0, ALL: 32.0}
 
 
 def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,21 +144,26 @@ def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkey
 
 
 TWICE = (Setting(x=1.0, case=CommonCase()),) * 2
-NO_TABLE = "^snr: expected a method, and settings that differ in x or series$"
+NO_TABLE = "^snr: methods .*; expected methods with names of their own, and settings that differ in x or series$"
 
 
-@pytest.mark.parametrize(("change", "repetitions", "message"), [
-    ({"settings": (Setting(x=1.0, case=RecordedCase()),)}, 1, "RecordedCase cannot be run on a CommonDrive"),
-    ({}, 0, "at least 1 repetition, not 0"),
-    ({"settings": (Setting(x=1.0, case=CommonCase(branches=4)),)}, 1, "4 branches: drive smooth has 2 to 2"),
-    ({"settings": ()}, 1, NO_TABLE),
-    ({"settings": TWICE}, 1, NO_TABLE),
-    ({"methods": ()}, 1, NO_TABLE),
-    ({"methods": (PERFECT, POSTERIOR, PERFECT)}, 1, "^2 methods are called 'published/perfect'; give each method"),
+@pytest.mark.parametrize(("change", "message"), [
+    ({"settings": (Setting(x=1.0, case=RecordedCase()),)}, "^snr: cannot be run on a CommonDrive; see fleet_for"),
+    ({"settings": ()}, NO_TABLE),
+    ({"settings": TWICE}, NO_TABLE),
+    ({"methods": ()}, NO_TABLE),
+    ({"methods": (PERFECT, POSTERIOR, PERFECT)}, "^snr: methods published/perfect, posterior, published/perfect;"),
 ])  # fmt: skip
-def test_experiment_that_cannot_give_a_table_is_refused(change: dict[str, Any], repetitions: int, message: str) -> None:
+def test_experiment_that_cannot_give_a_table_is_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(FleetError, match=message):
-        run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive(), repetitions=repetitions)
+        run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive())
+
+
+def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
+    small = EXPERIMENTS["asymmetry"].small()
+    assert [(each.series, each.x) for each in small.settings] == [("0", 20.0), ("0.5", 2000.0)]
+    assert {each.case.vehicles for each in small.settings} == {20}
+    assert (EXPERIMENTS["asymmetry"].repetitions, small.repetitions) == (3, 2)
 
 
 def test_settings_are_chosen_by_a_text_in_their_name() -> None:
@@ -195,27 +173,16 @@ def test_settings_are_chosen_by_a_text_in_their_name() -> None:
     assert "asymmetry: no setting has '0.3' in its name; there are 0, 0.2, 0.4, 0.5" in str(ran.exception)
 
 
-def test_settings_kept_by_option_quick_must_exist() -> None:
-    with pytest.raises(FleetError, match="small: --quick keeps K=9, which no setting is called"):
-        replace(EXPERIMENTS["small"], quick={"K=9": (6.0,)})
-
-
 def test_number_of_vehicles_without_length_of_their_drives_is_refused() -> None:
     with pytest.raises(FleetError, match="40 vehicles, and each trip is one: give minutes as well"):
         RecordedCase(vehicles=40)
 
 
-def test_experiment_command_runs_records_and_pools(tmp_path: Path) -> None:
+def test_experiment_command_runs_and_records(tmp_path: Path) -> None:
     out = ("--out", str(tmp_path / "results"))
-    ran = CliRunner().invoke(app, ["experiment", "calibration", *out])
-    assert "no experiment has a confidence to check; run 'calibrator experiment all --out" in str(ran.exception)
-    assert not (tmp_path / "results").exists()
     ran = CliRunner().invoke(app, ["experiment", "snr", "--quick", "--repetitions", "1", "--workers", "1", *out])
     assert ran.exit_code == 0, ran.output
-    ran = CliRunner().invoke(app, ["experiment", "calibration", "--json", *out])
-    assert ran.exit_code == 0, ran.output
-    assert json.loads(ran.stdout)["settings"]["experiments"] == "snr"
-    assert (tmp_path / "results" / "calibration.png").is_file()
+    assert {path.name for path in (tmp_path / "results").iterdir()} == {"snr.json", "snr.md", "snr.png"}
     listed = CliRunner().invoke(app, ["experiment"]).stdout.splitlines()
     assert [line.split()[0] for line in listed] == list(EXPERIMENTS)
 
@@ -256,84 +223,27 @@ def test_table_shows_own_methods_and_the_first_available_confidence() -> None:
     result = run(PERFECT, Own("silent"), sure)
     table = headline(result)
     assert list(table.columns[:6]) == ["reading of S", "sparsity S [%]", "paper", PERFECT.name, "silent", "own"]
-    assert table.iloc[:, :3].to_numpy().tolist() == [["", "60", "0.91"], ["3 of 6", "60", "0.91"]]
+    assert table.iloc[:, :3].to_numpy().tolist() == [["", "60", "0.91"], ["3 of 6", "60", "0.91"], [ALL, "all", "-"]]
     assert table["confidence"].iloc[0] == "0.800"
-    assert "then figures of own:" in result_markdown(result)
+    assert "then figures of own." in result_markdown(result)
     silent = run(Own("silent"))
     assert list(headline(silent).columns[2:]) == ["paper", "silent"]
-    assert "with 95 % intervals:" in result_markdown(silent)
+    assert "with 95 % intervals.\n" in result_markdown(silent)
     both = run(sure, POSTERIOR)
     default = both.value("confidence", x=60.0, method=POSTERIOR.name)
     assert headline(both)["confidence"].iloc[0] == f"{default:.3f}"
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    (lambda _: MANY, r"what estimate\(\) returned is float64 of shape \(20, 2\), expected an Estimate; see"),
-    (lambda e: replace(e, faults=None), "faults is NoneType, expected Faults of calibrator.faults"),
-    (with_faults(drift=None), r"faults.drift is NoneType, expected finite numbers of shape \(20, 2\)"),
-    (with_faults(hardware_drift=np.zeros(3)), r"faults.hardware_drift is .*\(3,\), expected .*\(20,\)"),
-    (with_faults(drift=MANY * np.nan), "faults.drift .* expected finite numbers .*, 0 where no fault is found"),
+    (lambda _: MANY, r"estimate\(\) returned ndarray, expected an Estimate"),
+    (with_faults(drift=None), r"drift is object of shape \(\), expected finite numbers of shape \(20, 2\)"),
+    (with_faults(hardware_drift=np.zeros(3)), r"hardware_drift is .*\(3,\), expected .*\(20,\)"),
+    (with_faults(drift=MANY * np.nan), "drift .* expected finite numbers .*, 0 where no fault is found"),
     (lambda e: replace(e, hardware=np.zeros(N)), "hardware is float64 .* expected bool"),
-    (lambda e: replace(e, confidence=np.full(N, 1.5)), "confidence is .* probabilities from 0 to 1"),
     (lambda e: replace(e, drift_sd=MANY[:3], offset_sd_a=MANY), r"drift_sd is .* \(3, 2\), expected .*\(20, 2\)"),
-    (lambda e: replace(e, findings=[["load"]]), "findings of 1 vehicles is list, expected those of 20, or none"),
+    (lambda e: replace(e, confidence=np.linspace(0.0, 1.5, N)), "confidence is 0 to 1.5, expected 0 to 1"),
+    (lambda e: replace(e, findings=[["load"]]), "findings of 1 vehicles, expected those of 20, or none"),
 ])  # fmt: skip
 def test_invalid_estimate_is_refused_with_the_name_of_the_method(change: Change, message: str) -> None:
     with pytest.raises(FleetError, match=f"^method 'mine': {message}"):
         run(Own("mine", change))
-
-
-# Pictures: nothing is hidden, cut off or indistinguishable
-
-BIASES = ("0", "0.2", "0.4", "0.5")
-
-
-def shown_as(result: ExperimentResult, name: str) -> ExperimentResult:
-    """The same figures, drawn as another experiment."""
-    return replace(result, experiment=EXPERIMENTS[name])
-
-
-@pytest.fixture(scope="module")
-def equal() -> ExperimentResult:
-    """All series and methods the same, at the ends of the scale, of 30 vehicles each; the default knows it."""
-    tables = []
-    for series, (x, rate), method in product(BIASES, ((20.0, 0.0), (2000.0, 1.0)), (PERFECT, POSTERIOR)):
-        within = np.full(30, rate > 0.0)
-        values = {"recovery_rate": within}
-        if method is POSTERIOR:
-            values |= {"confidence": within + 0.0, "sure": within, "sure_confidence": within[within] + 0.0}
-            values |= {"ece": np.column_stack([np.where(within, 0.99, 0.25), within])}
-        tables.append([table.assign(series=series, x=x, method=method.name) for table in figure_rows([values])])
-    figures, tenths = (pd.concat(some, ignore_index=True) for some in zip(*tables, strict=True))
-    return ExperimentResult(experiment=EXPERIMENTS["asymmetry"], settings={"seed": 0}, figures=figures, tenths=tenths)
-
-
-def drawn(result: ExperimentResult) -> Figure:
-    figure = draw_result(result)
-    figure.draw_without_rendering()
-    return figure
-
-
-def test_identical_curves_do_not_hide_each_other(equal: ExperimentResult) -> None:
-    for axes in drawn(equal).axes:
-        curves = [container.lines[0] for container in axes.containers if isinstance(container, ErrorbarContainer)]
-        assert len(curves) == len(BIASES)
-        for looks in (Line2D.get_color, Line2D.get_marker, Line2D.get_linestyle):
-            assert len({looks(curve) for curve in curves}) == len(BIASES)
-        places = axes.transData.transform(np.concatenate([np.asarray(curve.get_xydata())[:1] for curve in curves]))
-        assert np.all(np.diff(places[:, 0]) > 5.0)
-
-
-def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult) -> None:
-    for result in (equal, shown_as(equal, "real"), pool_confidences([equal])):
-        figure = drawn(result)
-        (legend,) = figure.legends
-        assert not any(legend.get_window_extent().overlaps(axes.get_window_extent()) for axes in figure.axes)
-        names = [text.get_text() for text in legend.get_texts()]
-        assert len(names) == len(set(names))
-    assert [text.get_text() for text in drawn(equal).legends[0].get_texts()] == [f"sign bias {b}" for b in BIASES]
-
-
-def test_every_cell_of_a_map_shows_its_rate(equal: ExperimentResult) -> None:
-    texts = [text.get_text() for text in drawn(shown_as(equal, "phase")).axes[0].texts]
-    assert sorted(texts) == ["0.00"] * len(BIASES) + ["1.00"] * len(BIASES)

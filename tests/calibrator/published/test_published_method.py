@@ -132,7 +132,7 @@ def test_symmetric_fleet_is_recovered_through_noise(perfect: bool, least: float)
             np.full(3, 0.05),
             full_scale_a=FULL_SCALE_A,
             expected=FaultSettings(sparsity=80.0, balanced=True),
-            reference_vehicles=None,
+            reference_vehicles=len(faults),
         )
     found = recover_fleet(evidence, classes, full_scale_a=FULL_SCALE_A)
     assert recovered(found.faults, faults, full_scale_a=FULL_SCALE_A, smallest_fault=0.05).mean() >= least
