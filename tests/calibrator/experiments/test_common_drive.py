@@ -105,7 +105,7 @@ def test_best_subset_lasso_and_median_recover_single_faults() -> None:
 
 @pytest.mark.parametrize("name", ["best subset", "LASSO"])
 def test_faults_outside_the_support_are_exactly_zero(name: str) -> None:
-    trial = common_trial(smooth_drive(), CommonCase(vehicles=40, sparsity=80.0), 0)
+    trial = common_trial(smooth_drive(branches=3), CommonCase(vehicles=20, sparsity=80.0), 0)
     found = METHODS[name].estimate(trial)
     for values in (found.faults.drift, found.faults.offset_a / trial.full_scale_a):
         assert not np.any((values != 0.0) & (np.abs(values) < 1e-12)), "rounding is no fault"
