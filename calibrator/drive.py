@@ -22,6 +22,7 @@ __all__ = [
     "FleetSource",
     "Mask",
     "Samples",
+    "good_samples",
     "good_values",
 ]
 
@@ -77,6 +78,18 @@ class Drive:
         if not channels:
             return 0.0
         return float(max(c.time_s[-1] for c in channels) - min(c.time_s[0] for c in channels))
+
+
+def good_samples(channel: Channel) -> tuple[Array, Array]:
+    """Return the instants [s] of a channel's good samples, strictly increasing, and their values, shape (n,) each.
+
+    Of several samples at one instant the last counts.
+    """
+    time_s, value = channel.time_s, channel.value
+    if not channel.good.all():
+        time_s, value = time_s[channel.good], value[channel.good]
+    last = np.diff(time_s, append=np.inf) > 0.0
+    return (time_s, value) if last.all() else (time_s[last], value[last])
 
 
 def good_values(drives: Iterable[Drive], name: str) -> Array:

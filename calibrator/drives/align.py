@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.compiled import compiled
-from calibrator.drive import Array, Channel, Drive, Mask, Samples
+from calibrator.drive import Array, Channel, Drive, Mask, Samples, good_samples
 from calibrator.errors import DriveError
 from ecu_node.formulas import FUNCTIONS, formula_value, parse_formula
 from ecu_node.layout import Layout
@@ -29,7 +29,6 @@ __all__ = [
     "at_pace",
     "choose_inputs",
     "evaluate_formula",
-    "good_samples",
     "step_seen",
 ]
 
@@ -241,18 +240,6 @@ def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:
     if last - first >= MAX_SAMPLES:
         raise DriveError(f"{where}: {stop - start:.0f} s long; the time stamps are wrong, or cut it into drives")
     return np.arange(first, last + 1) * period_s
-
-
-def good_samples(channel: Channel) -> tuple[Array, Array]:
-    """Return the instants [s] of a channel's good samples, strictly increasing, and their values, shape (n,) each.
-
-    Of several samples at one instant the last counts.
-    """
-    time_s, value = channel.time_s, channel.value
-    if not channel.good.all():
-        time_s, value = time_s[channel.good], value[channel.good]
-    last = np.diff(time_s, append=np.inf) > 0.0
-    return (time_s, value) if last.all() else (time_s[last], value[last])
 
 
 def _interpolated(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, NDArray[np.uint8]]:

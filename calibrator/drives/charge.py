@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.compiled import compiled
-from calibrator.drive import Array, Channel, Mask
-from calibrator.drives.align import good_samples
+from calibrator.drive import Array, Channel, Mask, good_samples
 
 __all__ = ["Band", "ChargeCurve", "charge_curve", "covered"]
 
