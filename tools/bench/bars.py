@@ -42,6 +42,7 @@ class Bars:
             found = measured.loc[measured["name"].str.fullmatch(rows), figure]
             return (float(found.iloc[-1]) if len(found) else np.nan), ""
         table = pd.DataFrame(json.loads((self.results / f"{where}.json").read_text())["figures"])
+        table = table.dropna(subset="x")  # all settings together are a row of their own
         table["row"] = table["series"] + ", " + table["x"].map("{:g}".format)
         table = table[table["row"].str.fullmatch(rows)]
         values, cases = (
