@@ -26,7 +26,7 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.small_drive import BRANCHES, sent_by_core
+from tests.vcan.small_drive import BRANCHES, sent_by_core, true_currents
 
 INSTANTS = 45
 """A multiple of the counter's period, so that a drive may follow itself."""
@@ -42,8 +42,8 @@ def wait_for_correcting(here: Recording) -> None:
 
 def send_branches(database: VehicleDatabase, k: int) -> None:
     """One frame of each branch."""
-    for branch in BRANCHES.values():
-        send("#".join(branch.frame(database, k, 20.0 + 0.02 * k)))
+    for name, current_a in true_currents(0.02 * k).items():
+        send("#".join(BRANCHES[name].frame(database, k, current_a)))
 
 
 @pytest.fixture
