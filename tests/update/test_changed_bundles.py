@@ -10,11 +10,12 @@ import shutil
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
 from tuf.api.metadata import Metadata
 
 from ecu_node.core.status import UnfitError
@@ -25,7 +26,7 @@ from tests.update.repo import Repo
 
 BUNDLES = int(os.environ.get("HV_BUNDLES", "300"))
 AT_A_TIME = min(BUNDLES, 1_000)
-VALUES: tuple[Any, ...] = (None, True, 0, -1, 2**70, 0.5, float("inf"), "", "\u03bc\n", "9" * 5000, [], {})
+VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20) | st.sampled_from(["9" * 5000])
 """What somebody might write in the place of another value."""
 
 
@@ -35,15 +36,18 @@ def files_of(bundle: bytes) -> dict[str, str]:
 
 def signed_in(bundle: bytes) -> dict[str, Any]:
     """What is signed in the metadata that counts; a space between two values changes nothing of it."""
-    names = [name for name in files_of(bundle) if name.startswith("metadata") and "root" not in name]
-    return {name: Metadata.from_bytes(files_of(bundle)[name].encode()).signed for name in names}
+    names = {
+        name: text for name, text in files_of(bundle).items() if name.startswith("metadata") and "root" not in name
+    }
+    return {name: Metadata.from_bytes(text.encode()).signed for name, text in names.items()}
 
 
-def changed_bytes(rng: Random, content: bytes) -> bytes:
+@st.composite
+def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
     """A piece is replaced, cut out, repeated or put in, or the end is missing."""
-    at, length = rng.randrange(len(content)), rng.choice((0, 1, 2, 16, 200, len(content)))
+    at, length = draw(st.integers(0, len(content) - 1)), draw(st.sampled_from((0, 1, 2, 16, 200, len(content))))
     piece = content[at : at + length]
-    return content[:at] + rng.choice((b"", rng.randbytes(rng.randrange(16)), 2 * piece)) + content[at + length :]
+    return content[:at] + draw(st.binary(max_size=16) | st.just(2 * piece)) + content[at + length :]
 
 
 def places(value: Any) -> Iterator[tuple[Any, Any]]:
@@ -53,30 +57,34 @@ def places(value: Any) -> Iterator[tuple[Any, Any]]:
         yield from places(value[key])
 
 
-def changed_json(rng: Random, text: str) -> str:
+@st.composite
+def changed_json(draw: st.DrawFn, text: str) -> str:
     """A value is changed, removed, or put in the place of another."""
     document = json.loads(text)
-    (container, key), (other, other_key) = rng.choices([*places(document)], k=2)
-    if rng.random() < 0.5:
-        container[key] = rng.choice((*VALUES, json.loads(json.dumps(other[other_key]))))
+    (container, key), (other, other_key) = (draw(st.sampled_from([*places(document)])) for _ in range(2))
+    if draw(st.booleans()):
+        container[key] = draw(VALUES | st.just(json.loads(json.dumps(other[other_key]))))
     else:
         del container[key]
     return json.dumps(document)
 
 
-def changed_bundle(rng: Random, first: bytes, second: bytes) -> bytes:
+@st.composite
+def changed_bundles(draw: st.DrawFn, first: bytes, second: bytes) -> bytes:
     """The second bundle, changed as it is or in one of its files, which may also be that of the first bundle."""
     old, files = files_of(first), files_of(second)
-    name, kind = rng.choice(sorted(files)), rng.choice(("bundle", "bytes", "json", "old"))
+    name, kind = draw(st.sampled_from(sorted(files))), draw(st.sampled_from(("bundle", "bytes", "json", "old", "none")))
     if kind == "bundle":
-        return changed_bytes(rng, second)
-    if kind == "bytes":
-        files[name] = changed_bytes(rng, files[name].encode()).decode(errors="replace")
+        return draw(changed_bytes(second))
+    if kind == "none":
+        del files[name]
+    elif kind == "bytes":
+        files[name] = draw(changed_bytes(files[name].encode())).decode(errors="replace")
     elif kind == "json":
-        files[name] = changed_json(rng, files[name])
+        files[name] = draw(changed_json(files[name]))
     else:
         kin = [text for key, text in old.items() if key.partition(".")[2] == name.partition(".")[2]]
-        files[name] = rng.choice(kin or sorted(old.values()))
+        files[name] = draw(st.sampled_from(kin or sorted(old.values())))
     packed = json.dumps(files, ensure_ascii=False).encode(errors="replace")
     return lzma.compress(packed, check=lzma.CHECK_SHA256, preset=0)  # as bundle_bytes, but quickly
 
@@ -90,17 +98,22 @@ def test_changed_bundle_is_refused_in_one_line_and_changes_nothing(
     first = repo.bundle().read_bytes()
     repo.offer(other)
     second, bundle, held = repo.bundle().read_bytes(), tmp_path / "v1.json.xz", (state / "state.json").read_bytes()
-    for seed in range(part * AT_A_TIME, (part + 1) * AT_A_TIME):
-        content = changed_bundle(Random(seed), first, second)
+
+    @settings(max_examples=AT_A_TIME, suppress_health_check=[HealthCheck.too_slow])
+    @given(content=changed_bundles(first, second))
+    def require_refused(content: bytes) -> None:
+        assume(content not in (first, second))
         bundle.write_bytes(content)
         try:
             update(state, str(bundle), database, datetime.now(UTC))
         except UnfitError as error:
             said.append(str(error))
-            assert said[-1].isprintable(), f"more than one line, seed {seed}"
-            assert (state / "state.json").read_bytes() == held, f"changed, seed {seed}"
+            assert said[-1].isprintable(), "more than one line"
+            assert (state / "state.json").read_bytes() == held
         else:
             (state / "state.json").write_bytes(held)
-            assert signed_in(content) == signed_in(second), f"accepted, seed {seed}"
+            assert signed_in(content) == signed_in(second), "accepted"
+
+    require_refused()
     for words in ("not a whole bundle", "was signed by", "older than", "is not in the bundle", "Failed to deserialize"):
         assert any(words in text for text in said), f"no change came as far as {words!r} in part {part}"

@@ -1,5 +1,6 @@
 """Updates from an honest repository: our own checks, revocation, time, and damaged files."""
 
+import lzma
 import math
 import os
 import subprocess
@@ -23,6 +24,7 @@ from ecu_node.errors import UserError
 from ecu_node.parameters import FileReference, VehicleParameters
 from ecu_node.update.client import update
 from ecu_node.update.signers import public_key_of
+from ecu_node.update.sources import open_source
 from ecu_node.update.state import ParameterSet, add_decision, read_state
 from ecu_node.update.store import conclude, end_expired
 from tests.ecu_node.processes import Done
@@ -149,6 +151,14 @@ def test_same_set_with_a_later_expiry_needs_no_trial(
     assert held_set(state).expires > datetime.now(UTC) + timedelta(days=799)
 
 
+def test_dry_run_of_an_update_writes_nothing(repo: Repo, new: Path) -> None:
+    before = {path.name: path.read_bytes() for path in new.iterdir()}
+    code, out, _ = repo.update(new, None, "--dry-run")
+    assert code == 0
+    assert out.startswith("dry run, nothing is changed: on trial: parameter set 300")
+    assert {path.name: path.read_bytes() for path in new.iterdir()} == before
+
+
 def test_expired_set_ends(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
@@ -245,6 +255,20 @@ def test_flipped_bit_in_the_state_is_detected(state: Path) -> None:
         (state / "state.json").write_bytes(damaged)
         with pytest.raises(TrustError, match="damaged"):
             read_state(state)
+
+
+def test_change_of_any_byte_of_a_bundle_is_detected(repo: Repo, new: Path) -> None:
+    """Each byte of head and tail, and every seventh between, is changed, or is the last one of a cut bundle."""
+    content, path = repo.bundle().read_bytes(), repo.folder / "changed"
+    places = sorted({*range(64), *range(0, len(content), 7), *range(len(content) - 64, len(content))})
+    weak = lzma.compress(lzma.decompress(content))  # whole, but checked by CRC-64 alone
+    changed = [content[:k] + bytes([content[k] ^ 1 << k % 8]) + content[k + 1 :] for k in places]
+    for item in (*changed, *(content[:length] for length in places), content + b"\0", content + content, weak):
+        path.write_bytes(item)
+        with pytest.raises(TrustError, match="not a whole bundle") as caught:
+            open_source(str(path))
+        assert str(caught.value).isprintable()
+    repo.refused(new, "not a whole bundle", path)
 
 
 def test_unusable_source_or_state_is_reported_in_one_line(repo: Repo, state: Path) -> None:
