@@ -21,6 +21,8 @@ from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.parameters import JunctionResidual
 from tests.ecu_node.vehicles import (
     BATTERY,
+    HEATER,
+    MOTOR,
     NET,
     PAIR,
     SMALL_DBC,
@@ -32,9 +34,7 @@ from tests.ecu_node.vehicles import (
     corrector_for,
     damaged,
     decoded,
-    drive,
     frame_of,
-    motor,
     parameters_for,
     passed_on,
     protected,
@@ -42,6 +42,10 @@ from tests.ecu_node.vehicles import (
 )
 
 STATUS, DCDC = FrameKey(0x5F0, False), FrameKey(0x140, False)
+
+
+def motor(database: VehicleDatabase, counter: int, current: float = 100.0) -> Frame:
+    return Frame(MOTOR, protected(database, "HV_Motor", counter, MotorCurrent=current))
 
 
 def status_of(database: VehicleDatabase, corrector: Corrector, now_s: float) -> dict[str, Any]:
@@ -110,6 +114,41 @@ def test_status_is_starting_until_branches_arrive_then_correcting(database: Vehi
 
 TAKE: dict[Mode, Callable[[Corrector, Frame, float], object]] = {Mode.OVERLAY: answers, Mode.GATEWAY: passed_on}
 """What a node of either mode does with a frame."""
+Current = float | Callable[[int], float]
+"""Of all frames, or of each by its number. [A]"""
+
+
+def drive(
+    database: VehicleDatabase,
+    corrector: Corrector,
+    start_s: float,
+    end_s: float,
+    *,
+    silent: Collection[str] = (),
+    battery_a: Current = 80.0,
+    motor_a: Current = 60.0,
+    period_s: float = 0.05,
+    spoil: int = 0,
+    **more: float,
+) -> list[Quality]:
+    """Battery and motor frames, and a look after each pair; some may be silent, every so many of the battery damaged.
+
+    Further signals are those of the battery's message. Returns the qualities of the answers to the battery.
+    """
+    qualities = []
+    for k in range(round(start_s / period_s), round(end_s / period_s)):
+        battery_now_a, motor_now_a = (item(k) if callable(item) else item for item in (battery_a, motor_a))
+        if "battery" not in silent:
+            frame = battery(database, k % 15, battery_now_a, **more)
+            found = answers(corrector, damaged(frame) if spoil and k % spoil == 0 else frame, k * period_s)
+            values = [decoded(database, "HV_BatteryCorrected", answer.data) for answer in found]
+            qualities += [item["BatteryCurrentQuality"] for item in values]
+        if "motor" not in silent:
+            answers(corrector, motor(database, k % 15, motor_now_a), k * period_s)
+        corrector.look((k + 0.5) * period_s)
+    return qualities
+
+
 balanced = partial(drive, battery_a=100.0, motor_a=100.0)
 
 
@@ -122,7 +161,13 @@ BOTH, LATE = ("battery", "motor"), ("motor",)
     "phases",
     [
         [(1.0, (), CORRECTING), (0.5, LATE, STALE), (1.5, (), STALE)],
-        [(1.0, (), CORRECTING), (0.5, LATE, STALE), (1.5, BOTH, STALE), (6.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
+        [
+            (1.0, (), CORRECTING),
+            (0.5, LATE, STALE),
+            (1.5, BOTH, STALE),
+            (6.0, BOTH, ASLEEP),
+            (1.0, (), CORRECTING),
+        ],
         [(2.9, LATE, STARTING), (0.4, LATE, STALE)],
         [(10.0, BOTH, STARTING), (1.0, (), CORRECTING), (2.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
     ],
@@ -184,12 +229,16 @@ def test_only_the_last_frames_are_remembered(database: VehicleDatabase) -> None:
 
     source = corrector_for(database, battery=(0.25, 5.0)).sources[BATTERY]
     (branch,) = source.branches
-    payloads = [Payload(battery(database, k % 15).data) for k in range(1 + REMEMBERED_FRAMES)]
-    first = ref(payloads[0])
-    for k in range(1 + REMEMBERED_FRAMES):
-        source.answer(payloads.pop(0), 0.01 * k)
-        assert branch.time_s == pytest.approx(0.01 * k)
-    assert first() is None
+    data = [battery(database, counter).data for counter in range(15)]
+    first = Payload(data[0])
+    is_kept = ref(first)
+    source.answer(first, 0.0)
+    del first
+    assert is_kept()
+    for k in range(1, 1 + REMEMBERED_FRAMES):
+        assert branch.time_s == pytest.approx(0.01 * (k - 1))
+        source.answer(bytearray(data[k % 15]), 0.01 * k)
+    assert not is_kept()
     assert len([*branch.newest_first()]) == REMEMBERED_FRAMES
 
 
@@ -236,7 +285,9 @@ WATCHED = '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
 
 
 @pytest.mark.parametrize(("contactor", "reason"), [(1, Reason.NONE), (2, Reason.CORRECTION_WORSE)])
-def test_sum_is_judged_only_in_valid_states(make_database: MakeDatabase, contactor: int, reason: Reason) -> None:
+def test_junction_sum_is_judged_only_in_the_valid_states_of_the_watch(
+    make_database: MakeDatabase, contactor: int, reason: Reason
+) -> None:
     own = whole_vehicle(make_database, WATCHED)
     corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
     balanced(own, corrector, 0.0, 12.0, ContactorState=contactor)
@@ -258,7 +309,9 @@ def test_missing_input_of_the_watch_is_reported(make_database: MakeDatabase) -> 
 @pytest.mark.parametrize(
     ("key", "value"), [("[watch] valid", "4"), ("[watch] valid", "-1"), ("[contactor] open", "0.5")]
 )
-def test_layout_with_an_impossible_input_value_is_refused(make_database: MakeDatabase, key: str, value: str) -> None:
+def test_layout_with_an_impossible_value_of_an_input_is_refused(
+    make_database: MakeDatabase, key: str, value: str
+) -> None:
     name = key.partition(" ")[2]
     words = rf"{re.escape(key)}: {value} is no value of HV_Battery\.ContactorState, which has 2 bits"
     with pytest.raises(LayoutError, match=words):
@@ -297,7 +350,10 @@ def test_junction_sum_is_judged_relative_to_the_expected_sum(
 
 @pytest.mark.parametrize(
     ("drift", "base_a", "swing_a", "motor_a", "stuck"),
-    [(0.1, 100.0, 50.0, 60.0, ("motor",)), (-0.2, 0.0, 10.0, 0.0, ())],
+    [
+        (0.1, 100.0, 50.0, 60.0, ("motor",)),
+        (-0.2, 0.0, 10.0, 0.0, ()),
+    ],
     ids=["stuck", "at rest"],
 )
 def test_branch_is_stuck_if_it_stays_constant_while_the_sum_moves(
@@ -395,6 +451,17 @@ def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDa
     assert corrector.branches[2].currents_at(0.9) is None, "nor one near zero"
 
 
+@pytest.mark.parametrize(("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")])
+def test_scale_given_both_in_the_unit_and_as_factor_is_applied_once(
+    make_database: MakeDatabase, scale: str, unit: str
+) -> None:
+    dbc = SMALL_DBC.replace('(1,0) [0|60000] "W"', f'({scale},0) [0|60000] "{unit}"')
+    corrector = corrector_for(make_database(SMALL_LAYOUT, dbc), heater=(0.0, 0.0))
+    answers(corrector, Frame(HEATER, (80).to_bytes(4, "little")), 0.0)
+    answers(corrector, Frame(NET, (40_000).to_bytes(2, "little")), 0.0)
+    assert corrector.branches[2].currents_at(0.0) == pytest.approx((-10.0, -10.0))
+
+
 def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_database: MakeDatabase) -> None:
     """Until it is stale, it is repeated in each answer to the other branches of its message."""
     layout = SMALL_LAYOUT.replace('"Net.Voltage"', '"Net.Voltage", corrected = "PairOut.Heater"')
@@ -432,7 +499,11 @@ def test_a_signal_beyond_the_end_of_its_frame_is_invalid(make_database: MakeData
 
 
 MOTOR_SNA = '512 Motor -32768 "SNA"'
-PAGED_QUALITY = ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1'
+INIT = (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"')
+PAGE = (" SG_ Quality", ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1')
+OWN_E2E = '\n[e2e]\nprofile = "P01"\nmessages = ["PairOut"]\n'
+LOOP = ("PairOut.Motor", "Pair.Spare")
+SPARE = (" SG_ Battery", ' SG_ Spare : 48|16@1- (1,0) [0|0] "A" Node\n SG_ Battery')
 OWN_STATUS = '\n[status]\nmessage = "Own"\nstate = "State"\nreason = "Reason"\n'
 OTHER_SENDER = (
     SMALL_DBC.replace("Node Corrector", "Node Corrector Other")
@@ -446,39 +517,33 @@ WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1-
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("8 Corrector", "8 Node", r"small\.dbc has PairOut by Node; all corrected"),
-        ("Motor : 16|16", "Motor : 15|16", "PairOut.Motor is written twice"),
-        ("Quality : 32|2", "Quality : 64|2", "Quality ends in byte 9"),
-        ("Quality : 32|2", "Quality : 32|1", "Quality holds at most 1; 3 must fit"),
-        (" SG_ Quality", PAGED_QUALITY, "PairOut.Quality is multiplexed; what the node sends .* in every frame"),
-        (MOTOR_SNA, '512 Motor 32767 "Max"', "Motor needs a code named SNA"),
-        (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"', "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
-        (MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"', r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'"),
-    ],
-)
-def test_dbc_disturbing_the_bus_is_refused(make_database: MakeDatabase, old: str, new: str, words: str) -> None:
-    with pytest.raises((LayoutError, DatabaseError), match=words):
-        corrector_for(make_database(dbc=SMALL_DBC.replace(old, new)))
-
-
-@pytest.mark.parametrize(
     ("layout", "dbc", "words"),
     [
-        (
-            SMALL_LAYOUT.replace("PairOut.Motor", "Pair.Spare"),
-            SMALL_DBC.replace(" SG_ Battery", ' SG_ Spare : 48|16@1- (1,0) [0|0] "A" Node\n SG_ Battery'),
-            "Pair would be both received and sent",
-        ),
+        (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC.replace(*SPARE), "Pair would be both received and sent"),
+        (SMALL_LAYOUT, SMALL_DBC.replace("8 Corrector", "8 Node"), r"small\.dbc has PairOut by Node; all corrected"),
         (SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER, "PairOut by Corrector, Own by Other; all corrected values and the"),
-        (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
-        (SMALL_LAYOUT + OWN_SUM, WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n', "code 3 of signal Sum means .* beyond 0.2"),
+        (SMALL_LAYOUT, SMALL_DBC.replace("Motor : 16|16", "Motor : 15|16"), "PairOut.Motor is written twice"),
+        (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 64|2"), "Quality ends in byte 9"),
+        (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
         (
-            f'{SMALL_LAYOUT}\n[e2e]\nprofile = "P01"\nmessages = ["PairOut"]\n',
-            SMALL_DBC,
-            "PairOut.Battery is written twice, or overlaps .*, or the E2E header",
+            SMALL_LAYOUT,
+            SMALL_DBC.replace(*PAGE),
+            "PairOut.Quality is multiplexed; what the node sends .* in every frame",
         ),
+        (SMALL_LAYOUT, SMALL_DBC.replace(MOTOR_SNA, '512 Motor 32767 "Max"'), "Motor needs a code named SNA"),
+        (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
+        (
+            SMALL_LAYOUT + OWN_SUM,
+            WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n',
+            "code 3 of signal Sum means 'SNA', .* beyond 0.2",
+        ),
+        (SMALL_LAYOUT, SMALL_DBC.replace(*INIT), "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
+        (
+            SMALL_LAYOUT,
+            SMALL_DBC.replace(MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"'),
+            r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'",
+        ),
+        (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery is written twice, or overlaps .*, or the E2E header"),
     ],
 )
 def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layout: str, dbc: str, words: str) -> None:
@@ -547,6 +612,36 @@ def test_branch_of_a_frozen_control_unit_becomes_stale(make_database: MakeDataba
         take(corrector, motor(own, k % 15, 100.0 + k % 2), 0.02 * k)
         corrector.look(0.02 * k)
     assert (used, corrector.latched, corrector.latched_branches) == (51, Reason.BRANCH_STALE, ("battery",))
+
+
+@pytest.mark.parametrize(
+    ("faulty", "name", "corrected_a", "quality"),
+    [
+        ("battery", "battery", (100.0 - 5.0) / 1.25, Quality.CORRECTED),
+        ("motor", "motor", -(-100.0 - 5.0) / 1.25, Quality.CORRECTED),
+        ("battery", "motor", 100.0, Quality.PASSED_THROUGH),
+    ],
+)
+def test_answer_is_corrected_if_parameters_name_the_branch(
+    database: VehicleDatabase, faulty: str, name: str, corrected_a: float, quality: Quality
+) -> None:
+    """Offsets are positive into the junction, the motor's signal is positive out of it."""
+    corrector = corrector_for(database, **{faulty: (0.25, 5.0)})
+    frame = battery(database, 3) if name == "battery" else motor(database, 3)
+    assert published(database, corrector, frame, 0.0, name) == (corrected_a, quality)
+    ((key, data),) = [(answer.key, answer.data) for answer in corrector.sources[frame.key].targets]
+    assert key == FrameKey(frame.key.identifier + 0x400, False)
+    assert e2e_p01_check(bytearray(data), key.identifier)
+
+
+@pytest.mark.parametrize("window_s", [1.0, 60.0])
+def test_watch_window_of_any_length_works_at_ten_looks_per_second(make_database: MakeDatabase, window_s: float) -> None:
+    own = whole_vehicle(make_database, f"\n[watch]\nwindow_s = {window_s}\n")
+    corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
+    balanced(own, corrector, 0.0, 0.85 * window_s, period_s=0.1)
+    assert corrector.state()[1] == Reason.NONE
+    balanced(own, corrector, 0.85 * window_s, window_s + 0.5, period_s=0.1)
+    assert corrector.state()[1] == Reason.CORRECTION_WORSE
 
 
 @pytest.mark.parametrize(("old", "new"), [("8 Corrector", "8 Vector__XXX"), ("8 Other", "8 Corrector")])

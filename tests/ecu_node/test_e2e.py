@@ -1,7 +1,7 @@
 """End-to-end protection: accepted and rejected frames; independent libraries find the frames intact."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pytest
@@ -104,6 +104,13 @@ def test_protection_writes_only_the_bits_of_crc_and_counter(kind: str, protectio
     assert {Receiver(protection).check(bytearray(size)) for size in range(len(header))} == {Check.CORRUPT}
 
 
+def test_corrupt_frame_changes_neither_counter_nor_initial_state(protection: Protection) -> None:
+    (first, second), receiver = stream(protection, 2), Receiver(protection)
+    found = [(receiver.check(frame), receiver.state) for frame in (damaged(first), first, damaged(second), second)]
+    ok, corrupt = (Check.OK, E2EState.VALID), (Check.CORRUPT, E2EState.VALID)
+    assert found == [(Check.CORRUPT, E2EState.INIT), ok, corrupt, ok]
+
+
 def test_any_flipped_bit_is_detected_and_sealing_keeps_the_counter(protection: Protection) -> None:
     (frame,) = stream(protection, 1)
     for bit in range(8 * SIZE):
@@ -173,6 +180,15 @@ def test_manufacturer_crc_covers_the_bytes_described_in_the_layout(
     assert Receiver(protection).check(frame) is (Check.OK if is_code else Check.CORRUPT), "its CRC is right"
 
 
+@pytest.mark.parametrize("first", [0, -1, -6, -8, -14])
+def test_repeats_gaps_and_jumps_are_detected_across_counter_overflow(protection: Protection, first: int) -> None:
+    frames = stream(protection, 17, first=protection.modulus + first)
+    check = Receiver(protection).check
+    found = [check(frames[k]) for k in (5, 5, 6, 9, 10, 14, 15, 16)]
+    ok, jump = Check.OK, Check.JUMPED
+    assert found == [ok, Check.REPEATED, ok, Check.LOST, ok, jump, ok, ok]
+
+
 @pytest.mark.parametrize(
     ("kind", "counter"), [("P04", 0x0100), ("P04", 0x0101), ("P07", 0x0101), ("P07", 0x010001), ("P07", 0x01000000)]
 )
@@ -185,14 +201,31 @@ def test_every_byte_of_a_multi_byte_counter_is_compared(protection: Protection, 
 # ---- the message as a whole
 
 
-def test_each_state_has_the_window_of_the_layout(protect: Callable[..., Protection]) -> None:
-    windows = [{"window": 6, "min_ok": 3, "max_error": 2}, {"window": 5, "min_ok": 2, "max_error": 1}]
-    windows.append({"window": 4, "min_ok": 1, "max_error": 0})
-    entries = (
-        f"{name} = {{ {', '.join(f'{key} = {n}' for key, n in window.items())} }}"
-        for name, window in zip(("init", "valid", "invalid"), windows, strict=True)
-    )
-    assert [*protect(ENTRIES["P01"] + "\n" + "\n".join(entries)).windows] == [E2EWindow(**window) for window in windows]
+@pytest.mark.parametrize(
+    ("windows", "sent", "spoilt", "states"),
+    [
+        (
+            "valid = { window = 6, min_ok = 1, max_error = 2 }\ninvalid = { window = 4, min_ok = 3, max_error = 0 }",
+            *(range(20), (12, 13, 14), "VVVVVVVVVVVVVVXXXXVV"),  # the third error of six; then four without one
+        ),
+        (
+            "init = { window = 4, min_ok = 3, max_error = 1 }\nvalid = { window = 4, min_ok = 4, max_error = 0 }",
+            *(range(0, 20, 2), (2,), "IIIVXVVVVV"),
+        ),
+        ("valid = { window = 5, min_ok = 1, max_error = 2 }", [0] * 6, (), "VVVVVX"),
+    ],
+    ids=["corrupt frames are errors", "lost frames are not errors", "repeated frames are not intact"],
+)
+def test_e2e_state_follows_the_windows_of_recent_frames(
+    kind: str, protect: Callable[..., Protection], windows: str, sent: Sequence[int], spoilt: Sequence[int], states: str
+) -> None:
+    """Initial, valid, or invalid (X) after each frame that was sent, by its place in a stream."""
+    protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
+    receiver, frames, found = Receiver(protection), stream(protection, 20), ""
+    for place in sent:
+        receiver.check(damaged(frames[place]) if place in spoilt else frames[place])
+        found += {E2EState.INIT: "I", E2EState.VALID: "V", E2EState.INVALID: "X"}[receiver.state]
+    assert found == states
 
 
 WINDOW = st.integers(1, 12).flatmap(  # a layout asks for no more intact frames than the window has

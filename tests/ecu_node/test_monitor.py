@@ -205,3 +205,14 @@ def test_monitor_draws_a_table_in_a_terminal_and_exits_with_0_on_ctrl_c() -> Non
     assert first[0] == f"virtual {CHANNEL}: no node on this bus"
     assert len(first) == 6
     assert max(map(len, first)) <= 60
+
+
+def test_latency_is_measured_from_a_frame_to_its_answer_on_the_bus(bus: Bus) -> None:
+    assert bus.monitor.look(0.0)["latency_us"] is None
+    for k in range(10):
+        bus.pair("Battery", 0.02 * k, 100.0, 95.0)
+    assert bus.monitor.look(0.2)["latency_us"]["max"] == 1000
+    assert "from a frame to its answer [us]: p50 1000, p99.9 1000, max 1000" in bus.lines(0.2)
+    bus.pair("Battery", 0.5, 100.0)
+    bus.pair("Battery", 3.0, 100.0, 95.0)
+    assert bus.monitor.look(3.0)["latency_us"]["max"] == 1000, "a frame that nobody answered"

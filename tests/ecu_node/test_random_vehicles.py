@@ -12,6 +12,7 @@ import pytest
 
 from bench.c_core import frames
 from ecu_node.bus.wiring import Mode
+from ecu_node.core.corrector import Source
 from tests.ecu_node.oracle import require_right
 from tests.ecu_node.random_vehicles import draw_vehicle
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
@@ -65,3 +66,20 @@ def test_every_code_of_8_bits_matches_the_oracle_beside_any_other_bits(
         for battery, motor in ((code, 77), (77, code))
     ]
     require_right(database, parameters, mode, [(256, data) for data in frames_of_pair])
+
+
+@pytest.mark.parametrize(("mode", "method"), [(Mode.OVERLAY, "answer"), (Mode.GATEWAY, "forward")])
+def test_oracle_detects_a_wrong_bit(monkeypatch: pytest.MonkeyPatch, mode: Mode, method: str, tmp_path: Path) -> None:
+    right = getattr(Source, method)
+
+    def damaged(source: Source, payload: bytearray, now_s: float) -> object:
+        made = right(source, payload, now_s)
+        for item in [made] if isinstance(made, bytearray) else [target.data for target in made or ()]:
+            item[0] ^= 1
+        return made
+
+    monkeypatch.setattr(Source, method, damaged)
+    database, parameters = draw_vehicle(Random(0), tmp_path)
+    drawn = [(identifier, data) for identifier, data in frames(database, Random(0), 500) if data is not None]
+    with pytest.raises(AssertionError, match=rf"{mode.name.lower()}, frame \d+: .* -> .*#.*: "):
+        require_right(database, parameters, mode, drawn)
