@@ -250,6 +250,8 @@ def learn_fleet(
     ordered = [branches[k] for k in order]
     balanced = _balanced(stack_summaries(summaries, order), ordered)
     used, summaries = np.flatnonzero(balanced).tolist(), list(compress(summaries, balanced))
+    if not summaries:
+        raise FleetError("the currents of no vehicle balance; check signs and units of the branches")
     readings = None if readings is None else readings[:, :, balanced]
     fleet = stack_summaries(summaries, order)
     feed = int(np.argmax(np.median(fleet.mean_a, axis=0)))

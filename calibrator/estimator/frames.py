@@ -54,6 +54,8 @@ FINEST_PERIOD_S = 0.1
 """Shortest time base of data frames without a layout: that of logs. [s]"""
 LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
 """Currents that never reach the former share of full scale, or go beyond the latter, are in another unit. [1]"""
+OTHER_SPACING = 20.0
+"""Row spacing of the fleet over that of a frame from which on the latter's time is in another unit. [1]"""
 OTHER_UNIT = 100.0
 """Largest current of the median vehicle over that of this one, from which on the latter is in another unit. [1]"""
 
@@ -79,7 +81,7 @@ def is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
 def names_of(given: Any, what: str) -> tuple[str, ...]:
     """Return the names in a list or the like (a set is sorted), numbers as strings; FleetError on anything else."""
     listed = isinstance(given, Collection) and not isinstance(given, (str, bytes, Mapping))
-    names = tuple(map(str, sorted(given) if isinstance(given, Set) else given)) if listed else ("",)
+    names = tuple(map(str, sorted(map(str, given)) if isinstance(given, Set) else given)) if listed else ("",)
     require(all(name.strip() for name in names), what, given, "a list of names, such as ['one', 'other']")
     return names
 
@@ -269,9 +271,11 @@ def _recordings(frames: Mapping[str, Any]) -> list[_Recording]:
     """List the frames of all vehicles."""
     if not isinstance(frames, Mapping) or not frames:
         raise FleetError(f"{type(frames).__name__} without vehicles: expected data frames by vehicle, {{'V1': frame}}")
-    found = []
+    found: list[_Recording] = []
     for vehicle, given in ((str(key), given) for key, given in frames.items()):
         require_plain_name(vehicle, "vehicle")
+        if any(vehicle == each.vehicle for each in found):
+            raise FleetError(f"vehicle {vehicle} is there twice; give all of its frames as one list")
         drives = [given] if isinstance(given, pd.DataFrame) else given
         if not isinstance(drives, Sequence) or not drives:
             raise FleetError(f"vehicle {vehicle}: {type(given).__name__} given; expected a DataFrame or a list of them")
@@ -339,7 +343,9 @@ def _seconds(frame: pd.DataFrame, where: str) -> Array:
     if isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex)):
         index = (index - index[0]).total_seconds()
     time_s = index.to_numpy(np.float64)
-    rises = np.diff(time_s) > 0.0  # false for NaN
+    if not np.isfinite(time_s).all():
+        raise DriveError(f"{where}: {int((~np.isfinite(time_s)).sum())} rows without a time; remove them")
+    rises = np.diff(time_s) > 0.0
     if not rises.all():
         row = int(np.argmin(rises))
         raise DriveError(
@@ -353,6 +359,7 @@ def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: flo
     """Return the time base: that of the layout, or the usual spacing of rows, which must not be too wide. [s]"""
     layout = junction.layout
     spacing_s = {where: float(np.median(np.diff(time_s))) for where, time_s in times.items()}
+    usual_s = float(np.median([*spacing_s.values()]))
     most_s, why = coarsest_s, f"expected {coarsest_s:g} s at most; if the index is not in seconds, convert it"
     if layout is not None:
         most_s = min(layout.max_age_s, *(branch.timeout_s for branch in layout.branch))
@@ -361,11 +368,11 @@ def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: flo
             f"Junction(branches=..., full_scale_a=...)"
         )
     for where, row_s in spacing_s.items():
-        if row_s > most_s + TIME_RESOLUTION_S:
+        if OTHER_SPACING * row_s < usual_s:
+            why = f"and those of the fleet {usual_s:.3g} s; if the index is not in seconds, convert it"
+        if row_s > most_s + TIME_RESOLUTION_S or OTHER_SPACING * row_s < usual_s:
             raise FleetError(f"{where}: rows are {row_s:.3g} s apart, {why}")
-    if layout is not None:
-        return layout.period_s
-    return max(round(float(np.median([*spacing_s.values()])), 6), FINEST_PERIOD_S)
+    return max(round(usual_s, 6), FINEST_PERIOD_S) if layout is None else layout.period_s
 
 
 def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
@@ -422,6 +429,8 @@ def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction) 
     largest_a = np.array([[np.abs(value).max() for value in _currents_a(mine, junction)] for mine in drives.values()])
     small = largest_a < LEAST_OF_SCALE * scale_a
     tiny = small & (small.all(axis=1, keepdims=True) | (np.median(largest_a, axis=0) > OTHER_UNIT * largest_a))
+    if len(drives) > 1:
+        tiny |= small & small.all(axis=0)
     for j, k in np.argwhere(tiny | (largest_a > MOST_OF_SCALE * scale_a)).tolist():
         unit = "kA: multiply by 1000" if tiny[j, k] else "mA: divide by 1000"
         raise DriveError(

@@ -197,18 +197,22 @@ def read_bench_table(
     bench: dict[tuple[str, str], BenchReading] = {}
     text, where = (source, "readings") if isinstance(source, str) else (_text(source), str(source))
     rows = csv.DictReader(text.splitlines(), skipinitialspace=True, restval="")
-    rows.fieldnames = header = [name.strip() for name in rows.fieldnames or ()]
+    try:
+        rows.fieldnames = header = [name.strip() for name in rows.fieldnames or ()]
+        lines = [(cells, rows.line_num) for cells in rows]
+    except csv.Error as error:
+        raise FleetError(f"{where}: line {rows.line_num}: not a table of bench readings: {error}") from None
     complete = {"vehicle", "branch"} <= set(header) <= set(COLUMNS) and len(set(header)) == len(header)
     if not complete or not any(set(pair) <= set(header) for pair in PAIRS):
         raise FleetError(
             f"{where}: columns {', '.join(header) or 'none'}; expected each of {', '.join(COLUMNS)} once, one pair of "
             f"the last four may be left out"
         )
-    for cells in rows:
+    for cells, number in lines:
         if not any(cells.values()):
             continue
         # rows of a data frame count from 0, without the header
-        place = f"{where}: row {rows.line_num - 2}" if isinstance(source, str) else f"{where}: line {rows.line_num}"
+        place = f"{where}: row {number - 2}" if isinstance(source, str) else f"{where}: line {number}"
         if None in cells:
             raise FleetError(f"{place}: more cells than the {len(header)} columns of the header")
         row = {name: cell.strip() for name, cell in cells.items()}
@@ -247,6 +251,8 @@ def _reading(row: Mapping[str, str], place: str, full_scale_a: float) -> BenchRe
         if not low <= numbers[name] <= high:
             expected = f"a number from {low:g} to {high:g}: {MEANING[name]}"
             raise FleetError(f"{place}: {name} is {row.get(name, '')!r}; expected {expected}")
+    if all(map(math.isnan, numbers.values())):
+        raise FleetError(f"{place}: nothing was read; give drift and drift_sd, or offset_a and offset_sd_a")
     return BenchReading(**numbers)
 
 

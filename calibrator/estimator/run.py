@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from calibrator.compiled import is_compiled
 from calibrator.drive import Equipment, FleetSource
+from calibrator.drives.store import DRIVES_FOLDER
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
 from calibrator.estimator.readings import read_bench_table
@@ -28,7 +29,7 @@ from calibrator.estimator.vehicle_parameters import time_of_run
 from calibrator.files.folders import require_new_folder, whole_folder
 from calibrator.files.storage import Storage, open_storage
 from calibrator.processes.run_many import Workers, run_many
-from calibrator.sources.fleet_source import find_fleet, probe_equipment
+from calibrator.sources.fleet_source import LOGS_FOLDER, find_fleet, probe_equipment
 from calibrator.summaries.identity import FEWEST_BUCKETS, StoreIdentity, read_identity
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.summarise_fleet import add_drives
@@ -93,6 +94,8 @@ def calibrate_fleet(
     UserError
         If the fleet as a whole cannot be calibrated.
     """
+    if settings.branches is not None and since is not None:
+        raise ContradictionError("--branches and --since exclude each other: the earlier result has decided on that")
     require_new_folder(out)
     storage = open_storage(place)
     layout, stored = database.layout, require_fleet(storage, place, database)
@@ -143,7 +146,12 @@ def require_fleet(storage: Storage, place: str | Path, database: VehicleDatabase
 
 
 def _require_summaries_enough(place: str | Path, settings: CalibrationSettings, layout: Layout) -> None:
-    """Refuse options that need the drives."""
+    """Refuse drives beside summaries, as nobody can tell which are meant, and options that need the drives."""
+    if drives := [name for name in (DRIVES_FOLDER, LOGS_FOLDER) if (Path(place) / name).is_dir()]:
+        raise FleetError(
+            f"{place}: holds drives ({few(drives)}) and summaries (summaries.json); move one of them elsewhere, and "
+            f"give the folder of the other"
+        )
     needs = {
         "--method published": settings.method is Method.PUBLISHED,
         "--branches": settings.branches is not None,
@@ -165,6 +173,7 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) 
         from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second)
 
         _require_named(settings, _problems(fleet), f"fleet {fleet.name}")
+        require_learning([*fleet.vehicles], settings, fleet.left_out)
         return calibrate_fleet_published
     names_branches = bool(settings.trusted) and not settings.trusted & fleet.vehicles.keys()
     names_branches = names_branches and settings.trusted <= set(layout.branch_names)
@@ -197,6 +206,7 @@ def _summarised(fleet: FleetSource, folder: str, identity: RunIdentity, workers:
     database, settings, problems = identity.database, identity.settings, _problems(fleet)
     limit_s, scale_a = settings.time_limit_s, database.layout.full_scale_a
     _require_named(settings, problems, f"fleet {fleet.name}")
+    require_learning([*fleet.vehicles], settings, fleet.left_out)
     equipment = probe_equipment(fleet, database, settings.branches, limit_s=limit_s)
     read_bench_table(settings.readings, equipment.branches, problems, trusted=settings.trusted, full_scale_a=scale_a)
     store = open_store(open_storage(folder), equipment, database, fleet)
@@ -290,6 +300,8 @@ def read_sample(
 def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:
     """Raise FleetError if an earlier result was made otherwise than this run, so that the run cannot go on from it."""
     run, layout = read_run(folder), database.layout
+    if not (folder / PARTS).is_dir():
+        raise FleetError(f"{folder / PARTS}: no such folder; give the whole folder that 'calibrator calibrate' wrote")
     for what, was, now in (
         ("method", run.method, Method.POSTERIOR.value),
         ("list of branches", ", ".join(run.branches), ", ".join(store.equipment.branches)),

@@ -6,9 +6,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from calibrator.errors import FleetError
+from calibrator.errors import ContradictionError, FleetError
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.text import counted, few_reasons
+from calibrator.terminal.text import counted, few, few_reasons
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.documents import text_digest
@@ -73,6 +73,11 @@ class CalibrationSettings:
         Share of the vehicles that have a sensor fault, if it is known; None: learnt from the fleet. [1]
     time_limit_s : float
         Longest time to read one vehicle, with either method; a vehicle that takes longer is left out. [s]
+
+    Raises
+    ------
+    ContradictionError
+        If a vehicle is both held out and trusted.
     """
 
     method: Method = Method.POSTERIOR
@@ -87,6 +92,12 @@ class CalibrationSettings:
     harm_limit: float = HARM_LIMIT
     expected_faults: float | None = None
     time_limit_s: float = TIME_LIMIT_S
+
+    def __post_init__(self) -> None:
+        if both := self.hold_out & self.trusted:
+            raise ContradictionError(
+                f"vehicle {few(sorted(both))} is both held out and trusted: the reference would be learnt from it"
+            )
 
     def record(self) -> dict[str, Any]:
         """Return the settings that the method in use takes into account, for the record of a run."""

@@ -79,12 +79,12 @@ def experiment(
         require_possible_folder(out.absolute().parent)
     # recorded trips are read only once, before anything is run
     trips = fleet_for(recorded[0], quick=quick, drives=drives, layout=layout) if recorded else None
-    texts = []
+    texts, made = [], made_now()
     for number, row in enumerate(rows, start=1):
         fleet = trips if row.recorded and trips is not None else fleet_for(row, quick=quick)
         with one_pass(number, len(rows)):
             result = run_experiment(row, fleet, repetitions=repetitions, seed=seed, workers=workers)
-        result = replace(result, made=made_now())
+        result = replace(result, made=made)
         texts.append(result.to_json())
         if not json:
             Console().print(result_table(result))

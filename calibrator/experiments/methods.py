@@ -148,12 +148,16 @@ def require_estimate(method: str, estimate: Estimate, truth: Faults) -> Estimate
     """
     if not isinstance(estimate, Estimate):
         raise FleetError(f"method '{method}': estimate() returned {type(estimate).__name__}, expected an Estimate")
+    if not isinstance(estimate.faults, Faults):
+        raise FleetError(f"method '{method}': faults is {type(estimate.faults).__name__}, expected Faults")
     N, K = truth.drift.shape
     optional = {name: getattr(estimate, name) for name in ("confidence", "drift_sd", "offset_sd_a")}
     arrays = {**vars(estimate.faults), "hardware": estimate.hardware, "corrected": estimate.corrected}
     arrays |= {name: values for name, values in optional.items() if values is not None}
-    for name, values in arrays.items():
-        given, shape = np.asarray(values), (N,) if name in {"hardware_drift", "hardware", "confidence"} else (N, K)
+    for name, given in arrays.items():
+        if not isinstance(given, np.ndarray):
+            raise FleetError(f"method '{method}': {name} is {type(given).__name__}, expected an array of numpy")
+        shape = (N,) if name in {"hardware_drift", "hardware", "confidence"} else (N, K)
         kinds, elements = ("b", "bool") if name in {"hardware", "corrected"} else ("fiu", "finite numbers")
         if given.shape != shape or given.dtype.kind not in kinds or not np.isfinite(given).all():
             raise FleetError(

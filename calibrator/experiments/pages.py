@@ -194,7 +194,7 @@ def draw_result(result: ExperimentResult) -> Figure:
     labels = [_setting_label(experiment, *setting) for setting in settings]
     figure = Figure(figsize=(11.0, 2.0 + max(3.0, 0.3 * len(labels))), layout="constrained")
     figure.suptitle(experiment.title)
-    all_axes = figure.subplots(1, len(experiment.panels), sharey=True)
+    (all_axes,) = figure.subplots(1, len(experiment.panels), sharey=True, squeeze=False)
     handles = {}
     for axes, name in zip(all_axes, experiment.panels, strict=True):
         for number, method in enumerate(result.methods):

@@ -66,7 +66,7 @@ def run_experiment(
         If methods or settings cannot be told apart in a table, the fleet has too few branches or is of the other kind,
         or a method returns what cannot be judged.
     """
-    methods, settings = experiment.methods if methods is None else methods, experiment.settings
+    methods, settings = tuple(experiment.methods if methods is None else methods), experiment.settings
     names, places = [method.name for method in methods], [(setting.series, setting.x) for setting in settings]
     if not names or not places or len({*names}) < len(names) or len({*places}) < len(places):
         raise FleetError(
@@ -78,6 +78,8 @@ def run_experiment(
     if isinstance(fleet, RecordedFleet):  # before anything is run
         fleet.with_branches(max(each.case.branches for each in settings if isinstance(each.case, RecordedCase)))
     repetitions = experiment.repetitions if repetitions is None else repetitions
+    if repetitions < 1:
+        raise FleetError(f"{experiment.name}: {repetitions} repetitions; expected at least 1")
     tasks = [(setting.case, seed + number) for setting in settings for number in range(repetitions)]
     judged = run_many(partial(_run_trial, fleet, methods), tasks, Workers(processes=workers))
     trials = list(shown(judged, experiment.name, len(tasks), "trials"))

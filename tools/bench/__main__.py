@@ -17,7 +17,7 @@ Group = Literal[
     "posterior", "ingest", "fleet_run", "node", "fleet_report", "on_board", "repository", "trust_chain", "cluster"
 ]
 """Modules of this folder with a function ``rows``."""
-OUT = Path("build") / "bench.json"
+OUT = Path(__file__).parents[2] / "build" / "bench.json"
 
 
 def main(group: Annotated[Group | None, typer.Argument()] = None, *, quick: bool = False, out: Path = OUT) -> None:
