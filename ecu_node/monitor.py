@@ -7,7 +7,6 @@ Currents are positive into the junction. Times are those of one steady clock. [s
 """
 
 import json
-import math
 import os
 import shutil
 import signal
@@ -15,9 +14,8 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -38,22 +36,28 @@ View = dict[str, Any]
 """What is shown at one instant; its keys are those of ``monitor --json``, see :meth:`BusMonitor.look`."""
 
 _RATE_WINDOW_S = 2.0
-"""Frame rates are means over this long. [s]"""
+"""Frame rates are means over about this long. [s]"""
 _LONGEST_LATENCY_S = 1.0
 """A frame that was not answered within this time counts as never answered. [s]"""
 _FAULTS = {Check.CORRUPT: "corrupt", Check.REPEATED: "repeated", Check.LOST: "lost", Check.JUMPED: "lost"}
 
 
 class _HeardMessage:
-    """A message of the DBC as it is heard: its last usable frames, and its faults."""
+    """A message of the DBC as it is heard: its intact frames, its faults, and its rate."""
 
-    def __init__(self, protection: Protection | None) -> None:
+    def __init__(self, protection: Protection | None, start_s: float) -> None:
         self._check = Receiver(protection).check if protection is not None else lambda _: Check.OK
+        self._count, self._counts = 0, deque([(start_s, 0)])
         self.frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
+        """Times [s] and payloads of the last intact frames."""
         self.faults = dict.fromkeys(_FAULTS.values(), 0)
+        self.answered_by: list[_HeardMessage] = []
+        self.unanswered: deque[tuple[float, _HeardMessage]] = deque(maxlen=REMEMBERED_FRAMES)
+        """Frames that this message has not answered yet: when each came [s], and its message."""
 
     def take(self, payload: bytearray, time_s: float) -> bool:
         """Take a frame; return whether it is used: only if it is intact, new, and its counter did not jump."""
+        self._count += 1
         found = self._check(payload)
         if found in _FAULTS:
             self.faults[_FAULTS[found]] += 1
@@ -61,6 +65,15 @@ class _HeardMessage:
             return False
         self.frames.append((time_s, payload))
         return True
+
+    def rate_hz(self, now_s: float) -> float:
+        """Return the mean rate of its frames, intact or not, since the latest call at least two seconds ago. [1/s]"""
+        counts = self._counts
+        while len(counts) > 1 and counts[1][0] <= now_s - _RATE_WINDOW_S:
+            counts.popleft()
+        counts.append((now_s, self._count))
+        since_s, before = counts[0]
+        return (self._count - before) / (now_s - since_s) if now_s > since_s else 0.0
 
 
 _Heard = Mapping[tuple[int, bool], _HeardMessage]
@@ -85,9 +98,11 @@ class BusMonitor:
 
     def __init__(self, database: VehicleDatabase, start_s: float) -> None:
         messages = received(database) | transmitted(database, Mode.OVERLAY)
-        self._heard: _Heard = {key: _HeardMessage(protection_of(database, item)) for key, item in messages.items()}
+        self._heard: _Heard = {
+            key: _HeardMessage(protection_of(database, message), start_s) for key, message in messages.items()
+        }
         self._branches = [_BranchOnBus(database, branch, self._heard) for branch in database.layout.branch]
-        self._database, self._start_s, self._latency = database, start_s, Latency()
+        self._database, self._latency = database, Latency()
 
     def take(self, key: tuple[int, bool], payload: bytearray, time_s: float) -> None:
         """Take a frame.
@@ -102,22 +117,32 @@ class BusMonitor:
             When it came. [s]
         """
         message = self._heard.get(key)
-        if message is not None and message.take(payload, time_s):
-            for branch in self._branches:
-                if branch.answering is message:
-                    branch.answer(payload, time_s, self._latency)
+        if message is None or not message.take(payload, time_s):
+            return
+        for answering in message.answered_by:
+            answering.unanswered.append((time_s, message))
+        waiting = message.unanswered
+        while waiting and time_s - waiting[0][0] > _LONGEST_LATENCY_S:
+            waiting.popleft()
+        asked_s, asking = waiting.popleft() if waiting else (time_s, None)
+        if asking is not None:
+            self._latency.add(time_s - asked_s)
+        for branch in self._branches:
+            if branch.answering is message and asking in {None, branch.asking}:
+                branch.answers.append((asked_s, payload))
 
     def look(self, now_s: float) -> View:
-        """Work out what is to be shown now. [s]
+        """Work out what is to be shown now [s], and note the frame counts for the next rates.
 
         Returns
         -------
         dict
-            ``branches`` : per branch its ``name``; ``is_seen`` (a vehicle may lack it); ``measured_a``, while answers
-            come that of the last answered frame; ``corrected_a`` and its ``quality``; ``rate_hz`` of its usable
-            frames, and ``age_s`` of the last one; ``is_stale`` (frames came, but none for longer than the timeout);
-            ``faults``: frames ``corrupt``, ``repeated``, and times that frames were ``lost``.
-            ``sums`` : ``measured_a`` and ``corrected_a``, each at the newest instant that all branches have reached.
+            ``branches`` : per branch its ``name``; ``is_seen`` (a vehicle may lack it); ``measured_a`` and
+            ``corrected_a`` of one instant, and ``correction_a``, their difference; ``quality`` of the corrected
+            current; ``rate_hz`` and ``age_s`` of the measured frames; ``corrected_rate_hz``; ``is_stale`` and
+            ``corrected_is_stale`` (frames came, but none for longer than the timeout); ``faults`` and
+            ``corrected_faults``: frames ``corrupt``, ``repeated``, and times that frames were ``lost``.
+            ``sums`` : ``measured_a`` and ``corrected_a`` of one instant.
             ``node`` : what its last intact status says, or None: ``state`` and ``reason`` (codes that have no name stay
             numbers), ``parameter_set``, ``sums``, ``age_s``, ``is_silent`` (it must be gone), ``faults``.
             ``latency_us`` : time from a frame to its answer, as seen on the bus: ``p50``, ``p99.9``, ``max``; None if
@@ -125,15 +150,10 @@ class BusMonitor:
             ``has_status``, ``publishes_corrected``, ``is_bus_open`` [bool].
             What is not known is None.
         """
-        seen = [branch for branch in self._branches if branch.measured.seen]
         publishes = any(branch.corrected.seen for branch in self._branches)
-        window_s = min(_RATE_WINDOW_S, now_s - self._start_s)
         return {
-            "branches": [branch.view(now_s, window_s) for branch in self._branches],
-            "sums": {
-                "measured_a": _sum_a([branch.measured for branch in seen], now_s),
-                "corrected_a": _sum_a([branch.shown for branch in seen], now_s) if publishes else None,
-            },
+            "branches": [branch.view(now_s) for branch in self._branches],
+            "sums": _sums([branch for branch in self._branches if branch.measured.seen], now_s, publishes=publishes),
             "node": _status_view(self._database, self._heard, now_s),
             "latency_us": self._latency.microseconds() if any(self._latency.counts) else None,
             "has_status": self._database.layout.status is not None,
@@ -159,12 +179,12 @@ class _BranchOnBus:
             follow(voltage, branch.voltage)
         make = partial(LiveBranch, name=branch.name, sign=branch.sign, timeout_s=branch.timeout_s, voltage=voltage)
         self.measured, self.corrected = make(codes=signals.source), make(codes=signals.target)
-        self._answers: Frames = deque(maxlen=REMEMBERED_FRAMES)
-        """Usable corrected frames, with the times of the frames that they answer."""
-        self._asked_s = -math.inf
-        """Time of the last frame that was answered. [s]"""
-        self._source = follow(self.measured, branch.source)
-        self.answering = follow(self.corrected, branch.corrected, self._answers) if branch.corrected else None
+        self.answers: Frames = deque(maxlen=REMEMBERED_FRAMES)
+        """Intact corrected frames, with the times of the frames that they answer."""
+        self.asking = follow(self.measured, branch.source)
+        self.answering = follow(self.corrected, branch.corrected, self.answers) if branch.corrected else None
+        if self.answering is not None and self.answering not in self.asking.answered_by:
+            self.asking.answered_by.append(self.answering)
         self._quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
 
     @property
@@ -172,42 +192,59 @@ class _BranchOnBus:
         """The current that counts in the corrected sum: the measured one if the layout publishes no corrected one."""
         return self.corrected if self.answering is not None else self.measured
 
-    def answer(self, payload: bytearray, time_s: float, latency: Latency) -> None:
-        """Take a corrected frame that came at a time [s], as the answer to the first measured one that waits for it."""
-        earliest_s = max(self._asked_s, time_s - _LONGEST_LATENCY_S)
-        waiting_s = [asked_s for asked_s, _ in self._source.frames if asked_s > earliest_s]
-        if waiting_s:
-            latency.add(time_s - waiting_s[0])
-        self._asked_s = waiting_s[0] if waiting_s else time_s
-        self._answers.append((self._asked_s, payload))
-
-    def view(self, now_s: float, window_s: float) -> View:
-        """Return what is to be shown of the branch; its rate is that of the last `window_s`. [s]"""
-        measured, is_answered = self.measured, not self.corrected.is_old(now_s)
-        code = self._quality.extract(self._answers[-1][1]) if self._quality is not None and is_answered else None
-        recent = takewhile(lambda frame: frame[0] > now_s - window_s, reversed(self._source.frames))
+    def view(self, now_s: float) -> View:
+        """Return what is to be shown; while answers come, the measured current is that of the last answered frame."""
+        measured, corrected, answering = self.measured, self.corrected, self.answering
+        measured_a = _current_at(measured, measured.time_s if corrected.is_old(now_s) else corrected.time_s)
+        corrected_a = _current_at(corrected, corrected.time_s)
+        quality = None
+        if self._quality is not None and self.answers:
+            quality = _name(Quality, self._quality.extract(self.answers[-1][1]))
         return {
             "name": measured.name,
             "is_seen": measured.seen,
-            "measured_a": _current_a(measured, self.corrected.time_s if is_answered else measured.time_s),
-            "corrected_a": _current_a(self.corrected, self.corrected.time_s) if is_answered else None,
-            "quality": Quality(code).name if code in set(Quality) else None,
-            "rate_hz": sum(1 for _ in recent) / window_s if window_s > 0.0 else 0.0,
+            "measured_a": measured_a,
+            "corrected_a": corrected_a,
+            "correction_a": _difference(corrected_a, measured_a),
+            "quality": quality if isinstance(quality, str) else None,
+            "rate_hz": self.asking.rate_hz(now_s),
+            "corrected_rate_hz": answering.rate_hz(now_s) if answering is not None else 0.0,
             "age_s": max(now_s - measured.time_s, 0.0) if measured.seen else None,
             "is_stale": measured.is_stale(now_s),
-            "faults": dict(self._source.faults),
+            "corrected_is_stale": corrected.is_stale(now_s),
+            "faults": dict(self.asking.faults),
+            "corrected_faults": dict(answering.faults) if answering is not None else {},
         }
 
 
-def _current_a(branch: LiveBranch, time_s: float) -> float | None:
+def _current_at(branch: LiveBranch, time_s: float) -> float | None:
     """Return the current that a signal shows at a time [A]; None if it is not known for that time."""
     return (branch.currents_at(time_s) or (None,))[0]
 
 
-def _sum_a(branches: Sequence[LiveBranch], now_s: float) -> float | None:
-    """Return the sum of currents at the newest instant that all have reached [A]; None if one is stale or unknown."""
-    found = aligned_currents(branches, {}, now_s) if all(branch.seen for branch in branches) else None
-    return sum(current_a for current_a, _ in found[1].values()) if found is not None else None
+def _difference(later_a: float | None, earlier_a: float | None) -> float | None:
+    return later_a - earlier_a if later_a is not None and earlier_a is not None else None
+
+
+def _name(names: type[Quality | Reason | State], code: int | None) -> str | int | None:
+    """Return the name of a code; the code itself if it has no name."""
+    return names(code).name if code in set(names) else code
+
+
+def _sums(branches: Sequence[_BranchOnBus], now_s: float, *, publishes: bool) -> View:
+    """Return ``measured_a`` and ``corrected_a``: the sums at the newest instant that all branches have reached. [A]
+
+    They are None while a branch is stale or has no value.
+    """
+    measured, shown = [branch.measured for branch in branches], [branch.shown for branch in branches]
+    is_published = publishes and all(branch.seen for branch in shown)
+    after = aligned_currents(shown, {}, now_s) if is_published else None
+    found = after or aligned_currents(measured, {}, now_s)
+    known = [] if found is None else [_current_at(branch, found[0]) for branch in measured]
+    return {
+        "measured_a": sum(x for x in known if x is not None) if known and None not in known else None,
+        "corrected_a": sum(current_a for current_a, _ in after[1].values()) if after is not None else None,
+    }
 
 
 _SILENT_PERIODS, _LEAST_SILENCE_S = 5.0, 1.0
@@ -228,16 +265,31 @@ def _status_view(database: VehicleDatabase, heard: _Heard, now_s: float) -> View
         if key.startswith("sum_") and code is not None:
             known = read_codes(signal, AMPERE, f"{database.layout.path}: status")
             sums[f"{key.removeprefix('sum_')}_a"] = float(known.worth(code)) if known.is_value(code) else None
-    age_s, state, reason = max(now_s - time_s, 0.0), codes["state"], codes["reason"]
+    age_s = max(now_s - time_s, 0.0)
     return {
-        "state": State(state).name if state in set(State) else state,
-        "reason": Reason(reason).name if reason in set(Reason) else reason,
+        "state": _name(State, codes["state"]),
+        "reason": _name(Reason, codes["reason"]),
         "parameter_set": codes.get("parameter_set"),
         "sums": sums,
         "age_s": age_s,
         "is_silent": age_s > max(_SILENT_PERIODS * status.period_s, _LEAST_SILENCE_S),
         "faults": dict(message.faults),
     }
+
+
+_COLUMNS = {
+    "branch": "",
+    "measured": "[A]",
+    "corrected": "[A]",
+    "correction": "[A]",
+    "quality": "",
+    "rate": "[1/s]",
+    "answers": "[1/s]",
+    "age": "[s]",
+    "faults": "",
+}
+"""Columns of the table and their units; one without a unit holds words, set to the left. "rate" is that of measured
+frames, "answers" that of corrected ones."""
 
 
 def view_lines(view: View, where: str, counters: Counters) -> list[str]:
@@ -257,28 +309,25 @@ def view_lines(view: View, where: str, counters: Counters) -> list[str]:
     list of str
         Lines; a number that is not known is "-".
     """
-    node = view["node"] if view["node"] is not None and not view["node"]["is_silent"] else None
+    node = view["node"]
+    table = [[name if unit else "" for name, unit in _COLUMNS.items()]]
+    table.append([unit or name for name, unit in _COLUMNS.items()])
+    table += [*map(_branch_row, view["branches"]), _sum_cells("sum", view["sums"])]
+    if node is not None and not node["is_silent"]:
+        table.append(_sum_cells("node's sum", node["sums"]))
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = [f"{where}: {_node_text(view)}"]
-    if node is not None and node["reason"] not in (None, "NONE"):
+    if node is not None and not node["is_silent"] and node["reason"] not in (None, "NONE"):
         lines.append(f"because {_words(Reason, node['reason'])}")  # in a line of its own: terminals are narrow
-    width = max(map(len, ["node's sum", *(branch["name"] for branch in view["branches"])]))
-    lines.append(_row(width, "branch", "measured", "corrected", "quality", "rate", "age", "faults"))
-    lines.append(_row(width, "", "[A]", "[A]", "", "[1/s]", "[s]"))
-    for branch in view["branches"]:
-        name, currents = branch["name"], [_number(branch["measured_a"]), _number(branch["corrected_a"])]
-        quality = (branch["quality"] or "-").lower().replace("_", " ")
-        notes = ["stale"] * branch["is_stale"] + ["not fitted?"] * (not branch["is_seen"])
-        notes += [text] if (text := _fault_text(branch["faults"])) else []
-        times = [f"{branch['rate_hz']:.1f}", f"{branch['age_s']:.2f}"] if branch["is_seen"] else ["-", "-"]
-        lines.append(_row(width, name, *currents, quality, *times, ", ".join(notes)))
-    for name, sums in (("sum", view["sums"]), ("node's sum", node and node["sums"])):
-        if sums is not None:
-            lines.append(_row(width, name, _number(sums["measured_a"]), _number(sums["corrected_a"])))
+    for cells in table:
+        columns = zip(_COLUMNS.values(), cells, widths, strict=True)
+        padded = [cell.rjust(width) if unit else cell.ljust(width) for unit, cell, width in columns]
+        lines.append(" ".join(padded).rstrip())
     if not any(branch["is_seen"] for branch in view["branches"]):
         lines += ["no frame of any branch: is the bus awake, and its bit rate the right one?"] * view["is_bus_open"]
     elif not view["publishes_corrected"]:
         lines.append("no corrected messages on this bus: the currents are shown as they are on it")
-    if node is not None and node["state"] in ("PASSING_THROUGH", "SHADOW"):
+    if node is not None and not node["is_silent"] and node["state"] in ("PASSING_THROUGH", "SHADOW"):
         lines.append("node's sum, corrected: what its parameters would make of it; it publishes what was measured")
     if view["latency_us"] is not None:
         found = ", ".join(f"{name} {latency_us}" for name, latency_us in view["latency_us"].items())
@@ -288,13 +337,6 @@ def view_lines(view: View, where: str, counters: Counters) -> list[str]:
     if counters.dropped:
         lines.append(f"frames that this computer was too slow to read: {counters.dropped}; they count as lost above")
     return lines
-
-
-def _row(width: int, name: str, measured: str, corrected: str, *others: str) -> str:
-    """Return a row of the table; `others` are quality, rate, age and faults, as far as the row has them."""
-    quality, rate, age, faults = [*others, "", "", "", ""][:4]
-    row = f"{name:<{width}} {measured:>9} {corrected:>9} {quality:<14} {rate:>6} {age:>6} {faults}"
-    return row.rstrip()
 
 
 def _node_text(view: View) -> str:
@@ -309,8 +351,8 @@ def _node_text(view: View) -> str:
     if node["is_silent"]:
         return f"no node on this bus any more: its last status came {node['age_s']:.1f} s ago"
     which = f"; parameter set {node['parameter_set']}" if node["parameter_set"] else ""
-    faults = f"; {text}" if (text := _fault_text(node["faults"])) else ""
-    return f"node: {_words(State, node['state'])}{which}; status {node['age_s']:.1f} s ago{faults}"
+    words = f"node: {_words(State, node['state'])}{which}; status {node['age_s']:.1f} s ago"
+    return "; ".join([words, *_fault_texts(node["faults"])])
 
 
 def _words(names: type[Reason | State], shown: str | int | None) -> str:
@@ -319,8 +361,36 @@ def _words(names: type[Reason | State], shown: str | int | None) -> str:
     return known.words if known is not None else f"{names.__name__.lower()} {shown}, which this version does not know"
 
 
-def _fault_text(faults: Mapping[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in faults.items() if count)
+def _branch_row(branch: View) -> list[str]:
+    faults = _fault_texts(branch["faults"])
+    if not branch["is_seen"]:
+        return [branch["name"], *["-"] * (len(_COLUMNS) - 2), ", ".join(["not fitted?", *faults])]
+    lasting = []
+    if branch["is_stale"]:
+        lasting.append("stale")
+    else:
+        lasting += ["not available"] * (branch["measured_a"] is None)
+        lasting += ["corrected: stale"] * branch["corrected_is_stale"]
+    is_answered = branch["corrected_rate_hz"] or branch["corrected_a"] is not None
+    return [
+        branch["name"],
+        *(_number(branch[key]) for key in ("measured_a", "corrected_a", "correction_a")),
+        (branch["quality"] or "-").lower().replace("_", " "),
+        f"{branch['rate_hz']:.1f}",
+        f"{branch['corrected_rate_hz']:.1f}" if is_answered else "-",
+        f"{branch['age_s']:.2f}",
+        ", ".join([*lasting, *faults, *(f"corrected: {text}" for text in _fault_texts(branch["corrected_faults"]))]),
+    ]
+
+
+def _sum_cells(name: str, sums: View) -> list[str]:
+    measured_a, corrected_a = sums["measured_a"], sums["corrected_a"]
+    cells = [name, *map(_number, (measured_a, corrected_a, _difference(corrected_a, measured_a)))]
+    return cells + [""] * (len(_COLUMNS) - len(cells))
+
+
+def _fault_texts(faults: Mapping[str, int]) -> list[str]:
+    return [f"{name} {count}" for name, count in faults.items() if count]
 
 
 def _number(value_a: float | None) -> str:
@@ -331,7 +401,7 @@ _LIVE_PERIOD_S, _PLAIN_PERIOD_S = 0.25, 1.0
 """Time between two views, live in a terminal and as plain text. [s]"""
 _LONGEST_WAIT_S = 0.25
 """The monitor wakes up at least this often, so that a request to stop is seen. [s]"""
-_HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
+_CLEAR_SCREEN, _HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[2J", "\x1b[H", "\x1b[K", "\x1b[J"
 
 
 def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, as_json: bool) -> int:
@@ -366,7 +436,10 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
     is_terminal = sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
     is_live = once_s is None and is_terminal
     period_s = once_s or (_LIVE_PERIOD_S if is_live else _PLAIN_PERIOD_S)
-    with closing(SteadyBus(partial(open_bus, database, mode=Mode.OVERLAY, **bus), counters, say)) as steady:
+    opened = partial(open_bus, database, mode=Mode.OVERLAY, **bus)
+    with ExitStack() as left_at_end:
+        steady = left_at_end.enter_context(closing(SteadyBus(opened, counters, say)))
+        write_output(_CLEAR_SCREEN if is_live else "", end="")
         monitor, view = BusMonitor(database, time.monotonic()), None
         while view is None or (once_s is None and not stop()):
             _listen(steady, monitor, time.monotonic() + period_s, stop)
@@ -381,7 +454,7 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
             elif as_json:
                 write_output(json.dumps(view, indent=2))
             else:
-                write_output("\n".join(lines), end="\n" if once_s else "\n\n")
+                write_output("\n".join(lines) if once_s else "\n".join([*lines, ""]))
     if once_s is not None and not any(branch["is_seen"] for branch in view["branches"]):
         say_error(f"ecu-node: {where}: no branch of {layout} was seen; see that the bus is the right one")
         return 1

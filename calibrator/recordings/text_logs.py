@@ -203,7 +203,7 @@ def _gvret_as_logged(text: bytes, columns: Sequence[str]) -> bytes:
                 raise ValueError
             name = f"{identifier:08X}" if _EXTENDED[extended] else f"{identifier:03X}"
             fd = "##0" if len(data) > CLASSIC_BYTES else "#"
-            lines.append(f"({time_us // 10**6}.{time_us % 10**6:06d}) {cells['Bus']} {name}{fd}{data.hex()}")
+            lines.append(f"({time_us // 10**6}.{time_us % 10**6:06d}) {cells['Bus'] or '0'} {name}{fd}{data.hex()}")
         except (ValueError, KeyError):
             lines.append("a damaged row")
     return "\n".join(lines).encode("latin-1")
@@ -305,8 +305,8 @@ def _parse_plain_asc(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
 def _parse_candump(text: _Text, digits: _Text, names: NDArray[np.int64], columns: FrameColumns) -> int:
     """Parse line by line into `columns`, and return the number of different channels.
 
-    The text must end with a line end. `names` receives where each channel's name starts and ends in it. The result
-    is -1 if a payload does not fit into the columns.
+    The text must end with a line end: no step passes one, so parsing ends. `names` receives where each channel's name
+    starts and ends in it. The result is -1 if a payload does not fit into the columns.
     """
     kind, time_ns, key, channel, length, data = columns
     row, start, channels = 0, 0, 0
@@ -350,10 +350,10 @@ def _parse_candump(text: _Text, digits: _Text, names: NDArray[np.int64], columns
             number = 0
             while number < channels and not _is_same(text, names[number, 0], names[number, 1], name_at, name_end):
                 number += 1
-            if number == channels and channels < len(names):
+            if sound and number == channels and channels < len(names):
                 names[number, 0], names[number, 1] = name_at, name_end
                 channels += 1
-            sound = sound and number < len(names)
+            sound = sound and number < channels
             time_ns[row], channel[row], length[row] = stamp_ns, number, size
             key[row] = identifier | EXTENDED_BIT if extended else identifier
         kind[row] = NOTHING if is_blank else what if sound else DAMAGED
@@ -384,7 +384,7 @@ def _is_same(text: _Text, first: int, last: int, first_too: int, last_too: int) 
 
 
 @inner
-def _asc_line(  # noqa: PLR0911 (as above)
+def _asc_line(  # noqa: PLR0911 (a line is judged from left to right)
     text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns
 ) -> int:
     """Parse the line that starts at `at` into a row of `columns`; return what kind of line it is."""
@@ -429,12 +429,17 @@ def _asc_line(  # noqa: PLR0911 (as above)
 
 
 @inlined
+def _is_blank(letter: int) -> bool:
+    return letter == ord(" ") or letter == ord("\t") or letter == ord("\r")
+
+
+@inlined
 def _word(text: _Text, at: int) -> tuple[int, int]:
     """Return where the next word of the line starts, and one past its end; the line's end for both if there is none."""
-    while text[at] <= ord(" ") and text[at] != ord("\n"):
+    while _is_blank(text[at]):
         at += 1
     end = at
-    while text[end] > ord(" "):
+    while text[end] != ord("\n") and not _is_blank(text[end]):
         end += 1
     return at, end
 

@@ -69,7 +69,7 @@ def info(store: StoreArgument, json: JsonOption = False) -> None:
 
 @store_app.command(epilog=example("calibrator store check summaries"))
 def check(store: StoreArgument, json: JsonOption = False) -> None:
-    """Read a whole store; exit code 1 if something is damaged or left over, or two vehicles share a recording."""
+    """Read a whole store; exit code 1 if something is damaged, or two vehicles share a recording."""
     with importing():
         from calibrator.summaries.summary_store import look_at_store
 

@@ -172,7 +172,7 @@ def add_drives(
         limit_s=time_limit_s,
         label="summarise drives",
         size=sum(fleet.sizes.values()),
-        size_of=lambda task: sum(drive.size for drive in task.drives),
+        size_of=lambda task: task.size,
     )
     with closing(outcomes):
         for bucket, group in groupby(outcomes, key=lambda pair: pair[0].bucket):
@@ -180,7 +180,9 @@ def add_drives(
                 _record(task.drives, problem=outcome.reason) if isinstance(outcome, Failed) else outcome
                 for task, outcome in group
             ]
-            store.append(bucket, records)
+            known = store.read(bucket, whole=False)
+            if new := [each for each in records if each.found or not _is_known(each, known.get(each.vehicle, ()))]:
+                store.append(bucket, new)
             for record in records:
                 owners.add(record.vehicle, record.digests)
                 _report(record, report)
@@ -195,13 +197,15 @@ def add_drives(
 class _Task(NamedTuple):
     """Unit of work: the drives of one vehicle that are not in the store yet.
 
-    ``digests`` and ``known_s`` (duration [s]) describe the recordings of the vehicle that the store has.
+    ``digests`` and ``known_s`` (duration [s]) describe the recordings of the vehicle that the store has. ``size`` is
+    what the progress bar advances by: that of this vehicle's drives and of those skipped since the task before. [byte]
     """
 
     bucket: int
     drives: tuple[DriveFile, ...]
     digests: frozenset[str]
     known_s: float
+    size: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +239,7 @@ def _key(digest: str) -> int:
 
 def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator[_Task]:
     """Yield the drives to read, bucket by bucket; enter into `owners` the recordings that the store has already."""
+    size = 0
     for bucket, names in store.by_bucket(fleet.vehicles).items():
         records = store.read(bucket, whole=False)
         for name in names:
@@ -244,8 +249,16 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator
             digests = frozenset(digest for record in kept for digest in record.digests)
             owners.add(name, digests)
             known = {drive for record in kept for drive in record.drives}
+            size += fleet.sizes.get(name, 0)
             if wanted := tuple(drive for drive in drives if drive.name not in known):
-                yield _Task(bucket, wanted, digests, sum(record.duration_s for record in kept))
+                yield _Task(bucket, wanted, digests, sum(record.duration_s for record in kept), size)
+                size = 0
+
+
+def _is_known(record: Record, known: Iterable[Record]) -> bool:
+    """Check whether the store says already that these drives cannot be used, and why: they are tried in each run."""
+    what = record.drives, record.sources, record.problem
+    return any(what == (each.drives, each.sources, each.problem) for each in known)
 
 
 def _stays(record: Record, versions: Mapping[str, str]) -> bool:

@@ -33,6 +33,8 @@ __all__ = [
     "require_store_or_nothing",
 ]
 
+MOST_FILES, LAST_NUMBER = 32, 99_999
+"""Most files of a bucket, which are merged then, as each is opened to read it; last number of such a file. [1]"""
 _FILE = re.compile(r"[0-9]{5}-[0-9]{5}\.parquet")
 
 
@@ -77,9 +79,9 @@ class SummaryStore:
         Raises
         ------
         FleetError
-            If there is a file that is not one of this store, by its name; it would never be read.
+            If there is a Parquet file that is not one of this store, by its name; it would never be read.
         """
-        names, count = self._files.names(), self.identity.buckets
+        names, count = [name for name in self._files.names() if name.endswith(".parquet")], self.identity.buckets
         for name in names:
             if not _FILE.fullmatch(name) or int(name[:5]) >= count:
                 raise FleetError(
@@ -94,7 +96,7 @@ class SummaryStore:
 
     def versions(self) -> dict[str, str]:
         """Return the version of each file of all buckets by name; it changes when the file does."""
-        return {entry.name: entry.version for entry in self._files.contents()[1]}
+        return {entry.name: entry.version for entry in self._files.contents()[1] if _FILE.fullmatch(entry.name)}
 
     def size_bytes(self) -> int:
         """Return the size of all files. [byte]"""
@@ -134,22 +136,29 @@ class SummaryStore:
         return [Outline.of(records) for records in self.read(bucket, whole=False).values()]
 
     def append(self, bucket: int, records: Iterable[Record]) -> None:
-        """Write records as a new file of a bucket; UserError if that fails."""
+        """Write records as a new file of a bucket, and merge its files if they are many; UserError if that fails."""
         with self.storage.locked():
             self._append(bucket, records)
+            if len(self.files(bucket)) > MOST_FILES:
+                self._merge(bucket)
 
     def _append(self, bucket: int, records: Iterable[Record]) -> None:
         files = self.files(bucket)
         number = int(files[-1][6:11]) + 1 if files else 0
+        if number > LAST_NUMBER:
+            raise FleetError(f"{self._files.url}: {LAST_NUMBER + 1} additions to a bucket; summarise into a new store")
         self._files.write(f"{bucket:05d}-{number:05d}.parquet", encode_records(list(records), self.identity))
 
     def compact(self, bucket: int) -> None:
         """Merge the files of a bucket into one; a run that is killed meanwhile leaves both, which count once."""
         with self.storage.locked():
-            old = self.files(bucket)
-            self._append(bucket, [record for records in self.read(bucket).values() for record in records])
-            for name in old:
-                self._files.remove(name)
+            self._merge(bucket)
+
+    def _merge(self, bucket: int) -> None:
+        old = self.files(bucket)
+        self._append(bucket, [record for records in self.read(bucket).values() for record in records])
+        for name in old:
+            self._files.remove(name)
 
 
 def require_store_or_nothing(storage: Storage) -> None:
@@ -226,7 +235,7 @@ def open_store(
 
 @dataclass(kw_only=True)
 class StoreReport:
-    """What a store holds: size in bytes, duration in hours, and faults by vehicle, bucket or file.
+    """What a store holds: size in bytes, duration in hours, and faults by vehicle or bucket.
 
     `unusable` of the vehicles cannot be calibrated.
     """
@@ -272,7 +281,7 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
     Returns
     -------
     StoreReport
-        What the store holds, and its faults by vehicle, bucket or file.
+        What the store holds, and its faults by vehicle or bucket.
 
     Raises
     ------

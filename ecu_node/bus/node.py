@@ -4,12 +4,12 @@ An overlay node works in one thread. In a gateway one thread corrects the sensor
 passes frames back from the vehicle. Frames that the kernel carries are passed on by neither.
 """
 
-import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import can
 
@@ -117,7 +117,7 @@ class OwnFrames:
 _LONGEST_WAIT_S = 0.1
 """The node wakes up at least this often, so that a request to stop is seen. [s]"""
 _LOOK_EVERY_S = 0.02
-"""The junction is looked at, and the watchdog fed, at least this often, a whole number of times per status. [s]"""
+"""The junction is looked at, and the watchdog fed, at least this often, even if the status is sent more rarely. [s]"""
 _LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
 """The node listens for another one before it sends: for this many status periods, but no longer than this [s]."""
 
@@ -129,6 +129,21 @@ _COPIES, _COPIES_WITHIN_S = 10, 2.0
 """This many copies of one bus's frames on the other, within this time [s], show that both are the same bus."""
 _REMEMBERED_COPIES = 16
 """Number of frames of each identifier that may be on their way from one bus to the other."""
+
+
+@dataclass
+class _Job:
+    """Something that is done periodically, between frames."""
+
+    period_s: float
+    do: Callable[[float], None]
+    due_s: float = float("-inf")
+
+    def run(self, now_s: float) -> None:
+        """Do the job; it is next due one period after it was due, or after now if it is a whole period late."""
+        self.do(now_s)
+        in_step_s = self.due_s + self.period_s
+        self.due_s = in_step_s if in_step_s > now_s else now_s + self.period_s
 
 
 class Node:
@@ -166,8 +181,6 @@ class Node:
     ) -> None:
         self._sensors, self._vehicle, self._corrector = sensors, vehicle, corrector
         self._period_s, self._on_tick, self._latency = period_s, on_tick, latency or Latency()
-        self._looks_per_status = math.ceil(period_s / _LOOK_EVERY_S)
-        self._looks = 0
         self._is_gateway, self._routed = vehicle is not sensors, routed
         self._take = self._pass_on if self._is_gateway else self._answer
         self._own = self._not_from_vehicle = OwnFrames(corrector.own_keys)
@@ -177,6 +190,8 @@ class Node:
         """When copies of frames from one bus came from the other bus. [s]"""
         self._time_of_day = TimeOfDay(corrector.counters)
         self._heard_s = self._due_s = self._back_s = float("-inf")
+        often_s = min(period_s, _LOOK_EVERY_S)
+        self._jobs = [_Job(often_s, self._look), _Job(period_s, self._tell)]
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop.
@@ -223,27 +238,24 @@ class Node:
                     raise _another_node(message, self._vehicle)
 
     def _work(self, stop: Callable[[], bool]) -> None:
-        """Take frames, and look at the junction when that is due, until `stop` returns True."""
+        """Take frames, and do the jobs when they are due, until `stop` returns True."""
         self._heard_s = time.monotonic()
-        every_s = self._period_s / self._looks_per_status
         while not stop():
             now_s = self._sensors.asked_s
-            if now_s >= self._due_s:
-                self._look(now_s)
-                in_step_s = self._due_s + every_s
-                self._due_s = in_step_s if in_step_s > now_s else now_s + every_s
+            job = min(self._jobs, key=lambda job: job.due_s)
+            if now_s >= job.due_s:
+                job.run(now_s)
+                self._due_s = min(job.due_s for job in self._jobs)
             self._hear()
 
     def _look(self, now_s: float) -> None:
-        """Look at the junction at the time up to which the bus was heard, and send the status if that is due, too.
-
-        Between the two call `on_tick` with the time [s].
-        """
+        """Look at the junction at the time up to which the bus was heard, then call `on_tick` with the time [s]."""
         self._corrector.look(self._heard_s)  # frames that wait to be read make no branch stale
         self._on_tick(now_s, not self._is_gateway or time.monotonic() - self._back_s < _LONGEST_TURN_S)
-        is_due = self._looks % self._looks_per_status == 0
-        self._looks += 1
-        status = self._corrector.status() if is_due else None
+
+    def _tell(self, _: float) -> None:
+        """Send the status message, if the layout has one."""
+        status = self._corrector.status()
         if status is not None:
             self._own.sent(status.key, status.data)
             self._vehicle.send(_data_frame(status.key, status.data, fd=status.fd))

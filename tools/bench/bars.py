@@ -8,6 +8,7 @@ Fails if a bar is missed that is not known to be, or farther than is known, or h
 import json
 import operator
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -42,13 +43,13 @@ class Bars:
     def __init__(self, bench: Path, results: Path) -> None:
         self.bench, self.results = bench, results
 
-    def figure(self, where: str, rows: str, figure: str, bar: str) -> tuple[float, str]:
+    def figure(  # noqa: PLR0911 (each figure has its own rule)
+        self, where: str, rows: str, figure: str, bar: str
+    ) -> tuple[float, str]:
         """Return a figure, NaN if it was not measured, and what is behind it: number of cases and 95 % interval."""
         worst = COMPARISONS[bar.split(maxsplit=1)[0]][1]
         if where == "bench":
-            measured = pd.DataFrame(json.loads(self.bench.read_text()))
-            found = measured.loc[measured["name"].str.fullmatch(rows), figure]
-            return (float(worst(found)) if len(found) else np.nan), ""
+            return self._benchmark(rows, figure, worst), ""
         table = pd.DataFrame(json.loads((self.results / f"{where}.json").read_text())["figures"])
         table = table.dropna(subset="x")  # all settings together are a row of their own
         table["row"] = table["series"] + ", " + table["x"].map("{:g}".format)
@@ -76,6 +77,12 @@ class Bars:
         count, number = round(float((value[figure] * of[figure]).sum())), int(of[figure].sum())
         interval = binomtest(count, number).proportion_ci()
         return count / number, f"{count} of {number}, {interval.low:.4f} to {interval.high:.4f}"
+
+    def _benchmark(self, rows: str, figure: str, worst: Callable[["pd.Series[float]"], float]) -> float:
+        """Return the figure of a benchmark; NaN if it was not measured."""
+        measured = pd.DataFrame(json.loads(self.bench.read_text()))
+        found = measured.loc[measured["name"].str.fullmatch(rows), figure]
+        return float(worst(found)) if len(found) else np.nan
 
 
 def main(*, bench: Path = ROOT / "build/bench.json", results: Path = ROOT / "docs/results") -> None:
