@@ -470,7 +470,16 @@ class CalibrationReport:
 
     def as_text(self) -> str:
         """The report for people."""
-        run, load_a = self.run, self.run.details.get("declared_load_a", 0.0)
+        run, details = self.run, self.run.details
+        load_a = details.get("declared_load_a", 0.0)
+        by_branch = {
+            "simulation SNR, median, {} [dB]": (details.get("simulation_snr_db", {}), "{:.1f}"),
+            "vehicles that agree, {} [%]": (details.get("reference", {}).get("agreeing_share", {}), "{:.0%}"),
+            "faultless vehicles differ by, {} [%]": (
+                details.get("hyperparameters", {}).get("model_spread", {}),
+                "{:.1%}",
+            ),
+        }
         about = (", median" if run.vehicles > 1 else "") + (f" about the {load_a:g} A declared" if load_a else "")
         rows = [
             ("vehicles calibrated", f"{run.vehicles}"),
@@ -480,6 +489,11 @@ class CalibrationReport:
             *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
             (f"junction sum RMS{about}, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
             (f"junction sum RMS{about}, corrected [A]", f"{self.junction_rms_deployed_a:.2f}"),
+            *(
+                (what.format(name), digits.format(value).rstrip("%"))
+                for what, (values, digits) in by_branch.items()
+                for name, value in values.items()
+            ),
         ]
         parts = [
             table((f"method {run.method}", ""), rows),
