@@ -72,6 +72,8 @@ def test_table_of_readings_may_have_any_column_order_and_empty_cells(tmp_path: P
     ([HEADER, "V1,motor,,,1.0,0"], r"line 2: offset_sd_a is '0'; expected a number from 0\.004 to 360: .* in A"),
     ([HEADER, "V1,motor,2,0.1,,"], r"line 2: drift is '2'; expected a number from -0\.9 to 0\.9: .*2 % is 0\.02"),
     ([HEADER, "V1,motor,0,0.1,,", "V1,motor,0,0.1,,"], r"line 3: the motor sensor of V1 stands there twice"),
+    ([HEADER, "V1,motor,,,,"], r"line 2: nothing was read; give drift and drift_sd, or offset_a and offset_sd_a"),
+    ([HEADER, 'V1,"' + 200_000 * "x"], r"not a table of bench readings: field larger than field limit"),
     ([HEADER, "V1,motor,0,0.1,,,,7"], r"line 2: more cells than the 6 columns of the header"),
 ])  # fmt: skip
 def test_mistake_in_a_table_of_readings_is_reported_with_its_line(

@@ -149,6 +149,8 @@ def test_small_fleet_is_calibrated_without_worker_processes(
     (("--charge", "battery=3"), 2, "give its standard deviation"),
     (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
     (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
+    (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
+    (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
     (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
     (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
     (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
@@ -164,7 +166,10 @@ def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
 
 def test_place_without_a_fleet_is_refused(store: SummaryStore, tmp_path: Path) -> None:
     shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
+    shutil.copytree(store.url, tmp_path / "both")
+    (tmp_path / "both" / "drives").mkdir()
     for place, code, message in (
+        (tmp_path / "both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them"),
         (tmp_path / "empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
         ("", 2, "an empty name; give the path"),
     ):

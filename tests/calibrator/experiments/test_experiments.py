@@ -159,6 +159,11 @@ def test_experiment_that_cannot_give_a_table_is_refused(change: dict[str, Any], 
         run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive())
 
 
+def test_experiment_without_repetitions_is_refused() -> None:
+    with pytest.raises(FleetError, match="snr: 0 repetitions; expected at least 1"):
+        run_experiment(EXPERIMENTS["snr"], smooth_drive(), repetitions=0)
+
+
 def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
     small = EXPERIMENTS["asymmetry"].small()
     assert [(each.series, each.x) for each in small.settings] == [("0", 20.0), ("0.5", 2000.0)]
@@ -236,7 +241,9 @@ def test_table_shows_own_methods_and_the_first_available_confidence() -> None:
 
 @pytest.mark.parametrize(("change", "message"), [
     (lambda _: MANY, r"estimate\(\) returned ndarray, expected an Estimate"),
-    (with_faults(drift=None), r"drift is object of shape \(\), expected finite numbers of shape \(20, 2\)"),
+    (with_faults(drift=None), "drift is NoneType, expected an array of numpy"),
+    (lambda e: replace(e, faults=None), "faults is NoneType, expected Faults"),
+    (lambda e: replace(e, confidence=[0.5] * N), "confidence is list, expected an array of numpy"),
     (with_faults(hardware_drift=np.zeros(3)), r"hardware_drift is .*\(3,\), expected .*\(20,\)"),
     (with_faults(drift=MANY * np.nan), "drift .* expected finite numbers .*, 0 where no fault is found"),
     (lambda e: replace(e, hardware=np.zeros(N)), "hardware is float64 .* expected bool"),

@@ -99,6 +99,21 @@ def test_candump_parser_agrees_with_python_can(lines: list[str], line_end: str) 
     assert [found.channels[c] for c in found.channel] == [str(m.channel) for m in messages]
 
 
+@given(st.text(alphabet="()#0123456789AFGRTcan .\r\t\0-", max_size=80))
+def test_damaged_candump_line_is_counted_and_its_neighbours_are_read(line: str) -> None:
+    good = "(1.000000) can0 123#01\n"
+    found, kind = parse_candump(f"{good}{line}\n{good}".encode())
+    kept = contents(found)
+    assert kept[0] == kept[-1] == (0x123, b"\x01")
+    assert len(kept) + found.damaged + found.remote_frames + found.error_frames == np.count_nonzero(kind)
+
+
+def test_damaged_candump_line_names_no_channel() -> None:
+    text = b"(1.000000) can0 123#01\n(2.000000) cxn0 123#GG\n" + 40 * b"\0" + b"\n(3.000000) can1 123#02"
+    found, _ = parse_candump(text)
+    assert (found.channels, found.damaged) == (("can0", "can1"), 2)
+
+
 ERROR_FRAME = "(1.200000) can0 20000080#0000000000000000"
 
 

@@ -107,6 +107,9 @@ def test_vehicle_with_a_bad_drive_is_left_out_and_tried_again(fleet: SmallFleet)
     left_out = fleet.add().left_out
     assert list(left_out) == ["V1"]
     assert "not a drive" in left_out["V1"]
+    store = fleet.open()
+    assert fleet.add().left_out == left_out
+    assert len(store.files(store.bucket_of("V1"))) == 1, "what is known is not noted again"
     path.write_bytes(whole)
     again = fleet.add()
     assert (again.vehicles, again.left_out) == (1, {})

@@ -17,7 +17,7 @@ from calibrator.files.storage import Storage, open_storage
 from calibrator.summaries.identity import SCHEMA_VERSION, read_identity, write_identity
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import MOST_BLOCKS, SCHEMA, Record, joined_records
-from calibrator.summaries.summary_store import SummaryStore, compact_store, look_at_store
+from calibrator.summaries.summary_store import MOST_FILES, SummaryStore, compact_store, look_at_store
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, summaries_of
 from tests.calibrator.summaries.small_stores import identity_of, random_faults, record_of, small_store
@@ -84,6 +84,17 @@ def test_added_records_are_separate_files_until_compacted(tmp_path: Path, databa
     assert [record.drives for record in store.read(bucket)["V001"]] == [("d1",), ("d2",)]
     report = look_at_store(store.url, whole=True)
     assert (report.vehicles, report.drives, report.faults) == (4, 5, {})
+
+
+def test_many_files_of_a_bucket_are_merged(own_store: SummaryStore) -> None:
+    (record, *_) = all_records(own_store)
+    bucket, before = own_store.bucket_of(record.vehicle), own_store.read(own_store.bucket_of(record.vehicle))
+    for _ in range(MOST_FILES + 3):
+        own_store.append(bucket, [record])
+    assert len(own_store.files(bucket)) <= MOST_FILES
+    assert {name: [each.drives for each in records] for name, records in own_store.read(bucket).items()} == {
+        name: [each.drives for each in records] for name, records in before.items()
+    }
 
 
 def test_records_of_a_vehicle_add_up(store: SummaryStore) -> None:
