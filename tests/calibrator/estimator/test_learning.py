@@ -9,10 +9,11 @@ from calibrator.drive import Array
 from calibrator.estimator import learning
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces
 from calibrator.estimator.learning import learn_fault_models
-from calibrator.estimator.posterior import FaultModel, explain
-from calibrator.estimator.prior import GRID
+from calibrator.estimator.posterior import FaultModel, Spread, explain, weigh
+from calibrator.estimator.prior import GRID, Prior, first_prior
+from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
-from tests.calibrator.estimator.simulated_rows import Errors, model_of_equals, random_faults, rows_of
+from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
 
 
 def moved(rows: EvidenceRows, by: Array) -> EvidenceRows:
@@ -38,6 +39,14 @@ def shared_by(models: list[FaultModel]) -> dict[tuple[int, ...], float]:
     return found
 
 
+def same(one: FaultModel, other: FaultModel, rtol: float) -> None:
+    np.testing.assert_allclose(one.spread.mean, other.spread.mean, rtol=rtol, atol=1e-9)
+    np.testing.assert_allclose(one.spread.covariance, other.spread.covariance, rtol=rtol, atol=1e-12)
+    np.testing.assert_allclose(one.prior.counts, other.prior.counts, rtol=rtol, atol=1e-9)
+    np.testing.assert_allclose(one.prior.gain.density, other.prior.gain.density, rtol=rtol, atol=1e-9)
+    assert one.log_evidence == pytest.approx(other.log_evidence, rel=rtol)
+
+
 @pytest.mark.parametrize("magnitude", [(0.05, 0.25), pytest.param((0.3, 0.6), marks=pytest.mark.long)])
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_learnt_prior_matches_sizes_and_numbers_of_the_faults(K: int, magnitude: tuple[float, float]) -> None:
@@ -54,6 +63,12 @@ def test_learnt_prior_matches_sizes_and_numbers_of_the_faults(K: int, magnitude:
     assert not model.spread.shared.any()
     assert np.abs(model.spread.mean).max() < 0.002
     assert model.prior.load_share < 0.02
+
+
+def test_learnt_model_is_invariant_to_vehicle_order_even_if_subsampled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learning, "MOST_LEARNT", 25)
+    rows = rows_of(random_faults(6, vehicles=40, branches=2), seed=6)
+    same(learned(rows.take(np.random.default_rng(6).permutation(40))), learned(rows), rtol=1e-6)
 
 
 @pytest.mark.parametrize("expected", [0.0, 1.0])
@@ -76,6 +91,26 @@ def test_uncertain_gain_ratios_are_not_taken_for_a_shared_gain_error(bias: float
     np.testing.assert_allclose(models[0].spread.mean[rows.places.slopes], 0.0, atol=0.002)
 
 
+@pytest.mark.parametrize("vague", [0.0005, 0.04])
+def test_gain_error_shared_in_one_branch_is_not_given_to_a_branch_of_uncertain_gain_ratio(vague: float) -> None:
+    faults = no_faults(16, 4)
+    faults.drift[:, 0] = 0.05
+    faults.drift[3, 1], faults.offset_a[5, 2] = -0.12, 0.1
+    rows = rows_of(faults, seed=7)
+    row = rows.places.ratio(3)
+    rows.covariance[:, row, row] += vague**2
+    rows.values[:, row] += vague * np.random.default_rng(7).normal(size=16)
+    assert shared_by(learn_fault_models(rows, feed=0)).keys() == {(4,)}
+
+
+def test_gain_ratios_off_by_another_amount_in_each_vehicle_are_no_shared_gain_error() -> None:
+    """As where the signal of one branch is a mean over a second: how far a ratio is off depends on the drive."""
+    rows = rows_of(no_faults(16, 3), seed=8)
+    by = np.zeros((16, 15))
+    by[:, rows.places.ratios] = 0.04 + 0.02 * np.random.default_rng(8).normal(size=(16, 1))
+    assert shared_by(learn_fault_models(moved(rows, by), feed=0)).keys() == {()}
+
+
 def test_doubtful_gain_ratios_reveal_no_shared_gain_error() -> None:
     faults = no_faults(16, 3)
     faults.drift[4, 1] = 0.1
@@ -92,6 +127,25 @@ def test_gain_errors_of_a_tenth_of_the_gain_can_be_learnt_from() -> None:
     faults = no_faults(12, 3)
     faults.drift[:5, 2] = -0.9
     assert learned(rows_of(faults, seed=10)).prior.gain.high > 0.8
+
+
+def test_load_in_a_single_vehicle_does_not_make_loads_probable() -> None:
+    """It may be an offset of the feeding branch as well, of which the other vehicles have none either."""
+    faults = no_faults(8, 2)
+    faults.offset_a[0, 0] = 0.03
+    rows = rows_of(faults, seed=11)
+    model = learned(rows)
+    draws = explain(rows, model, feed=0)
+    loaded = (weigh(draws, model.prior)[0] * draws.fits.support[:, :, -1, None, None])[0].sum()
+    assert model.prior.load_share < 0.01
+    assert loaded < 0.9
+
+
+def test_offset_of_all_sensors_and_load_of_all_vehicles_are_about_as_probable_if_nothing_tells_them_apart() -> None:
+    faults = no_faults(12, 3)
+    faults.offset_a[:, 0] = 0.015
+    causes = shared_by(learn_fault_models(rows_of(faults, seed=12), feed=0))
+    assert 0.5 < causes[()] < 0.95
 
 
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
@@ -114,6 +168,15 @@ def test_branch_of_a_shared_offset_stays_open_if_it_is_not_a_load(offset: float,
     for model in models:
         by_branch[np.argmin(model.spread.mean[RowPlaces(3).intercepts])] += model.probability
     assert by_branch.max() < 0.9
+
+
+def test_offset_of_most_vehicles_is_not_a_group_beside_a_declared_load() -> None:
+    """What eight of twelve sensors share is their offset: the four others show the load that is declared."""
+    faults = no_faults(12, 3)
+    faults.offset_a[:8, 1] += 0.02
+    for model in learn_fault_models(rows_of(faults, seed=5), feed=0, load=0.0):
+        assert model.prior.group_share.max(initial=0.0) < 0.1
+        np.testing.assert_allclose(model.spread.mean[RowPlaces(3).intercepts], 0.0, atol=0.002)
 
 
 @pytest.mark.parametrize("seed", [8, 10])
@@ -163,6 +226,24 @@ def test_single_fault_does_not_determine_the_prior_of_fault_sizes() -> None:
     assert np.interp(0.03, GRID, density) > 0.3 * np.interp(0.25, GRID, density)
 
 
+def test_single_vehicle_does_not_reinforce_its_own_number_of_faults() -> None:
+    """It is judged by the initial guess, not by a prior that it has shaped itself."""
+    errors = Errors(slope=0.1, ratio=0.03, intercept=0.05, junction=0.03)
+    rows = rows_of(random_faults(3, vehicles=1, branches=2), seed=3, errors=errors)
+    draws, guess = explain(rows, law_of(2), feed=0), first_prior(2)
+
+    def numbers(prior: Prior) -> Array:
+        tally = np.zeros(prior.counts.shape)
+        np.add.at(tally, (draws.fits.hardware, draws.fits.sensor), weigh(draws, prior)[0].sum(axis=(2, 3)))
+        return tally
+
+    alone, C = numbers(guess), learning.COUNT_VEHICLES
+    learnt = replace(guess, counts=(alone + C * guess.counts) / (1.0 + C))
+    confirmed, found = numbers(learnt), learning._tally(draws, weigh(draws, learnt)[0], learnt)
+    assert np.abs(confirmed - alone).max() > 0.05
+    np.testing.assert_allclose(found, alone, atol=0.01)
+
+
 @pytest.mark.parametrize("of_sensor", [False, True])
 def test_vehicles_sharing_a_constant_form_a_group_of_open_cause(of_sensor: bool) -> None:
     faults, some = random_faults(13, vehicles=24, branches=2), np.arange(24) < 8
@@ -198,6 +279,14 @@ def test_shared_gain_error_is_found_but_not_in_which_of_two_branches(K: int, bra
         assert causes.get((K + branch,), 0.0) > 0.99
 
 
+def law_of(K: int, prior: Prior | None = None) -> FaultModel:
+    """FaultModel of vehicles that are alike but for their faults."""
+    spread = Spread(
+        mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(2 * K + 1)
+    )
+    return FaultModel(spread=spread, priors=((1.0, prior or first_prior(K)),))
+
+
 def test_unexplained_vehicle_gets_wider_uncertainty_and_others_do_not() -> None:
     K = 2
     rows = rows_of(random_faults(15, vehicles=6, branches=K), seed=15)
@@ -207,12 +296,27 @@ def test_unexplained_vehicle_gets_wider_uncertainty_and_others_do_not() -> None:
     read = rows.covariance.copy()
     read[2, [3, 4, 8, 9], [3, 4, 8, 9]] = 1e-6  # ... while readings say that all sensors are right
     rows = replace(rows, covariance=read)
-    plain, odd = (explain(each, model_of_equals(K), feed=0) for each in (rows, moved(rows, by)))
+    plain, odd = (explain(each, law_of(K), feed=0) for each in (rows, moved(rows, by)))
     wide = [np.sqrt((draws.fits.root[2, : draws.fits.number[2]] ** 2).max()) for draws in (plain, odd)]
     assert wide[1] > 3.0 * wide[0]
     for j in (0, 1, 3, 4, 5):
         n = plain.fits.number[j]
         np.testing.assert_array_equal(odd.fits.theta[j, :n], plain.fits.theta[j, :n])
+
+
+def test_learning_works_with_one_vehicle_and_with_an_unused_branch() -> None:
+    K = 3
+    rows = rows_of(Faults(**{name: values[:1] for name, values in vars(no_faults(2, K)).items()}), seed=17)
+    assert len(learn_fault_models(rows, feed=0)) >= 1
+    rows = rows_of(no_faults(8, K), seed=17, currents=np.array([0.1, -0.1, 0.0]))
+    at = RowPlaces(K)
+    for row in (at.slope(K - 1), at.ratio(K - 1)):
+        rows.covariance[:, row], rows.covariance[:, :, row] = 0.0, 0.0
+        rows.covariance[:, row, row] = 100.0
+        rows.relative[:, row] = 0.0
+    model = learned(rows)
+    assert np.isfinite(model.spread.covariance).all()
+    assert model.spread.mean[K - 1] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_learning_finds_intercept_errors_larger_than_stated() -> None:
