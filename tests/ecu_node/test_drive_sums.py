@@ -143,12 +143,16 @@ def test_write_failure_and_its_end_are_each_reported_once(drive: Drive) -> None:
     assert record.starts == [True, True, True]
 
 
-def test_record_of_another_version_is_refused(drive: Drive) -> None:
+def test_record_of_another_version_or_damaged_is_refused(drive: Drive) -> None:
     drive.go_on(60.0)
     (record,) = drive.ended()
     other = msgspec.structs.replace(record, schema_version=1)
     with pytest.raises(ValueError, match=f"schema version 1, expected {rule.SCHEMA_VERSION}"):
         decode_summary(encode_summary(other))
+    content = encode_summary(record)
+    for damaged in (content[: len(content) // 2], b"no summary", content[:2] + content[3:]):
+        with pytest.raises(ValueError, match=r"cut, or too large|Error -3"):
+            decode_summary(damaged)
 
 
 def test_unusable_summary_folder_or_vehicle_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:

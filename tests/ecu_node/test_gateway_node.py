@@ -171,3 +171,11 @@ def test_second_gateway_between_two_buses_refuses_to_start(database: VehicleData
             second.result(LONGEST_WAIT_S)
         receive(vehicle, STATUS, 3)
         assert not first.done()
+
+
+def test_branch_frame_that_waited_too_long_is_held_back(database: VehicleDatabase, ends: Ends, channel: str) -> None:
+    with gateway(database, channel) as (corrector, _), VirtualBus(f"{channel} a", preserve_timestamps=True) as bus:
+        for counter, age_s in enumerate((0.0, 5.0, 0.0)):
+            bus.send(battery_frame(database, counter, time.time() - age_s))
+        frames = [decoded(database, "HV_Battery", bytes(frame.data)) for frame in received(ends[1], 2)]
+        assert ([frame["AliveCounter"] for frame in frames], corrector.counters.late) == ([0, 2], 1)
