@@ -22,7 +22,6 @@ from ecu_node.parameters import JunctionResidual
 from tests.ecu_node.vehicles import (
     BATTERY,
     HEATER,
-    MOTOR,
     NET,
     PAIR,
     SMALL_DBC,
@@ -34,7 +33,9 @@ from tests.ecu_node.vehicles import (
     corrector_for,
     damaged,
     decoded,
+    drive,
     frame_of,
+    motor,
     parameters_for,
     passed_on,
     protected,
@@ -42,10 +43,6 @@ from tests.ecu_node.vehicles import (
 )
 
 STATUS, DCDC = FrameKey(0x5F0, False), FrameKey(0x140, False)
-
-
-def motor(database: VehicleDatabase, counter: int, current: float = 100.0) -> Frame:
-    return Frame(MOTOR, protected(database, "HV_Motor", counter, MotorCurrent=current))
 
 
 def status_of(database: VehicleDatabase, corrector: Corrector, now_s: float) -> dict[str, Any]:
@@ -114,41 +111,6 @@ def test_status_is_starting_until_branches_arrive_then_correcting(database: Vehi
 
 TAKE: dict[Mode, Callable[[Corrector, Frame, float], object]] = {Mode.OVERLAY: answers, Mode.GATEWAY: passed_on}
 """What a node of either mode does with a frame."""
-Current = float | Callable[[int], float]
-"""Of all frames, or of each by its number. [A]"""
-
-
-def drive(
-    database: VehicleDatabase,
-    corrector: Corrector,
-    start_s: float,
-    end_s: float,
-    *,
-    silent: Collection[str] = (),
-    battery_a: Current = 80.0,
-    motor_a: Current = 60.0,
-    period_s: float = 0.05,
-    spoil: int = 0,
-    **more: float,
-) -> list[Quality]:
-    """Battery and motor frames, and a look after each pair; some may be silent, every so many of the battery damaged.
-
-    Further signals are those of the battery's message. Returns the qualities of the answers to the battery.
-    """
-    qualities = []
-    for k in range(round(start_s / period_s), round(end_s / period_s)):
-        battery_now_a, motor_now_a = (item(k) if callable(item) else item for item in (battery_a, motor_a))
-        if "battery" not in silent:
-            frame = battery(database, k % 15, battery_now_a, **more)
-            found = answers(corrector, damaged(frame) if spoil and k % spoil == 0 else frame, k * period_s)
-            values = [decoded(database, "HV_BatteryCorrected", answer.data) for answer in found]
-            qualities += [item["BatteryCurrentQuality"] for item in values]
-        if "motor" not in silent:
-            answers(corrector, motor(database, k % 15, motor_now_a), k * period_s)
-        corrector.look((k + 0.5) * period_s)
-    return qualities
-
-
 balanced = partial(drive, battery_a=100.0, motor_a=100.0)
 
 
