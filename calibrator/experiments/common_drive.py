@@ -22,6 +22,7 @@ from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, builtin_trip
 from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
 from calibrator.artificial.trips import with_branches
 from calibrator.drive import Array
+from calibrator.errors import FleetError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, densest_clusters
 from calibrator.experiments.trial import CommonEvidence, Trial, drawn_distribution
 from calibrator.faults import Faults, slopes_and_intercepts
@@ -102,8 +103,10 @@ def builtin_common_drive(duration_s: float, branches: int = 2) -> CommonDrive:
     Raises
     ------
     FleetError
-        If fastsim is not installed.
+        If the number of branches is another one, or fastsim is not installed.
     """
+    if not 2 <= branches <= len(BUILTIN_BRANCHES):
+        raise FleetError(f"{branches} branches: the built-in vehicle has 2 to {len(BUILTIN_BRANCHES)}")
     trip, unseen = (
         with_branches(
             builtin_trip(random_stream(purpose, 0), duration_s=duration_s, name="builtin-0"),

@@ -184,49 +184,43 @@ def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
     }
 
 
-def decode_records(
-    contents: Sequence[bytes], identity: StoreIdentity, where: str, *, whole: bool = True
-) -> list[Record]:
-    """Read records from Parquet files.
+def decode_records(content: bytes, identity: StoreIdentity, where: str, *, whole: bool = True) -> list[Record]:
+    """Read the records of a Parquet file.
 
     Parameters
     ----------
-    contents : sequence of bytes
-        Contents of the files.
+    content : bytes
+        Content of the file.
     identity : StoreIdentity
-        Identity of their store.
+        Identity of its store.
     where : str
-        Where the files are, for messages.
+        Where the file is, for messages.
     whole : bool
         Whether to read the summaries as well, and not only names, versions, digests and problems of the drives.
 
     Returns
     -------
     list of Record
-        Records in the order of the files.
+        Records in the order of the file.
 
     Raises
     ------
     FleetError
-        If a file is damaged or cut, or is not a file of summaries.
+        If the file is damaged or cut, or is not a file of summaries.
     DriveError
         If the name of a vehicle cannot be a file name.
     """
-    found: list[Record] = []
-    for content in contents:
-        reason = "its columns are not those of this store"
-        try:
-            file = pq.ParquetFile(pa.BufferReader(content), pre_buffer=False, page_checksum_verification=True)
-            if file.schema_arrow.equals(SCHEMA):
-                table = file.read(columns=None if whole else _ABOUT, use_threads=False)
-                found += _records(table, identity, where, whole=whole)
-                continue
-        except (pa.ArrowException, OSError):
-            reason = "it is cut or changed, or no Parquet file"
-        except ValueError:  # lists of wrong lengths
-            pass
-        raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again")
-    return found
+    reason = "its columns are not those of this store"
+    try:
+        file = pq.ParquetFile(pa.BufferReader(content), pre_buffer=False, page_checksum_verification=True)
+        if file.schema_arrow.equals(SCHEMA):
+            table = file.read(columns=None if whole else _ABOUT, use_threads=False)
+            return _records(table, identity, where, whole=whole)
+    except (pa.ArrowException, OSError):
+        reason = "it is cut or changed, or no Parquet file"
+    except ValueError:  # lists of wrong lengths
+        pass
+    raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again")
 
 
 def _records(table: pa.Table, identity: StoreIdentity, where: str, *, whole: bool) -> list[Record]:

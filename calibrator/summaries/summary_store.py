@@ -120,7 +120,7 @@ class SummaryStore:
         found: dict[str, list[Record]] = {}
         for name in self.files(bucket):
             where = f"{self._files.url}/{name}"
-            for record in decode_records([self._files.read(name)], self.identity, where, whole=whole):
+            for record in decode_records(self._files.read(name), self.identity, where, whole=whole):
                 if (right := self.bucket_of(record.vehicle)) != bucket:
                     raise FleetError(
                         f"{where}: vehicle {record.vehicle} belongs into bucket {right:05d}; this file was renamed or "

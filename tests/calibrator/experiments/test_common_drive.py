@@ -40,6 +40,11 @@ def test_state_space_models_of_a_symmetric_fleet_give_the_slopes_of_the_faults()
     np.testing.assert_allclose(trial.evidence.intercepts_a, b, atol=1e-3)
 
 
+def test_number_of_branches_that_the_builtin_vehicle_lacks_is_refused() -> None:
+    with pytest.raises(FleetError, match="9 branches: the built-in vehicle has 2 to 5"):
+        builtin_common_drive(60.0, branches=9)
+
+
 @pytest.mark.long
 def test_recovery_rate_rises_with_sparsity_snr_and_better_classifiers() -> None:
     f2 = rates(CASE, PERFECT, TREE, THRESHOLD, figure="f2")
