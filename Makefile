@@ -79,7 +79,8 @@ bench-quick: setup       ## the same at small sizes, within five minutes
 
 experiments: setup       ## docs/results anew, the repetitions of each from SEED on; TRIPS=folder of the recorded BMW i3 trips (half an hour)
 	$(BIN)/python tools/import_bmw_i3.py $(TRIPS) --layout dbc/hv_powertrain.toml --out build/i3
-	$(BIN)/calibrator experiment all --seed $(SEED) --drives build/i3 --layout dbc/hv_powertrain.toml --out docs/results
+	$(BIN)/calibrator experiment all --seed $(SEED) --drives build/i3 --layout dbc/hv_powertrain.toml --out build/results
+	cp build/results/* docs/results/ # all at once, so that each says of which commit it is, unchanged
 
 soak: setup              ## the node at the full load of a CAN FD bus, 10^7 frames; its watch on 24 h of real drives (hours)
 	PYTHONPATH=tools $(BIN)/python -m bench node --out build/soak.json
@@ -90,7 +91,7 @@ fuzz: setup              ## 10^7 random frames through node and C core, 10^6 cha
 		tests/ecu_node/test_random_vehicles.py tests/calibrator/export/test_c_core.py
 	PYTHONPATH=tools $(BIN)/python -m bench.c_core fuzz --seconds 3600
 
-release-check: coverage check-long experiments bench package ## the bars of a release on one commit, met or not (two hours)
+release-check: coverage check-long bench experiments package ## the bars of a release on one commit, met or not (two hours)
 	PYTHONPATH=tools $(BIN)/python -m bench.bars
 
 mutants: setup           ## change the code in small ways and see that tests notice (an hour; goes on where it stopped)

@@ -105,6 +105,12 @@ class FleetTask:
             advice = f"its evidence cannot be used: {error}; look at its recordings"
             return {vehicles[0].vehicle: advice if isinstance(error, UserError) else internal_error(error)}
 
+    def choices(self, vehicle: str) -> tuple[object, ...]:
+        """Return the user's choices that decide on the parameters of a vehicle, beside its drives."""
+        settings = self.identity.settings
+        bench = [self.bench.get((vehicle, branch)) for branch in self.branches]
+        return settings.harm_limit, settings.load, settings.expected_faults, vehicle in settings.trusted, bench
+
     def _found(self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int) -> Calibrated | str:
         if why := impossible(estimate, j, self.branches):
             return why
@@ -250,7 +256,7 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
             f"path by which every worker reaches it"
         )
     records, before = store.read(bucket), {} if previous is None else read_part(part_file(previous, bucket))
-    digests = {name: drives_digest(items) for name, items in records.items()}
+    digests = {name: drives_digest(items, task.choices(name)) for name, items in records.items()}
     found: dict[str, Calibrated | str] = dict.fromkeys(before.keys() - records.keys(), NOT_THERE)
     todo, moved = list[VehicleSummary](), dict[str, dict[str, str]]()
     for name, items in records.items():

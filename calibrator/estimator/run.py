@@ -81,8 +81,8 @@ def calibrate_fleet(
     workers : Workers
         Processes or cluster that compute it.
     since : Path or None
-        Earlier result to go on from: vehicles without new drives keep its parameters. The fleet is then a store of
-        summaries that holds the earlier drives as well.
+        Earlier result to go on from: vehicles without new drives, and with the same settings, keep its parameters. The
+        fleet is then a store of summaries that holds the earlier drives as well.
 
     Returns
     -------

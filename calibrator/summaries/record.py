@@ -111,12 +111,15 @@ class Outline(NamedTuple):
         return cls(records[0].vehicle, drives, too_short(duration_s, len(drives)) if usable else records[-1].problem)
 
 
-def drives_digest(records: Sequence[Record]) -> str:
-    """Return a digest of the usable drives of a vehicle; it changes when a drive is added or its file changes."""
+def drives_digest(records: Sequence[Record], choices: object) -> str:
+    """Return a digest of the usable drives of a vehicle and of the user's choices for it.
+
+    It changes when a drive is added or its file changes, and with what the choices are printed as.
+    """
     known = sorted(
         pair for record in records if record.found for pair in zip(record.drives, record.sources, strict=True)
     )
-    return hashlib.blake2b(repr(known).encode(), digest_size=16).hexdigest()
+    return hashlib.blake2b(repr((known, choices)).encode(), digest_size=16).hexdigest()
 
 
 def joined_records(records: Sequence[Record]) -> VehicleSummary:

@@ -1,19 +1,23 @@
 """The bars of a release are compared with what experiments and benchmarks have left."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from bench import bars
 
+MADE = "calibrator 1.1.0 of commit 0123456789ab, Python 3.13.0"
 DOCS = Path(__file__).parents[2] / "docs"
 
 
 def bench_rows(folder: Path, **ratios: float) -> Path:
     """Write the rows of benchmarks, each with a ratio."""
     path = folder / "bench.json"
-    rows = [{"name": f"{name} log to drive", "value": 1.0, "ratio": ratio} for name, ratio in ratios.items()]
+    rows = [
+        {"name": f"{name} log to drive", "value": 1.0, "ratio": ratio, "made": MADE} for name, ratio in ratios.items()
+    ]
     path.write_text(json.dumps(rows))
     return path
 
@@ -44,8 +48,21 @@ def test_shares_of_several_rows_are_pooled_by_their_cases(tmp_path: Path) -> Non
         {"series": series, "x": 80.0, "method": "posterior", "figure": "harmed", "value": value, "of": of}
         for series, value, of in rows
     ]
-    (tmp_path / "real.json").write_text(json.dumps({"figures": figures}))
+    (tmp_path / "real.json").write_text(json.dumps({"figures": figures, "made": MADE}))
     value, behind = bars.Bars(tmp_path / "bench.json", tmp_path).figure("real", "K=.*", "harmed", "<= 0")
     assert value == 5 / 40
     assert behind.startswith("5 of 40, ")
     assert bars.Bars(tmp_path / "bench.json", tmp_path).figure("real", "K=.*", "each harmed", "<= 0")[0] == 0.5
+
+
+@pytest.mark.parametrize(("mark", "expected"), [("", None), ("-dirty", "figures of 0123456789ab-dirty; expected")])
+def test_figures_are_of_one_commit_without_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mark: str, expected: str | None
+) -> None:
+    (tmp_path / "bars.toml").write_text('bars = [["bench", "BLF.*", "ratio", ">= 25"]]')
+    monkeypatch.setattr(bars, "LIST", tmp_path / "bars.toml")
+    (tmp_path / "bench.json").write_text(
+        bench_rows(tmp_path, BLF=30.0).read_text().replace("0123456789ab", f"0123456789ab{mark}")
+    )
+    with nullcontext() if expected is None else pytest.raises(SystemExit, match=expected):
+        bars.main(bench=tmp_path / "bench.json", results=DOCS / "results")

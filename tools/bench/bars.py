@@ -2,7 +2,8 @@
 
     python -m bench.bars        (in tools/, after experiments and benchmarks)
 
-Fails if a bar is missed that is not known to be, or farther than is known, or has no figure.
+Fails if a bar is missed that is not known to be, or farther than is known, or has no figure; or if figures are of more
+than one commit, or of changed files.
 """
 
 import json
@@ -19,6 +20,7 @@ from scipy.stats import binomtest
 __all__ = ["Bars", "main"]
 
 ROOT = Path(__file__).parents[2]
+LIST = Path(__file__).parent / "bars.toml"
 COMPARISONS = {"<=": (operator.le, max), ">=": (operator.ge, min)}
 """How a figure is compared with a bar, and which of several rows is farthest from it."""
 
@@ -42,6 +44,8 @@ class Bars:
 
     def __init__(self, bench: Path, results: Path) -> None:
         self.bench, self.results = bench, results
+        self.made: set[str] = set()
+        """Commits of the figures that were looked up."""
 
     def figure(  # noqa: PLR0911 (each figure has its own rule)
         self, where: str, rows: str, figure: str, bar: str
@@ -50,7 +54,9 @@ class Bars:
         worst = COMPARISONS[bar.split(maxsplit=1)[0]][1]
         if where == "bench":
             return self._benchmark(rows, figure, worst), ""
-        table = pd.DataFrame(json.loads((self.results / f"{where}.json").read_text())["figures"])
+        result = json.loads((self.results / f"{where}.json").read_text())
+        self.made.add(commit(result["made"]))
+        table = pd.DataFrame(result["figures"])
         table = table.dropna(subset="x")  # all settings together are a row of their own
         table["row"] = table["series"] + ", " + table["x"].map("{:g}".format)
         table = table[table["row"].str.fullmatch(rows)]
@@ -81,14 +87,20 @@ class Bars:
     def _benchmark(self, rows: str, figure: str, worst: Callable[["pd.Series[float]"], float]) -> float:
         """Return the figure of a benchmark; NaN if it was not measured."""
         measured = pd.DataFrame(json.loads(self.bench.read_text()))
-        found = measured.loc[measured["name"].str.fullmatch(rows), figure]
-        return float(worst(found)) if len(found) else np.nan
+        found = measured[measured["name"].str.fullmatch(rows)]
+        self.made.update(map(commit, found["made"]))
+        return float(worst(found[figure])) if len(found) else np.nan
+
+
+def commit(made: str) -> str:
+    """Return the commit in what :func:`.made_now` has written; it ends with "-dirty" if files were changed."""
+    return made.partition(" of commit ")[2].partition(",")[0] or "unknown"
 
 
 def main(*, bench: Path = ROOT / "build/bench.json", results: Path = ROOT / "docs/results") -> None:
     """Print each bar with its figure, and whether it is met."""
     bars, missed = Bars(bench, results), 0
-    for where, rows, figure, bar, *known in tomllib.loads((Path(__file__).parent / "bars.toml").read_text())["bars"]:
+    for where, rows, figure, bar, *known in tomllib.loads(LIST.read_text())["bars"]:
         value, behind = bars.figure(where, rows, figure, bar)
         verdict = "met" if meets(value, bar) else "MISSED"
         if verdict == "MISSED" and known and meets(value, known[0]):
@@ -97,6 +109,8 @@ def main(*, bench: Path = ROOT / "build/bench.json", results: Path = ROOT / "doc
         print(f"{where:9} {rows[:48]:48} {figure:17} {bar:8} {value:8.4g}  {verdict:6} {behind}")
     if missed:
         raise SystemExit(f"{missed} bars are missed that were met before, missed by more, or have no figure")
+    if len(bars.made) > 1 or any(each.endswith("-dirty") for each in bars.made):
+        raise SystemExit(f"figures of {', '.join(sorted(bars.made))}; expected those of one commit, without changes")
 
 
 if __name__ == "__main__":

@@ -278,6 +278,24 @@ def test_option_since_recalibrates_changed_vehicles_and_detects_moved_sensors(
     assert abs(battery["offset_a"] - faults.offset_a[0, 0]) <= 4.0 * battery["offset_sd_a"]
 
 
+def test_option_since_recalibrates_what_another_choice_concerns(
+    store: SummaryStore, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1800000000")  # stands in parameters that are found anew
+    readings = tmp_path / "readings.csv"
+    readings.write_text("vehicle,branch,offset_a,offset_sd_a\nV009,battery,0.0,300.0\n")
+    old = contents(result / "params")
+    for number, (options, concerned) in enumerate([
+        ((), set()),
+        (("--readings", readings), {"V009.json"}),
+        (("--harm-limit", "0.02"), set(old)),
+    ]):  # fmt: skip
+        out = tmp_path / f"out{number}"
+        succeeded(*words(store.url, out, "--since", result, *options))
+        now = contents(out / "params")
+        assert {name for name in old if old[name] != now[name]} == concerned
+
+
 def test_vehicle_removed_from_the_store_is_named(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     """Also if it was the only one of its bucket."""
     shutil.copytree(store.url, tmp_path / "store")
