@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DRIVES ?= builtin
 OUT ?= build/demo
 TRIPS ?= ../shared/data/bmw_i3_summer
-SEED ?= 1100
+SEED ?= 2900
 PYTHONS ?=
 PIP_QUIET := --quiet --disable-pip-version-check --no-deps
 # processes share the cores: threads of BLAS in each would only wait for those of the others

@@ -665,9 +665,9 @@ def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
 
 
 def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
-    """Return the covariance of two columns: the mean product of their distances from their means."""
-    mean_x, mean_y = math.fsum(x) / len(x), math.fsum(y) / len(y)
-    return math.fsum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / len(x)
+    """Return the covariance of two columns; it is enough that one of them has its mean taken out."""
+    mean_y = math.fsum(y) / len(y)
+    return math.fsum(a * (b - mean_y) for a, b in zip(x, y, strict=True)) / len(x)
 
 
 def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, bool]:
