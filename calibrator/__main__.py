@@ -1,6 +1,6 @@
-"""Start the calibrator as ``python -m calibrator`` or console command; say what to install if only the node is there.
+"""Start the calibrator as ``python -m calibrator`` or console command; say what to install if packages are missing.
 
-Slow modules are imported inside a function, so that Ctrl-C or a closed pipe ends the program alike even during imports.
+Slow modules are imported inside a function, so that Ctrl-C or a closed pipe is handled during imports as it is later.
 """
 
 import signal
@@ -16,7 +16,10 @@ __all__ = ["calibrator_program"]
 
 
 def calibrator_program() -> None:
-    """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 70 internal, 130 interrupted, 143 SIGTERM."""
+    """Run the command line and end the process.
+
+    Exit codes: 0 done, 1 failed, 2 wrong use, 70 a fault of the program, 130 Ctrl-C, 143 SIGTERM.
+    """
     ending_at_sigterm()
     try:
         code = _run()

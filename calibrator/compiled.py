@@ -3,7 +3,7 @@
 A compiled function may use only numbers, arrays, tuples and other compiled functions.
 
 Compiling the estimator takes about half a minute on first use. Numba keeps the result in the user's cache folder, in
-one folder per version of the source; within it numba itself separates versions of Python and numba, and processors.
+one folder per version of the source; within it numba itself keeps versions of Python and numba, and processors, apart.
 """
 
 import hashlib
@@ -74,7 +74,7 @@ def inner(function: _Function) -> _Function:
 
 
 def inlined(function: _Function) -> _Function:
-    """Compile a small function into those that call it: a call would count references to its arrays."""
+    """Compile a small function into its callers, as a call would take time to count references to its arrays."""
     return cast("_Function", _dispatcher(function, inline="always"))
 
 

@@ -105,7 +105,7 @@ class Samples:
     Attributes
     ----------
     branch_names, input_names : tuple of str
-        Names of the K branches and M inputs, derived ones included.
+        Names of the K branches, and of the M inputs; these include derived inputs.
     time_s : ndarray of shape (T,)
         Instants since the start of the drive, equally spaced. [s]
     currents_a : ndarray of shape (T, K)
@@ -182,7 +182,7 @@ class FleetSource:
     vehicles : mapping of str to tuple of DriveFile
         Files of the drives by name of the vehicle; vehicles and drives are sorted by name.
     left_out : mapping of str to str
-        Reasons: why a vehicle was left out, by its name; why a file or folder was, by ``problem 1``, ``problem 2`` ...
+        Why something was left out: a vehicle under its name; a file or folder under ``problem 1``, ``problem 2`` ...
     sizes : mapping of str to int
         Size of all drives together, by name of the vehicle. [byte]
     """

@@ -58,7 +58,7 @@ class DriveError(UserError):
 
 
 class FleetError(UserError):
-    """A fleet cannot be calibrated (too small, contradictory, wrong folder)."""
+    """A fleet cannot be calibrated (too small, contradictory), or a file or folder cannot be used or written."""
 
 
 class ContradictionError(UserError):

@@ -1,4 +1,4 @@
-"""Fault model: how the measured, true and ideal currents of a vehicle are related.
+"""How sensor faults and hardware faults relate the measured, true and ideal currents of a vehicle.
 
 Symbols: i_s ideal, i true, i_m measured currents (T samples, K branches, N vehicles), d drift, o offset; index h
 hardware, m measurement (sensor). Currents are positive into the junction. Equations are those of [1]_.
@@ -53,7 +53,8 @@ class Faults:
         Parameters
         ----------
         x : ndarray of shape (N, 3K)
-            (d_h, o_h,1 .. o_h,K-1, D_m, o_m), offsets in fractions of full scale; o_h,K is minus the sum of the others.
+            (d_h, o_h,1 .. o_h,K-1, D_m, o_m), offsets in fractions of full scale; o_h,K is minus the sum
+            of the other o_h.
         full_scale_a : float
             Full scale of the junction. [A]
         """
@@ -82,7 +83,7 @@ class Faults:
 
 
 def true_currents(i_s: Array, faults: Faults) -> Array:
-    """Currents that flow in one vehicle, (11) in [1]_.
+    """Currents that flow in one vehicle, equation (11) of [1]_.
 
     Parameters
     ----------
@@ -100,12 +101,12 @@ def true_currents(i_s: Array, faults: Faults) -> Array:
 
 
 def measured_currents(i: Array, faults: Faults) -> Array:
-    """What the sensors of one vehicle show for its true currents, (13) in [1]_; shapes as in true_currents."""
+    """What the sensors of one vehicle show for its true currents, equation (13) of [1]_; shapes as in true_currents."""
     return (1.0 + faults.drift) * i + faults.offset_a
 
 
 def slopes_and_intercepts(faults: Faults) -> tuple[Array, Array]:
-    """Slopes a and intercepts b of the measured over the ideal currents, (15) in [1]_.
+    """Slopes a and intercepts b of the measured over the ideal currents, equation (15) of [1]_.
 
     Parameters
     ----------

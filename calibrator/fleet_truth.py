@@ -36,7 +36,7 @@ class VehicleTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class FleetTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How an artificial fleet was made, and every vehicle of it."""
+    """How an artificial fleet was made, and the truth about every vehicle in it."""
 
     schema_version: Literal[1] = 1
     layout: str
@@ -64,7 +64,7 @@ def write_truth(path: Path, truth: FleetTruth) -> None:
 
 
 def read_truth(path: Path) -> FleetTruth:
-    """Read ``truth.json``; FleetError says what is wrong with it."""
+    """Read ``truth.json``; FleetError, which says what is wrong, if it cannot be read or is no such file."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=FleetTruth)
     except OSError as error:

@@ -2,9 +2,9 @@
 
     recovered   drift vector and offset vector (offsets / full scale) each within a tolerance of the truth in the
                 Euclidean norm, the truth's norm counted as at least the fleet's smallest fault
-    f2          weighted harmonic mean of precision and recall of the hardware classification, footnote 7 of the paper
-    harmed      some branch current corrected by (i_m - o) / (1 + d), (25) of [1]_, is farther (RMSE) from the true
-                current than the measured one
+    f2          weighted harmonic mean of precision and recall of the hardware classification, footnote 7 of [1]_
+    harmed      some branch current corrected by (i_m - o) / (1 + d), equation (25) of [1]_, is farther (RMSE) from
+                the true current than the measured one
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -20,7 +20,7 @@ from calibrator.faults import Faults
 __all__ = ["TOLERANCE", "UnseenDrive", "f2_score", "harmed", "recovered"]
 
 TOLERANCE = 0.10
-"""Relative error below which a vehicle counts as recovered, section IV-D. [1]"""
+"""Relative error up to which a vehicle counts as recovered, section IV-D of the paper. [1]"""
 
 
 def recovered(
@@ -69,7 +69,7 @@ def f2_score(predicted: Mask, actual: Mask) -> float:
 
 @dataclass(frozen=True)
 class UnseenDrive:
-    """Moments of the true currents i and of the sensors' errors e = i_m - i on a drive that no method has seen.
+    """Moments of the true currents i and of the sensors' errors e = i_m - i on a drive not used for calibration.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class UnseenDrive:
         return np.asarray(np.sqrt(np.maximum(square, 0.0)) / np.abs(1.0 + drift))
 
     def worsening_a(self, drift: Array, offset_a: Array) -> Array:
-        """By how much such a correction raises the root mean square error, (N, K): negative where it helps. [A]"""
+        """By how much correcting with these values raises the RMS error, shape (N, K); negative where it helps. [A]"""
         zero = np.zeros_like(drift)
         return self.rms_a(drift, offset_a) - self.rms_a(zero, zero)
 

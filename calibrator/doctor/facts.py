@@ -63,7 +63,7 @@ class Facts:
     logs : sequence of ExaminedLog
         All logs and tables.
     drives : sequence of Drive
-        Drives of those that have a branch.
+        Drives of those logs that have a branch.
     channels : DataFrame
         A row for each branch and input, in the order of the layout:
 
@@ -77,7 +77,7 @@ class Facts:
         - ``low``, ``high``: least and greatest good value, of branches positive into the junction; NaN without any;
         - ``clipped``: number of good values at an end of the signal's range, several in a row.
     junction : RecordedJunction
-        What the sum of the branches shows; its layout has the logs' sample period, and voltages as further inputs.
+        What the sum of the branches shows; its layout has a period that suits the logs, and voltages as more inputs.
     """
 
     database: VehicleDatabase

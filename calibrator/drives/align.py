@@ -39,12 +39,12 @@ SLOWER = 1.5
 """If even the fastest branch's frames are this many periods or more apart, the period becomes their distance. [1]"""
 LEVELS, FEW_LEVELS, LOOKED_AT = 10, 4, 2000
 """In :func:`step_seen`: fewest different values whose least distance is taken for the step; fewest if all are whole
-steps apart, as a heater may only be on or off; most samples that are looked at. [1]"""
+steps apart, as a heater may only be on or off; about how many samples are looked at. [1]"""
 _STALE, _NOT_GOOD = "stale", "not good"
 
 
 def at_pace(layout: Layout, drives: Sequence[Drive]) -> Layout:
-    """Return the layout; if its period is too short for all branches, with the fastest one's frame distance instead."""
+    """Return the layout; with the frame distance of the fastest branch as period, if its own is far shorter."""
     channels = [channel for drive in drives for channel in drive.branches.values() if channel.good.sum() > 1]
     fastest_s = min((float(np.median(np.diff(each.time_s[each.good]))) for each in channels), default=0.0)
     if fastest_s < SLOWER * layout.period_s:
@@ -69,7 +69,8 @@ def choose_inputs(
     Returns
     -------
     kept, left_out : tuple of str
-        Names of the wanted inputs that are available, or are derived from inputs that all are; and of all other ones.
+        Names of the wanted inputs that are available, or derived from available inputs only; and of the other wanted
+        inputs.
     """
     wanted = layout.model_inputs if names is None else names
     kept = tuple(name for name in wanted if layout.base_inputs([name]) <= set(available))
@@ -87,7 +88,7 @@ _ARRAY_FUNCTIONS: Mapping[str, Callable[..., Any]] = {
 
 
 def evaluate_formula(formula: str, values: Mapping[str, Array]) -> Array:
-    """Return the values of a formula of the layout, shape (T,); NaN or infinite where it has none.
+    """Return the values of a formula of the layout, shape (T,); NaN or infinite where it is not defined.
 
     Parameters
     ----------
@@ -126,7 +127,8 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
     Raises
     ------
     DriveError
-        If a channel is missing, has no good sample, or the channels have no instant in common.
+        If a channel is missing or has no good sample, the channels have no instant in common, or the drive is longer
+        than :data:`MAX_SAMPLES`.
     """
     names = tuple(layout.model_inputs if inputs is None else inputs)
     recorded = sorted(layout.base_inputs(names))
@@ -189,7 +191,8 @@ def align_channels(
     Raises
     ------
     DriveError
-        If a channel has no good sample, or the channels have no instant in common.
+        If a channel has no good sample, the channels have no instant in common, or more than :data:`MAX_SAMPLES`
+        of them.
     """
     empty = [name for name, channel in channels.items() if not channel.good.any()]
     if empty:
@@ -261,7 +264,7 @@ def _interpolate(  # noqa: PLR0917 (compiled: no keywords)
     """Fill `value` and `label` at increasing instants from the good samples before (or at) and after (or at) each.
 
     Before the first and after the last sample, that sample's value is held. If the two samples are farther apart than
-    the limit, the label is ``_SPOILT`` if a bad sample lies between them or beside one, else ``_FAR``.
+    the limit, the label is ``_SPOILT`` if a bad sample lies between them or at one of them, else ``_FAR``.
     """
     known_s, known = samples
     after, bad = 0, 0

@@ -51,7 +51,7 @@ class ChargeCurve:
         Column k, at sample k: integral P of the charge [A s^2], charge Q since the first sample [A s], current i [A],
         and slope of the line to sample k + 1 [A/s].
     gap_s : ndarray of shape (n,)
-        Time spent in gaps before each sample. [s]
+        Total length of all gaps before each sample. [s]
     period_s : float
         Median distance of the samples. [s]
     """

@@ -223,8 +223,8 @@ def without_delays(drive: Drive, delays: Mapping[str, float]) -> Drive:
     Returns
     -------
     Drive
-        The drive with the samples of each named branch moved to the instants at which they were true. Inputs stay as
-        they are.
+        The drive with the samples of each named branch moved to the instants at which these currents flowed. Inputs
+        stay as they are.
 
     Raises
     ------
@@ -315,7 +315,7 @@ def _search_lags(parts: Sequence[_Stretch], band: Band) -> Array:
 
 
 def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int], width: int) -> NDArray[np.intp]:
-    """Return columns of `moments` (lags), one for each branch in `group`: those that let all best explain the first."""
+    """Return columns of `moments` (lags), one per branch in `group`: with these, all others best explain the first."""
     choices = np.stack(np.meshgrid(*(width * k + np.arange(width) for k in group)), axis=-1).reshape(-1, len(group))
     tried = np.repeat(column[None, 1:], len(choices), axis=0)
     tried[:, np.array(group) - 1] = choices

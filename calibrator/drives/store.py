@@ -103,7 +103,7 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
     Raises
     ------
     DriveError
-        If vehicle or drive has a name that is no file name.
+        If the name of vehicle or drive cannot be a file name on every system.
     UserError
         If the file cannot be written.
     """
@@ -131,7 +131,10 @@ def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
 
 
 def remove_leftovers(store: str | Path, vehicles: Iterable[str], *, before_s: float) -> None:
-    """Remove incomplete files of these vehicles that a killed process left before `before_s` [s since 1970]."""
+    """Remove incomplete files of these vehicles, older than `before_s` [s since 1970], that a killed process left.
+
+    Only in a store on this machine.
+    """
     for folder in (_folder(store, vehicle) for vehicle in vehicles):
         if folder.is_local:
             for left in Path(folder.url).glob(".*.parquet.*"):
@@ -168,7 +171,7 @@ def iterate_drives(store: Path, layout: Layout) -> Iterator[Drive]:
 
 
 def is_drive_file(path: Path) -> bool:
-    """Check whether a file is a drive of a store, and not any other Parquet table. A damaged file counts as a drive."""
+    """Check whether a file is a drive of a store, and not any other Parquet table. A damaged one counts as a drive."""
     if path.suffix != ".parquet":
         return False
     try:
@@ -197,7 +200,7 @@ def read_drive_file(path: Path, layout: Layout) -> Drive:
 
 
 def recording_digest(drive: Drive) -> str:
-    """Return a digest of a drive's channels, without the names of drive and vehicle; two recordings differ by noise."""
+    """Return a digest of a drive's channels, without the names of drive and vehicle: equal for copies only."""
     digest = hashlib.blake2b(digest_size=16)
     for channels in (drive.branches, drive.inputs):
         for name, channel in channels.items():

@@ -1,4 +1,4 @@
-"""Write files and folders so that they appear only when they are complete, and leave nothing behind on failure."""
+"""Write files and folders so that they appear only when they are complete, and leave nothing incomplete on failure."""
 
 import os
 import shutil
@@ -27,7 +27,8 @@ def require_possible_folder(out: Path) -> None:
 def require_possible_file(out: Path) -> None:
     """Raise FleetError, before any work is done, if a file cannot be written or replaced.
 
-    Links and devices are refused: writing would replace the link, not the file that it points to, or the device.
+    Folders, links, devices, pipes and sockets are refused: writing would replace a link, not the file that it points
+    to; and a device, pipe or socket would be replaced by a file.
     """
     if out.is_symlink():
         raise FleetError(f"{out}: is a link, so it cannot be replaced; name the file itself or another one")
@@ -39,7 +40,7 @@ def require_possible_file(out: Path) -> None:
 
 
 def require_new_folder(out: Path) -> None:
-    """Raise FleetError if a folder to be written is not empty, or cannot be made or replaced."""
+    """Raise FleetError if a folder to be written exists and is not empty, or cannot be made or replaced."""
     if out.is_symlink():
         raise FleetError(f"{out}: is a link, so it cannot be replaced; name the folder itself or choose another --out")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -56,7 +57,7 @@ def _partial(out: Path) -> Path:
 
 
 def _require_possible(folder: Path, out: Path) -> None:
-    """Check by a trial inside a hidden folder that `folder` can be made; `out` is its name in messages."""
+    """Raise FleetError, which names `out`, unless a trial inside a hidden folder shows that `folder` can be made."""
     if out.parts and out.parts[0].endswith(":"):
         raise FleetError(f"{out}: is a URL; name a folder of this machine, as nothing else can be written to")
     nearest = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
@@ -82,12 +83,12 @@ def whole_folder(out: Path) -> Iterator[Path]:
     ------
     Path
         Folder to fill. It is removed if the block fails; one that a killed process left is removed by the next run. If
-        it cannot be renamed, it stays and is named.
+        it cannot be renamed, it stays, and the error names it.
 
     Raises
     ------
     FleetError
-        If the folder is not empty or cannot be made, or the disk is full.
+        If `out` is not empty, a link or a mount point, if it cannot be made or replaced, or if the disk is full.
     """
     require_new_folder(out)
     out, partial = out.absolute(), _partial(out)
@@ -121,7 +122,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
     Raises
     ------
     UserError
-        If one cannot be written; the message names it.
+        If a file cannot be written; the message names it. Files before it have been written.
     """
     for path, content in files.items():
         try:

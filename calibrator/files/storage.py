@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 OBJECT_STORAGE = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"})
-"""Kinds of storage in which a file appears only when it is complete, and which need no folders."""
+"""URL schemes of storage in which a file appears only when it is complete, and which needs no folders."""
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
@@ -77,7 +77,7 @@ class Storage:
     def contents(self, prefix: str = "") -> tuple[list[str], list[Entry]]:
         """Return the names of the inner folders, and the files, both sorted; none if this folder does not exist.
 
-        Hidden ones are left out, and so are names that do not begin with `prefix`.
+        Hidden folders and files are left out, and so are those whose names do not begin with `prefix`.
         """
         folders, files = list[str](), list[Entry]()
         with self._reporting("", "read"), suppress(FileNotFoundError, NotADirectoryError):
@@ -173,7 +173,7 @@ class Storage:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold a lock against other processes of this machine; without effect in object storage and on some disks."""
+        """Hold a lock against other processes of this machine; without effect in object storage and on NFS."""
         if not self.is_local:
             yield
             return
@@ -198,7 +198,7 @@ class Storage:
 
     @contextmanager
     def _reporting(self, name: str, what: str) -> Iterator[None]:
-        """Turn what fails in the block into a StorageError: that a file of this name cannot be read, say, and why."""
+        """Turn any exception in the block into a StorageError: cannot `what` (read, say) the file `name`, and why."""
         try:
             yield
         except StorageError:
@@ -230,7 +230,7 @@ def open_storage(place: str | Path) -> Storage:
     Raises
     ------
     StorageError
-        If the text is empty, which would otherwise mean the current folder.
+        If the text names no place: it is empty, which would otherwise mean the current folder, or only ``s3://``.
     """
     text = str(place).removeprefix("file://")
     if not text.strip() or text.endswith("://"):
@@ -245,8 +245,8 @@ def walk(
 ) -> Iterator[tuple[Storage, list[Entry]]]:
     """Yield each folder that holds files, at any depth, with its files; a folder is listed just before it is yielded.
 
-    An inner folder that cannot be read is added to `problems`, and the others go on. Links are followed, except those
-    that lead back to a folder above.
+    If an inner folder cannot be read, the reason is added to `problems`, and the walk goes on; StorageError if
+    `storage` itself cannot be read. Links are followed, except those that lead back to a folder above.
     """
     place = os.path.realpath(storage.url) if storage.is_local else storage.url
     if place in above:

@@ -8,7 +8,7 @@ __all__ = ["templates_of"]
 
 
 def templates_of(package: str, folder: str = "templates", **settings: Any) -> Environment:
-    """Return jinja2's environment for the templates of a package; rendering without a value that one uses raises.
+    """Return jinja2's environment for the templates of a package; rendering fails if a value is missing.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Checks of the sum of the currents, used by both doctor and kirchhoff.
+"""Checks of the sum of the currents, for the commands ``doctor`` and ``kirchhoff``.
 
 To add a check, add a function to :data:`CHECKS`, or to :data:`CHECKS_OF_MOVING` if it needs currents that move.
 """
@@ -181,7 +181,7 @@ def cannot_tell(junction: RecordedJunction) -> Findings:
 
 
 def delays(junction: RecordedJunction) -> Findings:
-    """Report branches whose frames come late or early, compared with most of the others."""
+    """Report branches whose frames come late or early, compared with those of most other branches."""
     found = junction.delays
     if found is None:
         return

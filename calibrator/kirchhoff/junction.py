@@ -58,7 +58,8 @@ class RecordedJunction:
     Attributes
     ----------
     database : VehicleDatabase
-        DBC and layout with the voltages as inputs, see :func:`.with_voltages`; its period is at least the recordings'.
+        DBC and layout with the voltages as inputs, see :func:`.with_voltages`; its period is the frame
+        distance of the fastest branch if the layout's is far shorter.
     branches : tuple of str
         The K branches.
     drives : tuple of Drive
@@ -166,7 +167,7 @@ def look_at_junction(
     Parameters
     ----------
     drives : sequence of Drive
-        Drives of one vehicle; a drive that lacks a branch that another one has does not count.
+        Drives of one vehicle; a drive that lacks a branch which another drive has is not used.
     database : VehicleDatabase
         DBC and layout with the voltages, see :func:`.with_voltages`.
     full_scale_a : float, optional
@@ -219,7 +220,7 @@ def _multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
 
 
 def _multipliers(bands: Bands, price: Callable[[Array], float], least_a: float) -> Array:
-    """Return likely multipliers, shape (K,); all 1 if the sum varies by no more than least_a, by quantisation."""
+    """Return likely multipliers, shape (K,); all 1 if the sum varies by `least_a` (quantisation) or less."""
     ones = np.ones(bands.current_a.shape[1])
     return ones if bands.rms_a(ones) <= least_a else likely_multipliers(bands, price)
 
@@ -252,8 +253,8 @@ def _orientation(drives: Sequence[Drive], battery: str) -> float:
     """Tell from the battery's voltage whether its current is positive into the junction.
 
     Near 1 if the voltage falls when the current rises, near -1 if it rises. Without a voltage that follows the current
-    it is a third of the mean current over its root mean square, since driving takes energy out of a battery; 0 if the
-    current is 0, too.
+    the result is a third of the mean current over its root mean square, since driving takes energy out of a battery; 0
+    if the current is 0, too.
     """
     both = [drive for drive in drives if battery in drive.branches and VOLTAGE in drive.inputs]
     correlation = sag([(drive.branches[battery], drive.inputs[VOLTAGE]) for drive in both])

@@ -137,6 +137,6 @@ def _neighbours(multipliers: Array, factors: Sequence[float]) -> Iterator[Array]
 
 
 def sag(pairs: Sequence[tuple[Channel, Channel]]) -> float:
-    """Return the correlation of a battery's currents and voltages: -1 if these fall under load, 0 if unknown. [1]"""
+    """Return the correlation of a battery's current and voltage: near -1 if it falls under load, 0 if unknown. [1]"""
     band = bands_of(pairs).current_a
     return float(np.corrcoef(band[:, 0], band[:, 1])[0, 1]) if len(band) and np.all(band.std(axis=0) > 0.0) else 0.0

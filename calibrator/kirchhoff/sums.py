@@ -5,7 +5,7 @@ For a current x(t) over the valid instants of the common time base of :mod:`cali
     RMSE = sqrt(mean(x^2)),    maximum = max |x|,    mean,    sd = standard deviation
 
 For the sum S of all branches the ideal is 0 A, or the load that layout or parameter file expect; its RMSE and maximum
-are about that, so that they are errors. For a single branch nobody knows the ideal: its RMSE is the root mean square of
+are of the difference from this ideal. For a single branch nobody knows the ideal: its RMSE is the root mean square of
 the current itself; what the correction did to it stands under *change*, the figures of (corrected - measured).
 
 Right sensors do not sum to exactly 0 A either. The standard deviation that is expected of S at the instant t is
@@ -65,7 +65,8 @@ class Comparison:
     left_out : tuple of str
         Branches of the layout without usable values: not in the sum.
     uncorrected : tuple of str
-        Branches that are not corrected, and enter the corrected sum with measured values; empty without such a sum.
+        Branches that are not corrected, and enter the corrected sum with measured values; empty if there is no
+        corrected sum.
     masked : mapping of str to int
         Number of instants that are not valid, by reason; one may have several.
     stages : mapping of str to DataFrame of shape (T, K + 1)
@@ -76,7 +77,8 @@ class Comparison:
     expected_sd_a : ndarray of shape (T,)
         Standard deviation expected of the sum at each instant, see the top of this module. [A]
     parts_a : mapping of str to float
-        Median of each part of that: ``quantisation``, ``noise``, ``sampling``, ``delays``, ``formulas``, ``load``. [A]
+        Median of each part of this deviation: ``quantisation``, ``noise``, ``sampling``, ``delays``, ``formulas``,
+        ``load``. [A]
     residual : mapping of str to dict, or None
         By stage, the shares in the mean square of the sum about its expected value, which add up to 1: ``constant``,
         its mean; ``gains``, what gain errors explain of the variation about the mean; ``delays``, what delays explain
@@ -220,7 +222,7 @@ def compare_kirchhoff(
     corrected : mapping of str to Channel or None
         Corrected currents in the same recording, by branch, positive into the junction. [A]
     parameters : VehicleParameters or None
-        Corrections to apply here instead, i = (i_m - offset) / (1 + drift), as the node would.
+        Corrections to apply instead of `corrected`, as the node would: i = (i_m - offset) / (1 + drift).
 
     Raises
     ------

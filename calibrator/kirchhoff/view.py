@@ -28,7 +28,7 @@ MOST_DRAWN = 50_000
 
 
 def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
-    """Return tables of at most 80 columns, the notices, and a last line with the root mean square error of the sum."""
+    """Return the figures as text: tables, the notices, and a last line with the root mean square error of the sum."""
     stages = {stage: found for stage, found in comparison.figures.items() if stage != "change"}
     rows = [
         [name, *(f"{value:z.2f}" for value in row)] for name, *row in pd.concat(stages.values(), axis=1).itertuples()

@@ -23,8 +23,9 @@ MAIN = ("battery", "motor")
 NAMED, NAMED_AROUND, HV, MEASURED, BESIDE = 35.0, 40.0, 15.0, 10.0, 20.0
 AGAINST, WEAK, STEADY, NEVER = -65.0, -30.0, -40.0, -150.0
 """Points of a candidate. NAMED: name or comment has a word of the place; NAMED_AROUND: these, message or sender have
-one; HV: a word for high voltage; MEASURED: a word, and again the unit, of a current; BESIDE: a voltage in its message.
-AGAINST: a word or range excludes it, WEAK: makes it unlikely; STEADY: its value never changes; NEVER: it is none."""
+one; HV: a word for high voltage; MEASURED: a word for current or power, and again if it is a current; BESIDE: a high
+voltage in the message of a battery or charger. AGAINST: a word or range excludes it, WEAK: makes it unlikely; STEADY:
+its value never changes; NEVER: it cannot be a branch."""
 UNITS, LEAST_OF_LOADS = {"current": "A", "power": "W"}, {"current": 3.0, "power": 500.0}
 """Units by quantity, and least range of heaters, converters and chargers in a database; valves have less. [A, W]"""
 CELL_V, LOW_V, HIGH_V = 6.0, 40.0, 60.0
@@ -42,7 +43,8 @@ OWN_GAIN, FEWEST_BINS = 1.3, 20
 MOST_TOGETHER, MOST_TRIED = 2, 12
 """Most currents without a place that are tried together, and that are tried at all, the best first. [1]"""
 MEANS = 50
-"""One row of means is added per so many instants; not more rows, as the means contain loads without a sensor."""
+"""In :func:`find_signs` one row of mean currents is added per so many instants; not more, as the means contain loads
+without a sensor."""
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
 """Reason why a charger is not taken as a branch where there is a motor, but no log."""
 
@@ -139,7 +141,7 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
     Parameters
     ----------
     found : sequence of Candidate
-        All candidates of a database or table; with a log, only those of the database that it holds.
+        All candidates of a database or table; with a log, only signals that the log holds.
     everything : sequence of Candidate
         All candidates, also those that the log does not hold: their words may tell what a message or sender is about.
 
@@ -183,7 +185,7 @@ def _named_branches(judged: Sequence[Candidate]) -> dict[int, str]:
 
 
 def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
-    """Return where a motor or the like is, ``rear`` or a number, if name, comment or message say so; else no text."""
+    """Return where a motor or the like is, ``rear`` or a number, if name, comment or message say so; else empty."""
     for words in (item.own, item.words):
         if found := [position for position in POSITIONS if position in words]:
             return found[0]
@@ -195,7 +197,7 @@ def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
 
 
 def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
-    """Make currents of unknown place branches, alone or in pairs, if the others sum to 0 A far better with them.
+    """Make currents of unknown place branches, alone or in pairs, if the sum varies far less with them.
 
     The battery's current is fitted by the other branches, each with a gain. With the added current all gains must be
     near 1, which excludes copies of a branch, and the residual must be less than half of that without it.
@@ -313,7 +315,10 @@ def find_signs(chosen: Sequence[Candidate], voltage: Candidate | None) -> list[C
 
 
 def closure(chosen: Sequence[Candidate], voltage: Candidate | None) -> float:
-    """Return the variation of the sum over that of the current that varies most [1]; NaN without a recording."""
+    """Return how much the sum varies (RMS), over the variation of the current that varies most; NaN if not recorded.
+
+    Of a current that hardly varies, :data:`STEADY_SHARE` of its peak counts as its variation. [1]
+    """
     if not (known := _channels(chosen, voltage)):
         return float("nan")
     current = bands_of([known]).current_a * np.array([item.sign for item in chosen])

@@ -109,7 +109,7 @@ class Candidate:
 
     @property
     def points(self) -> float:
-        """Score cut off to 0 to 100, as people see it."""
+        """Score limited to the range 0 to 100, as users see it."""
         return min(max(self.score, 0.0), 100.0)
 
     @property
@@ -239,7 +239,7 @@ def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
 
 
 def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
-    """Return the candidate with its recorded values; if many are outside its range, that is wrong and they are good."""
+    """Return the candidate with its recorded values; if many exceed its range, that is wrong and they are good."""
     outside = channel.good & ~inside
     wrong = (
         outside.sum() > WRONG_RANGE * channel.good.sum() and len(np.unique(channel.value[outside])) >= FEWEST_OUTSIDE

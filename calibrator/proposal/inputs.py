@@ -28,7 +28,7 @@ class Role(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     quantity : str
         Quantity of the candidate, see :class:`.Candidate`.
     wanted, also : str
-        Words with blanks between; name or comment must have one of `wanted` and, unless that is empty, one of `also`.
+        Words with blanks between; name or comment must have one of `wanted`, and one of `also` unless `also` is empty.
     likely, against : str
         Words with blanks between, in name, comment, message or sender, that speak for a candidate, and against it.
     """

@@ -237,7 +237,7 @@ def parsed_branches(text: str, proposal: Proposal) -> Proposal:
 
 
 def _named(wanted: str, proposal: Proposal) -> Candidate:
-    """Return the only candidate with this name, or with this last part of its name; ProposalError if there is none."""
+    """Return the only candidate with this name, or this last part of its name; ProposalError if none or several fit."""
     items = (*proposal.everything, *proposal.found)
     known = {item.name: item for item in items if item.quantity in {"current", "power", ""}}
     same = [name for name in known if wanted in {name.rpartition(".")[2], bare_name(name)}]

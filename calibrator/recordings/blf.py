@@ -2,7 +2,7 @@
 
 A BLF file is a header ``LOGG`` and objects ``LOBJ``, each with its own size. Most objects are containers, whose
 content, often compressed, is again a sequence of objects; one of these may continue in the next container. There is no
-public specification; the layout of the objects is that of python-can's reader, against which the tests compare.
+public specification; objects are taken to be built as python-can's reader has them, with which the tests compare.
 
 An object of size zero makes a naive reader loop for ever, and a file cut inside a container reads as a shorter file
 without any error. So the structure is checked throughout, and damage is refused with its place.
@@ -43,7 +43,8 @@ BATCH_BYTES = 1 << 21
 LARGEST_OBJECT = 1 << 28
 """Objects of a larger size count as damage: containers have some 128 KiB. [byte]"""
 _FILE_HEADER = struct.Struct("<4sL8xQ16x8H")
-"""Signature, size of the header, size of the file, date and time of the start (year, month, day of the week, ..)."""
+"""Signature, size of the header, size of the file, start: year, month, day of the week, day, hour, minute,
+second, millisecond."""
 _FILE_HEADER_BYTES = 144
 _OBJECT_HEADER = struct.Struct("<4sHHLL")
 """Signature, size and version of the header, size of the object, type."""
@@ -61,7 +62,7 @@ _TEN_MICROSECONDS = 1
 """Value of an object's flags if its time counts in units of 10 us; otherwise it counts in nanoseconds."""
 _TEN_MICROSECONDS_NS = 10_000
 _SOUND, _IMPOSSIBLE, _NO_OBJECT, _WIDE = range(4)
-"""How parsing a batch ended. ``_WIDE``: it has payloads of CAN FD, but the columns are for classic ones."""
+"""How parsing a batch ended. ``_WIDE``: a payload is longer than the 8 bytes for which there are columns."""
 
 
 class _DamageError(Exception):
@@ -95,8 +96,8 @@ def blf_frames(file: BinaryIO, name: str) -> Frames:
     Raises
     ------
     LogError
-        If the file is no BLF file, is cut, or has an object of impossible size; the message gives the byte, what is
-        wrong there, and how many frames come before it.
+        If the file is no BLF file, is cut or damaged (as by an object of impossible size); the message gives the byte,
+        what is wrong there, and how many frames come before it.
     """
     parts: list[Frames] = []
     try:
@@ -151,7 +152,7 @@ def _batches(file: BinaryIO) -> Iterator[list[tuple[bytes, int]]]:
 
 
 def _file_header(file: BinaryIO) -> tuple[int, int]:
-    """Read the header; return the file size that it states, and the start in ns since 1970; each 0 if unknown."""
+    """Read the header; return the file size that it states (0: none), and the start in ns since 1970 (0: no date)."""
     head = file.read(_FILE_HEADER_BYTES)
     if len(head) < _FILE_HEADER_BYTES or head[:4] != b"LOGG":
         raise _DamageError(0, f"the header 'LOGG' of {_FILE_HEADER_BYTES} bytes is expected, found {head[:4]!r}")
@@ -204,7 +205,7 @@ def _container_content(content: bytes, position: int) -> bytes:
 
 
 class _Numbers(NamedTuple):
-    """Views of n bytes, shape (n,): element k is the little-endian number of 1 to 8 bytes that begins at byte k."""
+    """Views of n bytes, shape (n,): element k is the little-endian number of 1, 2, 4 or 8 bytes from byte k on."""
 
     u8: NDArray[np.uint8]
     u16: NDArray[np.uint16]
@@ -227,7 +228,7 @@ def _take_apart(  # noqa: PLR0912, PLR0915 (see below)
     Returns how parsing ended (such as ``_SOUND``), the number of rows filled, the byte at which the unparsed rest
     begins, and the size of an impossible object (0: none). All is one function with a name for each array: arrays
     passed to another function, or taken out of a tuple, would be reference-counted in each round of the loop, which
-    takes seven times as long as all else.
+    takes seven times as long as the parsing itself.
     """
     u8, u16, u32, u64 = data
     kinds, time_ns, keys, channels, lengths, payloads = columns

@@ -83,9 +83,9 @@ def decode_signal(
     signal : Signal
         One of its signals.
     data : ndarray of uint8, shape (n, W)
-        Payloads, zeros after the length.
+        Payloads; bytes beyond the length of a frame are 0.
     length : ndarray of uint8, shape (n,)
-        Payload bytes of each frame.
+        Number of payload bytes of each frame.
     no_value : frozenset of int, optional
         Raw values that stand for no value, as :func:`ecu_node.database.codes_of_no_value` returns them; by default
         those whose name in the DBC means "not available".
@@ -119,7 +119,7 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
     signal : Signal
         The signal; its multiplexing is ignored.
     data, length : ndarray
-        Payloads, and bytes of each frame, as in :func:`decode_signal`.
+        Payloads, and number of payload bytes of each frame, as in :func:`decode_signal`.
 
     Returns
     -------
@@ -202,7 +202,7 @@ def signal_range(signal: Signal, factor: float = 1.0) -> SignalRange:
 
 
 def _bit_run(signal: Signal) -> tuple[list[int], int]:
-    """Return the indices of a signal's bytes, least significant first, and how many bits of the first lie below it."""
+    """Return the indices of a signal's bytes, least significant first, and how many bits of the first are below it."""
     if signal.byte_order == "little_endian":
         first, shift = divmod(signal.start, 8)
         return list(range(first, (signal.start + signal.length - 1) // 8 + 1)), shift
@@ -274,9 +274,9 @@ def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: in
     Parameters
     ----------
     data : ndarray of uint8, shape (n, W)
-        Payloads, zeros after the length.
+        Payloads; bytes beyond the length of a frame are 0.
     length : ndarray of uint8, shape (n,)
-        Payload bytes of each frame.
+        Number of payload bytes of each frame.
     data_id : int
         Data identifier of the message, 0 to 65535.
 
@@ -315,13 +315,13 @@ def message_is_sound(
     message : Message
         The message that the frames carry.
     data, length : ndarray
-        Payloads, and bytes of each frame, as in :func:`p01_is_sound`.
+        Payloads, and number of payload bytes of each frame, as in :func:`p01_is_sound`.
 
     Returns
     -------
     ndarray of bool, shape (n,)
-        True where the frame is long enough and its CRC and counter are valid; True everywhere if the message is not
-        protected.
+        True where the frame is long enough, its CRC right and its counter a possible value (its order is not checked);
+        True everywhere if the message is not protected.
     """
     protection = protection_of(database, message)
     if protection is None:

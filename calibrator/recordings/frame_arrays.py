@@ -1,7 +1,7 @@
 """Hold the frames of a log as arrays, so that all later steps work on whole columns, and repair their time stamps.
 
-A frame is kept as it was logged: time stamp, identifier, channel, length and payload. Error and remote frames carry no
-payload; they and damaged lines are counted.
+A frame is kept as it was logged: time stamp, identifier, channel, length and payload. Error frames, remote
+frames and damaged lines are not kept, only counted.
 """
 
 from collections.abc import Iterator, Sequence
@@ -45,15 +45,16 @@ class Frames:
     channel : ndarray of uint32, shape (n,)
         Index into `channels`.
     length : ndarray of uint8, shape (n,)
-        Payload bytes of each frame.
+        Number of payload bytes of each frame.
     data : ndarray of uint8, shape (n, 8) or (n, 64)
-        Payloads, zeros after the length; 64 columns where any frame is longer than 8 bytes.
+        Payloads; bytes beyond the length of a frame are 0. 64 columns if any frame is longer than 8 bytes.
     channels : tuple of str
         Names of the buses that the frames came from.
     error_frames, remote_frames, damaged : int
-        Counts of what else the log has: error frames, remote frames, and lines or frames that could not be read.
+        Numbers of error frames, of remote frames, and of lines or frames that could not be read.
     first_damaged : int
-        Number of the first damaged line of a text log, from 1; 0 if there is none or the log has no lines.
+        Number of the first damaged line of a text log, from 1; 0 if there is none, and for logs without lines or
+        read by python-can.
     """
 
     time_ns: NDArray[np.int64]
@@ -98,7 +99,10 @@ _COUNTS = ("error_frames", "remote_frames", "damaged")
 
 
 def concatenate_frames(parts: Sequence[Frames]) -> Frames:
-    """Join the pieces of a log, or several logs, in their order; counts add up, channels are merged by name."""
+    """Join pieces of a log, or several logs, in the order given.
+
+    Numbers of error, remote and damaged frames add up, and channels of the same name become one.
+    """
     parts = parts or [FrameColumns.of(0, fd=False).frames()]
     if len(parts) == 1:
         return parts[0]
@@ -144,7 +148,7 @@ class FrameColumns(NamedTuple):
         )
 
     def frames(self, channels: Sequence[str] | None = None, *, rows: int | None = None) -> Frames:
-        """Return the data frames, and the counts of other kinds, of the first `rows` rows or of all.
+        """Return the data frames, and the numbers of other frames, in the first `rows` rows or in all.
 
         `channels` are the names of the reader's channel numbers. Without names, each channel is named after its number
         minus one, as logs count channels from 1 and python-can from 0.
@@ -196,7 +200,7 @@ def frames_of(messages: Sequence[can.Message]) -> Frames:
 # ---- time
 
 LARGEST_DISORDER_S = 1.0
-"""A larger step back shows that the clock was set: loggers mix up frames only within buffers emptied sooner. [s]"""
+"""A larger step back shows that the clock was set: loggers mix up frames only within shorter times. [s]"""
 LONGEST_PAUSE_S = 600.0
 """A bus that is silent for longer has been asleep; the pause is replaced by :data:`CLOCK_GAP_S`. [s]"""
 CLOCK_GAP_S = 60.0

@@ -42,9 +42,9 @@ __all__ = [
 ]
 
 UNREADABLE = (OSError, EOFError, zlib.error, isal_zlib.error)
-"""What opening and unpacking may raise; gzip.BadGzipFile is an OSError."""
+"""Exceptions of opening and unpacking a file; gzip.BadGzipFile is an OSError."""
 _NO_ARCHIVE = (*UNREADABLE, zipfile.BadZipFile, UnicodeError, RuntimeError, KeyError)
-"""What opening and unpacking an archive may raise; RuntimeError where it is encrypted."""
+"""Exceptions of opening and unpacking an archive; RuntimeError if it is encrypted."""
 _BINARY = (".mf4", ".parquet", ".feather", ".arrow")
 """Suffixes of formats whose readers cannot read gzip and need an unpacked file."""
 PRINTED_CANDUMP = re.compile(
@@ -55,7 +55,7 @@ PRINTED_CANDUMP = re.compile(
 )
 """A line as candump prints it without ``-L``, such as ``can0  2E5   [4]  00 00 07 32``."""
 _NUMBER = re.compile(r"(?<![\w.:-])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?![\w.:-])")
-"""A number in a line of a table, no part of a date, a time or a word."""
+"""A number in a line of a table that is not part of a date, a time or a word."""
 _LOGGED = re.compile(rb"\(\d+\.\d+\) \S+ [\dA-Fa-f]{3,8}#")
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf4")
 FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
@@ -129,7 +129,7 @@ def text_head(path: Path) -> tuple[str, str]:
 
 
 def read_rows(file: BinaryIO | TextIO, **options: Any) -> tuple[pd.DataFrame, int]:
-    """Read a CSV with options of :func:`pandas.read_csv`; return its rows, and how many were left out as too long."""
+    """Read a CSV with options of :func:`pandas.read_csv`; return its rows, and how many too wide ones were left out."""
     with warnings.catch_warnings(record=True) as complaints:
         warnings.simplefilter("always")
         rows = pd.read_csv(file, index_col=False, skipinitialspace=True, on_bad_lines="warn", **options)
@@ -145,14 +145,14 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_candump(head: str, *, printed: bool = False) -> bool:
-    """Check whether a text begins with lines of candump: of any form, or only of that without ``-L`` if `printed`."""
+    """Check whether most of the first 50 lines are of candump, with or without ``-L``; if `printed`, only without."""
     lines = [line for line in head.splitlines() if line.strip()][:50]
     forms = (PRINTED_CANDUMP,) if printed else (PRINTED_CANDUMP, _LOGGED)
     return 2 * sum(any(form.match(line.encode()) for form in forms) for line in lines) > len(lines)
 
 
 def is_bus_log(path: Path) -> bool:
-    """Check whether an MDF 4 file holds frames: their channel has a name set by ASAM, which is never compressed.
+    """Check whether an MDF 4 file holds frames: ASAM sets the name of their channel, and names are never compressed.
 
     An empty file counts as one that holds frames.
     """
@@ -219,7 +219,8 @@ def _is_hidden(name: PurePath) -> bool:
 def readable(path: Path) -> Iterator[Path]:
     """Yield a path that readers can open: the file itself, or an unpacked copy for the time of the block.
 
-    A UserError in the block that names the copy is raised anew with `path` in its place.
+    A UserError in the block that names the copy is raised anew with `path` in its place. LogError if the file cannot be
+    unpacked.
     """
     archive, packed = _archive(path), path.name.lower().endswith(".gz") and suffix_of(path) in _BINARY
     if archive is None and not packed:

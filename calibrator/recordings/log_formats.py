@@ -2,10 +2,10 @@
 
 Each format is one function and one line of :data:`READERS`.
 
-A damaged file is refused; the message gives the place of the damage and the number of frames before it. Its readable
-part is not used, because nobody can tell what else is missing. Many logs have single broken lines, or frames with an
-impossible length or time: these are left out and counted, up to :data:`MAX_DAMAGED_SHARE`. Formats that python-can
-reads are refused at the first line that it does not understand.
+A file that is cut, or cannot be read from some place on, is refused; the message gives the place and the number of
+frames before it. Its readable part is not used, because nobody can tell what else is missing. Many logs have single
+broken lines, or frames with an impossible length or time: these are left out and counted, up to
+:data:`MAX_DAMAGED_SHARE`. A file that python-can reads is refused at the first line on which python-can fails.
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ _IS_TABLE = "a table of values, not a log of frames, which is needed here"
 
 
 def is_log(path: Path) -> bool:
-    """Check whether a file is a log or a table, by its suffix; a ``.txt`` is one by its content, or if damaged."""
+    """Check by its suffix whether a file is a log or a table; a ``.txt`` if its content is one, or unreadable."""
     suffix = suffix_of(path)
     if suffix == ".txt":
         try:
@@ -68,7 +68,8 @@ def logs_in(path: Path) -> list[Path]:
 def is_table(path: Path) -> bool:
     """Check whether a file is a table, or a folder or archive has tables and no logs of frames.
 
-    If tables and logs of frames share a suffix, the content decides.
+    If tables and logs of frames share a suffix, the content decides; an unreadable file counts as a table, except a
+    ``.txt``.
     """
     suffix = suffix_of(path)
     if suffix == ".zip" or path.is_dir():
@@ -104,7 +105,7 @@ def read_frames(path: Path) -> Frames:
     Raises
     ------
     LogError
-        If the file cannot be opened, has an unknown suffix, is a table, damaged, cut or empty.
+        If the file cannot be opened, has an unknown suffix, is a table, cut or empty, or has too much damage.
     """
     if path.is_dir() or path.suffix.lower() == ".zip":
         logs = logs_in(path)

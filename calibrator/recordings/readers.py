@@ -55,16 +55,16 @@ class RecordingReport:
     channels : collection of (str, Channel)
         All branches and inputs of the layout by name, in its order.
     frames, error_frames, damaged : int
-        Counts over the whole log; in a table, each row counts as a frame.
+        Numbers of data frames, of error frames, and of damaged lines or frames in the whole log; rows in a table.
     disordered, clock_steps : int
         Frames whose time is before that of a frame logged earlier; steps of the clock that became gaps.
     ignored : mapping of str to int
-        Number of frames from buses that the layout does not mean, by channel.
+        Number of frames left out because they come from a bus that is not the layout's, by channel.
     found : str
         What was detected about a table, ``found`` of :class:`.Table`; empty for logs.
     unfit : tuple of str
-        (What the recording lacks, what to do about it), each a text: it lacks the channel of a ``[[bus]]``, or numbers
-        in the column of a branch. Empty if nothing is lacking.
+        Two texts: what the recording lacks (the channel of a ``[[bus]]``, or numbers in the column of a branch), and
+        what to do about it. Empty if it lacks neither.
     """
 
     channels: Collection[tuple[str, Channel]]
@@ -78,7 +78,7 @@ class RecordingReport:
     unfit: tuple[str, ...] = ()
 
     def notices(self) -> list[Notice]:
-        """Return what a user should know; empty if the log is whole and sound."""
+        """Return what a user should know of the recording; empty for a log in which nothing is missing or wrong."""
         absent = ", ".join(name for name, channel in self.channels if not channel.time_s.size)
         spoilt = {name: (int(np.sum(~channel.good)), len(channel.good)) for name, channel in self.channels}
         return [
@@ -240,7 +240,10 @@ class SignalSource(ABC):
         return Channel(time_s=channel.time_s, value=channel.value * factor, good=channel.good)
 
     def _computed(self, branch: Branch, formula: str) -> Channel:
-        """Compute a branch from its formula, at the instants of the most frequent channel in the formula."""
+        """Compute a branch from its formula, at the instants of the most frequent channel in the formula.
+
+        There are no samples if a channel has no good one.
+        """
         layout, names = self.database.layout, formula_names(parse_formula(formula))
         signals = {item.name: item.signal for item in layout.input}
         channels = {name: self.samples(signals.get(name, name))[0] for name in layout.base_inputs(names)}
@@ -338,7 +341,10 @@ class FrameSource(SignalSource):
         return self._messages[name]
 
     def _is_of_bus(self, name: str, channel: NDArray[np.uint32]) -> Mask:
-        """Return which frames of a message come from its bus: the layout's, else the bus that carries nearly all."""
+        """Return which frames of a message come from its bus: the layout's, else the bus that carries nearly all.
+
+        LogError if no bus does.
+        """
         channels, wanted = self.frames.channels, self.database.channel_of(name)
         if wanted is not None:
             return np.asarray(channel == (channels.index(wanted) if wanted in channels else len(channels)))

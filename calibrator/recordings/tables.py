@@ -69,7 +69,7 @@ _TIME_UNITS = {
 _SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """Least numbers that are times since 1970 in this unit; in the next larger unit they would be absurd dates."""
 _LONG_STEPS = ((5000.0, "us"), (5.0, "ms"))
-"""Times that are whole numbers without a unit are taken to be in this unit if their median step is this or more.
+"""Times that are whole numbers without a unit are in the first of these units whose step their median step reaches.
 
 The bounds rest on tables with up to 200 rows a second, or one every few seconds. Steps below 100 count as milliseconds
 only if the table is then not shorter than :data:`_SHORTEST_S`.
@@ -310,7 +310,7 @@ def peak_of(value: Array) -> float:
 
 
 def likely_full_scale_a(peak_a: float) -> float:
-    """Guess the full scale of a junction from the recorded peak current, rounded up to a round number. [A]"""
+    """Guess the full scale of a junction: :data:`HEADROOM` times the peak current, rounded up to a round number. [A]"""
     least_a = HEADROOM * peak_a
     decade = 10.0 ** np.floor(np.log10(least_a))
     return float(next(step * decade for step in ROUND if step * decade >= least_a * (1.0 - 1e-9)))
@@ -363,7 +363,7 @@ def _coarse(time_s: Array, columns: Mapping[str, Array]) -> str:
 
 
 def _spread(time_s: Array) -> Array:
-    """Spread rows that share one time evenly until the next time; those of the first time end just before the next."""
+    """Spread rows that share one time evenly until the next; those of the first time end just before the second."""
     stamps, first, count = np.unique(time_s, return_index=True, return_counts=True)
     if len(stamps) < 2:
         return time_s
@@ -510,7 +510,7 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
 
 
 def _without_thousands(column: "pd.Series[str]", decimal: str) -> "pd.Series[str]":
-    """Remove the thousands separators of a column if any cell has both signs, as 1,234.5 or 1.234,5."""
+    """Remove the thousands separators of a column if any cell has these and a decimal sign, as 1,234.5 or 1.234,5."""
     comma, point = (",", r"\.") if decimal == "." else (r"\.", ",")
     text = column.astype("string").str.strip()
     if not text.str.fullmatch(rf"[-+]?\d{{1,3}}({comma}\d{{3}})+{point}\d*").any():

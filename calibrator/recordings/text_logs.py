@@ -6,9 +6,9 @@
 
        0.011478 1  1F334455x       Rx   d 8 50 04 0C A9 D4 03 88 01  Length = 0 BitCount = 0          ASC
 
-Lines of these two forms are read by compiled code, ASC some thirty times as fast as by python-can. What candump prints
-without ``-L``, and the rows of SavvyCAN, are turned into lines of ``candump -L`` first. python-can reads the rest: TRC,
-its own CSV, and ASC with CAN FD or decimal numbers.
+Lines of ``candump -L`` and of ASC are read by compiled code, ASC some thirty times as fast as by python-can. What
+candump prints without ``-L``, and the rows of SavvyCAN, are turned into lines of ``candump -L`` first. python-can reads
+the rest: TRC, its own CSV, and ASC with CAN FD or decimal numbers.
 """
 
 import io
@@ -125,7 +125,10 @@ def read_asc(path: Path) -> Frames:
 
 
 def read_trc(path: Path) -> Frames:
-    """Read the frames of a TRC file of any version; LogError if it is damaged."""
+    """Read the frames of a TRC file of version 1.0, 1.1, 1.3, 2.0 or 2.1 (any other is read as 1.0).
+
+    LogError if python-can fails on it.
+    """
     return _read_messages(path, can.TRCReader)
 
 
@@ -306,7 +309,7 @@ def _parse_candump(text: _Text, digits: _Text, names: NDArray[np.int64], columns
     """Parse line by line into `columns`, and return the number of different channels.
 
     The text must end with a line end: no step passes one, so parsing ends. `names` receives where each channel's name
-    starts and ends in it. The result is -1 if a payload does not fit into the columns.
+    starts and ends in the text. The result is -1 if a payload does not fit into the columns.
     """
     kind, time_ns, key, channel, length, data = columns
     row, start, channels = 0, 0, 0

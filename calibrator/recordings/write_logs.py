@@ -60,6 +60,11 @@ def encode_message(
     -------
     FrameSeries
         The frames.
+
+    Raises
+    ------
+    DatabaseError
+        If values are given for a floating-point signal.
     """
     message = database.message(message_name)
     bits = np.zeros((len(time_s), 8 * message.length), dtype=np.uint8)
@@ -77,7 +82,7 @@ def encode_message(
 
 
 def write_candump(path: Path, series: Iterable[FrameSeries]) -> int:
-    """Write frames of can0 in the order of their instants as ``candump -L`` does.
+    """Write frames as ``candump -L`` does, in the order of their instants, with can0 as their channel.
 
     Parameters
     ----------
@@ -112,7 +117,10 @@ def write_candump(path: Path, series: Iterable[FrameSeries]) -> int:
 
 
 def _raw_codes(signal: Signal, physical: Array) -> NDArray[np.int64]:
-    """Return the nearest raw code of each value, inside the valid range; for NaN the code SNA, or 0 without one."""
+    """Return the nearest raw code of each value, inside the valid range; for NaN the code SNA, or 0 without one.
+
+    DatabaseError if there is a number for a floating-point signal.
+    """
     named = {str(name): int(code) for code, name in (signal.choices or {}).items()}
     missing = named.get("SNA", 0)
     lowest, highest = _valid_codes(signal)
@@ -145,7 +153,7 @@ def _bit_positions(signal: Signal) -> list[int]:
 
 
 def _protect(data: NDArray[np.uint8], protection: Protection) -> None:
-    """Fill counter and CRC in place; the counter of the first frame is 0."""
+    """Fill in counter, CRC, length and data identifier, as far as the profile has them; the first counter is 0."""
     payload = bytearray(data.shape[1])
     last = protection.modulus - 1
     for row in data:

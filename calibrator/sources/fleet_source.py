@@ -96,7 +96,7 @@ def find_fleet(place: str | Path) -> FleetSource:
     Raises
     ------
     FleetError
-        If there is no drive at all.
+        If the place does not exist, or no drive is found in it.
     """
     storage = open_storage(place)
     if storage.is_local and not Path(storage.url).exists():
@@ -227,7 +227,7 @@ def _entry(path: Path) -> Entry:
 
 
 def _is_log(folder: Storage, name: str) -> bool:
-    """Check by its suffix whether a file is a log or a record made on board; a local text file also by its content."""
+    """Check by its suffix whether a file is a log or a record made by a node; a local ``.txt`` file by its content."""
     if folder.is_local:
         return name.endswith(SUFFIX) or is_log(Path(folder.url) / name)
     return name.endswith(SUFFIX) or (not name.endswith(".txt") and is_log(Path(name)))
@@ -295,7 +295,7 @@ def read_vehicles(
     names: Sequence[str] | None = None,
     label: str = "read drives",
 ) -> tuple[list[_Vehicle], dict[str, str]]:
-    """Read the vehicles of a fleet in worker processes; a bad one never stops the others.
+    """Read the vehicles of a fleet in worker processes; one that cannot be used is left out, the rest is read.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def read_vehicles(
     vehicles : list
         What `read` returned for the vehicles that can be used, in the order of the fleet, or of `names`.
     left_out : dict of str to str
-        Why the others cannot be used, by name; problems that were found with the fleet are included.
+        Why a vehicle cannot be used, by its name; and all of ``fleet.left_out``.
 
     Raises
     ------
@@ -360,8 +360,9 @@ def probe_equipment(
 ) -> Equipment:
     """Find out from some vehicles which branches and inputs the fleet has.
 
-    The first drive of each is read. A branch counts if more than half of these drives have it, an input if one has it;
-    a vehicle that lacks a chosen branch is left out later.
+    The first drive of each of the first :data:`PROBED_VEHICLES` readable vehicles is read. The fleet has a branch if
+    more than half of these drives have it, and an input if at least one has it. A vehicle that lacks a chosen branch is
+    left out later.
 
     Parameters
     ----------
@@ -376,7 +377,7 @@ def probe_equipment(
     modelled : bool
         Whether the branches are modelled from inputs, as in a fleet; if not, no inputs are chosen.
     drives : sequence of Drive
-        One drive of each vehicle to look at, if they have been read already; none are read then.
+        One drive of each vehicle to look at, if they have been read already; then no drive is read here.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Import logs of one or many vehicles as drives of a store. A bad log never stops the others."""
+"""Import logs of one or many vehicles as drives of a store. A log that cannot be used does not stop the import."""
 
 import time
 from collections.abc import Sequence
@@ -91,7 +91,7 @@ def import_logs(
     Raises
     ------
     UserError
-        If a drive cannot be written, as the others could not be written either.
+        If a drive cannot be written to the store. The import ends, as later drives could not be written either.
     """
     found, start_s = find_logs(logs), time.time()
     left_out, drives, already_there = dict(found.left_out), list[ImportedDrive](), list[str]()

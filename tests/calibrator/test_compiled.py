@@ -44,7 +44,7 @@ def test_compiled_code_is_cached_if_the_folder_is_writable(tmp_path: Path, writa
     assert any(cache.rglob("*.nbc")) == writable
 
 
-def test_all_sources_of_compiled_functions_invalidate_the_cache() -> None:
+def test_sources_that_invalidate_the_cache_include_all_that_compiled_functions_use() -> None:
     needed = set[str]()
     for path in (ROOT / "calibrator").rglob("*.py"):
         tree = ast.parse(path.read_text("utf-8"))

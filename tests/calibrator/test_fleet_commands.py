@@ -69,7 +69,7 @@ def test_nothing_is_learnt_from_a_held_out_vehicle(fleet: Path, tmp_path: Path) 
 
 @pytest.fixture
 def broken_fleet(fleet: Path, tmp_path: Path) -> Path:
-    """Six good vehicles, five with one fault each, and a copy of one."""
+    """Six good vehicles, copies of two of them, and vehicles whose logs have one flaw each."""
     copy = tmp_path / "broken"
     for folder in sorted((fleet / "logs").iterdir())[:6]:
         shutil.copytree(folder, copy / folder.name)
@@ -117,12 +117,12 @@ def test_unusable_vehicles_are_left_out_and_named(broken_fleet: Path, tmp_path: 
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
 
 
-def test_option_since_needs_summaries(fleet: Path, result: Path, tmp_path: Path) -> None:
+def test_option_since_is_refused_for_drives_as_it_needs_summaries(fleet: Path, result: Path, tmp_path: Path) -> None:
     line = ("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "x", "--since", result)
     assert "drives, and --since goes on with summaries; add the new drives to the store" in refused(*line)
 
 
-def test_single_vehicle_or_copies_of_one_are_not_a_fleet(fleet: Path, tmp_path: Path) -> None:
+def test_single_vehicle_or_copies_of_one_are_refused_as_a_fleet(fleet: Path, tmp_path: Path) -> None:
     files = ["--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1]
     shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "one")
     run = calibrator("calibrate", tmp_path / "logs", "--method", "published", *files)
@@ -183,7 +183,9 @@ def test_asymmetric_fleet_with_delays_and_load_is_recovered_without_harm(
     assert figures["harmed_rate"] == 0.0
 
 
-def test_delay_of_the_motor_is_in_the_parameter_file(delayed_fleet: Path, parameters: list[VehicleParameters]) -> None:
+def test_parameter_files_state_the_delay_of_the_motor_within_5_ms(
+    delayed_fleet: Path, parameters: list[VehicleParameters]
+) -> None:
     truth = read_truth(delayed_fleet / "truth.json").vehicles
     for item in parameters:
         delays = {name: branch.delay_s for name, branch in item.branches.items()}

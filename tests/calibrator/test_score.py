@@ -12,7 +12,7 @@ MEAN_A, MEAN_SQUARE_A2 = I_A.mean(axis=0), np.mean(I_A**2, axis=0)
 
 
 def sensor_faults(drift: list[list[float]] | Array, offset: list[list[float]] | Array) -> Faults:
-    """Offsets in fractions of full scale."""
+    """Make sensor faults from drifts, and from offsets in fractions of full scale."""
     d, o = np.array(drift), FULL_SCALE_A * np.array(offset)
     return Faults(hardware_drift=np.zeros(len(d)), hardware_offset_a=np.zeros_like(d), drift=d, offset_a=o)
 
@@ -25,7 +25,7 @@ def sensor_faults(drift: list[list[float]] | Array, offset: list[list[float]] | 
     ((0.0, 0.0), (0.0051, 0.0), False, True),
     ((0.1, 0.0), (float("nan"), 0.0), False, False),
 ])  # fmt: skip
-def test_vehicle_is_recovered_if_drift_and_offset_are_close(
+def test_vehicle_is_recovered_if_drift_and_offset_are_within_the_tolerance(
     true: tuple[float, float], found: tuple[float, float], within_10: bool, within_25: bool
 ) -> None:
     truth, estimate = (sensor_faults([[d, 0.0]], [[o, 0.0]]) for d, o in (true, found))
@@ -52,7 +52,7 @@ def test_error_from_moments_equals_the_error_of_corrected_currents() -> None:
         np.testing.assert_allclose(unseen.rms_a(drift, offset_a)[0], expected)
 
 
-def test_one_worsened_branch_is_harm_but_none_or_a_true_correction_is_not() -> None:
+def test_one_worsened_branch_is_harm_but_no_correction_or_the_true_one_is_not() -> None:
     rng = np.random.default_rng(2)
     truth = sensor_faults(*rng.uniform(-0.2, 0.2, (2, 50, 2)))
     moments = {"mean_a": MEAN_A, "mean_square_a2": MEAN_SQUARE_A2}

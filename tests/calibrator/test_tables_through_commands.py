@@ -1,4 +1,4 @@
-"""A fleet whose recordings are tables, through every command that takes recordings or what is made of them."""
+"""A fleet, and one plant, recorded as tables: the commands that take recordings or what is made of them."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ input = [{ name = "demand", signal = "demand" }, { name = "heater_demand", signa
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Layout, and tables with German numbers, of eight vehicles of the same kind."""
+    """Layout and tables (with decimal commas) of eight vehicles of the same kind."""
     place = tmp_path_factory.mktemp("tables")
     (place / "car.toml").write_text(LAYOUT)
     for seed in range(8):
@@ -63,7 +63,9 @@ def test_faults_of_a_fleet_recorded_as_tables_are_found(result: Path) -> None:
         assert rows.drift[vehicle, "motor"] == pytest.approx(gain, abs=0.01)
 
 
-def test_calibration_from_drives_or_summaries_of_tables_is_the_same(place: Path, result: Path, tmp_path: Path) -> None:
+def test_tables_give_the_same_result_directly_and_by_way_of_import_and_summarise(
+    place: Path, result: Path, tmp_path: Path
+) -> None:
     run(place, "import", place / "logs", "--out", tmp_path / "drives")
     run(place, "summarise", tmp_path / "drives", "--out", tmp_path / "summaries")
     run(place, "calibrate", tmp_path / "summaries", "--out", tmp_path / "result")
@@ -71,7 +73,7 @@ def test_calibration_from_drives_or_summaries_of_tables_is_the_same(place: Path,
         assert row["drift"] == pytest.approx(expected["drift"], abs=1e-6)
 
 
-def test_filter_bank_is_chosen_for_tables(place: Path) -> None:
+def test_identify_reads_all_vehicles_of_a_fleet_recorded_as_tables(place: Path) -> None:
     assert "vehicles: 8" in run(place, "identify", place / "logs")
 
 
@@ -91,7 +93,7 @@ def solar_plant(folder: Path) -> Path:
     return folder / "solar.csv"
 
 
-def test_rows_a_minute_apart_go_through_every_command(tmp_path: Path) -> None:
+def test_table_with_a_row_a_minute_passes_kirchhoff_layout_doctor_and_calibrate(tmp_path: Path) -> None:
     table, layout = solar_plant(tmp_path), tmp_path / "solar.toml"
     branches = ("--branches", "battery=Ibat,string1=I1,string2=I2,-inverter=Iinv")
     found = reported("kirchhoff", table, *branches)

@@ -33,7 +33,7 @@ def currents(time_s: Array) -> dict[str, Array]:
 
 
 def true_drive(*, delay_s: Mapping[str, float] | None = None, seed: int = 1) -> Drive:
-    """The drive as sensors of 0.2 A noise see it, some of them late."""
+    """The drive as sensors with 0.2 A of noise show it, some of them late."""
     noise = np.random.default_rng(seed)
     branches = {}
     for name, period_s in PERIOD_S.items():
@@ -61,7 +61,7 @@ def with_branch(drive: Drive, name: str, value: Array) -> Drive:
 
 
 def write_log(folder: Path, drive: Drive, database: VehicleDatabase) -> Path:
-    """The drive as a log."""
+    """Write the drive as a log, and return the path of it."""
     write_drive_log(folder / "drive.log", drive, database)
     return folder / "drive.log"
 
@@ -69,7 +69,7 @@ def write_log(folder: Path, drive: Drive, database: VehicleDatabase) -> Path:
 def write_layout(
     folder: Path, *, inverted: tuple[str, ...] = (), units: Mapping[str, str] | None = None, full_scale_a: float = 400.0
 ) -> Path:
-    """The layout with some signs inverted, beside its DBC with other units of some signals."""
+    """Write the layout, with some signs inverted, and its DBC, with other units of some signals."""
     dbc = (DBC / "hv_powertrain.dbc").read_text()
     for signal, unit in (units or {}).items():
         dbc, count = re.subn(rf'( SG_ {signal} :[^"]*)"[^"]*"', rf'\1"{unit}"', dbc)
@@ -94,7 +94,7 @@ class DoctorRun:
     report: dict[str, Any]
 
     def findings(self, *kinds: str) -> list[SimpleNamespace]:
-        """Findings with these codes, or all."""
+        """Findings with one of these codes; all findings if none is given."""
         found = [SimpleNamespace(**item) for item in self.report["findings"]]
         return [item for item in found if item.code in kinds or not kinds]
 
@@ -105,7 +105,7 @@ class DoctorRun:
 
 
 def examined(layout: Path, *logs: Path) -> DoctorRun:
-    """Run the command; its exit code must match its findings."""
+    """Run the doctor; its exit code must be 1 if there is an error among the findings, else 0."""
     done = calibrator("doctor", "--layout", layout, *(word for log in logs for word in ("--log", log)), "--json")
     assert not done.stderr, done.stderr
     doctor = DoctorRun(code=done.returncode, report=json.loads(done.stdout))

@@ -76,7 +76,7 @@ def test_sound_log_is_ready_for_all_commands(log: Path, layout: Path) -> None:
     assert [item.subject for item in doctor.findings("not in log") if "Rear" in item.text] == ["motor_rear"]
 
 
-def test_text_of_doctor_names_the_next_commands_within_80_columns(log: Path, layout: Path) -> None:
+def test_text_of_doctor_names_the_next_commands_and_its_tables_fit_80_columns(log: Path, layout: Path) -> None:
     lines = succeeded("doctor", "--layout", layout, "--log", log).splitlines()
     assert "ready for: kirchhoff, import, calibrate --trusted, calibrate, ecu-node, ecu-node --gateway" in lines
     assert f"calibrator calibrate {log} --layout {layout} --trusted battery --out result" in lines[-2]
@@ -85,7 +85,9 @@ def test_text_of_doctor_names_the_next_commands_within_80_columns(log: Path, lay
 
 
 @pytest.mark.parametrize(("declared_a", "reported"), [(2.5, False), (1.5, False), (0.5, True)])
-def test_declared_load_is_not_reported_again(declared_a: float, reported: bool, log: Path, layout: Path) -> None:
+def test_mean_of_the_sum_is_reported_unless_the_declared_load_explains_it(
+    declared_a: float, reported: bool, log: Path, layout: Path
+) -> None:
     with layout.open("a") as file:
         file.write(f"\n[unmeasured_load]\nmean_a = {declared_a}\nsd_a = 0.5\n")
     found = examined(layout, log).findings("mean")
@@ -100,7 +102,7 @@ def test_declared_load_is_not_reported_again(declared_a: float, reported: bool, 
 def at_rest(
     database: VehicleDatabase, folder: Path, *, noise_a: float, offset_a: float = 0.0, speed: float = 0.0
 ) -> Path:
-    """Two minutes of a car that stands: noise, offsets of 2 A, or nothing but quantisation."""
+    """Two minutes of a car that stands: noise and an offset of the battery's sensor, or only quantisation."""
     noise, drive = np.random.default_rng(4), true_drive()
     branches = {
         name: replace(item, value=noise.normal(0.0, noise_a, len(item.value)) + offset_a * (name == "battery"))
@@ -112,7 +114,7 @@ def at_rest(
 
 
 @pytest.mark.parametrize(("noise_a", "offset_a"), [(0.0, 0.0), (0.7, 0.0), (0.3, 2.0)])
-def test_car_at_rest_is_not_an_error(
+def test_log_of_a_car_at_rest_gives_a_standstill_hint_and_no_error(
     noise_a: float, offset_a: float, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
     log = at_rest(database, tmp_path, noise_a=noise_a, offset_a=offset_a)
@@ -171,7 +173,7 @@ def test_wrong_unit_is_reported_with_its_factor(
     assert doctor.findings("full scale") == []
 
 
-def test_sign_of_a_very_small_branch_is_not_guessed(log: Path, tmp_path: Path) -> None:
+def test_sign_of_a_very_small_branch_is_reported_as_unknown(log: Path, tmp_path: Path) -> None:
     """The converter's current changes too slowly to be seen in the sum."""
     doctor = examined(write_layout(tmp_path, inverted=("dcdc",)), log)
     assert doctor.errors == []
@@ -216,7 +218,7 @@ def test_wrong_unit_of_a_voltage_is_not_blamed_on_the_power(
 
 
 @pytest.mark.parametrize("delay_s", [0.06, 0.2, -0.3])
-def test_delay_is_reported_as_warning_or_hint(delay_s: float, examine: Examine) -> None:
+def test_delay_of_100_ms_or_more_is_a_warning_and_a_shorter_one_a_hint(delay_s: float, examine: Examine) -> None:
     late = {"motor": 0.4 + delay_s, "battery": 0.4, "auxiliary": 0.4, "dcdc": 0.4}
     doctor = examine(true_drive(delay_s=late))
     assert doctor.errors == []
@@ -243,7 +245,7 @@ def stuck(value: Array) -> Array:
 
 
 def lost(share: float) -> Callable[[Array], Array]:
-    """As with a wrong byte order in the DBC: the remaining values are no current either."""
+    """Make a share of the values unusable, as a wrong byte order in the DBC does: the others are no current either."""
     return lambda value: np.where(np.random.default_rng(0).random(len(value)) < share, np.nan, value)
 
 
@@ -255,7 +257,7 @@ def lost(share: float) -> Callable[[Array], Array]:
     ("dcdc", lost(0.7), "bad frames", "error", "of 1,200 frames"),
     ("dcdc", lost(0.2), "bad frames", "warning", "of 1,200 frames"),
 ])  # fmt: skip
-def test_branch_without_plausible_values_is_found(
+def test_stuck_clipped_constant_or_unusable_values_of_a_branch_are_reported(
     branch: str, change: Callable[[Array], Array], code: str, severity: str, text: str, examine: Examine
 ) -> None:
     drive = true_drive()
@@ -265,7 +267,7 @@ def test_branch_without_plausible_values_is_found(
     assert re.search(text, found.text)
 
 
-def test_gaps_and_failed_checks_are_counted(log: Path, tmp_path: Path, layout: Path) -> None:
+def test_longest_gap_and_frames_that_fail_the_e2e_check_are_reported(log: Path, tmp_path: Path, layout: Path) -> None:
     lines = log.read_text().splitlines(keepends=True)
     kept = [line for line in lines if not ("can0 110#" in line and 40.0 < float(line[1:].partition(")")[0]) < 45.0)]
     for k, line in enumerate(kept[:3000]):
@@ -298,7 +300,7 @@ def test_full_scale_that_is_exceeded_or_never_approached_is_reported(log: Path, 
 # ---- layout and logs that do not fit
 
 
-def test_log_of_another_vehicle_is_an_error_that_names_its_identifiers(tmp_path: Path, layout: Path) -> None:
+def test_log_without_any_branch_gives_an_error_that_names_the_identifiers_in_it(tmp_path: Path, layout: Path) -> None:
     (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n(1.100000) can0 7FF#01\n")
     doctor = examined(layout, tmp_path / "other.log")
     (error,) = doctor.findings("no branch")
@@ -307,7 +309,7 @@ def test_log_of_another_vehicle_is_an_error_that_names_its_identifiers(tmp_path:
     assert doctor.report["ready"] == []
 
 
-def test_branch_missing_in_some_logs_is_reported(log: Path, layout: Path, tmp_path: Path) -> None:
+def test_branch_missing_in_some_logs_gives_a_warning(log: Path, layout: Path, tmp_path: Path) -> None:
     without = [line for line in log.read_text().splitlines() if "can0 120#" not in line]
     (tmp_path / "other.log").write_text("\n".join(without))
     (lacks,) = [
@@ -353,7 +355,9 @@ def exchange(layout: Path, one: str, other: str) -> None:
     layout.write_text(mark.replace("signal = @", f"signal = {second[1]}"))
 
 
-def test_exchanged_branches_of_opposite_signs_are_an_error(log: Path, layout: Path, tmp_path: Path) -> None:
+def test_branches_of_opposite_signs_that_read_each_others_signal_give_an_error(
+    log: Path, layout: Path, tmp_path: Path
+) -> None:
     exchange(layout, "battery", "motor")
     doctor = examined(layout, log)
     assert doctor.errors == [("exchanged", "battery")]

@@ -9,7 +9,7 @@ from calibrator.drive import Array, Channel, Drive
 
 PERIOD_S = {"battery": 0.02, "motor": 0.01, "auxiliary": 0.05, "dcdc": 0.2, "motor_rear": 0.01}
 JITTER = 0.02
-"""Of the period."""
+"""Standard deviation of the frame times about even spacing, in periods. [1]"""
 RATES_HZ = (0.02, 0.6)
 """Range of the sinusoids that a current is made of."""
 SINUSOIDS = 12
@@ -50,7 +50,7 @@ def made_up_drive(seed: int, vehicle: MadeUp, *, name: str = "d") -> Drive:
 
 
 def frame_times(rng: np.random.Generator, period_s: float, duration_s: float) -> Array:
-    """Instants of one message: random phase, jitter. [s]"""
+    """Instants of the frames of one message, with random phase and jitter. [s]"""
     nominal = np.arange(rng.uniform(0.0, period_s), duration_s, period_s)
     return nominal + np.clip(rng.normal(0.0, JITTER, len(nominal)), -0.4, 0.4) * period_s
 
@@ -72,7 +72,7 @@ class _Waves:
 
 
 class _Consumer:
-    """A current that is known at any instant."""
+    """Current of one consumer, which can be computed for any instant."""
 
     def __init__(self, rng: np.random.Generator, vehicle: MadeUp, branch: str, common: _Waves) -> None:
         self._size_a, self._alike = vehicle.size_a[branch], vehicle.alike

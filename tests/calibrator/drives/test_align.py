@@ -79,7 +79,7 @@ def test_bad_samples_are_masked_with_their_reason_and_not_dropped(layout: Layout
     assert {reason: int(mask.sum()) for reason, mask in reasons.items()} == {"stale": 0, "not good": 2}
 
 
-def test_undefined_derived_input_masks_the_sample(layout: Layout) -> None:
+def test_instant_at_which_a_derived_input_is_undefined_is_not_valid(layout: Layout) -> None:
     time_s = np.arange(0.0, 2.0, 0.1)
     voltage = np.where(np.arange(20) == 7, 0.0, 400.0)
     inputs = {"voltage": channel(time_s, voltage), "aircon_demand": channel(time_s, 800.0 + 0.0 * time_s)}
@@ -90,7 +90,7 @@ def test_undefined_derived_input_masks_the_sample(layout: Layout) -> None:
     assert np.isnan(samples.inputs[7, 0])
 
 
-def test_missing_channel_is_named_with_the_available_ones(layout: Layout) -> None:
+def test_error_names_the_missing_channels_and_those_that_the_drive_has(layout: Layout) -> None:
     with pytest.raises(DriveError, match="vehicle V1, drive d: no motor, voltage; it has battery"):
         align(drive_of({"battery": ramp(0.0, 1.0, 0.1)}), layout, ["battery", "motor"], inputs=["voltage"])
 

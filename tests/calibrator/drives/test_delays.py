@@ -65,7 +65,7 @@ def test_delays_are_found_whatever_gains_and_offsets_the_sensors_have(
 
 
 def honest_sd_s(vehicles: list[MadeUp], branches: tuple[str, ...]) -> Array:
-    """Stated deviations of the last branch's delay; requires errors of this size with a mean of zero."""
+    """Return the stated standard deviations of the last branch's delay; the errors must have this size and mean 0."""
     drives = [made_up_drive(seed, vehicle) for seed, vehicle in enumerate(vehicles)]
     found = [estimate_delays([drive], branches, max_sd_s=0.05) for drive in drives]
     delay_s, sd_s = np.array([(each.delay_s[-1], each.sd_s[-1]) for each in found]).T
@@ -76,12 +76,12 @@ def honest_sd_s(vehicles: list[MadeUp], branches: tuple[str, ...]) -> Array:
 
 
 def test_noise_does_not_bias_the_delay_at_any_phase_of_the_frames() -> None:
-    """Frames of 50 and 100 Hz whose phases stay put: the mean error over many phases and noises is zero."""
+    """Frames of 50 and 100 Hz with fixed phases: over many phases and noises the mean error is zero."""
     small = replace(PAIR, size_a={"motor": 5.0}, duration_s=100.0)
     honest_sd_s([replace(small, delay_s={"motor": 0.1 + 0.02 * k / 40.0}) for k in range(40)], TWO)
 
 
-def test_delay_of_a_noisy_branch_is_unbiased_with_a_correct_deviation() -> None:
+def test_delay_of_a_noisy_branch_is_unbiased_and_its_standard_deviation_is_right() -> None:
     """Steps of 1.5 A under noise of 0.4 A."""
     small = replace(TRIO, size_a={"motor": 50.0, "auxiliary": 1.5}, duration_s=600.0)
     sd_s = honest_sd_s([replace(small, delay_s={"auxiliary": 0.1 + 0.05 * k / 30.0}) for k in range(30)], THREE)
@@ -141,7 +141,7 @@ SHORT = made_up_drive(1, replace(PAIR, duration_s=30.0))
     NO_SAMPLES,
     SHORT,
 ])  # fmt: skip
-def test_drive_without_information_on_a_delay_is_flagged(drive: Drive) -> None:
+def test_delay_is_marked_as_not_known_if_the_drive_does_not_show_it(drive: Drive) -> None:
     found = estimate_delays([drive], TWO)
     assert found.known.tolist() == [True, False]
     assert found.delay_s.tolist() == [0.0, 0.0]

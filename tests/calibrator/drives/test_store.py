@@ -42,7 +42,7 @@ def test_stored_drive_is_read_back_exactly(tmp_path: Path, layout: Layout) -> No
         np.testing.assert_array_equal(one.good, other.good)
 
 
-def test_drives_are_listed_and_read_in_order(tmp_path: Path, layout: Layout) -> None:
+def test_drives_are_listed_and_read_in_order_of_vehicle_and_name(tmp_path: Path, layout: Layout) -> None:
     for vehicle, name in (("V2", "a"), ("V1", "b"), ("V1", "a.2")):
         write_drive(tmp_path, some_drive(vehicle, name), layout)
     expected = [("V1", "a.2"), ("V1", "b"), ("V2", "a")]
@@ -51,7 +51,7 @@ def test_drives_are_listed_and_read_in_order(tmp_path: Path, layout: Layout) -> 
 
 
 @pytest.mark.parametrize("name", ["", "..", "../x", "/etc/x", "a/b", "a\\b", ".hidden", "x" * 65, "a\nb", "a.", "ä"])
-def test_drive_name_unusable_as_file_name_is_refused(tmp_path: Path, layout: Layout, name: str) -> None:
+def test_vehicle_or_drive_name_unusable_as_a_file_name_is_refused(tmp_path: Path, layout: Layout, name: str) -> None:
     for drive in (some_drive(vehicle=name), some_drive(name=name)):
         with pytest.raises(DriveError, match="cannot be used; expected 1 to 64 letters"):
             write_drive(tmp_path / "store", drive, layout)
@@ -87,7 +87,7 @@ def test_folder_that_is_not_a_store_is_refused(tmp_path: Path) -> None:
         list_drives(tmp_path)
 
 
-def test_store_that_cannot_be_written_is_named(tmp_path: Path, layout: Layout) -> None:
+def test_store_that_cannot_be_written_is_reported_with_what_to_do(tmp_path: Path, layout: Layout) -> None:
     (tmp_path / "store").write_text("a file")
     with pytest.raises(StorageError, match=r"cannot write it: .*; choose another folder"):
         write_drive(tmp_path / "store", some_drive(), layout)

@@ -166,7 +166,7 @@ def test_folder_on_a_file_system_without_locks_is_usable(tmp_path: Path, monkeyp
     (OSError(errno.ENOSPC, "No space left on device"), "No space left on device; make room, and run the same command"),
     (RuntimeError("Unable to locate credentials"), "Unable to locate credentials; check the credentials, "),
 ])  # fmt: skip
-def test_storage_that_fails_is_reported_with_what_to_do(
+def test_failure_of_a_storage_is_reported_with_what_to_do(
     monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
 ) -> None:
     def failing(*_: object) -> None:

@@ -24,7 +24,7 @@ def test_formula_is_evaluated_at_each_sample(formula: str, expected: list[float]
 
 
 @pytest.mark.parametrize("formula", ["a / b", "sqrt(a)", "a ** 0.5", "sqrt(b - 1)", "1e200 * 1e200 * b"])
-def test_undefined_formula_gives_a_non_finite_value_without_warning(formula: str) -> None:
+def test_formula_gives_a_non_finite_value_without_warning_where_it_is_undefined(formula: str) -> None:
     result = evaluate_formula(formula, VALUES)
     assert np.isfinite(result[0]) == (formula != "1e200 * 1e200 * b")
     assert not np.isfinite(result[1])

@@ -1,4 +1,4 @@
-"""Through the command line: the sum of the currents of logs and tables, before and after."""
+"""Through the command line: the sum of the currents of logs and tables, before and after correction."""
 
 import json
 import re
@@ -34,7 +34,7 @@ def figures(*arguments: object) -> Any:
 
 
 def table(folder: Path, digits: int = 3, **columns_a: Array) -> tuple[object, ...]:
-    """A table of currents as they are measured, and the arguments to read it."""
+    """Write a table of measured currents, and return the arguments with which ``kirchhoff`` reads it."""
     frame = pd.DataFrame({"time [s]": TABLE_S, **columns_a}).round(digits)
     frame.to_csv(folder / "table.csv", index=False)
     return folder / "table.csv", "--branches", ",".join(f"{name}={name}" for name in columns_a)
@@ -42,7 +42,7 @@ def table(folder: Path, digits: int = 3, **columns_a: Array) -> tuple[object, ..
 
 @pytest.fixture(scope="module")
 def log(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Battery offset of 12 A; the corrected frames, 1 ms later, are right."""
+    """A log with a battery offset of 12 A; the corrected frames in it, 1 ms later, have the true currents."""
     true, good = 100.0 * np.sin(TIME_S), np.ones(len(TIME_S), np.bool_)
     measured = {"battery": true + 12.0, "motor": -true}
     branches = {name: Channel(time_s=TIME_S, value=value, good=good) for name, value in measured.items()}
@@ -114,7 +114,7 @@ def shares(found: Any) -> dict[str, float]:
     return {name: found["residual"]["before"][name] for name in ("constant", "gains", "delays", "rest")}
 
 
-def test_sum_of_a_gain_error_is_distinguished_from_a_constant_and_a_delay(tmp_path: Path) -> None:
+def test_gain_error_constant_and_delay_are_told_apart_in_the_sum(tmp_path: Path) -> None:
     noise = 0.05 * np.random.default_rng(5).normal(size=1200)
     late = 60.0 * np.sin(0.7 * (TABLE_S - 0.08)) + 25.0 * np.sin(2.3 * (TABLE_S - 0.08) + 1.0) + 20.0
     for wrong, name in ((1.03 * MOTOR_A - 0.6, "gains"), (MOTOR_A + 2.0, "constant"), (late, "delays")):
@@ -155,7 +155,7 @@ def test_advice_on_a_wrong_sign_or_unit_removes_the_error(
     assert errors("motor", "", -1.2 * MOTOR_A) == []
 
 
-def test_layout_init_is_suggested_only_where_it_works(tmp_path: Path) -> None:
+def test_layout_init_is_suggested_only_for_branches_without_a_formula(tmp_path: Path) -> None:
     path, *_ = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
     for column, is_told in (("motor", True), ("motor*1", False)):  # no layout is made from formulas
         done = calibrator("kirchhoff", path, "--branches", f"battery=battery,motor={column}")
@@ -173,7 +173,7 @@ def parameters(folder: Path, **values: object) -> Path:
     return folder / "V1.json"
 
 
-def test_parameters_correct_as_the_node_would(log: Path, tmp_path: Path) -> None:
+def test_parameter_file_corrects_a_branch_only_if_it_is_marked_to_apply(log: Path, tmp_path: Path) -> None:
     file = parameters(tmp_path, offset_a=12.0, apply=True)
     found = figures(log, "--layout", LAYOUT, "--parameters", file)
     assert found["after"]["sum"]["max_a"] < 0.05
@@ -194,7 +194,7 @@ def test_parameters_of_another_layout_are_refused(log: Path, tmp_path: Path) -> 
 # ---- text, pictures and tables
 
 
-def test_output_fits_80_columns_and_ends_with_the_sum(log: Path) -> None:
+def test_tables_fit_80_columns_and_the_last_line_gives_the_rmse_of_the_sum(log: Path) -> None:
     lines = run(log, "--layout", LAYOUT).splitlines()
     assert all(len(line) <= 80 for line in lines[:6]), lines
     assert "\x1b" not in "".join(lines)
@@ -223,7 +223,7 @@ def test_long_recording_is_thinned_out_in_the_plot(tmp_path: Path) -> None:
     assert len(page) < 10e6
 
 
-def test_table_contains_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> None:
+def test_currents_and_their_sum_are_written_as_csv_or_parquet(log: Path, tmp_path: Path) -> None:
     for name, read in (("out.csv", pd.read_csv), ("out.parquet", pd.read_parquet)):
         run(log, "--layout", LAYOUT, "--table", tmp_path / name)
         frame = read(tmp_path / name)

@@ -36,7 +36,7 @@ def database_file(folder: Path, *messages: str, name: str = "car.dbc") -> Path:
 
 
 def found(path: Path, *arguments: object) -> Layout:
-    """The layout that is written, which the rest of the software can read."""
+    """Return the layout that is written; the readers of layouts and databases must accept it."""
     out = path.parent / "found" / f"{path.stem}.toml"
     out.unlink(missing_ok=True)
     succeeded("layout", "init", path, "--out", out, *arguments)
@@ -56,7 +56,7 @@ WITH_HEATER = PACK_AND_MOTOR | {"heater": ("ClimaStatus.HeaterCurrent", -1)}
 # ---- from a database alone
 
 
-def test_all_branches_and_inputs_of_the_own_power_train_are_found(tmp_path: Path) -> None:
+def test_branches_and_inputs_of_the_built_in_vehicle_are_found_in_its_dbc(tmp_path: Path) -> None:
     (tmp_path / "hv_powertrain.dbc").write_bytes((DBC / "hv_powertrain.dbc").read_bytes())
     guessed = found(tmp_path / "hv_powertrain.dbc")
     by_hand = read_layout(DBC / "hv_powertrain.toml")
@@ -82,7 +82,7 @@ BATTERIES = {
 
 
 @pytest.mark.parametrize("kind", BATTERIES)
-def test_battery_current_is_found_under_usual_names(kind: str, tmp_path: Path) -> None:
+def test_battery_current_is_found_under_usual_names_and_units(kind: str, tmp_path: Path) -> None:
     signal, sender = BATTERIES[kind]
     message = f'BO_ 1 Status1: 8 {sender}\n {signal} INV\n SG_ HV_Voltage : 40|16@1+ (0.1,0) [0|900] "Volts" INV\n'
     limits = 'BO_ 7 Limits: 8 BMS\n SG_ MaxPackCurrent : 0|16@1- (0.1,0) [-500|500] "A" INV\n'
@@ -117,7 +117,7 @@ LEFT_OUT = {
 
 
 @pytest.mark.parametrize("kind", LEFT_OUT)
-def test_missing_pack_current_is_reported_with_the_reason(kind: str, tmp_path: Path) -> None:
+def test_reason_is_given_why_a_current_is_not_taken_as_that_of_the_pack(kind: str, tmp_path: Path) -> None:
     message, why = LEFT_OUT[kind]
     path = database_file(tmp_path, message, INVERTER)
     run = calibrator("layout", "init", path, "--out", tmp_path / "car.toml")
@@ -128,7 +128,7 @@ def test_missing_pack_current_is_reported_with_the_reason(kind: str, tmp_path: P
     assert last.startswith(f"calibrator: {path}: no pack current found")
 
 
-def test_charger_is_a_branch_only_without_a_motor(tmp_path: Path) -> None:
+def test_charger_is_a_branch_without_a_log_only_if_there_is_no_motor(tmp_path: Path) -> None:
     charger = (
         'BO_ 5 Chg: 8 OBC\n SG_ CHG_Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS\n'
         ' SG_ CHG_Volts : 16|16@1+ (0.1,0) [0|1] "Volts" BMS\n'
@@ -224,7 +224,7 @@ UNSIGNED = PACK.replace("@1- (0.1,0) [-1000|1000]", "@1+ (0.1,0) [0|0]")
     (PACK, lambda t: 15.0 * np.sin(5.3 * t), "of the greatest of them: a branch is missing or wrong; --branches"),
     (UNSIGNED, DRIVING["DcPower"], "PackStatus.PackCurrent signed; in the database it is unsigned: correct it"),
 ])  # fmt: skip
-def test_log_that_contradicts_its_database_is_reported(
+def test_log_that_contradicts_the_database_is_refused_with_the_reason(
     pack: str, motor_kw: Callable[[Any], Any], said: str, tmp_path: Path
 ) -> None:
     dbc = database_file(tmp_path, pack, INVERTER)
@@ -254,7 +254,9 @@ def test_multiplexed_battery_current_is_found(tmp_path: Path) -> None:
     assert layout.find_branch("battery").timeout_s == 0.5  # every 100 ms: every other frame
 
 
-def test_guessed_tesla_layout_equals_the_layout_written_by_hand(shared_data: Path, tmp_path: Path) -> None:
+def test_guessed_branches_of_a_tesla_equal_those_of_the_layout_written_by_hand(
+    shared_data: Path, tmp_path: Path
+) -> None:
     (tmp_path / "Model3CAN.dbc").symlink_to(shared_data / "tesla_model3" / "Model3CAN.dbc")
     guessed = found(tmp_path / "Model3CAN.dbc", "--log", shared_data / "tesla_model3" / "drive.log.gz")
     for one, other in zip(guessed.branch, read_layout(DBC / "tesla_model3.toml").branch, strict=True):
@@ -272,10 +274,8 @@ BO_ 690 Charger2B2: 8 OBC
 
 
 @pytest.mark.parametrize("recording", ["Circontrol_end", "Circontrol_midpoint", "eacaec_enda", "efacaec_mida"])
-def test_branches_and_signs_of_an_i3_at_its_chargers_are_found(
-    recording: str, shared_data: Path, tmp_path: Path
-) -> None:
-    """Real ones, of 9 to 40 s; in two of them the current does not change, and only its mean reveals the signs."""
+def test_branches_and_signs_of_a_charging_i3_are_found(recording: str, shared_data: Path, tmp_path: Path) -> None:
+    """Real recordings of 9 to 40 s; in two the current does not change, and only its mean reveals the signs."""
     log = shared_data / "bmw_i3_charging" / f"2019_{recording}.csv.gz"
     layout = found(database_file(tmp_path, I3), "--log", log)
     assert signed(layout) == {"battery": ("Battery112.Battery_Current", -1), "charger": ("Charger2B2.CHG_Amps", 1)}
@@ -317,7 +317,7 @@ def test_current_that_closes_the_sum_is_a_branch_under_any_name(tmp_path: Path) 
     assert set(signed(found(late))) == {"battery", "motor"}
 
 
-def test_column_in_another_unit_than_its_header_is_reported(tmp_path: Path) -> None:
+def test_current_1000_times_too_large_is_refused_with_a_guess_of_its_unit(tmp_path: Path) -> None:
     path = columns(tmp_path / "x.csv", "Ibat", "Imot", scale=1000.0)
     run = calibrator("layout", "init", path, "--out", tmp_path / "x.toml")
     assert run.returncode == 1
@@ -325,7 +325,7 @@ def test_column_in_another_unit_than_its_header_is_reported(tmp_path: Path) -> N
     assert not (tmp_path / "x.toml").exists()
 
 
-def test_table_serves_as_log_of_a_database(tmp_path: Path) -> None:
+def test_table_whose_columns_are_signals_of_the_database_serves_as_a_log(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     kilowatts = 1e-3 * motor_a(TIME_S) * volts(TIME_S)
     names = "time", "PackStatus.PackCurrent [mA]", "PackVoltage", "DcPower", "ClimaStatus.HeaterCurrent"
@@ -351,7 +351,7 @@ def test_branches_given_by_the_user_are_written_unchanged(table: Path) -> None:
     ("other.log --log car.dbc", "the database comes first"),
     ("car.dbc --out there.toml", "exists, and is not overwritten"),
 ])  # fmt: skip
-def test_mistake_in_a_database_is_reported_in_one_line(
+def test_layout_init_refuses_unfit_files_with_one_line(
     line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     database_file(tmp_path, PACK, INVERTER)
@@ -367,7 +367,7 @@ def test_mistake_in_a_database_is_reported_in_one_line(
     assert (tmp_path / "there.toml").read_text() == "kept"
 
 
-def test_json_lists_every_candidate_signal(tmp_path: Path) -> None:
+def test_json_lists_every_candidate_and_states_why_there_is_no_layout(tmp_path: Path) -> None:
     report = reported("layout", "init", database_file(tmp_path, PACK, INVERTER))
     assert report["branches"] == ["battery", "motor"]
     assert {item["signal"]: item["branch"] for item in report["candidates"]} == {

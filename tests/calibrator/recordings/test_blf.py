@@ -156,7 +156,7 @@ def test_damaged_container_is_reported_with_the_number_of_frames_before_it(wrong
 
 
 @pytest.mark.parametrize("batch_bytes", [1, 100, 1 << 21])
-def test_result_does_not_depend_on_the_batch_size_of_containers(
+def test_frames_do_not_depend_on_how_many_containers_are_parsed_together(
     batch_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(blf, "BATCH_BYTES", batch_bytes)

@@ -36,7 +36,7 @@ def one_signal(
 
 
 def by_cantools(message: Message, row: bytes) -> dict[str, Any]:
-    """All signals that the frame holds whole."""
+    """Values of all signals that the frame holds completely."""
     values = message.decode(row, decode_choices=False, allow_truncated=True)
     assert isinstance(values, dict)
     return values
@@ -48,7 +48,7 @@ BYTE_ORDERS: tuple[Literal["little_endian", "big_endian"], ...] = ("little_endia
 def a_signal(
     draw: st.DrawFn, size: int, name: str, *, first: int = 0, under: str | None = None, pages: Sequence[int] = ()
 ) -> Signal:
-    """Any signal within some bytes from the first on; if it is under another, on some pages of that one."""
+    """Any signal within `size` bytes from byte `first` on; if under a selector, on some pages of that."""
     is_float = draw(st.booleans()) and size >= 2
     floats = st.sampled_from([bits for bits in (16, 32, 64) if bits <= 8 * size])
     length = draw(floats if is_float else st.integers(1, min(64, 8 * size)))
@@ -166,5 +166,5 @@ def test_crc_of_profile_1_agrees_with_the_e2e_package(content: bytes, data_id: i
     assert p01_is_sound(data, length, data_id).tolist() == expected == [True, False]
 
 
-def test_frame_too_short_for_crc_and_counter_fails_its_check() -> None:
+def test_frame_too_short_for_crc_and_counter_fails_the_e2e_check() -> None:
     assert not p01_is_sound(*payloads([b"", b"\0"], 8), 0).any()

@@ -63,7 +63,7 @@ def test_every_log_format_is_read_completely_compressed_or_not(tmp_path: Path, s
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".csv"])
-def test_can_fd_frames_are_read_with_all_their_bytes(tmp_path: Path, suffix: str) -> None:
+def test_frames_of_can_fd_are_read_with_all_their_bytes(tmp_path: Path, suffix: str) -> None:
     messages = [
         can.Message(timestamp=1.7e9 + k, arbitration_id=0x123, is_extended_id=False, is_fd=True, data=bytes(range(n)))
         for k, n in enumerate((3, 8, 12, 64))
@@ -108,7 +108,7 @@ def test_damaged_candump_line_is_counted_and_its_neighbours_are_read(line: str) 
     assert len(kept) + found.damaged + found.remote_frames + found.error_frames == np.count_nonzero(kind)
 
 
-def test_damaged_candump_line_names_no_channel() -> None:
+def test_channel_of_a_damaged_candump_line_is_not_listed() -> None:
     text = b"(1.000000) can0 123#01\n(2.000000) cxn0 123#GG\n" + 40 * b"\0" + b"\n(3.000000) can1 123#02"
     found, _ = parse_candump(text)
     assert (found.channels, found.damaged) == (("can0", "can1"), 2)
@@ -176,7 +176,7 @@ def test_unusable_log_is_refused_with_the_reason(tmp_path: Path, name: str, cont
         read_frames(tmp_path / name)
 
 
-def test_order_and_line_numbers_hold_in_logs_longer_than_one_block(tmp_path: Path) -> None:
+def test_order_and_line_numbers_are_right_in_logs_longer_than_one_block(tmp_path: Path) -> None:
     line = "({:.6f}) can0 123#0102030405060708\n"
     count = BLOCK_BYTES // len(line.format(1.0)) + 1000
     path = tmp_path / "long.log"
@@ -188,7 +188,7 @@ def test_order_and_line_numbers_hold_in_logs_longer_than_one_block(tmp_path: Pat
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
-def test_truncated_gzip_is_reported_with_line_and_readable_frames(tmp_path: Path, share: float) -> None:
+def test_truncated_gzip_is_reported_with_line_and_number_of_readable_frames(tmp_path: Path, share: float) -> None:
     packed = gzip.compress(write_log(tmp_path / "drive.log", some_messages(20_000)).read_bytes())
     cut = tmp_path / "cut.log.gz"
     cut.write_bytes(packed[: int(share * len(packed))])
@@ -200,7 +200,9 @@ def test_truncated_gzip_is_reported_with_line_and_readable_frames(tmp_path: Path
     assert len(lines) - _READ_BYTES // min(map(len, lines)) <= line <= len(lines)
 
 
-def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_mf4_without_asammdf_is_refused_and_names_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     path = tmp_path / "drive.mf4"
     path.write_bytes(b"MDF")
@@ -213,7 +215,7 @@ def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest
     ([5000.0, 5001.0, 100.0, 101.0], [0.0, 1.0, 1.0 + CLOCK_GAP_S, 2.0 + CLOCK_GAP_S], 0, 1),
     ([0.0, 600.0, 1201.0], [0.0, 600.0, 600.0 + CLOCK_GAP_S], 0, 1),
 ])  # fmt: skip
-def test_disorder_steps_and_gaps_of_log_times_are_repaired(
+def test_unordered_times_clock_steps_and_long_pauses_of_a_log_are_repaired(
     logged_s: list[float], time_s: list[float], disordered: int, clock_steps: int
 ) -> None:
     time = repaired_time(np.rint(1e9 * np.array(logged_s)).astype(np.int64))

@@ -69,7 +69,7 @@ def write_with_python_can(path: Path) -> None:
 
 
 def lines(form: str, head: str = "") -> Callable[[Path], None]:
-    """Writer of a text with a line per frame, whose `form` has the parts of one, below a head."""
+    """Return a writer of a text: a head, then for each frame a line of the given form."""
 
     def write(path: Path) -> None:
         before = 0.0
@@ -161,13 +161,13 @@ def require_currents(found: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("program", LOGS)
-def test_logs_written_by_other_programs_give_the_currents(tmp_path: Path, layout: Path, program: str) -> None:
+def test_logs_written_by_other_programs_give_the_right_currents(tmp_path: Path, layout: Path, program: str) -> None:
     name, write = LOGS[program]
     write(tmp_path / name)
     require_currents(before(tmp_path / name, layout))
 
 
-def test_logs_in_a_folder_are_one_recording_with_gaps_whatever_notes_lie_beside_them(
+def test_logs_in_a_folder_are_read_as_one_recording_and_notes_beside_them_are_ignored(
     tmp_path: Path, layout: Path
 ) -> None:
     (tmp_path / "logs").mkdir()
@@ -213,7 +213,7 @@ def of_buses(*names: str) -> str:
 
 
 def on_buses(path: Path, *channels: tuple[str, int]) -> Path:
-    """The car's frames on several buses of one candump log; of each bus the first so many."""
+    """One candump log of several buses; each has the given number of the car's frames, from the first on."""
     lines_ = [
         (time_s, f"({START_S + time_s:.6f}) {channel} {number:0{8 if extended else 3}X}#{data.hex()}")
         for channel, count in channels
@@ -282,7 +282,7 @@ def test_branch_can_be_computed_by_a_formula(tmp_path: Path, layout: Path) -> No
         (('dbc = "car.dbc"', 'dbc = "x.kcd"'), "x.kcd: cannot read the DBC: No such file"),
     ],
 )  # fmt: skip
-def test_mistake_in_a_layout_is_reported_in_one_line(
+def test_wrong_layout_is_refused_with_one_line(
     tmp_path: Path, layout: Path, change: tuple[str, str], words: str
 ) -> None:
     assert change[0] in LAYOUT
@@ -311,7 +311,7 @@ def nameless_archive(path: Path) -> None:
         ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
     ],
 )  # fmt: skip
-def test_mistake_in_a_log_is_reported_in_one_line(
+def test_unusable_log_is_refused_with_one_line(
     tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str
 ) -> None:
     write(tmp_path / name)
@@ -319,7 +319,7 @@ def test_mistake_in_a_log_is_reported_in_one_line(
 
 
 DAMAGED = {name: program for program, (name, _) in LOGS.items() if "." in name}
-"""A log of each name."""
+"""For each file name, the program (the last of several) whose log has that name."""
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda _: b"",
     "cut at its end": lambda whole: whole[: len(whole) // 2 + 7],
@@ -330,7 +330,9 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("name", DAMAGED)
-def test_damaged_log_gives_one_error_line_or_is_counted(tmp_path: Path, layout: Path, name: str, damage: str) -> None:
+def test_damaged_log_gives_one_error_line_or_a_notice_of_the_lines_left_out(
+    tmp_path: Path, layout: Path, name: str, damage: str
+) -> None:
     log = tmp_path / name
     LOGS[DAMAGED[name]][1](log)
     log.write_bytes(DAMAGES[damage](log.read_bytes()))
@@ -354,7 +356,9 @@ def test_damaged_log_gives_one_error_line_or_is_counted(tmp_path: Path, layout: 
     ("SavvyCAN", b"00000100,false", b"90000000000100,false"),
     ("PEAK TRC 1.3", b"00000200", b"9000000200"),
 ])  # fmt: skip
-def test_damaged_line_is_counted(tmp_path: Path, layout: Path, program: str, old: bytes, new: bytes) -> None:
+def test_single_damaged_line_is_left_out_and_counted(
+    tmp_path: Path, layout: Path, program: str, old: bytes, new: bytes
+) -> None:
     name, write = LOGS[program]
     write(tmp_path / name)
     above, found, below = (tmp_path / name).read_bytes().rpartition(old)
@@ -366,7 +370,7 @@ def test_damaged_line_is_counted(tmp_path: Path, layout: Path, program: str, old
 
 @pytest.mark.parametrize("damage", ["empty", "cut at its end", "random"])
 @pytest.mark.parametrize("suffix", [".dbc", ".kcd", ".sym", ".arxml"])
-def test_damaged_database_is_reported_in_one_line(tmp_path: Path, layout: Path, suffix: str, damage: str) -> None:
+def test_damaged_database_is_refused_with_one_line(tmp_path: Path, layout: Path, suffix: str, damage: str) -> None:
     path = write_database(tmp_path / f"car{suffix}")
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     layout.write_text(LAYOUT.replace("car.dbc", path.name))
@@ -379,7 +383,9 @@ def test_damaged_database_is_reported_in_one_line(tmp_path: Path, layout: Path, 
     (of_buses(), "has no 'dbc', so that it fits tables only"),
     (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
 ])  # fmt: skip
-def test_node_refuses_layouts_without_one_dbc(layout: Path, text: str, words: str) -> None:
+def test_node_refuses_layouts_of_several_or_no_dbc_or_with_a_computed_branch(
+    layout: Path, text: str, words: str
+) -> None:
     layout.write_text(text)
     with pytest.raises(LayoutError, match=words):
         node_database(layout)

@@ -81,7 +81,7 @@ def test_codes_for_no_value_in_dbc_or_layout_are_not_currents(tmp_path: Path) ->
     assert recorded(tmp_path, *lines).branches["motor"].good.all()
 
 
-def test_named_values_of_an_input_count_unless_they_mean_not_available(tmp_path: Path) -> None:
+def test_named_codes_of_an_input_are_values_unless_they_mean_not_available(tmp_path: Path) -> None:
     gear = '"V" A\n SG_ Gear : 16|8@1+ (1,0) [0|0] "" A\n'
     dbc = POWER_DBC.replace('"V" A\n', gear) + 'VAL_ 2 Gear 1 "Drive" 2 "Ungueltig" 3 "SNA" ;\n'
     layout = POWER_LAYOUT + '[[input]]\nname = "gear"\nsignal = "Volt.Gear"\n'
@@ -111,7 +111,7 @@ BO_ 100 M: 8 X
 """
 
 
-def test_frames_with_a_counter_of_several_bytes_are_written_and_read() -> None:
+def test_frames_of_e2e_profile_7_with_a_counter_of_4_bytes_are_written_and_checked() -> None:
     dbc = BIG_ENDIAN_DBC.replace("M: 8", "M: 32")
     database = big_endian_database(dbc, e2e=ProfileP07(messages=["M"], offset=8))
     count = 300

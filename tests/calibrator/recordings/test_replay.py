@@ -1,4 +1,4 @@
-"""Playing logs onto a bus: formats, order, timing, and logs that cannot be played."""
+"""Playing logs onto a bus: order, timing, a bus that takes no frame, and Ctrl-C."""
 
 import time
 from pathlib import Path

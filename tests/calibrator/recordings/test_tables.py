@@ -117,7 +117,7 @@ def test_tables_of_all_formats_give_currents_without_a_layout(tmp_path: Path, ki
     require_sum(before(tmp_path / name, "--branches", BRANCHES))
 
 
-def test_unusable_rows_are_counted(tmp_path: Path) -> None:
+def test_rows_without_time_or_with_too_many_cells_are_left_out_and_counted(tmp_path: Path) -> None:
     rows = frame().to_csv(index=False).splitlines()
     rows[20] += ",7"
     rows[30] = "," + rows[30].partition(",")[2]
@@ -225,7 +225,7 @@ def test_column_that_fits_two_messages_is_refused(tmp_path: Path) -> None:
     assert "column 'Current' could be Bms.Current and Inv.Current; call columns after message and signal" in said
 
 
-def test_column_of_texts_is_reported(tmp_path: Path) -> None:
+def test_branch_column_that_holds_texts_is_named_with_the_first_text(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text(LAYOUT)
     csv(powers().assign(**{"Ibat [A]": [f"{value:.1f} A" for value in BATTERY_A]}))(tmp_path / "x.csv")
     said = calibrator("kirchhoff", tmp_path / "x.csv", "--layout", tmp_path / "car.toml").stdout
@@ -233,7 +233,7 @@ def test_column_of_texts_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("heater", ['power = "Pheat", voltage = "Ubat"', 'formula = "1e3 * Pheat / Ubat"'])
-def test_layout_of_a_table_names_columns_and_quotients_of_columns(tmp_path: Path, heater: str) -> None:
+def test_branch_of_a_table_is_a_column_or_a_quotient_of_columns(tmp_path: Path, heater: str) -> None:
     (tmp_path / "car.toml").write_text(LAYOUT.replace('power = "Pheat", voltage = "Ubat"', heater))
     csv(powers())(tmp_path / "x.csv")
     quotient = "battery=Ibat,-motor=Imot,-heater=Pheat*1000/Ubat"
@@ -257,13 +257,15 @@ def test_layout_of_a_table_names_columns_and_quotients_of_columns(tmp_path: Path
         ("time,I,J\n0,True,2\n1,False,3\n", "I,J", "branch I: I is in 'on/off'; expected A, mA, kA"),
     ],
 )  # fmt: skip
-def test_mistake_with_a_table_is_reported_in_one_line(tmp_path: Path, text: str, branches: str, words: str) -> None:
+def test_unusable_table_or_wrong_branches_are_refused_with_one_line(
+    tmp_path: Path, text: str, branches: str, words: str
+) -> None:
     (tmp_path / "x.csv").write_text(text)
     assert words in refused("kirchhoff", tmp_path / "x.csv", "--branches", branches)
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".feather", ".mf4", ".csv.gz"])
-def test_damaged_table_is_reported_in_one_line(tmp_path: Path, suffix: str) -> None:
+def test_damaged_table_is_refused_with_one_line(tmp_path: Path, suffix: str) -> None:
     (tmp_path / f"x{suffix}").write_bytes(gzip.compress(frame().to_csv(index=False).encode())[:1500])
     said = refused("kirchhoff", tmp_path / f"x{suffix}", "--branches", "a,b")
     assert f"x{suffix}: not a readable" in said

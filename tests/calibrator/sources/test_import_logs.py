@@ -16,7 +16,9 @@ def imported(logs: list[Path], store: Path, database: VehicleDatabase) -> Import
     return import_logs(logs, database, store, workers=Workers())
 
 
-def test_only_new_logs_are_added(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+def test_import_adds_only_logs_that_the_store_lacks(
+    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
     first = imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     both = imported([two_vehicles / "logs"], tmp_path, database)
     assert (len(first.drives), first.already_there) == (1, ())
@@ -29,7 +31,9 @@ def report(two_vehicles: Path, tmp_path_factory: pytest.TempPathFactory, databas
     return imported([two_vehicles / "logs"], tmp_path_factory.mktemp("store"), database)
 
 
-def test_damaged_drive_is_not_imported(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+def test_damaged_drive_in_the_store_is_reported_and_not_imported_again(
+    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
     imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     (tmp_path / "drives" / "V001" / "drive.parquet").write_bytes(b"cut")
     report = imported([two_vehicles / "logs" / "V001"], tmp_path, database)
@@ -70,7 +74,9 @@ def test_slow_log_is_left_out_and_others_are_imported(
     assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 10 s and was ended; ")
 
 
-def test_full_disk_stops_an_import(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+def test_drive_that_cannot_be_written_stops_the_import(
+    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
     """Otherwise all further drives would be left out one by one, with exit code 0."""
     command = [sys.executable, "-m", "calibrator", "import", str(two_vehicles / "logs"), "--layout", str(LAYOUT)]
     limited = ["prlimit", "--fsize=1000", *command, "--out", str(tmp_path)]

@@ -1,4 +1,4 @@
-"""Which log belongs to which vehicle; nothing is opened."""
+"""Which log belongs to which vehicle, found without reading the logs; what branches a fleet has."""
 
 import zipfile
 from pathlib import Path
@@ -105,7 +105,7 @@ def store(database: VehicleDatabase, tmp_path: Path) -> Path:
     (None, []),
     (["battery", "motor"], ["branches recorded but not asked for, missing from the junction sum: auxiliary"]),
 ])  # fmt: skip
-def test_branches_not_recorded_or_not_requested_are_named(
+def test_branches_not_recorded_or_not_requested_are_named_in_notices(
     store: Path, database: VehicleDatabase, branches: list[str] | None, beside: list[str]
 ) -> None:
     notices = [n for n in probe_equipment(find_fleet(store), database, branches).notices if n.startswith("branches")]
@@ -116,6 +116,8 @@ def test_branches_not_recorded_or_not_requested_are_named(
     (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
     (["pack", "battery"], "no branch 'pack'; known are battery, motor"),
 ])  # fmt: skip
-def test_wrong_branches_are_refused(store: Path, database: VehicleDatabase, branches: list[str], words: str) -> None:
+def test_repeated_or_unknown_branches_are_refused(
+    store: Path, database: VehicleDatabase, branches: list[str], words: str
+) -> None:
     with pytest.raises((FleetError, LayoutError), match=words):
         probe_equipment(find_fleet(store), database, branches)
