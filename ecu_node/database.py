@@ -45,7 +45,10 @@ class VehicleDatabase:
     """SHA-256 of the DBC file; see :attr:`.Layout.dbc_digest`."""
 
     def message(self, name: str, place: str = "") -> Message:
-        """Return the message of this name, or raise DatabaseError, which says where the layout names it: ``place``."""
+        """Return the message of this name.
+
+        DatabaseError (no such message) says where the layout names it: ``place``; LayoutError: there is no such bus.
+        """
         return self._found(name, place)[1]
 
     def channel_of(self, name: str) -> str | None:
@@ -79,8 +82,9 @@ class VehicleDatabase:
         return found[0]
 
     def signal(self, name: str) -> tuple[Message, Signal]:
-        """Return message and signal of ``Message.Signal``, or raise :class:`DatabaseError`.
+        """Return message and signal of ``Message.Signal``; raise :class:`DatabaseError` if the DBC lacks one of them.
 
+        LayoutError says that the name has another form, or a bus that the layout does not have.
         Without a DBC the name is that of a column; its signal is then a float in the unit that the layout gives.
         """
         if not self.layout.dbc_files:
@@ -126,7 +130,8 @@ def read_database(layout: Layout) -> VehicleDatabase:
     Raises
     ------
     DatabaseError
-        If the file cannot be read or parsed, or lacks messages or a signal that the layout names.
+        If the file cannot be read or parsed, lacks a message or signal that the layout names, or a signal of a branch
+        has a unit of another quantity.
     LayoutError
         If the layout names a value that an input's signal can never have, or a name is not ``Message.Signal``.
     """

@@ -1,4 +1,4 @@
-"""Reads files that a user names, if they are regular and not too large; writes files whole; locates their errors.
+"""Reads files that a user names, if they are regular and not too large; replaces files whole; says where one is wrong.
 
 msgspec decides whether a document has the right structure; :func:`field_error` says where it has not.
 """
@@ -82,7 +82,7 @@ def text_digest(content: bytes) -> str:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by new content; after a power cut either the old or the new content is there."""
+    """Replace a file by new content; after a power cut the old or the new content is there. OSError if it fails."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -98,6 +98,11 @@ def formula_value(
     -------
     float or array
         The value; NaN or infinite where the formula has none (division by zero, root of a negative number, overflow).
+
+    Raises
+    ------
+    LayoutError
+        If the formula holds anything but names, numbers, and the operations and functions of this module.
     """
     match node:
         case ast.Name(id=name):

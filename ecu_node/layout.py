@@ -112,7 +112,8 @@ class Branch(_Table, frozen=True, kw_only=True):
     timeout_s: _Positive = 0.5
     """Without a frame for this long the branch is stale. [s]"""
     balance: bool = False
-    """In ground truth made from recordings, this branch is set to minus the sum of the others, (19) of the paper."""
+    """In ground truth made from recordings, this branch is set to minus the sum of the others: equation (19) of the
+    paper."""
     corrected: SignalName | None = None
     """Signal into which an overlay node writes the corrected current or power."""
     quality: SignalName | None = None
@@ -197,7 +198,7 @@ class StatusMessage(_Table, frozen=True, kw_only=True):
 
 
 class Watch(_Table, frozen=True, kw_only=True):
-    """When the node takes its own corrections to be wrong."""
+    """When the node takes its corrections for wrong, a branch for missing, and the bus for asleep."""
 
     window_s: Annotated[float, msgspec.Meta(ge=1.0, le=3600.0)] = 10.0
     """Measured and corrected sums are compared over this long. [s]"""
@@ -215,7 +216,7 @@ class Watch(_Table, frozen=True, kw_only=True):
 
 
 class Activation(_Table, frozen=True, kw_only=True):
-    """What it takes until signed parameters are in force."""
+    """What signed parameters must fulfil to be put in force: their trial, and their largest step."""
 
     trial_s: Annotated[float, msgspec.Meta(ge=1.0, le=86400.0)] = 300.0
     """Length of the trial: time for which the Kirchhoff sum is watched while currents flow. [s]"""
@@ -432,7 +433,7 @@ class Layout(LayoutKeys, frozen=True, kw_only=True):
     path: Path
     """File that it was read from."""
     digest: str
-    """SHA-256 of the file."""
+    """SHA-256 of the file, the same for LF and CRLF line ends."""
 
     @property
     def dbc_path(self) -> Path:

@@ -20,7 +20,7 @@ BLOCK_S = 30.0
 BATCH_SAMPLES = 1500
 """Samples, in whole blocks, that are searched for spikes together: as many as a processor's cache holds. [1]"""
 LEAST_SHARE = 0.2
-"""Least share of valid samples of a block that is used. [1]"""
+"""A block with a smaller share of valid samples is not used. [1]"""
 TIME_RESOLUTION_S = 1e-3
 """Rounding of time stamps in logs; added to limits of time, so that samples exactly one limit apart pass. [s]"""
 INSTANT_SLACK = 1e-3

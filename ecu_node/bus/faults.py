@@ -1,8 +1,8 @@
 """Fault memory: why the node fell back, kept in the state folder as a control unit keeps its trouble codes.
 
 There is one entry per reason and branches: when first and last, how often, and the currents of the last time. An active
-fault stays so after a restart, until the bus has slept (a branch that was silent or stuck), another parameter set is in
-force, or ``ecu-node clear``.
+fault stays active, also after a restart, until the bus has slept (if a branch was silent or stuck), another parameter
+set is put in force, or ``ecu-node clear`` is run.
 """
 
 from collections.abc import Callable
@@ -69,7 +69,7 @@ def read_faults(folder: Path) -> list[Fault]:
 
 
 def clear_faults(folder: Path) -> None:
-    """Forget all entries; a node that runs corrects again within a second."""
+    """Forget all entries; a running node then corrects again within a second. UserError: there is no such folder."""
     _file(folder).unlink(missing_ok=True)
 
 
@@ -155,7 +155,7 @@ class FaultMemory:
         self._written = self._background.submit(self._write, content)
 
     def _add(self, reason: str, branches: list[str]) -> None:
-        """Enter a fault that occurs now, or count it if it is there, as the first entry."""
+        """Put a fault that occurs now first in the list: its old entry, counted once more, or a new one."""
         corrector, now = self._corrector, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         found = [item for item in self._faults if (item.reason, item.branches) == (reason, branches)]
         fault = found[0] if found else Fault(reason=reason, branches=branches, parameter_set=0, first=now, last=now)

@@ -63,7 +63,7 @@ class _Route(NamedTuple):
 
 
 class KernelRoutes:
-    """The kernel's rules between two buses, both ways.
+    """The kernel's rules between two buses, in both directions.
 
     Leaving the context removes them, except by an exception that is no :class:`UserError`.
 
@@ -118,7 +118,9 @@ class KernelRoutes:
                 raise
 
     def set(self) -> None:
-        """Set all rules, both ways, or none; right rules that an earlier gateway left stay as they are.
+        """Set all rules, in both directions, or none; rules of an earlier gateway stay if they are correct.
+
+        Other rules between the two buses that a gateway left are deleted.
 
         Raises
         ------
@@ -147,7 +149,7 @@ class KernelRoutes:
         self._said = text
 
     def remove(self) -> None:
-        """Remove all rules, both ways."""
+        """Remove all rules, in both directions."""
         with suppress(OSError):  # an interface may vanish just now, with its rules
             self._replace(Counter())
 
@@ -160,7 +162,7 @@ class KernelRoutes:
         self._socket.close()
 
     def _wanted(self) -> Counter[_Route]:
-        """Return the rules that must be set, both ways."""
+        """Return the rules that must be set, in both directions."""
         one, other = map(socket.if_nametoindex, self._channels)
         ways = (one, other), (other, one)
         return Counter(_Route(flags, *way, *pair) for way in ways for flags, *pair in self._kinds)

@@ -61,7 +61,7 @@ class TimeOfDay:
             self._read()
 
     def ahead_s(self) -> float:
-        """Return by how much it is ahead [s]; infinity while frames stamped before it was set may be waiting."""
+        """Return by how much the time of day is ahead [s]; infinity while frames stamped before it was set may wait."""
         before_s = self._ahead_s
         now_s = self._read()
         if abs(self._ahead_s - before_s) > _LARGEST_JITTER_S:

@@ -88,7 +88,7 @@ class _Channel:
         samples.append(sample)
 
     def until(self, time_s: float) -> _Samples:
-        """Return all samples, and keep those that instants from a time [s] on need."""
+        """Return all samples, then drop those that no instant from a time [s] on needs."""
         samples = self.samples
         self.samples = samples[max(bisect_right(samples, (time_s, math.inf)) - 1, 0) :]
         return samples
@@ -303,7 +303,7 @@ class OnBoardSummary:
             self._sum_batch()
 
     def end_drive(self) -> None:
-        """End the drive: sum and write its last block, if at least the share ``LEAST_SHARE`` of it is there."""
+        """End the drive: sum and write the rest of it; a block counts if at least ``LEAST_SHARE`` of it is valid."""
         self._zero.end_window()
         if self._zero_s is not None and (self._next is not None or self._start()):
             end_s = min(self._channels[name].samples[-1][0] for name in (*self._recorded, *self._branches))
@@ -591,7 +591,10 @@ def _products(columns: Sequence[Sequence[float]]) -> _Column:
 
 
 def _white_noise_a2(current_a: Sequence[float]) -> float:
-    """Estimate the variance of white noise in a block from its median third difference; NaN is a gap. [A^2]"""
+    """Estimate the variance of white noise in a block from its median third difference. [A^2]
+
+    NaN is a gap; the result is 0 if no four consecutive samples are known.
+    """
     x = current_a
     third = [abs(late - early - 3.0 * (c - b)) for early, b, c, late in zip(x, x[1:], x[2:], x[3:], strict=False)]
     known = [value for value in third if not math.isnan(value)]

@@ -87,21 +87,21 @@ class ServiceManager:
         self._due_s = 0.0
 
     def ready(self, text: str) -> None:
-        """Tell that the node is at work."""
+        """Tell systemd that the node is at work."""
         self._notify(f"READY=1\nSTATUS={text}")
 
     def alive(self, now_s: float) -> None:
-        """Tell that the node has just done its work, at intervals of half the time that the watchdog allows."""
+        """Tell systemd that the node has just done its work, at intervals of half the time that the watchdog allows."""
         if self._period_s is not None and now_s >= self._due_s:
             self._due_s = now_s + self._period_s
             self._notify("WATCHDOG=1")
 
     def status(self, text: str) -> None:
-        """Tell what the node does now."""
+        """Tell systemd what the node does now."""
         self._notify(f"STATUS={text}")
 
     def stopping(self) -> None:
-        """Tell that the node ends."""
+        """Tell systemd that the node ends."""
         self._notify("STOPPING=1")
 
     def _notify(self, text: str) -> None:

@@ -143,8 +143,8 @@ class SteadyBus:
         Returns
         -------
         sent, not_sent : int
-            Numbers of frames that the bus took, and did not take. A full bus is tried a few times; while it stays full,
-            once.
+            Numbers of frames that the bus took, and did not take. If the send queue is full it is tried a few times; at
+            later calls, while it stays full, once each.
         """
         queue, first, lost = self._queue, 0, 0
         attempts_left = _SEND_ATTEMPTS if self._full_since_s is None else 1
@@ -358,7 +358,7 @@ class SocketCanLink:
         return self._message(number)
 
     def _fill(self, timeout_s: float) -> bool:
-        """Take all frames that wait; return whether there were any."""
+        """Take the frames that wait, at most :data:`MOST_AT_ONCE`; return whether there were any."""
         if timeout_s > 0.0:
             waiting_s = time.monotonic()
             is_asked = bool(self._waiting.poll(1e3 * timeout_s))

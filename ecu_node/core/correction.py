@@ -1,6 +1,6 @@
 """Integer correction plan: multiply, add and shift from the measured code to the corrected one.
 
-A sensor shows i_m = (1 + d) i + o, positive into the junction; the true current is, by (25) in [1]_,
+A sensor shows i_m = (1 + d) i + o, positive into the junction; the true current is, by equation (25) in [1]_,
 
     i = (i_m - o) / (1 + d).
 
@@ -11,7 +11,7 @@ The plan holds G, H and B as integers over 2^shift:
 
     code_out = (code_in * gain + voltage_code * voltage_gain + bias + half) >> shift,    half = 2^(shift - 1),
 
-clamped into the values of the target.
+clamped to the codes that may be written into the target.
 
 Rounding rule: the exact line, rounded to the nearest code, halves up. The integers approximate the exact line from
 above, by less than :data:`LARGEST_ERROR` of a code: an exact half is never rounded down, but an exact result less than
@@ -50,7 +50,7 @@ class SensorFault:
         return bool(self.drift or self.offset_a)
 
     def true_current(self, i_m: float) -> float:
-        """Return the true current for a measured one, (25) in [1]_; both are positive into the junction. [A]"""
+        """Return the true current for a measured one, equation (25) of the paper; positive into the junction. [A]"""
         return (i_m - self.offset_a) / (1.0 + self.drift)
 
 
@@ -145,7 +145,7 @@ def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
     Raises
     ------
     DatabaseError
-        If the target's value table leaves no values around 0.
+        If the target's code of 0 has a name in the DBC's value table, so that 0 cannot be written.
     """
     source, target, voltage = signals.source, signals.target, signals.voltage
     per_unit = 1 / (1 + as_written(fault.drift)) / target.scale

@@ -26,7 +26,7 @@ __all__ = ["OF_ONE_DRIVE", "Corrector", "StatusFields"]
 _OK, _LAST_USABLE = Check.OK, Check.LOST  # looking up members of an enumeration is slow
 _INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
 _LEAST_SILENCE_S = 1.0
-"""A message's counter may start anywhere after a silence of this, or of its branches' timeout if longer. [s]"""
+"""After a silence of this, or of its branches' timeout if that is longer, any counter of a message is accepted. [s]"""
 
 _Rewrite = Callable[[bytearray, bytearray, float], bytearray]
 """Function of the payload of a frame, the previous outgoing payload, and the time at which the frame came [s]; returns
@@ -36,7 +36,11 @@ a new outgoing payload, with the branches written into it."""
 def _signal_by_signal(
     branches: Mapping[LiveBranch, Written], inside: Collection[LiveBranch], counters: Counters
 ) -> _Rewrite:
-    """Return a function that writes each branch by itself; one that the payload lacks gets its last known value."""
+    """Return a function that writes each branch by itself.
+
+    A branch that the payload lacks gets its last value in an overlay's answer, or the code for "no value" if that value
+    is too old or a frame that must not be used came since; in a gateway's frame its bits stay as they are.
+    """
 
     def rewrite(payload: bytearray, before: bytearray, now_s: float) -> bytearray:
         made = bytearray(before)
@@ -58,9 +62,10 @@ def _in_one_word(
     made_length: int,
     otherwise: _Rewrite,
 ) -> _Rewrite:
-    """Return a function that writes all branches at once, or `otherwise` if payloads of this length may lack a branch.
+    """Return a function that writes all branches at once, or `otherwise` where that cannot be done.
 
-    It falls back to `otherwise` for a frame with a code that is not ordinary, see ``LiveBranch.ordinary_codes``.
+    It cannot if payloads of this length may lack a branch, if byte orders differ, or if a branch has no ordinary codes
+    (``LiveBranch.ordinary_codes``). For a frame with a code that is not ordinary the function calls `otherwise`.
     Two's complements are handled as unsigned numbers: their sign bits are inverted, in the payload and in the outgoing
     one.
     """
@@ -138,9 +143,9 @@ class _Ways(NamedTuple):
     missing: list[LiveBranch]
     """Branches that such a payload is too short for."""
     in_place: _Rewrite
-    """Writes corrected currents into the payload itself."""
+    """For a gateway: makes the payload to be passed on, with corrected currents in place of the measured ones."""
     answers: list[tuple[OwnMessage, _Rewrite]]
-    """Messages that answer such a payload, each with the function that fills it."""
+    """For an overlay: messages that answer such a payload, each with the function that fills it."""
 
 
 class Source:
@@ -206,7 +211,7 @@ class Source:
         Returns
         -------
         sequence of OwnMessage
-            Messages to be sent.
+            Messages to be sent; none if the frame is corrupt, repeated, or its counter jumped.
         """
         ways = self.ways.get(len(payload)) or self._find(len(payload))
         if self._take(payload, now_s, ways) > _LAST_USABLE:
@@ -236,8 +241,9 @@ class Source:
         Returns
         -------
         bytearray or None
-            Payload to be sent on, protected with the counter that the frame came with; None if the frame is held back.
-            The receivers judge for themselves whether too many frames fail their check to rely on the message.
+            Payload to be sent on, protected with the counter that the frame came with; None if the frame carries a
+            branch and is corrupt, repeated, or its counter jumped: then it is not passed on. That too many frames of
+            the message fail their check holds nothing up: the receivers judge that for themselves.
         """
         ways = self.ways.get(len(payload)) or self._find(len(payload))
         if self._take(payload, now_s, ways) > _LAST_USABLE:
@@ -325,7 +331,7 @@ class Corrector:
     shadow : bool
         Compute and report, change nothing.
     sleep_s : float
-        Silence of all branches after which one that was latched as silent or stuck is tried again. [s]
+        Silence of all branches after which a branch that was latched as silent or stuck is tried again. [s]
     """
 
     def __init__(
@@ -378,7 +384,7 @@ class Corrector:
         self.latch(Reason.NONE)
 
     def look(self, now_s: float) -> None:
-        """Judge the whole junction, and fall back to passing through if a branch is stale or a sum is wrong.
+        """Judge the whole junction; fall back to passing through if a branch is stale or stuck, or the sums are wrong.
 
         Must be called every 20 ms for a jump to be seen within 0.1 s.
         """
@@ -417,7 +423,7 @@ class Corrector:
         return State.CORRECTING, beside
 
     def status(self) -> OwnMessage | None:
-        """Make the status message, with the sums of the last look; None if the layout has none."""
+        """Make the status message, with the sums of the last look; None if the layout has no status message."""
         fields = self._status_fields
         if fields is None:
             return None
@@ -462,7 +468,7 @@ class Corrector:
         self.latch(Reason.NONE)
 
     def _is_missed(self, branch: LiveBranch, now_s: float) -> bool:
-        """Whether a branch is stale, and another sent after its deadline; if none did, the vehicle goes to sleep."""
+        """Whether a branch is stale though another sent after this one's deadline; else the vehicle goes to sleep."""
         return branch.is_stale(now_s) and any(other.time_s > branch.deadline_s for other in self.branches)
 
     def latch(self, reason: Reason, branches: Sequence[str] = ()) -> None:

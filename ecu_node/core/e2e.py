@@ -24,13 +24,13 @@ class Check(IntEnum):
     """Outcome of checking one frame; if it is OK or LOST, its content is new and intact."""
 
     OK = 0
-    """Valid, and the next one in order."""
+    """Intact, and the next one in order."""
     LOST = 1
-    """Valid, but a few frames before it were lost."""
+    """Intact, but a few frames before it were lost."""
     REPEATED = 2
-    """Valid, but seen before."""
+    """Intact, but with the same counter as the frame before."""
     JUMPED = 3
-    """Valid, but its counter has advanced further than the layout allows."""
+    """Intact, but its counter has advanced further than the layout allows."""
     CORRUPT = 4
     """Too short, with a wrong CRC, or with an impossible counter."""
 
@@ -53,7 +53,8 @@ class Protection:
     Attributes
     ----------
     header_mask : int
-        Bits of CRC, counter and all else that the profile writes, in the frame read as one little-endian integer.
+        Bits of CRC, counter, length and data identifier, as far as the profile writes them, in the frame read as one
+        little-endian integer.
     least_bytes : int
         Bytes that a frame must have.
     modulus : int
@@ -69,7 +70,7 @@ class Protection:
     identity : int or bytes
         Data identifier, or the list of them.
     windows : tuple of E2EWindow
-        For each :class:`E2EState`, what it takes for a message in that state to be VALID.
+        For each :class:`E2EState`, what it takes for a message in that state to become or stay VALID.
     """
 
     header_mask: int
@@ -100,7 +101,7 @@ class Protection:
         self.counter.put(payload, self.modulus - 1)
 
     def seal(self, payload: bytearray) -> None:
-        """Write CRC and all else that the profile has, and keep the counter as it is."""
+        """Write CRC, length and data identifier, as far as the profile has them; the counter stays as it is."""
         place, last = self.counter, self.counter.end - 1
         if payload[last] & place.highest and not place.shift:
             payload[last] -= 1  # protect adds it again; the keyword argument would cost three times as much
@@ -109,7 +110,7 @@ class Protection:
             self.protect(payload, self.identity, increment_counter=False)
 
     def advance(self, payload: bytearray) -> None:
-        """Increment the counter, and write CRC and all else that the profile has."""
+        """Increment the counter; write CRC, length and data identifier, as far as the profile has them."""
         self.protect(payload, self.identity)
 
 
@@ -125,7 +126,7 @@ class Receiver:
     ----------
     state : E2EState
         Whether the message as a whole can be relied on, by AUTOSAR's E2E state machine. A repeated frame, or one
-        whose counter jumped, counts neither as intact nor as corrupt.
+        whose counter jumped, counts neither for ``min_ok`` nor for ``max_error`` of a window.
     """
 
     def __init__(self, protection: Protection) -> None:
@@ -199,13 +200,13 @@ class Receiver:
 
 
 class _Profile(NamedTuple):
-    """A profile of AUTOSAR: its functions in autosar-e2e, and its header, whose bytes count from its start."""
+    """A profile of AUTOSAR: its functions in autosar-e2e, the size of its header, and its counter."""
 
     check: Callable[..., bool]
     protect: Callable[..., None]
     header_bits: int
     counter_byte: int
-    """Most significant byte of the counter."""
+    """Most significant byte of the counter, as counted from the start of the header."""
     counter_bits: int
     modulus: int
 
@@ -248,7 +249,9 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
     Raises
     ------
     LayoutError
-        If the message cannot carry its protection.
+        If the message cannot carry its protection, or has no signal for its counter or CRC.
+    DatabaseError
+        If the signal of its counter or CRC is a floating-point number or wider than 64 bits.
     """
     layout = database.layout
     place, entry = next((pair for pair in layout.protections if message.name in pair[1].messages), ("", None))
@@ -309,7 +312,7 @@ def _autosar(entry: AutosarProfile, message: Message) -> dict[str, Any]:
 def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str, Any]:
     """Return the fields of a :class:`Protection` by a counter and a CRC-8, both of them signals of the DBC.
 
-    The CRC covers all other bytes, and a data identifier if there is one.
+    The CRC covers all other bytes, and a data identifier if there is one. Errors are those of :func:`protection_of`.
     """
     signals = {signal.name: signal for signal in message.signals}
     for name in (entry.counter, entry.crc):

@@ -179,23 +179,26 @@ class LiveBranch(HeardSignal):
             self._waited_s = max(self._waited_s, expected_since_s)
 
     def activate(self, *, active: bool, doubted: bool) -> None:
-        """Correct the fault, if any, while `active`; else pass through, with quality IMPLAUSIBLE if `doubted`."""
+        """Correct the branch if `active` and its fault is applied, else pass it through.
+
+        If it is not corrected and `doubted`, its quality is IMPLAUSIBLE.
+        """
         corrects = active and self.fault.applied
         self.plan = self._correcting if corrects else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.IMPLAUSIBLE if doubted else Quality.PASSED_THROUGH
 
     def spoil(self, now_s: float) -> None:
-        """Note that a frame came that must not be used: until the next one there is no value."""
+        """Note that a frame came that must not be used: there is no value until the next usable frame."""
         self._spoilt_s = now_s
 
     @property
     def time_s(self) -> float:
-        """When its last frame came [s]; -infinity if none did."""
+        """When the last frame with its signal came [s]; -infinity if none did."""
         self._time_s = next((seen_s for seen_s, _ in self.newest_first()), self._time_s)
         return self._time_s
 
     def latest(self) -> tuple[float, int] | None:
-        """Return time [s] and code of its last frame; None if the code is no value."""
+        """Return time [s] and code of its last frame; None if the code is no value, or no frame came."""
         found = next(self.newest_first(), None)
         return found if found is not None and self.codes.is_value(found[1]) else None
 
@@ -234,7 +237,7 @@ class LiveBranch(HeardSignal):
         return self.quality is not Quality.CORRECTED or no_value or self._voltage_code(now_s) is None
 
     def _voltage_code(self, time_s: float) -> int | None:
-        """Return the raw code of the branch's voltage in its last frame up to a time of frames, not interpolated.
+        """Return the raw code of the branch's voltage in the last frame up to a time [s], not interpolated.
 
         None if there is no such frame, it is too old, or its code is no value; 0 if the plan needs no voltage.
         """
@@ -376,7 +379,7 @@ def aligned_currents(
         The instant, in time of the junction. [s]
     currents : dict of str to (float, float)
         Each branch's current as measured and as the parameters in force correct it; positive into the junction. [A]
-        None, instead of both, while a fitted branch is stale or has no value.
+        None, instead of both, while a fitted branch is stale or has no value, or no branch is fitted.
     """
     fitted = [(branch, delays_s.get(branch.name, 0.0)) for branch in branches if branch.is_fitted]
     times_s = [branch.time_s - delay_s for branch, delay_s in fitted if not branch.is_stale(now_s) and branch.latest()]
@@ -460,7 +463,7 @@ class _Window:
             self._sums = [total - term for total, term in zip(self._sums, old, strict=True)]
 
     def means(self, share: float) -> list[float] | None:
-        """Return the means of the moments' ``terms``; None until this share of the window is filled."""
+        """Return the means of the moments' ``terms``; None until this share of the window is filled, by ten moments."""
         moments = self.moments
         if len(moments) < _LEAST_LOOKS or moments[-1].time_s - moments[0].time_s < share * self._length_s:
             return None
@@ -575,7 +578,7 @@ class JunctionWatch:
         self._recent.add(moment)
 
     def _sum_sd_a(self) -> float:
-        """Standard deviation that the sum may have now. [A]"""
+        """Standard deviation that the corrected sum of right sensors has at the currents of this instant. [A]"""
         throughput_a = 0.5 * sum(abs(corrected) for _, corrected in self.currents_a.values())
         return math.hypot(self._sd_a, self._sd_per_a * throughput_a)
 
@@ -620,7 +623,7 @@ class JunctionWatch:
         return tuple(name for name in still if abs(self.currents_a[name][1]) > least_a)
 
     def _stuck(self) -> tuple[str, ...]:
-        """Return branches whose code never changed in the window; none if another's gain error explains the sum."""
+        """Return branches whose code never changed in the window; none if another's gain explains the sum."""
         moments = self._window.moments
         still = [name for name, code in moments[-1].codes.items() if all(m.codes.get(name) == code for m in moments)]
         measured_a = [moment.terms[0] for moment in moments]

@@ -1,10 +1,11 @@
 """A signal of the DBC: its raw integer in a frame, and the values of its codes.
 
 The bytes that a signal touches are one integer of its own byte order; the signal is ``length`` bits of it, ``shift``
-bits above the least significant one. No other bit is ever touched. A multiplexed signal is in a frame only if the
-multiplexers above it have one of its codes. value = scale * code + offset, with scale and offset as the decimals that
-stand in the DBC, held exactly. A code is a value if it lies in the DBC's [minimum|maximum] and has no name in the DBC's
-value table: a named code of a current ("SNA", "Error") is a message, not a number of amperes.
+bits above the least significant one. No other bit is ever touched. A multiplexed signal is in a frame only if each
+multiplexer above it has one of the codes with which the signal is sent. value = scale * code + offset, with scale and
+offset as the decimals that stand in the DBC, held exactly. A code is a value if it lies in the DBC's [minimum|maximum]
+and has no name in the DBC's value table: a named code of a current ("SNA", "Error") is a message, not a number of
+amperes.
 """
 
 import math
@@ -73,7 +74,10 @@ def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float
 
 
 def factor_of(unit: str, known: Mapping[str, float], what: str) -> float:
-    """Return the factor from a unit to the base unit, 1 for an empty text; DatabaseError says that `what` is in it."""
+    """Return the factor from a unit to the base unit, 1 for an empty text.
+
+    If the unit is not known, DatabaseError says that `what` is in it.
+    """
     if not unit:
         return 1.0
     try:
@@ -367,7 +371,8 @@ def read_codes(signal: Signal, units: Mapping[str, float] | None, where: str) ->
     Raises
     ------
     DatabaseError
-        If the unit is wrong, the scale is zero, or the signal cannot be read bit by bit.
+        If the unit is of another quantity, the scale is 0 or not finite, no code lies in the DBC's range, or the signal
+        is a floating-point number or wider than 64 bits.
     """
     place = bit_place(signal)
     if signal.scale == 0 or not math.isfinite(signal.scale + signal.offset):

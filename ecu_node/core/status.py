@@ -107,7 +107,7 @@ class Counters:
     not_returned: int = 0
     """Frames from the vehicle's bus that the sensors' bus did not take."""
     held_back: int = 0
-    """Frames that failed their check and that a gateway did not pass on."""
+    """Frames of branches that failed their end-to-end check, so that a gateway did not pass them on."""
     corrupt: int = 0
     """Frames with a wrong CRC or an impossible counter."""
     repeated: int = 0
@@ -115,11 +115,11 @@ class Counters:
     jumped: int = 0
     """Frames whose counter had advanced further than the layout allows."""
     gaps: int = 0
-    """Times that the counter showed a few lost frames."""
+    """Times that the counter of a message showed that a few frames before were lost."""
     short: int = 0
-    """Frames too short for a signal that the layout reads from them."""
+    """Signals of branches for which their frame was too short: one frame may count for several branches."""
     late: int = 0
-    """Frames of branches that were too old when they were read; they were not used."""
+    """Frames of messages with branches that were too old when they were read; they were not used."""
     dropped: int = 0
     """Frames that the kernel dropped because they were not read in time."""
     saturated: int = 0
@@ -152,8 +152,8 @@ class Counters:
 class Latency:
     """Histogram of the time from the arrival of a branch's frame until its answer was sent.
 
-    All answers sent with one call count with the latency of the one that waited longest: that costs a fifth of timing
-    each of them, and is never too small.
+    All answers sent with one call count with the latency of the one that waited longest: that costs a fifth of what
+    timing each of them would, and the latency counted is never too small.
 
     Attributes
     ----------

@@ -44,7 +44,8 @@ from ecu_node.update.state import (
 __all__ = ["TargetFacts", "expiry_of", "provision", "target_path", "update"]
 
 _CONFIG = UpdaterConfig(max_delegations=4, targets_max_length=2_000_000)
-"""Limits of TUF's client; others are its own: 16 kB for a timestamp, 500 kB for a root, 2 MB for a snapshot."""
+"""Limits of TUF's client; its other limits are its defaults: 16 kB for a timestamp, 500 kB for a root, 2 MB for a
+snapshot."""
 _LARGEST_ROOT_BYTES = 512_000
 _WORK = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
 """Folder in which TUF's client works: in memory if there is such a folder, which saves time and flash wear."""
@@ -62,7 +63,7 @@ def _canonical_json(document: Any) -> str | None:
 
     securesystemslib encodes in Python, and python-tuf lets it do so twice for each file: for the snapshot of 10^6
     vehicles that took two thirds of the time of an update. It refuses numbers that are not finite, which msgspec writes
-    as null, so it also encodes documents with a null.
+    as null, so documents with a null are left to securesystemslib, too.
     """
     text = msgspec.json.encode(document, order="sorted").decode()
     return encode_canonical(document) if "\\" in text or "null" in text else text
@@ -112,12 +113,12 @@ def expiry_of(metadata: bytes) -> datetime:
 
 
 def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
-    """Create the state of a vehicle, which says which repository it trusts.
+    """Create the state folder of a vehicle, which says which repository it trusts.
 
     Parameters
     ----------
     folder : Path
-        State of the vehicle; made if it does not exist.
+        State folder of the vehicle; made if it does not exist.
     vehicle : str
         Identity of the vehicle.
     root : Path
@@ -163,7 +164,7 @@ def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, 
     Parameters
     ----------
     folder : Path
-        State of the vehicle.
+        State folder of the vehicle.
     source : str
         Bundle, folder or URL.
     database : VehicleDatabase
@@ -181,9 +182,9 @@ def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, 
     Raises
     ------
     UnfitError
-        If the offer is refused, with the reason.
+        If there is no state that can be read, or the offer is refused; with the reason.
     UserError
-        If the state cannot be written.
+        If another process holds the lock, or the state cannot be written.
     """
     with nullcontext() if dry_run else locked(folder):
         before = state = read_state(folder)
@@ -208,7 +209,7 @@ def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, 
 
 
 def _verified_offer(state: VehicleState, source: str, now: datetime) -> _Offer:
-    """Run TUF's client workflow on a copy of the trusted metadata; the state is not touched."""
+    """Run TUF's client workflow on a copy of the trusted metadata; raise TrustError if anything is refused."""
     fetcher = open_source(source)
     target = target_path(state.vehicle)
     with TemporaryDirectory(prefix="ecu-node-", dir=_WORK) as name:
@@ -238,7 +239,7 @@ def _verified_offer(state: VehicleState, source: str, now: datetime) -> _Offer:
 
 
 def _require_fresh(path: Path, source: str, now: datetime) -> None:
-    """Check the expiry of verified metadata against the latest known time, as TUF's client uses only the clock."""
+    """Raise TrustError if verified metadata has expired by the latest known time; TUF's client uses only the clock."""
     expires = expiry_of(path.read_bytes())
     if now >= expires:
         raise TrustError(
@@ -271,7 +272,10 @@ def _refusal(error: Exception, source: str, vehicle: str) -> TrustError:
 
 
 def _without_revoked(state: VehicleState, offer: _Offer, now: datetime) -> tuple[VehicleState, str]:
-    """Return the state with the verified metadata and without revoked sets, and in words what was revoked."""
+    """Return the state with the verified metadata and without revoked sets, and in words what was revoked.
+
+    Raise TrustError if the offer is for another vehicle.
+    """
     if offer.facts.vehicle != state.vehicle:
         raise TrustError(
             Reason.WRONG_VEHICLE, f"the parameters are for {offer.facts.vehicle!r}, this is {state.vehicle!r}"
@@ -322,7 +326,7 @@ def _judged(
 
 
 def _require_small_step(before: VehicleParameters, new: VehicleParameters, database: VehicleDatabase) -> None:
-    """Check that parameters differ from those in force by the layout's largest step at most."""
+    """Raise TrustError if parameters differ from those in force by more than the layout's largest step."""
 
     def applied(branch: BranchParameters | None) -> tuple[float, float]:
         return (branch.drift, branch.offset_a) if branch is not None and branch.apply else (0.0, 0.0)

@@ -120,7 +120,7 @@ def read_state(folder: Path) -> VehicleState:
     Raises
     ------
     TrustError
-        If there is no state, or it is damaged.
+        If there is no state, or it cannot be read, is damaged, or of another version.
     """
     path = state_path(folder)
     try:

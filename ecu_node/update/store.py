@@ -1,4 +1,4 @@
-"""Parameters of a running node: those in force, those on trial, and how a trial puts them in force. Needs no TUF."""
+"""Parameters of a running node: in force, on trial, and how a trial puts them in force. Works without python-tuf."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -38,12 +38,12 @@ _SURELY_EXPIRED = timedelta(minutes=1)
 
 
 def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now: datetime) -> VehicleState:
-    """End a trial: put the set in force, or drop it. Does not wait for the lock, as the bus would wait too.
+    """End a trial: put the set in force, or drop it. If another process holds the lock, raise an error at once.
 
     Parameters
     ----------
     folder : Path
-        State of the vehicle.
+        State folder of the vehicle.
     tried : ParameterSet
         The set that was on trial.
     passed : bool
@@ -61,7 +61,7 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
     Raises
     ------
     UserError
-        If the state cannot be read or written.
+        If another process holds the lock, or state or log of decisions cannot be read or written.
     """
     with locked(folder, wait=False):
         state = read_state(folder)
@@ -84,7 +84,10 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
 
 
 def end_expired(folder: Path, expired: ParameterSet, now: datetime) -> VehicleState:
-    """Take an expired set out of the state for good: a clock that is set back later does not bring it back."""
+    """Take an expired set out of the state for good: a clock that is set back later does not bring it back.
+
+    Returns and errors are those of :func:`conclude`.
+    """
     with locked(folder, wait=False):
         state = read_state(folder)
         if state.in_force != expired:
@@ -96,12 +99,12 @@ def end_expired(folder: Path, expired: ParameterSet, now: datetime) -> VehicleSt
 
 
 class ParameterStore:
-    """Keeps the parameters of a running node in step with the state of its vehicle.
+    """Puts in force on a running node what the state folder of its vehicle says, and runs the trials of new sets.
 
     Parameters
     ----------
     folder : Path
-        State of the vehicle.
+        State folder of the vehicle.
     database : VehicleDatabase
         Layout and DBC in use.
     mode : Mode

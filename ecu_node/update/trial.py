@@ -4,13 +4,13 @@ The set changes the sum from m (measured) to c, by s = m - c. Right sensors show
 them sees. If the set is right, the remainder c - e is uncorrelated with s, and correction lowers the mean square of the
 sum about e by exactly that of s:
 
-    share = (E[(m - e)^2] - E[(c - e)^2]) / E[s^2]        1: the set is right; 0: half of s is wrong; -1: all of it is
+    share = (E[(m - e)^2] - E[(c - e)^2]) / E[s^2]     1: the set is right; 0: half of s is wrong; -1: all of s is wrong
 
 The share does not depend on how hard the vehicle is driven. The parameter file says e, and which share the calibrator
 saw on the drives that it used; where that is below 1, as where one of two offsets that cancel is corrected, so is the
-share on the vehicle. A set whose s stays below the layout's margin changes too little for this sum to judge, and must
-only not make it worse. In either case the rest, the RMS of c - e, must not much exceed what the calibrator saw: a set
-that removes one error and leaves others is not for this vehicle, or not any more.
+share on the vehicle. A set whose s stays below the layout's margin changes too little for its share to be judged; it
+passes if it leaves the sum no worse. In either case the rest, the RMS of c - e, must not much exceed what the
+calibrator saw: a set that removes one error and leaves others is not for this vehicle, or not any more.
 """
 
 import math

@@ -39,9 +39,9 @@ BU_: N C X
 _CURRENT = ' SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" X\n'
 KEYS = {name: FrameKey(16 + number, False) for number, name in enumerate(NAMES)}
 PHASE_S = {"battery": 0.0, "motor": 0.003, "heater": 0.007}
-"""Control units send one after the other. [s]"""
+"""Time from the begin of a period to the frame of each branch: control units send one after the other. [s]"""
 BREAK_S = 15.0
-"""When sensors break. [s]"""
+"""Time from the start at which sensors break in :meth:`Junction.break_sensors`. [s]"""
 
 
 def three_branches(folder: Path, quality_bits: int = 3) -> VehicleDatabase:
@@ -91,7 +91,7 @@ class Junction:
         self.wrong: dict[str, Callable[[float], float]] = {}
         """By branch, what its broken sensor makes of the current that it showed before. [A]"""
         self.forged: dict[str, float] = {}
-        """By branch, what a forged frame before each real one says more. [A]"""
+        """By branch: a forged frame comes before each real one, and its current is greater by this. [A]"""
         self.fell_back_s: float | None = None
         self.corrected_after = 0
         """Answers with quality CORRECTED after the fall-back."""
@@ -102,7 +102,7 @@ class Junction:
         return self.step * self.period_s
 
     def run(self, seconds: float, true_a: Callable[[float], Mapping[str, float]], *, look_s: float = 0.02) -> None:
-        """Send frames of these true currents into the node [A], each counted as its sensor does."""
+        """Send frames of these true currents [A] into the node, with positive directions as the sensors have them."""
         every = max(round(look_s / self.period_s), 1)
         for self.step in range(self.step, self.step + round(seconds / self.period_s)):  # noqa: B020
             for name, phase_s in PHASE_S.items():

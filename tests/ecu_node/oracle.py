@@ -23,7 +23,7 @@ from tests.ecu_node.random_vehicles import Codes, mask_of
 __all__ = ["Oracle", "require_right"]
 
 _TOLERANCE = Fraction(1, 1024)
-"""Of a code."""
+"""Share of a code by which the value that the node rounds may exceed the exact one."""
 
 
 class _Outcome(NamedTuple):
@@ -73,12 +73,12 @@ class _Branch:
         self.outcome, self._seen = _Outcome(None, Quality.NOT_AVAILABLE), False
 
     def spoil(self) -> None:
-        """A frame came that must not be used."""
+        """Note that a frame came that must not be used."""
         if self._seen:
             self.outcome = _Outcome(None, Quality.INVALID)
 
     def take(self, code: int, volts: Fraction | None) -> None:
-        """Take the code of an intact frame, at a voltage, if it is known."""
+        """Take the code of an intact frame, and the voltage at its time; None if no voltage is known."""
         self._seen = True
         if not self.codes.is_value(code):
             is_named = code in self.codes.gaps
@@ -91,7 +91,7 @@ class _Branch:
             self.outcome = self._published(self.codes.worth(code), volts)
 
     def _published(self, measured: Fraction, volts: Fraction | None) -> _Outcome:
-        """Of a current, in the sensor's own sign, i = (i_m - o) / (1 + d); of a power the same times the voltage."""
+        """Return the outcome for a value: i = (i_m - o) / (1 + d) in the sensor's own sign; a power, times volts."""
         if self.corrects:
             u = (volts or Fraction(0)) if self.is_power else Fraction(1)
             measured = (measured - self.sign * self._offset_a * u) / (1 + self._drift)
@@ -137,7 +137,7 @@ class Oracle:
         Parameters
         ----------
         identifier : int
-            Of the frame; bit 31: of 29 bits.
+            Of the frame; bit 31 is set if it has 29 bits.
         data : bytes
             Its payload.
         sent : sequence of (int, bytes)
@@ -182,7 +182,7 @@ class Oracle:
     def _rewritten(
         self, message: Message, own: Sequence[_Branch], data: bytes, sent: Sequence[tuple[int, bytes]]
     ) -> str | None:
-        """What is wrong with a frame that a gateway passes on."""
+        """Say what is wrong with a frame that a gateway passes on; None if nothing is."""
         if len(sent) != 1 or self._messages.get(sent[0][0]) is not message or len(sent[0][1]) != len(data):
             return "another frame was sent"
         before, protection = _codes(message, data), self._protections.get(message.name)
@@ -191,7 +191,7 @@ class Oracle:
         return self._wrong_frame(message, data, sent[0][1], allowed, protection.counter_of(data) if protection else 0)
 
     def _wrong_answer(self, message: Message, data: bytes) -> str | None:
-        """What is wrong with a frame that an overlay node sends."""
+        """Say what is wrong with a frame that an overlay node sends; None if nothing is."""
         allowed, protection = dict[Signal, tuple[int, int]](), self._protections.get(message.name)
         for item in self._branches:
             if item.target is not None and item.target[0] is message:

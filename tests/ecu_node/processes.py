@@ -1,4 +1,4 @@
-"""Commands of the node in this process; the node in one of its own, and the service manager that it reports to."""
+"""Commands of the node in this process; the node in a process of its own; the service manager that it reports to."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ LONGEST_WAIT_S = 60.0
 
 
 class Done(NamedTuple):
-    """What comes of a command."""
+    """Exit code and output of a command."""
 
     code: int
     out: str

@@ -35,7 +35,7 @@ _SIZES = (1, 2, 3, 4, 6, 7, 8, 8, 8, 8, 8, 12, 16, 24, 32, 48, 64)
 _FACTORS = {"mA": Fraction(1, 1000), "kW": Fraction(1000)}
 _TRIES = 50
 _LONGEST_WITH_RANGE = 24
-"""Longer ranges have more digits than a floating-point number. [bit]"""
+"""Longest signal that gets a range: ends of longer ones have more digits than a floating-point number. [bit]"""
 _SETTINGS = {
     "schema": 1,
     "name": "fuzz",
@@ -48,11 +48,11 @@ _SETTINGS = {
 
 
 HEADER_BITS = {"P01": 12, "P02": 12, "P04": 96, "P05": 24, "P06": 40, "P07": 160, "P11": 12, "counter CRC8": 16}
-"""Of the kinds of protection: what a message needs beside it."""
+"""Bits of the header of each profile."""
 
 
 class Codes:
-    """Codes of a signal in the DBC's range, those among them that are no values, and what the others are worth."""
+    """Codes of a signal in the DBC's range: which of them are no values, and what those that are values are worth."""
 
     def __init__(self, signal: Signal, no_value: Sequence[int] = ()) -> None:
         factor, n = _FACTORS.get(signal.unit or "", Fraction(1)), signal.length
@@ -112,11 +112,11 @@ class _Draft:
     size: int
     signals: list[Signal] = field(default_factory=list)
     header: list[Signal] = field(default_factory=list)
-    """In the place of an AUTOSAR header, which the DBC does not have."""
+    """Signals that keep the place of an AUTOSAR header free, which is no signal of the DBC."""
     e2e: dict[str, Any] = field(default_factory=dict)
 
     def message(self, *more: Signal) -> Message:
-        """With these signals besides; refused by cantools if they overlap."""
+        """Return the message of cantools, with some more signals; cantools raises an error if signals overlap."""
         return Message(
             self.frame_id,
             self.name,
@@ -127,7 +127,7 @@ class _Draft:
         )
 
     def place(self, rng: Random, signal: Signal, *, multiplexed: bool = False, little: bool = False) -> str | None:
-        """Put a signal where no other one is: its name in the layout, None if there is no room."""
+        """Put a signal where no other one is; return its name in the layout, or None if there is no room."""
         selector = next((item for item in self.signals if item.is_multiplexer), None)
         if multiplexed and selector is not None:
             codes = range(1 << selector.length)
@@ -231,7 +231,7 @@ def _draw_target(rng: Random, name: str, draft: _Draft, units: Sequence[str]) ->
 
 
 def _draw_message(rng: Random, name: str, low: int, kinds: Collection[str], least_size: int = 1) -> _Draft:
-    """A message whose identifier ends in these three bits."""
+    """Draw a message whose identifier ends in the three bits `low`."""
     extended = rng.random() < 0.3
     frame_id = rng.getrandbits(26 if extended else 8) << 3 | low
     size = rng.choice([size for size in _SIZES if size >= least_size])

@@ -36,7 +36,7 @@ DATABASE = cantools.database.can.Database()
 DATABASE.add_dbc_string(SMALL_DBC)
 PAIR, ANSWER = DATABASE.get_message_by_name("Pair"), DATABASE.get_message_by_name("PairOut")
 BATTERY_A, CORRECTED_A = 111.0, 100.0
-"""Of a battery with a gain error of +0.1 and an offset of 1 A. [A]"""
+"""Measured and corrected current of a battery whose sensor has a gain error of +0.1 and an offset of 1 A. [A]"""
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +87,7 @@ def test_missing_or_contradictory_bit_rate_is_refused(
 
 
 @pytest.mark.parametrize("interface", ["kvaser", "neovi"])
-def test_missing_driver_is_reported(interface: str) -> None:
+def test_adapter_without_its_driver_is_refused_with_advice_to_install_it(interface: str) -> None:
     """python-can calls functions of a driver that it did not find."""
     with pytest.raises(BusError, match=f"^{interface} 0: cannot open the bus: .*; install the driver of the adapter"):
         connect(interface, "0", bitrate=500_000)
@@ -118,7 +118,7 @@ def test_can_fd_support_of_an_interface_is_read_from_its_mtu(interface: str, cha
 
 
 PCAN = ("--interface", "pcan", "--channel", "PCAN_USBBUS1")
-"""Its library is not here: opening it would fail."""
+"""An adapter whose library is not installed here: opening it would fail."""
 
 
 @pytest.fixture
@@ -179,7 +179,9 @@ def test_dry_run_of_a_gateway_prints_both_directions(dry_run: Callable[..., list
         ("virtual", "nothing is sent$"),
     ],
 )
-def test_listen_only_reports_acknowledgement(interface: str, words: str, dry_run: Callable[..., list[str]]) -> None:
+def test_dry_run_with_listen_only_says_whether_frames_are_acknowledged(
+    interface: str, words: str, dry_run: Callable[..., list[str]]
+) -> None:
     rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
     *_, sends, last = dry_run("--interface", interface, "--channel", "c0", *rate, "--listen-only")
     assert sends == "  sends nothing"
@@ -248,10 +250,10 @@ def test_node_on_slcan_adapter_sends_corrected_currents_unless_listen_only(
     assert any("listen-only: nothing is sent, and no frame acknowledged" in text for text in log) == bool(options)
 
 
-def test_unpublished_and_silent_branches_are_reported(
+def test_unpublished_branch_and_silence_of_all_branches_are_logged(
     node: list[str], line: SerialLine, make_database: MakeDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In its log, and the second one also to the service manager."""
+    """The service manager is told of the silence, too."""
     manager = ServiceManagerHere(tmp_path / "notify", monkeypatch)
     write_parameters(parameters_for(make_database(), battery=(0.1, 1.0), heater=(0.1, 0.0)), tmp_path / "v1.json")
     with manager.socket, running(*node, "--interface", "slcan", "--channel", line.path, "--bitrate", "250000") as log:

@@ -1,4 +1,4 @@
-"""Signals in frames; cantools is the oracle."""
+"""Reading and writing signals in frames, compared with cantools."""
 
 from pathlib import Path
 

@@ -72,10 +72,10 @@ def test_check_of_unfit_parameters_exits_with_1_and_gives_the_reason(
     assert done.out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
 
 
-def test_layout_without_signals_for_corrected_currents_needs_a_gateway(
+def test_check_of_a_layout_without_corrected_signals_fails_except_for_a_gateway(
     make_database: MakeDatabase, tmp_path: Path
 ) -> None:
-    """The options of run are those of check."""
+    """'ecu-node run' has the same option --gateway."""
     database = make_database(re.sub(r', (corrected|quality) = "[\w.]+"', "", SMALL_LAYOUT))
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
     options = check(tmp_path / "v1.json", layout=database.layout.path)
@@ -87,7 +87,7 @@ def test_layout_without_signals_for_corrected_currents_needs_a_gateway(
     assert report["branches"]["battery"]["target"] == "Pair.Battery"
 
 
-def test_check_shows_a_fault_that_is_not_applied_and_warns_that_can_fd_needs_its_option(
+def test_check_shows_an_unapplied_fault_and_warns_that_fd_messages_need_option_fd(
     make_database: MakeDatabase, tmp_path: Path
 ) -> None:
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
@@ -101,7 +101,9 @@ def test_check_shows_a_fault_that_is_not_applied_and_warns_that_can_fd_needs_its
 
 
 @pytest.mark.parametrize(("load", "expected_a"), [("[unmeasured_load]\nmean_a = 6.1\nsd_a = 1.0\n", 6.1), ("", 0.0)])
-def test_template_expects_the_load_of_the_layout(make_database: MakeDatabase, load: str, expected_a: float) -> None:
+def test_template_takes_the_expected_sum_from_the_unmeasured_load_of_the_layout(
+    make_database: MakeDatabase, load: str, expected_a: float
+) -> None:
     database = make_database(f"{SMALL_LAYOUT}{load}")
     document = json.loads(template_text(database, "v1", datetime(2026, 6, 1, 12, 0, tzinfo=UTC)))
     assert document["junction_residual"]["expected_a"] == expected_a
@@ -120,7 +122,9 @@ def test_template_expects_the_load_of_the_layout(make_database: MakeDatabase, lo
         (TypeError("a\nb"), INTERNAL_ERROR, "prog: internal error: TypeError: a b; run again with --debug and report "),
     ],
 )
-def test_each_error_is_one_line(error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_program_prints_each_error_as_one_line_and_returns_its_exit_code(
+    error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert end_of("prog", error, debug=False) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(text)
@@ -131,7 +135,7 @@ def test_trust_error_keeps_its_reason_when_pickled() -> None:
     assert (type(found), found.reason, str(found)) == (TrustError, Reason.REVOKED, "number 5 was revoked")
 
 
-def test_internal_error_names_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_message_names_file_and_line_of_the_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("nobody thought of that")
 
@@ -176,8 +180,8 @@ ROLES = {
 
 @pytest.mark.parametrize("make", UNSUITABLE)
 @pytest.mark.parametrize("role", ROLES)
-def test_input_that_is_not_a_regular_file_is_reported_in_one_line(make: Any, role: str, tmp_path: Path) -> None:
-    """Nobody waits for its end."""
+def test_input_that_is_no_regular_file_or_huge_is_refused_in_one_line(make: Any, role: str, tmp_path: Path) -> None:
+    """It is not read: a pipe would keep the reader waiting, and a device never ends."""
     make(tmp_path / role)
     (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
     layout = {"small.dbc": tmp_path / "small.toml", "other.toml": tmp_path / role}.get(role, LAYOUT)
@@ -210,7 +214,7 @@ def test_unwritable_output_prints_one_line_and_exits_with_1(arguments: list[str]
 
 
 @pytest.mark.parametrize("arguments", [check(Path("p")), ["--help"]])
-def test_closed_output_pipe_causes_no_traceback(arguments: list[str]) -> None:
+def test_closed_output_pipe_ends_a_command_silently_with_exit_code_1(arguments: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     done = program(*arguments, stdout=writing)

@@ -1,4 +1,4 @@
-"""Integer plan against exact fractions."""
+"""The integer plan of a branch, compared with exact fractions; units, ranges and named codes of signals."""
 
 import math
 from collections.abc import Mapping
@@ -60,7 +60,7 @@ def integer_plan(source: Codes, target: Codes, *, sign: int, drift: float, offse
 
 
 def exact(source: Codes, target: Codes, code: int, *, sign: int, drift: str, offset_a: str) -> Fraction:
-    """Corrected code without rounding, straight from (25)."""
+    """Corrected code without rounding, straight from equation (25) of the paper."""
     i_m = sign * (source.scale * code + source.offset)
     i = (i_m - Fraction(offset_a)) / (1 + Fraction(drift))
     return (sign * i - target.offset) / target.scale
@@ -130,7 +130,9 @@ def test_correction_error_stays_within_its_bound_at_any_signal_width(
     offset=st.floats(-150, 150),
     sign=st.sampled_from([1, -1]),
 )
-def test_power_offset_is_current_times_voltage(code: int, volts: int, drift: float, offset: float, sign: int) -> None:
+def test_offset_of_a_power_branch_is_its_current_offset_times_the_voltage(
+    code: int, volts: int, drift: float, offset: float, sign: int
+) -> None:
     power, voltage = current(2.0, limits=(-60000, 60000)), current(0.02, signed=False, limits=(0, 1000))
     signals = Signals(source=power, target=power, sign=sign, voltage=voltage)
     plan = correction_plan(signals, SensorFault(drift=drift, offset_a=offset))
@@ -148,7 +150,9 @@ def test_power_offset_is_current_times_voltage(code: int, volts: int, drift: flo
         (current(), -0.3, 100.0),
     ],
 )
-def test_correction_uses_a_64_bit_word_and_never_overflows_it(source: Codes, drift: float, offset_a: float) -> None:
+def test_largest_sum_of_the_integer_plan_has_59_bits_and_fits_a_64_bit_word(
+    source: Codes, drift: float, offset_a: float
+) -> None:
     plan = integer_plan(source, current(), sign=1, drift=drift, offset_a=offset_a)
     largest = max(abs(source.lowest), abs(source.highest)) * plan.gain + abs(plan.bias) + (1 << (plan.shift - 1))
     assert 1 << 58 <= largest < 1 << 59
@@ -240,5 +244,7 @@ LARGEST = float("1.79769313486232E+308")
         ((1.99, 2.01), range(100, 101)),
     ],
 )
-def test_dbc_limits_restrict_the_codes_only_if_they_are_a_range(limits: tuple[float, float], codes: range) -> None:
+def test_dbc_limits_restrict_the_codes_only_if_minimum_is_below_maximum(
+    limits: tuple[float, float], codes: range
+) -> None:
     assert whole_range(current(limits=limits)) == codes

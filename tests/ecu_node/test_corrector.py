@@ -110,7 +110,7 @@ def test_status_is_starting_until_branches_arrive_then_correcting(database: Vehi
 
 
 TAKE: dict[Mode, Callable[[Corrector, Frame, float], object]] = {Mode.OVERLAY: answers, Mode.GATEWAY: passed_on}
-"""What a node of either mode does with a frame."""
+"""By mode, the function that gives a frame to the node."""
 balanced = partial(drive, battery_a=100.0, motor_a=100.0)
 
 
@@ -187,7 +187,7 @@ def test_value_from_before_bus_sleep_or_reload_is_never_published(make_database:
 
 def test_only_the_last_frames_are_remembered(database: VehicleDatabase) -> None:
     class Payload(bytearray):
-        """Unlike a bytearray, it can be referred to weakly."""
+        """A bytearray to which there can be weak references."""
 
     source = corrector_for(database, battery=(0.25, 5.0)).sources[BATTERY]
     (branch,) = source.branches
@@ -205,7 +205,7 @@ def test_only_the_last_frames_are_remembered(database: VehicleDatabase) -> None:
 
 
 def test_branches_going_silent_one_after_another_are_not_a_fault(database: VehicleDatabase) -> None:
-    """Their timeouts differ."""
+    """Battery and DC/DC fall silent at once, but their timeouts differ."""
     corrector = corrector_for(database, battery=(0.25, 5.0), dcdc=(0.0, 0.0))
     seen = set()
     for k in range(100):
@@ -229,7 +229,7 @@ def test_stray_frame_of_an_unfitted_branch_affects_only_the_current_drive(databa
     assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
-def test_parameters_that_worsen_the_sum_are_dropped_until_others_are_loaded(database: VehicleDatabase) -> None:
+def test_parameters_that_worsen_the_sum_are_not_used_until_others_are_put_in_force(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.2, 0.0), motor=(0.0, 0.0))
     balanced(database, corrector, 0.0, 9.0)
     assert corrector.state() == (State.CORRECTING, Reason.NONE)
@@ -257,7 +257,7 @@ def test_junction_sum_is_judged_only_in_the_valid_states_of_the_watch(
     assert corrector.watch.sums is not None
 
 
-def test_missing_input_of_the_watch_is_reported(make_database: MakeDatabase) -> None:
+def test_missing_signal_of_watch_input_key_is_reported(make_database: MakeDatabase) -> None:
     own = whole_vehicle(make_database, '\n[watch]\ninput = "speed"\nvalid = [0]\n')
     corrector, motion = corrector_for(own, battery=(0.01, 0.0), motor=(0.0, 0.0)), FrameKey(0x200, extended=False)
     missing = (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
@@ -513,7 +513,7 @@ def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layou
         corrector_for(make_database(layout, dbc))
 
 
-def test_frame_without_the_current_repeats_its_last_value_until_stale(make_database: MakeDatabase) -> None:
+def test_answer_to_a_frame_without_the_current_repeats_its_last_value_until_stale(make_database: MakeDatabase) -> None:
     page = ' SG_ Page M : 48|8@1+ (1,0) [0|255] "" Node\n'
     database = make_database(dbc=SMALL_DBC.replace(" SG_ Battery : 7", f"{page} SG_ Battery m0 : 7", 1))
     corrector = corrector_for(database, battery=(0.5, 0.0))
@@ -524,7 +524,7 @@ def test_frame_without_the_current_repeats_its_last_value_until_stale(make_datab
     assert found == [current, current, current, (-3276.8, Quality.NOT_AVAILABLE)]
 
 
-# Messages that fail their check in part
+# Messages of which some frames fail their check
 
 
 at_20_ms = partial(drive, period_s=0.02)
@@ -584,7 +584,7 @@ def test_branch_of_a_frozen_control_unit_becomes_stale(make_database: MakeDataba
         ("battery", "motor", 100.0, Quality.PASSED_THROUGH),
     ],
 )
-def test_answer_is_corrected_if_parameters_name_the_branch(
+def test_answer_is_corrected_if_parameters_apply_a_fault_to_its_branch(
     database: VehicleDatabase, faulty: str, name: str, corrected_a: float, quality: Quality
 ) -> None:
     """Offsets are positive into the junction, the motor's signal is positive out of it."""
@@ -621,7 +621,7 @@ def test_alive_counter_of_the_status_starts_at_0_and_wraps_at_its_width(make_dat
     assert found == [0, 1, 2, 3, 0]
 
 
-# Frames that are lost, repeated or damaged, of either mode
+# Frames that are lost, repeated or damaged, in both modes
 
 
 @pytest.mark.parametrize("mode", Mode)

@@ -37,7 +37,7 @@ class Drive:
         self.stamp_s = 1000.0
 
     def go_on(self, duration_s: float, *, battery_only: bool = False, open_s: float = OPEN_S) -> None:
-        """Frames at 10 Hz; the contactors are open in the first seconds."""
+        """Send frames at 10 Hz; the contactors are open in the first `open_s` seconds."""
         for step in range(round(10.0 * duration_s)):
             flows = step >= 10.0 * open_s
             motor_a, heater_a = flows * (50.0 + 30.0 * math.sin(0.37 * step)), flows * HEATER_W / NET_V
@@ -52,7 +52,7 @@ class Drive:
             self.stamp_s += 0.1
 
     def ended(self) -> list[SummaryFile]:
-        """Records after the end of the node."""
+        """End the node, and return its records."""
         self.summary.close()
         return self.records()
 
@@ -109,7 +109,7 @@ def test_drive_shorter_than_a_fifth_of_a_block_makes_no_record(drive: Drive, flo
     assert len(drive.ended()) == records
 
 
-def test_noise_is_that_of_rounding_without_four_consecutive_samples(drive: Drive) -> None:
+def test_noise_equals_that_of_rounding_where_no_four_samples_are_consecutive(drive: Drive) -> None:
     for _ in range(60):
         drive.go_on(0.3, open_s=0.0)
         drive.stamp_s += 0.7
@@ -127,7 +127,7 @@ def test_full_record_file_is_followed_by_another(drive: Drive, monkeypatch: pyte
     assert [record.zero_offset_a[0] for record in records] == [pytest.approx(OFFSET_A), None, None]
 
 
-def test_write_failure_and_its_end_are_each_reported_once(drive: Drive) -> None:
+def test_write_failure_and_its_end_are_each_logged_once(drive: Drive) -> None:
     shutil.rmtree(drive.folder)
     for _ in range(2):
         drive.go_on(60.0)

@@ -93,7 +93,7 @@ def test_counter_starts_at_0_and_wraps_and_frames_in_order_are_ok(kind: str, pro
     assert {check(frame) for frame in frames} == {Check.OK}
 
 
-def test_protection_writes_only_the_bits_of_crc_and_counter(kind: str, protection: Protection) -> None:
+def test_protection_writes_only_the_bits_of_its_header_mask(kind: str, protection: Protection) -> None:
     header = bytes.fromhex(KINDS[kind][2])
     assert protection.header_mask == int.from_bytes(header, "little")
     for frame in stream(protection, 20):
@@ -104,7 +104,7 @@ def test_protection_writes_only_the_bits_of_crc_and_counter(kind: str, protectio
     assert {Receiver(protection).check(bytearray(size)) for size in range(len(header))} == {Check.CORRUPT}
 
 
-def test_corrupt_frame_changes_neither_counter_nor_initial_state(protection: Protection) -> None:
+def test_corrupt_frame_changes_neither_the_expected_counter_nor_the_initial_state(protection: Protection) -> None:
     (first, second), receiver = stream(protection, 2), Receiver(protection)
     found = [(receiver.check(frame), receiver.state) for frame in (damaged(first), first, damaged(second), second)]
     ok, corrupt = (Check.OK, E2EState.VALID), (Check.CORRUPT, E2EState.VALID)
@@ -142,7 +142,9 @@ def test_first_frame_equals_autosar_example(protect: Callable[..., Protection], 
 
 
 @pytest.mark.parametrize(("profile", "identity"), [("P04", 0x12345678), ("P05", 0x5678), ("P07", 0x12345678)])
-def test_default_data_id_is_the_message_id(protect: Callable[..., Protection], profile: str, identity: int) -> None:
+def test_default_data_id_is_the_message_id_cut_to_its_width(
+    protect: Callable[..., Protection], profile: str, identity: int
+) -> None:
     long = ROOM.replace("BO_ 700", f"BO_ {0x80000000 | 0x12345678}")
     protection = protect(autosar(profile, "offset = 3"), room=long)
     assert protection.identity == identity
@@ -219,7 +221,7 @@ def test_every_byte_of_a_multi_byte_counter_is_compared(protection: Protection, 
 def test_e2e_state_follows_the_windows_of_recent_frames(
     kind: str, protect: Callable[..., Protection], windows: str, sent: Sequence[int], spoilt: Sequence[int], states: str
 ) -> None:
-    """Initial, valid, or invalid (X) after each frame that was sent, by its place in a stream."""
+    """`sent` are places in a stream of frames; `states` has the state after each: initial, valid, or invalid (X)."""
     protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
     receiver, frames, found = Receiver(protection), stream(protection, 20), ""
     for place in sent:
@@ -293,7 +295,7 @@ HEADS = [("[e2e]", "[e2e]"), ('[[e2e]]\nprofile = "P01"\nmessages = ["Net"]\n[[e
     ],
 )
 @pytest.mark.parametrize(("head", "place"), HEADS)
-def test_mistake_in_an_e2e_entry_is_reported_with_its_place(
+def test_mistake_in_an_e2e_entry_is_refused_naming_its_place_in_the_layout(
     protect: Callable[..., Protection], head: str, place: str, entry: str, words: str
 ) -> None:
     with pytest.raises(LayoutError, match=rf"small\.toml: {re.escape(place)}.*{re.escape(words)}") as caught:

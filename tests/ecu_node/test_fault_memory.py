@@ -14,7 +14,7 @@ from tests.ecu_node.vehicles import LAYOUT, AtOnce
 
 
 class Vehicle:
-    """A node with a state folder; started anew as often as wanted."""
+    """A node with a state folder; :meth:`start` starts it again."""
 
     def __init__(self, folder: Path) -> None:
         self.state = folder / "state"
@@ -72,7 +72,7 @@ def test_fault_is_stored_with_its_currents(vehicle: Vehicle) -> None:
 
 @pytest.mark.parametrize(("number", "latched"), [(44, Reason.SUM_IMPLAUSIBLE), (43, Reason.NONE)])
 def test_latched_fault_survives_a_restart_until_it_is_cleared(vehicle: Vehicle, number: int, latched: Reason) -> None:
-    """With the same parameter set; another set is tried."""
+    """With the same parameter set; with another one the node corrects from the start."""
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.file.write_text(vehicle.file.read_text().replace('"parameter_set": 44', f'"parameter_set": {number}'))
     vehicle.start()
@@ -99,7 +99,7 @@ def test_bus_sleep_releases_a_stale_branch_and_a_short_gap_does_not(vehicle: Veh
     assert [fault["active"] for fault in vehicle.faults()] == [True, False], "the last one first"
 
 
-def test_fault_that_cannot_be_stored_is_reported_and_stored_later(vehicle: Vehicle) -> None:
+def test_fault_that_cannot_be_stored_is_logged_once_and_stored_later(vehicle: Vehicle) -> None:
     vehicle.state.rmdir()
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.later(3.0)
@@ -136,7 +136,9 @@ def test_cleared_faults_do_not_return(vehicle: Vehicle) -> None:
         ("", None, "cannot read the fault memory: it is a folder"),
     ],
 )
-def test_damaged_fault_memory_is_reported_in_one_line(vehicle: Vehicle, old: str, new: str | None, why: str) -> None:
+def test_damaged_fault_memory_is_logged_at_start_and_makes_ecu_node_faults_fail(
+    vehicle: Vehicle, old: str, new: str | None, why: str
+) -> None:
     vehicle.latch(Reason.BRANCH_STALE, "motor")
     content = vehicle.file.read_text()
     vehicle.file.unlink()
@@ -151,7 +153,7 @@ def test_damaged_fault_memory_is_reported_in_one_line(vehicle: Vehicle, old: str
     assert "'ecu-node clear' begins a new one" in err
 
 
-def test_node_without_vehicle_state_passes_values_through_and_reports_why(tmp_path: Path) -> None:
+def test_node_without_vehicle_state_passes_values_through_and_logs_why(tmp_path: Path) -> None:
     bus = ["--interface", "virtual", "--channel", "state"]
     with running("run", "--state", str(tmp_path), "--layout", str(LAYOUT), *bus) as log:
         assert log[-1].endswith("running on virtual state, correcting nothing\n")

@@ -32,7 +32,7 @@ def test_frames_passed_unchanged_are_not_counted_as_rewritten(database: VehicleD
     assert (corrector.counters.frames_in, corrector.counters.rewritten, corrector.counters.answers) == (3, 2, 0)
 
 
-def test_foreign_branch_frames_are_reported_for_10_s(database: VehicleDatabase) -> None:
+def test_status_reason_is_foreign_frames_for_10_s_after_such_a_frame(database: VehicleDatabase) -> None:
     corrector, found = gateway_for(database, battery=(0.25, 5.0)), []
     for k in range(1200):
         passed_on(corrector, battery(database, k % 15), 0.01 * k)
@@ -50,7 +50,7 @@ def test_codes_for_no_value_are_forwarded_unchanged(database: VehicleDatabase, c
     assert passed_on(corrector, frame, 0.0) == frame.data
 
 
-def test_code_listed_as_no_value_must_be_one_of_the_signal(make_database: MakeDatabase) -> None:
+def test_no_value_code_beyond_the_range_of_its_signal_is_refused(make_database: MakeDatabase) -> None:
     layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [32768, -8500]')
     words = r"branch motor: no_value: Pair\.Motor has no code 32768; it has -32768 to 32767"
     with pytest.raises(LayoutError, match=words):
@@ -81,7 +81,9 @@ def test_gateway_writes_a_corrected_power_as_power(make_database: MakeDatabase) 
     ("profile", "offset", "branch"),
     [("P01", 0, "battery"), ("P04", 0, "battery"), ("P06", 1, "battery"), ("P07", 3, "motor"), ("P11", 2, "motor")],
 )
-def test_branch_over_e2e_header_is_refused(make_database: MakeDatabase, profile: str, offset: int, branch: str) -> None:
+def test_branch_signal_that_overlaps_the_e2e_header_is_refused(
+    make_database: MakeDatabase, profile: str, offset: int, branch: str
+) -> None:
     layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'
     with pytest.raises(LayoutError, match=rf"branch {branch}: Pair\.{branch.title()} is written twice, or overlaps"):
         gateway_for(make_database(layout, SMALL_DBC.replace("Pair: 8", "Pair: 24")))

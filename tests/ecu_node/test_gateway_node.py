@@ -30,7 +30,7 @@ Ends = tuple[can.BusABC, can.BusABC]
 
 @pytest.fixture
 def ends(channel: str) -> Iterator[Ends]:
-    """The sensors' and the vehicle's bus, as the rest of the car sees them."""
+    """The sensors' and the vehicle's bus: bus objects of the other control units."""
     with (
         can.Bus(interface="virtual", channel=f"{channel} a") as sensors,
         can.Bus(interface="virtual", channel=f"{channel} b") as rest,
@@ -54,11 +54,13 @@ STATUS = 0x5F0
 
 
 def received(bus: can.BusABC, count: int) -> list[can.Message]:
-    """The next frames but for those of the status."""
+    """The next frames other than status messages."""
     return receive(bus, STATUS, count, operator.ne)
 
 
-def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, ends: Ends, channel: str) -> None:
+def test_gateway_passes_all_frames_in_order_and_those_without_branches_unchanged(
+    database: VehicleDatabase, ends: Ends, channel: str
+) -> None:
     sensors, vehicle = ends
     chance = random.Random(1)
     sent = [random_frame(chance) for _ in range(1000)]
@@ -77,7 +79,7 @@ def test_other_frames_pass_unchanged_and_in_order(database: VehicleDatabase, end
     assert sensors.recv(0.0) is None, "nothing comes back"
 
 
-def test_watchdog_is_not_fed_while_sending_towards_the_sensors_blocks(
+def test_watchdog_is_not_fed_while_a_send_to_the_sensor_bus_is_stuck(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)
@@ -119,7 +121,9 @@ def test_frames_from_before_the_start_are_not_passed_on(database: VehicleDatabas
                 assert early < 10, "those of the listening, more than 10, are not passed on"
 
 
-def test_remote_frame_of_any_identifier_passes(database: VehicleDatabase, ends: Ends, channel: str) -> None:
+def test_remote_frames_of_branches_and_status_pass_from_vehicle_to_sensors(
+    database: VehicleDatabase, ends: Ends, channel: str
+) -> None:
     sensors, vehicle = ends
     remote = partial(can.Message, is_extended_id=False, is_remote_frame=True, dlc=8)
     asked = [remote(arbitration_id=key) for key in (0x110, 0x5F0)]
@@ -134,7 +138,7 @@ WORDS = "another node sends frames 0x(110|5F0), which only this one may send the
 
 
 @pytest.mark.parametrize(("origin", "identifier"), [("vehicle", 0x110), ("vehicle", 0x5F0), ("sensors", 0x5F0)])
-def test_foreign_frames_are_dropped_and_counted(
+def test_frames_that_only_the_gateway_may_send_are_dropped_and_counted_if_foreign(
     database: VehicleDatabase, ends: Ends, channel: str, origin: str, identifier: int
 ) -> None:
     sensors, vehicle = ends
@@ -173,7 +177,9 @@ def test_second_gateway_between_two_buses_refuses_to_start(database: VehicleData
         assert not first.done()
 
 
-def test_branch_frame_that_waited_too_long_is_held_back(database: VehicleDatabase, ends: Ends, channel: str) -> None:
+def test_branch_frame_that_waited_too_long_is_dropped_and_counted_as_late(
+    database: VehicleDatabase, ends: Ends, channel: str
+) -> None:
     with gateway(database, channel) as (corrector, _), VirtualBus(f"{channel} a", preserve_timestamps=True) as bus:
         for counter, age_s in enumerate((0.0, 5.0, 0.0)):
             bus.send(battery_frame(database, counter, time.time() - age_s))

@@ -9,7 +9,7 @@ from ecu_node.layout import file_digest, read_layout
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase
 
 
-def test_source_of_a_power_branch_is_its_power_signal(make_database: MakeDatabase) -> None:
+def test_layout_gives_source_resolution_and_offset_limit_of_its_branches(make_database: MakeDatabase) -> None:
     assert read_layout(LAYOUT).offset_limit_a == 150.0
     layout = make_database().layout
     assert layout.find_branch("heater").source == "Heater.Power"
@@ -17,7 +17,7 @@ def test_source_of_a_power_branch_is_its_power_signal(make_database: MakeDatabas
     assert layout.offset_limit_a == pytest.approx(0.4 * 400.0)
 
 
-def test_byte_order_mark_and_line_ends_do_not_matter(tmp_path: Path) -> None:
+def test_layout_with_byte_order_mark_is_read_and_its_digest_ignores_line_ends(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text(SMALL_LAYOUT, encoding="utf-8-sig")
     layout = read_layout(tmp_path / "x.toml")
     (tmp_path / "x.toml").write_text(SMALL_LAYOUT, encoding="utf-8-sig", newline="\r\n")
@@ -97,7 +97,7 @@ def test_a_diagnostics_database_is_refused(make_database: MakeDatabase, tmp_path
 @pytest.mark.parametrize("mark", [1 << 31, 0])
 @pytest.mark.parametrize("more", ["", 'VAL_ 258 Gone 1 "On";\n'])
 def test_dbc_with_unmarked_29_bit_ids_or_stray_names_is_read(make_database: MakeDatabase, mark: int, more: str) -> None:
-    """As they stand in many public DBCs."""
+    """Many public DBCs have such identifiers, and value tables of signals that do not exist."""
     number = mark | 0x18FF0200
     texts = f'CM_ SG_ {number} Power "Taken up";\nVAL_ {number} Power 65535 "SNA";\n'
     database = make_database(dbc=SMALL_DBC.replace("BO_ 2147484160", f"BO_ {number}") + texts + more)

@@ -1,4 +1,4 @@
-"""``ecu-node monitor``: frames by cantools and autosar-e2e, how they are evaluated and shown."""
+"""``ecu-node monitor``: how it evaluates and shows frames, which are made with cantools and autosar-e2e."""
 
 import json
 import os
@@ -25,7 +25,7 @@ MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--chan
 
 
 class Bus:
-    """Frames of the project's DBC, each message with its own counter."""
+    """Sends frames of the project's DBC to a monitor; each message has its own counter."""
 
     def __init__(self, database: VehicleDatabase, start_s: float = 0.0) -> None:
         self.database, self.monitor = database, BusMonitor(database, start_s)
@@ -38,7 +38,7 @@ class Bus:
         self.monitor.take(key_of(self.database.message(message)), data, time_s)
 
     def pair(self, name: str, time_s: float, measured_a: float, corrected_a: float | None = None) -> None:
-        """A measured frame and its answer, in the direction of the signal."""
+        """Send a measured frame and, if a corrected current is given, its answer; signs are those of the signals."""
         values: dict[str, Any] = {f"{name}Current": measured_a}
         self.send(f"HV_{name}", time_s, **values)
         if corrected_a is not None:
@@ -110,7 +110,7 @@ def test_sums_are_taken_at_one_instant_however_late_the_answers_are(bus: Bus) ->
     assert corrected_a is not None
 
 
-def test_sum_needs_a_fresh_value_of_every_branch_seen_and_its_answer(bus: Bus) -> None:
+def test_measured_sum_needs_all_seen_branches_fresh_and_corrected_sum_also_their_answers(bus: Bus) -> None:
     bus.send("HV_BatteryCorrected", 0.001, BatteryCurrentCorrected=500.0)
     assert bus.sums(0.002) == (None, None)
     bus.pair("Battery", 0.01, 100.0, 90.0)
@@ -156,7 +156,7 @@ def test_monitor_shows_the_status_message_of_the_node(bus: Bus) -> None:
     assert bus.lines(4.0)[0] == "can0: node: state 14, which this version does not know; status 0.0 s ago"
 
 
-def test_view_reports_silence_errors_and_lost_frames(make_database: MakeDatabase) -> None:
+def test_monitor_shows_silent_branches_bus_errors_and_unread_frames(make_database: MakeDatabase) -> None:
     """A small vehicle without a status message, whose heater is a power."""
     bus = Bus(make_database())
     lines = bus.lines(0.1, Counters(bus_errors=2, dropped=3))

@@ -58,7 +58,7 @@ def at_work(node: Node, *, may_end: bool = False) -> Iterator[Future[None]]:
 def receive(
     bus: can.BusABC, identifier: int, count: int, is_wanted: Callable[[int, int], bool] = operator.eq
 ) -> list[can.Message]:
-    """The first frames of one identifier, or of those that compare with it as wanted."""
+    """Return the first frames whose identifier is this one, or compares with it as `is_wanted` says."""
     found: list[can.Message] = []
     give_up = time.monotonic() + LONGEST_WAIT_S
     while len(found) < count:
@@ -77,13 +77,15 @@ def battery_frame(database: VehicleDatabase, number: int, time_s: float = 0.0, c
 
 @pytest.fixture
 def peer(channel: str) -> Iterator[can.BusABC]:
-    """The rest of the vehicle."""
+    """Bus object of the other control units."""
     with can.Bus(interface="virtual", channel=channel) as bus:
         yield bus
 
 
 @pytest.mark.parametrize("filters", [True, False])
-def test_node_corrects_only_branches(database: VehicleDatabase, peer: can.BusABC, channel: str, filters: bool) -> None:
+def test_node_answers_only_data_frames_of_branches(
+    database: VehicleDatabase, peer: can.BusABC, channel: str, filters: bool
+) -> None:
     with node_on(database, channel, None if filters else lambda: VirtualBus(channel)) as corrector:
         for k in range(100):
             frame = battery_frame(database, k, current_a=float(k))
@@ -122,7 +124,7 @@ def undisturbed(*_: object) -> None:
 
 
 class Adapter(VirtualBus):
-    """A bus whose sending and receiving may be disturbed: what is to be done before either may fail, or wait."""
+    """A bus that calls a hook before it sends, and one before it receives; a hook may raise an error, or wait."""
 
     def __init__(self, channel: str, *, sending: Hook = undisturbed, receiving: Hook = undisturbed) -> None:
         super().__init__(channel)
@@ -145,7 +147,7 @@ def failing(error: Exception) -> Hook:
 
 
 def test_echo_of_own_frames_is_counted_and_ignored(database: VehicleDatabase, peer: can.BusABC, channel: str) -> None:
-    """As some adapters return what is sent."""
+    """Some adapters return what is sent through them."""
     bus = Adapter(channel, sending=lambda message: bus.queue.put(deepcopy(message)))
     with node_on(database, "", lambda: bus) as corrector:
         receive(peer, 0x5F0, 1)
@@ -171,7 +173,9 @@ def test_gateway_stops_if_one_direction_fails(database: VehicleDatabase, channel
             running.result(LONGEST_WAIT_S)
 
 
-def test_full_send_queue_is_reported_until_it_is_free(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_send_queue_is_logged_once_and_shown_as_state_until_it_is_free(
+    channel: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     said, states = list[str](), list[str]()
     full = Adapter(channel, sending=failing(can.CanOperationError("Transmit buffer full")))
     now_s, frame = time.monotonic(), can.Message(arbitration_id=1)
@@ -230,7 +234,9 @@ def test_pause_of_the_process_makes_no_branch_stale(database: VehicleDatabase, c
     assert corrector.counters.clock_steps == 0
 
 
-def test_pause_after_waiting_for_a_frame_is_not_listening(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bus_counts_as_heard_only_until_the_timeout_if_the_process_pauses_after_it(
+    channel: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     silent, now_s = VirtualBus(channel), time.monotonic()
     with closing(SteadyBus(lambda: silent, Counters())) as bus:
         clock = iter([now_s, now_s + 5.0])
@@ -250,8 +256,8 @@ def test_frames_that_waited_too_long_are_not_used(database: VehicleDatabase, cha
     assert (corrector.counters.answers, corrector.counters.late) == (2, 1)
 
 
-def test_failed_bus_is_reported_as_open_only_when_it_works_again(peer: can.BusABC, channel: str) -> None:
-    """A bus-off that is reported as the bus opens again is counted."""
+def test_failed_bus_is_logged_as_open_only_when_it_works_again(peer: can.BusABC, channel: str) -> None:
+    """An error frame that reports bus-off just as the bus opens again is counted."""
     down = can.CanOperationError("Network is down", errno.ENETDOWN)
     opened = iter([*(Adapter(f"{channel} down", receiving=failing(down)) for _ in range(3)), VirtualBus(channel)])
     peer.send(can.Message(arbitration_id=0x40, is_error_frame=True))
@@ -295,7 +301,7 @@ def test_kernel_filter_passes_only_branches_voltages_and_own_frames(make_databas
     }
 
 
-def test_dbc_with_can_fd_messages_needs_the_fd_option(make_database: MakeDatabase) -> None:
+def test_bus_for_a_dbc_with_fd_messages_opens_only_with_option_fd(make_database: MakeDatabase) -> None:
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 16"))
     with pytest.raises(BusError, match=r"CAN FD messages \(PairOut\); start with --fd"):
         open_bus(database, interface="virtual", channel="c0", fd=False, mode=Mode.OVERLAY)

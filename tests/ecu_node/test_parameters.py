@@ -1,4 +1,4 @@
-"""The parameter file: schema and reader agree, and whatever is wrong is one line with a reason."""
+"""The parameter file: schema and reader agree, and whatever is wrong is refused in one line, with a reason."""
 
 import codecs
 import json
@@ -184,7 +184,9 @@ def test_file_of_version_1_0_is_read_unless_it_has_a_sensor_model(database: Vehi
         ({"expected_a": -150.0, "delay_s": None}, None),
     ],
 )
-def test_values_beyond_limits_are_unfit(database: VehicleDatabase, change: dict[str, Any], words: str | None) -> None:
+def test_parameters_beyond_the_limits_of_drift_offset_sum_or_delay_are_unfit(
+    database: VehicleDatabase, change: dict[str, Any], words: str | None
+) -> None:
     expected = {key: value for key, value in change.items() if key == "expected_a"}
     residual = JunctionResidual(measured_a=1.0, corrected_a=0.1, **expected)
     branches = {"battery": replace(SOUND, **{key: change[key] for key in change.keys() - expected})}
@@ -198,7 +200,9 @@ def test_values_beyond_limits_are_unfit(database: VehicleDatabase, change: dict[
 
 
 @pytest.mark.parametrize("verdict", ["cannot tell", "not enough data"])
-def test_undecided_parameters_that_are_to_be_applied_are_unfit(database: VehicleDatabase, verdict: Verdict) -> None:
+def test_parameters_that_apply_a_branch_without_a_decisive_verdict_are_unfit(
+    database: VehicleDatabase, verdict: Verdict
+) -> None:
     parameters = replace(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)), verdict=verdict)
     withheld = {name: replace(branch, apply=False) for name, branch in parameters.branches.items()}
     check_fit(replace(parameters, branches=withheld), database, "v1")
@@ -258,7 +262,7 @@ NUMBER = b'"number":300'
     ],
     ids=count(),
 )
-def test_malformed_parameter_file_is_reported_in_one_line(
+def test_malformed_parameter_file_is_refused_in_one_line(
     database: VehicleDatabase, tmp_path: Path, content: bytes | Callable[[bytes], bytes], words: str
 ) -> None:
     sound = msgspec.json.encode(parameters_for(database, battery=(0.1, -2.5), motor=(0.1, 1.0)))
@@ -278,7 +282,9 @@ def test_malformed_parameter_file_is_reported_in_one_line(
         ("", "not a parameter file: it is a folder", Reason.MALFORMED_PARAMETERS),
     ],
 )
-def test_unreadable_parameter_file_is_named(tmp_path: Path, name: str, words: str, reason: Reason) -> None:
+def test_missing_or_unreadable_parameter_file_is_refused_by_name(
+    tmp_path: Path, name: str, words: str, reason: Reason
+) -> None:
     (tmp_path / "p.json").write_bytes(b"{}")
     with pytest.raises(UnfitError, match=words) as caught:
         read_parameters(tmp_path / name)
@@ -323,7 +329,7 @@ def test_unfit_parameter_file_is_not_used(
 
 @pytest.mark.parametrize("mode", Mode)
 def test_changing_parameters_has_the_same_effect_as_starting_with_them(make_database: MakeDatabase, mode: Mode) -> None:
-    """Measured and corrected signal have different scales here."""
+    """Measured and corrected signal have different scales here, so that passing through needs a plan, too."""
     database = make_database(dbc=SMALL_DBC.replace("SG_ Battery : 0|16@1- (0.1,0)", "SG_ Battery : 0|16@1- (0.2,0)"))
     after = InForce(parameters=parameters_for(database, battery=(0.125, 5.0)))
     corrector, fresh = corrector_for(database, mode, motor=(0.0, 1.0)), wire(database, after, 2.0, mode=mode)

@@ -41,7 +41,7 @@ def test_gain_change_of_a_sensor_stops_the_correction(
     assert junction.corrected_after == 0
 
 
-def test_branch_with_a_creeping_offset_is_among_those_named(junction: Junction) -> None:
+def test_branch_with_a_creeping_offset_is_among_the_branches_named(junction: Junction) -> None:
     def parked(_: float) -> dict[str, float]:
         return {"battery": 6.0, "motor": 0.0, "heater": 6.0}
 
@@ -51,7 +51,7 @@ def test_branch_with_a_creeping_offset_is_among_those_named(junction: Junction) 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_branch_that_jumps_at_constant_currents_is_among_those_named(tmp_path: Path, name: str) -> None:
+def test_branch_that_jumps_at_constant_currents_is_among_the_branches_named(tmp_path: Path, name: str) -> None:
     def charging(_: float) -> dict[str, float]:
         return {"battery": -80.0, "motor": -92.0, "heater": 12.0}
 
@@ -72,7 +72,7 @@ def test_forged_frame_before_each_real_one_stops_the_correction(junction: Juncti
     assert junction.corrected_after == 0
 
 
-def test_broken_battery_sensor_alone_is_named_beside_a_steady_load(junction: Junction) -> None:
+def test_only_the_broken_battery_sensor_is_named_beside_a_steady_load(junction: Junction) -> None:
     def steady_heater(time_s: float) -> dict[str, float]:
         return driving(time_s) | {"battery": driving(time_s)["motor"] + 10.0, "heater": 10.0}
 
@@ -82,7 +82,7 @@ def test_broken_battery_sensor_alone_is_named_beside_a_steady_load(junction: Jun
     assert junction.corrector.latched_branches == ("battery",)
 
 
-def test_sensor_that_stays_constant_while_the_others_move_is_stuck(junction: Junction) -> None:
+def test_sensor_that_stays_constant_while_other_currents_move_is_named_as_stuck(junction: Junction) -> None:
     def accelerating(time_s: float) -> dict[str, float]:
         motor_a = 40.0 + max(time_s - 15.0, 0.0) * 10.0
         return {"battery": motor_a + 10.0, "motor": motor_a, "heater": 10.0}
@@ -93,8 +93,8 @@ def test_sensor_that_stays_constant_while_the_others_move_is_stuck(junction: Jun
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_stuck_branch_is_named_even_if_the_sum_may_vary_widely(tmp_path: Path, name: str) -> None:
-    """No jump, gain error or offset is visible, but after a while one code that never changes is."""
+def test_stuck_branch_is_named_even_if_the_allowed_deviation_of_the_sum_is_large(tmp_path: Path, name: str) -> None:
+    """The sum shows no jump, gain error or offset, but after a while the watch sees that one code never changes."""
 
     def swinging(time_s: float) -> dict[str, float]:
         motor_a, heater_a = 60.0 + 30.0 * math.sin(0.7 * time_s), 60.0 + 30.0 * math.sin(3.1 * time_s)
@@ -108,7 +108,7 @@ def test_stuck_branch_is_named_even_if_the_sum_may_vary_widely(tmp_path: Path, n
     assert (junction.corrector.latched, junction.corrector.latched_branches) == (Reason.BRANCH_STUCK, (name,))
 
 
-def test_steady_load_beside_a_corrected_gain_error_is_not_stuck(junction: Junction) -> None:
+def test_steady_load_beside_a_corrected_gain_error_is_not_taken_for_stuck(junction: Junction) -> None:
     def swinging(time_s: float) -> dict[str, float]:
         motor_a = 350.0 * math.sin(0.7 * time_s)
         return {"battery": motor_a + 20.0, "motor": motor_a, "heater": 20.0}
@@ -118,7 +118,7 @@ def test_steady_load_beside_a_corrected_gain_error_is_not_stuck(junction: Juncti
     assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
-def test_quality_signal_of_two_bits_reports_implausible_as_invalid(tmp_path: Path) -> None:
+def test_quality_signal_of_two_bits_shows_implausible_as_invalid(tmp_path: Path) -> None:
     junction = Junction(three_branches(tmp_path, quality_bits=2))
     junction.run(5.0, driving)
     junction.wrong = {"battery": lambda shown_a: shown_a + 100.0}
@@ -140,7 +140,7 @@ def test_load_steps_are_not_a_fault(junction: Junction) -> None:
 
 
 def test_gross_fault_is_detected_without_residual_standard_deviations(tmp_path: Path) -> None:
-    """A sum as large as the calibrator stated is not a fault."""
+    """A sum no larger than what the calibrator saw is not taken for a fault."""
     junction = Junction(three_branches(tmp_path), sd_a=None, sd_per_a=None, corrected_a=60.0)
     junction.wrong = {"heater": lambda shown_a: shown_a + 60.0}
     junction.run(20.0, driving)

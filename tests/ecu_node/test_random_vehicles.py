@@ -1,6 +1,6 @@
 """Random frames of random vehicles through the node's core, each compared with the oracle.
 
-``HV_FRAMES=10000000 pytest -n auto tests/ecu_node/test_random_vehicles.py`` tries that many.
+``HV_FRAMES=10000000 pytest -n auto tests/ecu_node/test_random_vehicles.py`` tries ten million frames.
 """
 
 import os
@@ -18,7 +18,7 @@ from tests.ecu_node.random_vehicles import draw_vehicle
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
 
 EACH, ALWAYS = 1_000, 3
-"""Frames of a vehicle; vehicles that are tried in every run of the tests."""
+"""Number of frames of each vehicle; number of vehicles that are tried in every run of the tests."""
 VEHICLES = [
     number if number < ALWAYS else pytest.param(number, marks=pytest.mark.long)
     for number in range(-(-int(os.environ.get("HV_FRAMES", "40000")) // EACH))
@@ -45,10 +45,10 @@ def test_frames_of_random_vehicles_match_the_oracle_in_both_modes(seed: int, tmp
         (SMALL_LAYOUT.replace(MOTOR_ENTRY, ""), "-", "0", "-128", 0.2),
     ],
 )
-def test_every_code_of_8_bits_matches_the_oracle_beside_any_other_bits(
+def test_every_8_bit_code_matches_the_oracle_whatever_the_other_bits_are(
     make_database: MakeDatabase, mode: Mode, layout: str, sign: str, offset: str, missing: str, drift: float
 ) -> None:
-    """Over the whole width, of two branches in a frame or one: results are rounded, and clipped at either end."""
+    """With one branch in the frame or two: over the whole width results are rounded, and clipped at both ends."""
     dbc = SMALL_DBC
     for old, new in (
         ("|16@0-", f"|8@0{sign}"),

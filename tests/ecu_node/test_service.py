@@ -51,7 +51,7 @@ def managed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service
         yield manager
 
 
-def test_watchdog_is_fed_at_half_its_timeout(managed: ServiceManagerHere) -> None:
+def test_watchdog_is_fed_at_intervals_of_half_its_timeout(managed: ServiceManagerHere) -> None:
     service = ServiceManager()
     fed_s = []
     for tick in range(100):
@@ -72,7 +72,9 @@ def test_service_manager_that_does_not_read_does_not_block_the_node(managed: Ser
     assert len(managed.told()) < told
 
 
-def test_repeated_log_line_is_held_back(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_repeated_log_line_is_written_3_times_in_10_s_and_later_with_a_count(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     log = Log()
     for tenth in range(201):
         monkeypatch.setattr("ecu_node.bus.service.time.monotonic", lambda now_s=0.1 * tenth: now_s)
@@ -95,8 +97,8 @@ def test_closed_log_does_not_end_the_node(monkeypatch: pytest.MonkeyPatch) -> No
         os.dup2(os.open(os.devnull, os.O_WRONLY), gone.fileno())  # what is left in its buffer can be closed
 
 
-def test_missing_real_time_permissions_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The memory lock is refused by the C library, whose error number says why."""
+def test_real_time_log_line_names_the_permissions_that_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Setting SCHED_FIFO raises an error; mlockall of the C library fails, and errno says why."""
 
     def refused(*_: object) -> None:
         raise PermissionError(errno.EPERM, "Operation not permitted")
@@ -112,13 +114,13 @@ def test_missing_real_time_permissions_are_reported(monkeypatch: pytest.MonkeyPa
     assert len(processors) == 1
 
 
-# ---- lines in the log: each fall-back, each sleep, and their ends, once each
+# ---- lines of the log: begin and end of each fall-back and of each silence of the bus, once each
 
 FALLS_BACK = "passing measured values through until"
 
 
 class Node:
-    """A node whose battery may send; what it says of its state."""
+    """The core of a node whose battery may send, and what it logs of its state."""
 
     def __init__(self, database: VehicleDatabase, *, has_memory: bool = True) -> None:
         self.database, self.now_s = database, 0.0
@@ -147,8 +149,10 @@ class Node:
 
 @pytest.mark.parametrize("before", [Reason.NONE, Reason.BRANCH_STALE])
 @pytest.mark.parametrize("revoked", [False, True])
-def test_every_bus_silence_and_its_end_are_reported(database: VehicleDatabase, before: Reason, revoked: bool) -> None:
-    """After a fall-back, or without parameters, in the same way."""
+def test_start_and_end_of_every_bus_silence_are_logged_once(
+    database: VehicleDatabase, before: Reason, revoked: bool
+) -> None:
+    """In the same way after a fall-back, and without parameters."""
     node = Node(database)
     assert node.drive() is None
     node.latch(before, "motor")
@@ -158,7 +162,7 @@ def test_every_bus_silence_and_its_end_are_reported(database: VehicleDatabase, b
         assert [node.later(1.0), node.later(6.0), node.drive()] == ["no branch sends", None, "branches send again"]
 
 
-def test_fall_back_is_reported_with_reason_end_and_resumption(database: VehicleDatabase) -> None:
+def test_log_gives_reason_and_end_condition_of_a_fall_back_and_its_end(database: VehicleDatabase) -> None:
     node = Node(database)
     stuck = node.latch(Reason.BRANCH_STUCK, "motor", "dcdc")
     assert stuck == f"{FALLS_BACK} the bus has slept: {Reason.BRANCH_STUCK.words} (motor, dcdc)"
@@ -172,7 +176,7 @@ def test_fall_back_is_reported_with_reason_end_and_resumption(database: VehicleD
     assert f"{FALLS_BACK} a restart: " in (alone.latch(Reason.CORRECTION_WORSE) or "")
 
 
-def test_revocation_during_bus_sleep_is_not_reported_as_waking_up(database: VehicleDatabase) -> None:
+def test_revocation_during_bus_sleep_is_not_logged_as_waking_up(database: VehicleDatabase) -> None:
     node = Node(database)
     assert [node.drive(), node.later(1.0)] == [None, "no branch sends"]
     assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None

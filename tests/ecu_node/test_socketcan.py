@@ -1,4 +1,4 @@
-"""Many frames per system call: what python-can writes is read, and what is written python-can reads."""
+"""Many frames per system call: the link reads what python-can writes, and python-can reads what the link writes."""
 
 import errno
 import random
@@ -20,7 +20,7 @@ Ends = tuple[SocketCanLink, socket.socket]
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    """A link, and the other end; the system calls treat datagrams between processes like frames."""
+    """A link, and the other end of its socket: a pair of datagram sockets, on which the system calls work as on CAN."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     far.settimeout(1.0)
     with near, far:
@@ -97,7 +97,7 @@ def test_more_frames_than_fit_one_system_call_arrive_complete_and_in_order(ends:
     assert came == list(range(count))
 
 
-def test_frames_have_kernel_timestamps_and_never_that_of_another_frame(ends: Ends) -> None:
+def test_frame_has_its_own_kernel_timestamp_or_0_but_never_that_of_another_frame(ends: Ends) -> None:
     link, far = ends
     frame, before_s = build_can_frame(can.Message(arbitration_id=1)), time.time()
     far.send(frame)
@@ -110,7 +110,7 @@ def test_frames_have_kernel_timestamps_and_never_that_of_another_frame(ends: End
     assert undated.timestamp == 0.0
 
 
-def test_closed_bus_reports_no_dropped_frames(ends: Ends) -> None:
+def test_number_of_newly_dropped_frames_of_a_closed_bus_is_0(ends: Ends) -> None:
     link, _ = ends
     link.close()
     assert link.newly_dropped() == 0

@@ -1,4 +1,4 @@
-"""Telemetry, latency, garbage and real time: none of them delays the bus."""
+"""Telemetry and the histogram of latencies: neither delays or ends the correction, and lost lines are counted."""
 
 import json
 import os
@@ -31,7 +31,7 @@ CURRENTS = bytes.fromhex("0320f9c000000000")
 
 
 class Outlet:
-    """Telemetry of a small vehicle of which battery frames came."""
+    """Telemetry of a node on the small vehicle."""
 
     def __init__(self, database: VehicleDatabase, target: Path | tuple[str, int]) -> None:
         self.corrector = corrector_for(database, Mode.OVERLAY, time.monotonic(), battery=(0.25, 5.0))
@@ -46,7 +46,7 @@ class Outlet:
         wait_until(lambda: self.corrector.counters.telemetry_lost >= count)
 
     def second(self) -> None:
-        """A frame of the pair, and what is done once per second."""
+        """Take a frame of battery and motor, and do what is done once per second."""
         self.now_s += 1.0
         answers(self.corrector, Frame(PAIR, CURRENTS), self.now_s)
         self.corrector.look(self.now_s)
@@ -98,7 +98,7 @@ def test_telemetry_lines_are_sent_by_udp(make_outlet: Any) -> None:
         assert json.loads(receiver.recv(65536))["branches"][VSS]["corrected_a"] == 60.0
 
 
-def test_telemetry_lines_lost_on_a_full_disk_are_counted_and_reported_once(make_outlet: Any, tmp_path: Path) -> None:
+def test_telemetry_lines_lost_on_a_full_disk_are_counted_and_logged_once(make_outlet: Any, tmp_path: Path) -> None:
     path = tmp_path / "link"
     path.symlink_to("/dev/full")
     outlet = make_outlet(path)
@@ -114,7 +114,9 @@ def test_telemetry_lines_lost_on_a_full_disk_are_counted_and_reported_once(make_
 
 
 @pytest.mark.parametrize("target", [".", "pipe", ("no-such-host.invalid", 5000), ("a" * 64, 5000)])
-def test_unusable_telemetry_target_is_reported(target: str | tuple[str, int], make_outlet: Any, tmp_path: Path) -> None:
+def test_unusable_telemetry_target_is_logged_and_does_not_block_the_node(
+    target: str | tuple[str, int], make_outlet: Any, tmp_path: Path
+) -> None:
     """A folder, a pipe without a reader, a host without an address, and one that no name server could know."""
     os.mkfifo(tmp_path / "pipe")
     outlet = make_outlet(tmp_path / target if isinstance(target, str) else target)
@@ -149,7 +151,9 @@ def test_mqtt_example_extracts_the_currents_from_a_line(make_outlet: Any, tmp_pa
     assert currents((tmp_path / "node.jsonl").read_text()) == {VSS: -60.0, "motor": -80.0}
 
 
-def test_partly_written_line_is_removed(make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partly_written_telemetry_line_is_removed_from_the_file(
+    make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, write = tmp_path / "node.jsonl", os.write
     outlet = make_outlet(path)
     monkeypatch.setattr(os, "write", lambda file, line: write(file, line[:7] if line.startswith(b'{"time"') else line))

@@ -25,9 +25,9 @@ from ecu_node.parameters import (
 )
 
 BATTERY, MOTOR = FrameKey(0x110, False), FrameKey(0x120, False)
-"""Of the project's own layout."""
+"""Identifiers of messages of the project's own layout."""
 PAIR, HEATER, NET = FrameKey(256, False), FrameKey(512, True), FrameKey(258, False)
-"""Of the small vehicle."""
+"""Identifiers of messages of the small vehicle."""
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 MakeDatabase = Callable[..., VehicleDatabase]
 """Makes a database from the texts of layout and DBC; without them, those of the small vehicle."""
@@ -130,7 +130,7 @@ def decoded(database: VehicleDatabase, message: str, data: bytes) -> dict[str, A
 
 
 class AtOnce(Executor):
-    """Runs background work at once, in the foreground."""
+    """Runs work that is meant for the background at once, in the caller's thread."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         done: Future[Any] = Future()
@@ -164,7 +164,7 @@ def battery(database: VehicleDatabase, counter: int, current: float = 100.0, **m
 
 
 def damaged(frame: Frame) -> Frame:
-    """The same with a wrong CRC."""
+    """The frame with a wrong CRC."""
     return Frame(frame.key, bytes([frame.data[0] ^ 1]) + frame.data[1:])
 
 
@@ -183,7 +183,7 @@ def corrector_for(
 
 
 Current = float | Callable[[int], float]
-"""Of all frames, or of each by its number. [A]"""
+"""A current that is the same in all frames, or a function that returns that of a frame by its number. [A]"""
 
 
 def drive(
@@ -200,10 +200,10 @@ def drive(
     look: Callable[[Corrector, float], object] = lambda *_: None,
     **more: float,
 ) -> list[Quality]:
-    """Battery and motor frames of the project's own layout, and a look of the node's core, and of another, after each.
+    """Send battery and motor frames of the project's own layout; after each pair the core looks, then `look` is called.
 
-    Some may be silent, every so many of the battery damaged. Further signals are those of the battery's message.
-    Returns the qualities of the answers to the battery.
+    Branches in `silent` send nothing; every `spoil`-th frame of the battery is damaged. `more` are further signals of
+    the battery's message. Returns the qualities in the answers to the battery's frames.
     """
     qualities = []
     for k in range(round(start_s / period_s), round(end_s / period_s)):

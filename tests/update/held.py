@@ -1,4 +1,4 @@
-"""Parameter sets that a vehicle holds, put there without a repository; its node, which uses them."""
+"""Parameter sets put into the state of a vehicle without a repository, and the node that uses them."""
 
 from concurrent.futures import Executor
 from datetime import UTC, datetime, timedelta
@@ -26,7 +26,7 @@ def put_on_trial(vehicle: Path, parameters: VehicleParameters, *, days: int = 36
 
 
 class Running:
-    """The core of a node with the store of its parameters, in time that is counted."""
+    """The core of a node with the store of its parameters, in simulated time."""
 
     def __init__(self, state: Path, database: VehicleDatabase, *, background: Executor = AT_ONCE) -> None:
         self.database, self.now, self.said = database, NOW, list[str]()

@@ -19,7 +19,7 @@ from tests.ecu_node.vehicles import LAYOUT
 
 VEHICLE = "v1"
 Run = Callable[..., Done]
-"""A command line, and what comes of it."""
+"""Runs a command line; returns exit code and output."""
 ALL = ("r1", "r2", "t1", "t2", "snapshot", "timestamp")
 """Names of the keys in the folder of a repository."""
 
@@ -113,7 +113,7 @@ class Repo:
         assert words in (state / "decisions.log").read_text().splitlines()[-1]
 
     def copy(self, place: Path) -> "Repo":
-        """The same with a repository of its own."""
+        """Copy the repository and its keys into another folder."""
         shutil.copytree(self.path, place / "repo")
         shutil.copytree(self.folder / "keys", place / "keys")
         return Repo(place, self.calibrator, self.node)

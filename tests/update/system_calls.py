@@ -1,4 +1,4 @@
-"""Programs under strace: which system calls they make on a folder, and what becomes of them if one is their last."""
+"""Programs under strace: which system calls they make on a folder; they can be killed at one, or have it fail."""
 
 import os
 import re
@@ -24,7 +24,7 @@ class Call(NamedTuple):
 
     name: str
     number: int
-    """Which one of that name, from 1."""
+    """Which call of that name in the program, counted from 1."""
     path: Path
     """File or folder concerned; of two, the last."""
     changes: bool

@@ -1,6 +1,6 @@
 """Bundles that were changed anywhere: each is refused in one line, and nothing of the vehicle changes.
 
-``HV_BUNDLES=1000000 pytest -n auto tests/update/test_changed_bundles.py`` tries so many.
+``HV_BUNDLES=1000000 pytest -n auto tests/update/test_changed_bundles.py`` tries that many bundles.
 """
 
 import json
@@ -27,7 +27,7 @@ from tests.update.repo import Repo
 BUNDLES = int(os.environ.get("HV_BUNDLES", "300"))
 AT_A_TIME = min(BUNDLES, 1_000)
 VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20) | st.sampled_from(["9" * 5000])
-"""What somebody might write in the place of another value."""
+"""Values that an attacker might write in the place of another."""
 
 
 def files_of(bundle: bytes) -> dict[str, str]:

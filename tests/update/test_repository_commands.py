@@ -80,7 +80,7 @@ def test_key_rotation_keeps_the_threshold_unless_another_is_given(repo: Repo) ->
     assert "1 of 1 (was 2)" in repo.done("rotate", repo.path, "targets", *public[:2], "--threshold", 1)
 
 
-def test_adding_a_revoked_file_again_ends_its_revocation_and_is_reported(repo: Repo, state: Path) -> None:
+def test_adding_a_revoked_file_again_ends_its_revocation_and_says_so(repo: Repo, state: Path) -> None:
     repo.done("revoke", repo.path, "v1")
     repo.publish()
     repo.updated(state)
@@ -117,8 +117,8 @@ def test_key_given_by_uri_signs_like_a_key_file(repo: Repo, new: Path, other: Ve
     assert repo.updated(new).startswith("on trial: parameter set 301")
 
 
-def test_unusable_key_is_reported_in_one_line(repo: Repo) -> None:
-    """Files that are missing or empty are among the mistakes of users."""
+def test_unusable_key_is_refused_in_one_line(repo: Repo) -> None:
+    """Such as a public key, a missing file, an unknown kind of URI, or a key that others may read."""
     public, none = repo.folder / "keys" / "t1.pub", repo.folder / "none"
     repo.key("t1").chmod(0o644)
     for key, words in (
@@ -182,7 +182,9 @@ def test_partly_written_key_is_removed(free_bytes: int, repo: Repo) -> None:
     assert not list(repo.folder.glob("*anna*"))
 
 
-def test_each_mistake_is_one_line_and_changes_nothing(repo: Repo, other: VehicleParameters, tmp_path: Path) -> None:
+def test_each_mistake_is_refused_in_one_line_and_changes_nothing(
+    repo: Repo, other: VehicleParameters, tmp_path: Path
+) -> None:
     def files() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in repo.path.rglob("*") if path.is_file()}
 
@@ -226,7 +228,7 @@ def test_status_gives_the_expiry_of_a_root_that_expires_before_the_timestamp_rol
     assert f"valid until {day}; 1 roles staged: root has 0 of 2 signatures" in repo.done("status", repo.path)
 
 
-def test_damaged_or_expired_repository_is_reported_in_one_line(repo: Repo) -> None:
+def test_damaged_or_expired_repository_is_refused_in_one_line(repo: Repo) -> None:
     bundle, publish = ("bundle", repo.path, "v1", "--out", repo.folder / "b"), ("publish", repo.path, *keys(repo, *ALL))
     repo.forge("timestamp", expired, "timestamp")
     failed(repo, "when its metadata expired; publish first", *bundle)

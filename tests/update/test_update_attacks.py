@@ -1,4 +1,4 @@
-"""The attacks that TUF lists, each through the command line: one line, and nothing has changed."""
+"""The attacks that TUF lists, through the command line: each is refused in one line, and the state stays as it is."""
 
 import lzma
 import os
@@ -56,7 +56,7 @@ def test_metadata_of_foreign_keys_is_refused(role: str, repo: Repo, state: Path,
     repo.refused(state, "was signed by 0/")
 
 
-def test_rollback_is_refused(repo: Repo, state: Path) -> None:
+def test_bundle_older_than_the_accepted_metadata_is_refused(repo: Repo, state: Path) -> None:
     """Otherwise an old bundle could hide a revocation."""
     old = repo.bundle().read_bytes()
     repo.revoke()
@@ -66,7 +66,7 @@ def test_rollback_is_refused(repo: Repo, state: Path) -> None:
 
 
 def test_rollback_of_a_single_bin_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
-    """By somebody who has the keys of snapshot and timestamp."""
+    """The attacker has the keys of snapshot and timestamp."""
     repo.take(state, other)
 
     def back(snapshot: Snapshot) -> None:
@@ -78,7 +78,7 @@ def test_rollback_of_a_single_bin_is_refused(repo: Repo, state: Path, other: Veh
 
 
 @pytest.mark.parametrize("role", ["timestamp", "snapshot", "targets", "bin", "root"])
-def test_freeze_is_detected_when_metadata_expires(role: str, repo: Repo, new: Path) -> None:
+def test_expired_metadata_of_any_role_is_refused(role: str, repo: Repo, new: Path) -> None:
     role = repo.bin if role == "bin" else role
     repo.forge(role, expired, "r1", "r2", "t1", "t2", "snapshot", "timestamp", bump=role in ("root", "timestamp"))
     if role == "snapshot":
@@ -86,7 +86,7 @@ def test_freeze_is_detected_when_metadata_expires(role: str, repo: Repo, new: Pa
     repo.refused(new, "expired")
 
 
-def test_endless_data_is_refused(repo: Repo, new: Path) -> None:
+def test_oversized_metadata_and_bundles_are_refused(repo: Repo, new: Path) -> None:
     os.truncate(repo.metadata / "timestamp.json", 1 << 30)
     repo.refused(new, "larger than")
     os.truncate(repo.metadata / "timestamp.json", 100_000)
@@ -134,7 +134,7 @@ def test_bundle_or_repository_without_this_vehicle_is_refused(repo: Repo, new: P
 
 
 def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, new: Path) -> None:
-    """By somebody who has the keys of all online roles and of targets."""
+    """The attacker has the keys of targets, snapshot and timestamp."""
 
     def swap(targets: Targets) -> None:
         targets.targets["v1.json"].unrecognized_fields["custom"]["vehicle"] = "v2"
@@ -148,7 +148,7 @@ def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, n
     "keys", [("timestamp", "mallory"), ("snapshot", "mallory"), ("t1", "mallory"), ("r1",), ("snapshot", "timestamp")]
 )
 def test_one_stolen_key_cannot_deliver_parameters(keys: tuple[str, ...], repo: Repo, new: Path) -> None:
-    """Nor can all online keys: their thief signs all that they can sign."""
+    """Nor can the keys of snapshot and timestamp together. The thief signs whatever the stolen keys can sign."""
     repo.forge(repo.bin, evil_target(repo), *keys)
     repo.relist(repo.bin, *keys)
     repo.refused(new, "was signed by ")
@@ -162,7 +162,7 @@ def test_one_stolen_key_cannot_deliver_parameters(keys: tuple[str, ...], repo: R
     ],
 )
 def test_names_in_metadata_cannot_lead_out_of_the_repository(name: str, words: str, repo: Repo, new: Path) -> None:
-    """By somebody who has the keys of targets."""
+    """The attacker has the keys of targets, snapshot and timestamp."""
     (repo.folder / "secret").write_bytes(EVIL)
 
     def lead_out(targets: Targets) -> None:
@@ -202,7 +202,9 @@ def server(repo: Repo) -> Iterator[str]:
         thread.join()
 
 
-def test_update_from_the_web_is_limited(repo: Repo, new: Path, server: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_update_from_a_web_server_is_limited_in_size_and_time(
+    repo: Repo, new: Path, server: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     timestamp = repo.metadata / "timestamp.json"
     whole = timestamp.read_bytes()
     os.truncate(timestamp, 10_000_000)
@@ -231,7 +233,7 @@ def test_vehicle_of_any_name_updates_from_a_web_server(
 
 
 def test_additional_files_in_a_bundle_are_not_written(repo: Repo, new: Path, parameters: VehicleParameters) -> None:
-    """Names in a bundle are looked up, never written."""
+    """Names in a bundle are only looked up; no file is written under one."""
     files = msgspec.json.decode(lzma.decompress(repo.bundle().read_bytes()), type=dict[str, str])
     evil = {"../../evil": "x", "/tmp/evil": "x", "targets/v1.json": encode_parameters(parameters, "f").decode()}
     path = repo.folder / "evil.json.xz"

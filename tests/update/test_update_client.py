@@ -43,7 +43,7 @@ def held_set(state: Path, place: str = "in_force") -> ParameterSet:
 
 
 def numbers(state: Path) -> list[int | None]:
-    """Parameter sets in force, on trial and before."""
+    """Numbers of the parameter sets in force, on trial and in force before; None where there is none."""
     found = read_state(state)
     return [item.parameters.number if item else None for item in (found.in_force, found.on_trial, found.before)]
 
@@ -159,7 +159,9 @@ def test_dry_run_of_an_update_writes_nothing(repo: Repo, new: Path) -> None:
     assert {path.name: path.read_bytes() for path in new.iterdir()} == before
 
 
-def test_expired_set_ends(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
+def test_expired_set_neither_comes_nor_stays_in_force(
+    repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters
+) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
     update(state, str(repo.path), database, now)
@@ -238,7 +240,9 @@ def test_signed_but_inconsistent_description_is_refused(
 
 
 @pytest.mark.parametrize("damage", [without, cut, zeros, a_folder, a_pipe, huge])
-def test_damaged_state_is_reported_in_one_line(damage: Callable[[Path], None], repo: Repo, state: Path) -> None:
+def test_damaged_bundle_or_state_is_refused_in_one_line(
+    damage: Callable[[Path], None], repo: Repo, state: Path
+) -> None:
     bundle = repo.bundle()
     damage(bundle)
     repo.refused(state, str(bundle), bundle)
@@ -271,7 +275,7 @@ def test_change_of_any_byte_of_a_bundle_is_detected(repo: Repo, new: Path) -> No
     repo.refused(new, "not a whole bundle", path)
 
 
-def test_unusable_source_or_state_is_reported_in_one_line(repo: Repo, state: Path) -> None:
+def test_unusable_source_or_state_is_refused_in_one_line(repo: Repo, state: Path) -> None:
     for source in (repo.folder / "a\nb\x1b[2J", "x" * 5000, b"a\xff"):
         one_line(repo.update(state, source))
     one_line(repo.node("inspect", "--state", state / "state.json"), "cannot read the state: Not a directory")

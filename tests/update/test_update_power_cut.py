@@ -1,4 +1,4 @@
-"""A power cut at any moment, a full disk, a broken disk: the state of a vehicle is that of before or that of after.
+"""A power cut at any moment, a full disk, a broken disk: the state of a vehicle is the old or the new one.
 
 Programs are killed as they enter each system call with which they change the state: this is every moment there is, as
 nothing on the disk changes between the end of one call and the begin of the next. What was written and not yet synced
@@ -49,7 +49,7 @@ def command(
 
 
 def timeless(folder: Path) -> VehicleState:
-    """The state, but for the time of the last change."""
+    """The state, with the latest time seen replaced by a fixed one."""
     return replace(read_state(folder), latest=datetime(2026, 1, 1, tzinfo=UTC))
 
 
@@ -105,7 +105,7 @@ ERRORS = {"openat": "ENOSPC", "write": "ENOSPC", "fsync": "EIO", "rename": "EIO"
 
 
 @pytest.mark.parametrize("command", ["update"], indirect=True)
-def test_failed_disk_write_keeps_the_state_or_is_reported(
+def test_failed_disk_write_is_reported_and_keeps_the_state_unless_already_replaced(
     command: Callable[[Path], list[str]], state: Path, tmp_path: Path
 ) -> None:
     work, log = tmp_path / "work", tmp_path / "log"

@@ -24,7 +24,7 @@ def commands(text: str) -> list[str]:
 
 
 def section(name: str) -> list[str]:
-    """Commands of one recovery."""
+    """Commands of docs/trust.md for one recovery, marked with its name."""
     return commands(re.findall(rf"<!-- run: {name} -->\n(```\n.*?```)", TEXT, re.DOTALL)[0])
 
 

@@ -27,7 +27,7 @@ DRIFT, OTHER_DRIFT = 0.05, 0.06
 
 
 class _Ended(ParameterTrial):
-    """A trial that has seen enough."""
+    """A trial that has passed as soon as it is looked at."""
 
     def look(self, now_s: float) -> TrialResult | None:
         return TrialResult(passed=True, text="seen")
@@ -35,7 +35,7 @@ class _Ended(ParameterTrial):
 
 @pytest.fixture
 def ended(state: Path, other: VehicleParameters, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> Running:
-    """A node whose trial of set 301 ends well as soon as it is looked at."""
+    """A node with set 300 in force, whose trial of set 301 passes at its first look."""
     monkeypatch.setattr("ecu_node.update.store.ParameterTrial", _Ended)
     put_on_trial(state, other)
     running = Running(state, database)
@@ -161,7 +161,7 @@ def test_trial_starts_once_the_set_is_valid(state: Path, other: VehicleParameter
 def test_running_node_loads_a_set_written_to_its_state(
     new: Path, parameters: VehicleParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It also reports this to the service manager."""
+    """It tells the service manager, too."""
     manager = ServiceManagerHere(tmp_path / "notify", monkeypatch)
     bus = ["--interface", "virtual", "--channel", "state"]
     with manager.socket, running("run", "--state", str(new), "--layout", str(LAYOUT), *bus) as log:

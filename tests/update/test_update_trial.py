@@ -17,7 +17,7 @@ from tests.ecu_node.vehicles import LAYOUT, drive, parameters_for
 from tests.update.held import NOW, Running, put_on_trial
 
 DRIFT, OFFSET_A = 0.05, 2.0
-"""Of the battery's sensor in this vehicle."""
+"""Fault of the battery's sensor in this vehicle. [1, A]"""
 
 
 TRIAL_S = 30.0
@@ -89,7 +89,7 @@ PASSED, FAILED = "has passed its trial", "has failed its trial"
 
 
 def tried(vehicle: Path, parameters: VehicleParameters, database: VehicleDatabase, **conditions: float) -> Drive:
-    """A drive that is longer than a trial takes."""
+    """Put parameters on trial, and drive for longer than a trial takes."""
     put_on_trial(vehicle, parameters)
     drive = Drive(vehicle, database)
     drive.go_on(1.1 * TRIAL_S, **conditions)  # type: ignore[arg-type]
@@ -117,7 +117,7 @@ def test_right_set_comes_in_force_after_its_trial_and_not_before(new: Path, car:
 def test_wrong_set_fails_its_trial(
     new: Path, car: VehicleDatabase, drift: float, offset_a: float, left_a: float
 ) -> None:
-    """Also if the calibrator stated a large remaining sum."""
+    """Also if the parameter file says that the calibrator saw a large corrected sum."""
     drive = tried(new, right(car, drift, offset_a, left_a=left_a), car)
     assert drive.told == (State.PASSING_THROUGH, Reason.NO_PARAMETERS)
     assert (read_state(new).in_force, read_state(new).on_trial) == (None, None)
@@ -167,7 +167,7 @@ UNCHANGED = {"drift": 0.0, "offset_a": 0.0}
     ],
     ids=["without a change", "without a predicted change, as written by hand", "promises half, and a load is half"],
 )
-def test_set_that_keeps_its_promise_passes_its_trial(
+def test_set_that_lowers_the_sum_as_predicted_passes_its_trial(
     fault: Numbers, residual: JunctionResidual | None, conditions: Numbers, words: str, new: Path, car: VehicleDatabase
 ) -> None:
     parameters = right(car, **fault)
@@ -175,8 +175,8 @@ def test_set_that_keeps_its_promise_passes_its_trial(
     assert tried(new, promising, car, **conditions).has_said(words)
 
 
-def test_trial_waits_in_invalid_states_and_while_no_current_flows(new: Path, tmp_path: Path) -> None:
-    """As while the vehicle charges, if the layout excludes this state."""
+def test_trial_time_counts_only_in_valid_watch_states_while_current_flows(new: Path, tmp_path: Path) -> None:
+    """A layout may so exclude charging from the trial."""
     own = own_vehicle(tmp_path, '[watch]\ninput = "contactor_state"\nvalid = [2]\n')
     drive = tried(new, right(own), own, contactor=1)
     drive.go_on(1.1 * TRIAL_S, contactor=2, moving=False)

@@ -61,7 +61,7 @@ def long_queues(socketcan: None) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def database(tmp_path_factory: pytest.TempPathFactory) -> VehicleDatabase:
-    """The vehicle of the tests."""
+    """Layout and DBC of the vehicle of these tests."""
     return read_database(read_layout(write_patient_layout(tmp_path_factory.mktemp("vehicle"))))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 TIMEOUT_S = 5.0
-"""Branches are stale after this. [s]"""
+"""Timeout of all branches. [s]"""
 _TRUSTED_AT_ONCE = "invalid = {window = 10, min_ok = 1, max_error = 1}"
 """One intact frame after a silence is enough: whether a kernel pauses for longer than that is chance."""
 

@@ -32,7 +32,7 @@ class SmallBranch(NamedTuple):
     offset_a: float
 
     def frame(self, database: VehicleDatabase, k: int, i: float) -> LoggedFrame:
-        """Frame k of the sensor, with a current into the junction. [A]"""
+        """Frame k of the sensor while the true current `i` flows into the junction. [A]"""
         shown_a = self.sign * ((1.0 + self.drift) * i + self.offset_a)
         signal = f"{self.message.removeprefix('HV_')}Current"
         data = protected(database, self.message, k % 15, **{signal: shown_a})

@@ -21,7 +21,7 @@ SECONDS = 8.0
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fleet beside its result, made here unless it was before."""
+    """Folder of a fleet, with its result beside it; made here unless HV_CALIBRATED_FLEET names one made before."""
     made = os.environ.get("HV_CALIBRATED_FLEET")
     folder = Path(made) if made else tmp_path_factory.mktemp("calibrated")
     if not made:

@@ -29,7 +29,7 @@ from tests.vcan.processes import (
 from tests.vcan.small_drive import BRANCHES, sent_by_core, true_currents
 
 INSTANTS = 45
-"""A multiple of the counter's period, so that a drive may follow itself."""
+"""Length of the drive: a multiple of the counter's 15 codes, so that it can be played twice without a jump."""
 
 
 def qualities(frames: list[bytes]) -> set[int]:
@@ -41,7 +41,7 @@ def wait_for_correcting(here: Recording) -> None:
 
 
 def send_branches(database: VehicleDatabase, k: int) -> None:
-    """One frame of each branch."""
+    """Send one frame of each branch."""
     for name, current_a in true_currents(0.02 * k).items():
         send("#".join(BRANCHES[name].frame(database, k, current_a)))
 
@@ -57,7 +57,9 @@ def bus_is_back() -> Iterator[None]:
 
 @pytest.mark.parametrize("how", ["down", "deleted"])
 @pytest.mark.usefixtures("bus_is_back")
-def test_bus_once_down_or_deleted_is_used_again(tmp_path: Path, drive: Path, start_node: StartNode, how: str) -> None:
+def test_node_corrects_again_after_its_bus_was_down_or_deleted(
+    tmp_path: Path, drive: Path, start_node: StartNode, how: str
+) -> None:
     with start_node() as node:
         with running_recording(tmp_path / "before.log") as before:
             play(drive)
@@ -102,7 +104,9 @@ def test_full_send_queue_loses_frames_but_does_not_stop_the_gateway(
     assert "bus failed" not in node.messages
 
 
-def test_error_frames_are_not_passed_on(database: VehicleDatabase, start_gateway: StartNode, there: Recording) -> None:
+def test_gateway_does_not_pass_error_frames_on(
+    database: VehicleDatabase, start_gateway: StartNode, there: Recording
+) -> None:
     with start_gateway() as node:
         send("20000004#0008000000000000")
         send("20000040#0000000000000000")

@@ -1,4 +1,5 @@
-"""A gateway of which the kernel carries all but its own frames: killed, deceived, with joined buses."""
+"""A gateway for which the kernel carries all frames but those that only it may send: killed, with forged frames, with
+joined buses."""
 
 import os
 import re
@@ -38,7 +39,8 @@ from tests.vcan.processes import (
 NOISE, BACK = 0x345, 0x346
 """Identifiers of others, sent towards the vehicle and towards the sensors."""
 RULES = 2 * (34 + 1)
-"""Both ways, all standard identifiers but those of the five branches and the status, and all extended ones."""
+"""Number of rules, in both directions: for all 11-bit identifiers but those of the five branches and the status, and
+one for all 29-bit identifiers."""
 INSTANTS = 150
 GATEWAY = ("--gateway", OTHER_CHANNEL)
 FOREIGN = "FFFFFFFFFFFFFFFF"
@@ -61,7 +63,7 @@ def rules() -> list[tuple[str, ...]]:
 
 @contextmanager
 def noise(count: int) -> Iterator[None]:
-    """Frames of others on both buses meanwhile, numbered, every 8 ms; at the end all have been sent."""
+    """Within the block, send numbered frames of others on both buses, one each 8 ms; at its end all have been sent."""
     ways = ((CHANNEL, NOISE), (OTHER_CHANNEL, BACK))
     commands = [
         ["cangen", channel, "-I", f"{identifier:X}", "-D", "i", "-L", "8", "-n", str(count), "-g", "8"]
@@ -145,7 +147,9 @@ def test_removed_kernel_rules_are_restored(start_gateway: StartNode) -> None:
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin")
 
 
-def test_node_carries_frames_itself_without_rights(start_gateway: StartNode, here: Recording, there: Recording) -> None:
+def test_node_carries_frames_itself_without_cap_net_admin(
+    start_gateway: StartNode, here: Recording, there: Recording
+) -> None:
     with start_gateway(by=WITHOUT_RIGHTS) as node:
         with noise(50):
             pass
@@ -196,7 +200,7 @@ def test_rules_for_a_vanished_interface_are_refused_in_one_line() -> None:
             routes.set()
 
 
-def test_foreign_branch_frames_are_reported_and_dropped(
+def test_branch_frames_of_another_node_are_logged_and_dropped(
     drive: Path, start_gateway: StartNode, here: Recording, there: Recording
 ) -> None:
     command = ["cangen", OTHER_CHANNEL, "-I", f"{BATTERY:X}", "-D", FOREIGN, "-L", "8", "-g", "1"]

@@ -80,7 +80,7 @@ def test_sigterm_or_sigint_ends_the_node_within_a_second(start_node: StartNode, 
     assert node.messages.splitlines()[-1] == "ecu-node: ended: no frames"
 
 
-def test_nonexistent_interface_is_reported_in_one_line(tmp_path: Path, start_node: StartNode) -> None:
+def test_nonexistent_interface_is_refused_in_one_line(tmp_path: Path, start_node: StartNode) -> None:
     words = "nocan0: cannot open the bus: no such interface"
     with pytest.raises(AssertionError, match=words), start_node("--channel", "nocan0"):
         pass  # it does not start
@@ -160,7 +160,7 @@ EXTENDED = "18FF1234"
 
 
 def apart(frames: Iterable[LoggedFrame]) -> dict[str, list[LoggedFrame]]:
-    """Frames by who sends or carries them, each in their order; but for those of the status."""
+    """Sort frames into those of branches, of others, and noise, each in their order; leave out status and `BACK`."""
     found: dict[str, list[LoggedFrame]] = {"branches": [], "others": [], "noise": []}
     for item in frames:
         if item.identifier == NOISE or (len(item.identifier) == 8 and item.identifier != EXTENDED):
