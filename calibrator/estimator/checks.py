@@ -2,8 +2,8 @@
 
 The junction law is regressed once more on the vehicle's own data for each cause that is not linear, with a further
 column: a curve over the level of a current, or gains that change with time or temperature. The remaining residual shows
-noise and loads that switch. The fleet shows how much of each is usual; the junction law shows that something is wrong,
-the fleet model in which sensor.
+noise and loads that switch. The fleet shows how large misfit and noise usually are; the junction law shows that
+something is wrong, and the fleet model in which sensor.
 Equations: (M22) to (M25) of docs/method.md, section "Does the best explanation fit?".
 """
 
@@ -37,7 +37,8 @@ LEAST_MISFIT = 1e-5
 LARGEST_MISFIT = 0.2
 """Largest misfit, in fractions of full scale; before anything is seen, its size is log-uniform up to it. [1]"""
 EXPLAINED = 0.7
-"""Share of the unusual residual that a cause has to explain; else it is reported as switching if much is left. [1]"""
+"""Share of the unusual residual that a cause has to explain; if it explains less and what is left is unusual, too,
+switching is reported instead. [1]"""
 LEAST_NOISE_SPREAD = 0.2
 """Least spread over healthy vehicles of the logarithm of the mean square residual. [1]"""
 NOISE_RANGE = 9.0
@@ -47,20 +48,21 @@ FEWEST = 30
 CLIPPED = 0.55
 """Share of the gain that is lost beyond a bend, from which on the sensor counts as clipped. [1]"""
 OVERSHOOT = 1.3
-"""Without a fleet, clipping at a bend needs one sensor that never reads this multiple of it, and one that does. [1]"""
+"""Without a fleet, a sensor counts as clipped at a bend only if some sensor never reads this multiple of the bend's
+current, and another one does. [1]"""
 CHANCE = 0.3
 """Correlation by chance between the fleet model and its errors in one vehicle. [1]"""
 GAIN_SD, DEAD_SD = 0.3, 0.04
 """Standard deviation of the gains of running sensors about 1 or -1, and of dead ones about 0. [1]"""
 MOVING = 0.02
-"""Least standard deviation of a current whose level is used, in fractions of full scale: others are noise. [1]"""
+"""Least standard deviation of a current whose level is used, in fractions of full scale: smaller ones are noise. [1]"""
 NEAR_ZERO = 0.07
 """A bend at a current below this, in fractions of full scale, counts as a gain that differs by sign: the zero is not
 known better. [1]"""
 SPIKE_RATE = 5e-4
 """Least value of the usual share of spikes among the samples. [1]"""
 NOISE_RATE = 0.015
-"""Share of spikes in both directions from which on they are bursts of noise. [1]"""
+"""Share of spikes among the samples above which spikes to both sides count as noise. [1]"""
 ONE_SIDED = 0.1
 """Share of spikes in the rarer direction up to which they count as one-sided. [1]"""
 WARMING_K = 2.0
@@ -276,7 +278,7 @@ class _Checked:
         level_branch: ArrayLike = -1,
         stretch: ArrayLike = 0.0,
     ) -> tuple[Array, ...]:
-        """Return how much of the sum of r^2 one cause explains (N,), then its :attr:`fit` to :attr:`branch_fit`.
+        """Return how much of the sum of r^2 one cause explains, then its fit, size, place, level_branch, branch_fit.
 
         The fit is the log likelihood with noise of unknown size, less a penalty for the parameters (BIC). ``pattern``
         (N, p) and ``square`` (N,) are products of the misfit with all columns and with itself; ``stretch`` is the mean
@@ -474,9 +476,9 @@ def learn_usual_misfits(
     Parameters
     ----------
     summaries : sequence of DriveSummary
-        Of the vehicles to learn from, most of them without such faults.
+        Summaries of the vehicles to learn from, most of them with linear sensors.
     read_out : ndarray of shape (M + 1, K)
-        Of the fleet model, its branches in the order of the summaries. [A]
+        Read-out of the fleet model, its branches in the order of the summaries. [A]
     full_scale_a : float
         Full scale of the junction. [A]
 
@@ -516,9 +518,9 @@ def find_misfits(
     Parameters
     ----------
     summaries : sequence of N DriveSummary
-        Of the vehicles; one without fit sums has no findings.
+        Summaries of the vehicles; one without fit sums has no findings.
     read_out : ndarray of shape (M + 1, K)
-        Of the fleet model, its branches in the order of the summaries; zeros of shape (1, K) without one. [A]
+        Read-out of the fleet model, its branches in the order of the summaries; zeros of shape (1, K) without one. [A]
     usual : UsualMisfits or None
         Usual misfits of the fleet; None: nothing is found.
     full_scale_a : float
@@ -563,7 +565,10 @@ def _posterior(odds: ArrayLike) -> Array:
 
 
 def _probability(misfit_a: Array, usual_a: Array, largest_a: float) -> Array:
-    """Return the probability that a misfit is unusual: then its size is log-uniform, else half a Student's t."""
+    """Return the probability that a misfit is unusual.
+
+    Sizes of unusual misfits are log-uniform, those of usual ones have half a Student's t distribution.
+    """
     z = np.maximum(misfit_a / usual_a, 1.0)
     alternative = 1.0 / (z * np.log(np.maximum(largest_a / usual_a, math.e)))
     return _posterior(PRIOR * alternative / np.maximum(2.0 * student_t.pdf(z, TAIL), 1e-300))
@@ -662,9 +667,10 @@ class _Vehicle(NamedTuple):
         return _finding(name, cause, probability, f"{_who(name)}: {text}; {this_makes}")
 
     def of_spikes(self) -> list[SensorFinding]:
-        """Report sensors with more spikes than is usual in the fleet: samples at which one alone leaps and returns.
+        """Report sensors with more spikes than is usual in the fleet.
 
-        The cause is ``spikes`` if nearly all go to one side, else ``outliers``, or ``noise`` if there are very many.
+        A spike is a sample at which one current alone leaps and returns. The cause is ``spikes`` if nearly all go to
+        one side, else ``outliers``, or ``noise`` if there are very many.
         """
         found, n, usual = [], self.misfits.samples[self.j], self.usual.spike_rate
         for name, (up, down) in zip(self.branches, self.misfits.spikes[self.j], strict=True):

@@ -89,7 +89,7 @@ class FleetPoints(Points):
     hardware : ndarray of shape (n, 1 + K)
         Drift [1] and offsets, in fractions of full scale, of the hardware fault of the point's explanation.
     load : ndarray of shape (n,)
-        Load without a sensor beside what a group shares, in fractions of full scale.
+        Load without a sensor, in fractions of full scale; 0 if the vehicle is in a group, which shares its load.
     group : ndarray of int of shape (n,)
         0, or from 1 on the number of the group of :func:`group_centres` that the vehicle belongs to.
     """
@@ -100,7 +100,7 @@ class FleetPoints(Points):
 
 
 def group_centres(models: Sequence[FaultModel]) -> Array:
-    """Return what the vehicles of each group share in the feeding branch, over full scale: of the model with most."""
+    """Return what each group shares in the feeding branch, over full scale: of the model with most groups."""
     return max((model.prior.group_centre for model in models), key=len)
 
 
@@ -150,7 +150,7 @@ def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
     Parameters
     ----------
     points : Points
-        Of one vehicle.
+        Posterior of one vehicle.
     smallest : ndarray of shape (2,)
         Least norms that the vectors of drifts and of offsets count with: the smallest faults of the fleet. [1]
 
@@ -159,7 +159,8 @@ def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
     faults : ndarray of shape (2K,)
         Drifts [1] and offsets in fractions of full scale.
     confidence : float
-        Posterior probability that both are within 10 % of the truth in the Euclidean norm.
+        Posterior probability that the vector of drifts and that of offsets are within 10 % of the truth in the
+        Euclidean norm.
     """
     mass = np.bincount(points.explanation, points.weight)
     tried: list[Array] = []
@@ -182,7 +183,7 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
     Parameters
     ----------
     points : Points
-        Of one vehicle.
+        Posterior of one vehicle.
     candidates : ndarray of shape (C, 2K)
         Drifts [1] and offsets in fractions of full scale.
     smallest : sequence of float or ndarray of shape (2,)
@@ -191,7 +192,7 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
     Returns
     -------
     ndarray of shape (C,)
-        Probability that both are within 10 % of the truth in the Euclidean norm.
+        Probability that the vector of drifts and that of offsets are within 10 % of the truth in the Euclidean norm.
     """
     K = candidates.shape[1] // 2
     near = np.ones((len(points.faults), len(candidates)), bool)
@@ -204,12 +205,12 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
 
 
 def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: Array) -> Array:
-    """Compute for each branch the probability that its correction makes it worse (M19).
+    """Compute for each branch the probability that its correction makes it worse, (M19) of docs/method.md.
 
     Parameters
     ----------
     points : Points
-        Of one vehicle.
+        Posterior of one vehicle.
     estimate : ndarray of shape (2K,)
         Drifts [1] and offsets in fractions of full scale that the branches would be corrected with.
     mean, mean_square : ndarray of shape (D, K)
@@ -218,7 +219,7 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
     Returns
     -------
     ndarray of shape (K,)
-        Probability that it does so on any of the drives; 0 where nothing would be corrected.
+        Probability that the branch gets worse on at least one of the drives; 0 where nothing would be corrected.
     """
     K = len(estimate) // 2
     d, o, d_hat, o_hat = points.faults[:, :K], points.faults[:, K:], estimate[:K], estimate[K:]
@@ -237,17 +238,19 @@ class SensorEstimate:
     Attributes
     ----------
     drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N, K)
-        Sensor faults and their standard deviations. [1], [A]
+        Sensor faults and their standard deviations; in a fleet these are the distances from the estimate within which
+        68 % of the posterior lies. [1], [A]
     hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
-        Drift and probability of a hardware fault; probability that the estimate is within 10 % of the truth. [1]
+        Drift and probability of a hardware fault (NaN for single junctions); probability that the estimate is
+        recovered. [1]
     hardware_offset_a : ndarray of shape (N, K)
         Offsets of a hardware fault. [A]
     fault_probability, harm_probability : ndarray of shape (N, K)
         Probability that the sensor is faulty; that its correction makes the branch worse. [1]
     identifiable : ndarray of bool of shape (N, K)
-        Whether the branch moved enough for its gain to be known: some row shows it.
+        Whether drives or readings show the gain of the sensor well enough for a correction.
     points : sequence of N Points
-        The posterior.
+        Posterior of each vehicle.
     order : tuple of int
         Branches in the order of the points: branch k of the points is branch ``order[k]`` of the vehicles. Offsets of
         the points are in fractions of full scale.
@@ -297,7 +300,7 @@ class RowsEstimate(SensorEstimate):
     Attributes
     ----------
     points : sequence of N FleetPoints
-        The posterior.
+        Posterior of each vehicle.
     supports : sequence of N sequences of (float, ndarray of shape (3K + 1,))
         Explanations by falling probability, each as its probability, hardware drift, K hardware offsets, K drifts and K
         offsets; branches and units are those of the points.
@@ -351,7 +354,7 @@ def estimate_rows(
     Parameters
     ----------
     rows : EvidenceRows
-        Of the vehicles.
+        Evidence of the vehicles.
     models : sequence of FaultModel
         Fault models that explain their fleet.
     feed : int
@@ -359,7 +362,7 @@ def estimate_rows(
     mean, mean_square : ndarray of shape (N, K)
         Mean and mean square of the measured currents, over full scale and its square.
     usual : ndarray of shape (2, K)
-        The same two of the fleet's usual drive.
+        Mean, and mean square, on the usual drive of the fleet, in the same units.
     order : sequence of int or None
         Branches in the order of the rows: branch k of the rows is branch ``order[k]`` of the vehicles; None: branch k.
     full_scale_a : float
@@ -432,7 +435,10 @@ def _central_sd(points: Points, estimate: Array) -> Array:
 
 
 def _supports(points: FleetPoints) -> list[tuple[float, Array]]:
-    """List :attr:`RowsEstimate.supports` of a vehicle; explanations whose parameters have the same signs are merged."""
+    """List :attr:`RowsEstimate.supports` of a vehicle.
+
+    Explanations whose parameters have the same signs count as one, with the values of the most probable of them.
+    """
     share = np.bincount(points.explanation, points.weight)
     parameters = np.hstack([points.hardware, points.faults])
     total = np.zeros((len(share), parameters.shape[1]))

@@ -79,7 +79,7 @@ SINGULAR = 1e-12
 """Eigenvalue over the largest one below which a direction counts as unknown. [1]"""
 TINY = np.finfo(float).tiny
 LEAST_PRIOR = 100.0 * SINGULAR
-"""Least share of the prior in the diagonal of the normal equations, for a z that stands still, as the constant does."""
+"""Least share of the prior in the diagonal of the normal equations, for a regressor that never varies."""
 GAIN_SD = 0.4
 """Prior deviation of a gain ratio from -1, and of a slope from 1: no running sensor is farther off, and a branch that
 hardly moves counts as faultless. [1]"""
@@ -228,14 +228,14 @@ def stack_summaries(summaries: Sequence[DriveSummary], order: Sequence[int] | No
     Parameters
     ----------
     summaries : sequence of DriveSummary
-        Of N vehicles, at least one, with the same inputs and branches.
+        Summaries of N vehicles, at least one, with the same inputs and branches.
     order : sequence of int or None
         Branches to take, in this order; None: all, in the order of the summaries.
 
     Returns
     -------
     FleetMoments
-        Of the branches in that order.
+        Moments of the branches in that order.
 
     Raises
     ------
@@ -286,7 +286,7 @@ class VehicleRegressions:
 def regress_vehicles(
     gram: Array, right: Array, power: Array, blocks: Blocks, *, prior_gain: float
 ) -> VehicleRegressions:
-    """Regress y on z in each of N vehicles, by least squares with a weak prior (M9).
+    """Regress y on z in each of N vehicles, by least squares with a weak prior, (M9) of docs/method.md.
 
     Parameters
     ----------
@@ -347,12 +347,12 @@ def products(matrices: Array, vectors: Array) -> Array:
 
 
 def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
-    """Regress the first measured current on the others (M8), with their noise taken out of the moments.
+    """Regress the first measured current on the others, (M8) of docs/method.md, with their noise taken out.
 
     Parameters
     ----------
     fleet : FleetMoments
-        Of N vehicles; the first branch should be the one that moves most.
+        Moments of N vehicles; the first branch should be the one that moves most.
 
     Returns
     -------
@@ -383,15 +383,15 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
 
 
 def ratios_in_doubt(fleet: FleetMoments) -> Mask:
-    """Find gain ratios that slow changes of the currents show otherwise than fast ones, in the fleet as a whole (M8a).
+    """Find gain ratios that slow changes of the currents show otherwise than fast ones, in the fleet as a whole.
 
     Gains are the same at any speed. Filters of signals, means over a second, held values and loads that follow the
-    speed are not: what they add to a ratio looks like a gain error that all vehicles share.
+    speed are not: what they add to a ratio looks like a gain error that all vehicles share: (M8a) of docs/method.md.
 
     Parameters
     ----------
     fleet : FleetMoments
-        Of N vehicles; the first branch should be the one that moves most.
+        Moments of N vehicles; the first branch should be the one that moves most.
 
     Returns
     -------
@@ -425,12 +425,12 @@ def _shared_noise_a2(residual_a2: Array, bound_a2: Array, weight: Array) -> Arra
 
 
 def fit_fleet_model(fleet: FleetMoments) -> Array:
-    """Learn the fleet model (M7).
+    """Learn the fleet model, equation (M7) of docs/method.md.
 
     Parameters
     ----------
     fleet : FleetMoments
-        Of the N vehicles to learn from.
+        Moments of the N vehicles to learn from.
 
     Returns
     -------
@@ -479,14 +479,14 @@ def fit_fleet_model(fleet: FleetMoments) -> Array:
 
 
 def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegressions]:
-    """Regress each branch of each vehicle on the fleet model, on its own drives: slope and intercept (15).
+    """Regress each branch of each vehicle on the fleet model, on its own drives, equation (15) of the paper.
 
     Parameters
     ----------
     fleet : FleetMoments
-        Of N vehicles.
+        Moments of N vehicles.
     read_out : ndarray of shape (M + 1, K)
-        Of the fleet model. [A]
+        Read-out of the fleet model. [A]
 
     Returns
     -------
@@ -513,7 +513,7 @@ def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegres
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """One cluster of values that agree; centre and spread are in their unit.
+    """One cluster of values that agree; centre and spread are in the unit of the values.
 
     Attributes
     ----------
@@ -531,7 +531,7 @@ class Cluster:
 def densest_clusters(
     values: Array, sd: Array, *, most: int = 1, farthest: float = np.inf, widest: float = 0.0
 ) -> list[Cluster]:
-    """Find the most likely clusters (M15), the best first; later ones lie apart from those before.
+    """Find the most likely clusters, (M15) of docs/method.md, the best first; later ones lie apart from those before.
 
     Values are taken as a mixture of one Gaussian cluster (centre c, spread s, each value with its own sampling error)
     and a broad background. The most likely of a grid of centres and spreads is chosen. Unlike the mean and the median
@@ -552,7 +552,7 @@ def densest_clusters(
     Returns
     -------
     list of Cluster
-        At least one, unless no value is near enough; fewer than wanted if there are not so many.
+        Up to ``most`` clusters; at least one, unless the magnitude of every value is beyond ``farthest``.
     """
     near = values[np.abs(values) <= farthest]
     if not near.size:
@@ -603,7 +603,8 @@ class RowPlaces:
     offset_reads : slice
         K rows of readings of the offsets, in fractions of full scale.
     relative, constant : slice
-        The 3K - 1 rows of the first three kinds, and the 2K + 1 of the others.
+        The 3K - 1 rows of slopes, ratios and gain readings, and the 2K + 1 rows of intercepts, junction and offset
+        readings.
     measured : ndarray of int
         The 3K rows that come from drives; the others are readings.
     """
@@ -669,6 +670,11 @@ class EvidenceRows:
     means : ndarray of shape (N, 2, K)
         Means of the fleet model's and of the measured currents, in fractions of full scale: the lines of the constants
         pivot about them; zero where constants do not depend on the ratios. [1]
+
+    Raises
+    ------
+    FleetError
+        If any number is not finite.
     """
 
     values: Array
@@ -752,7 +758,7 @@ def collect_rows(
     Parameters
     ----------
     fleet : FleetMoments
-        Of N vehicles.
+        Moments of N vehicles.
     read_out : ndarray of shape (M + 1, K)
         Read-out of the fleet model, see :func:`fit_fleet_model`. [A]
     full_scale_a : float

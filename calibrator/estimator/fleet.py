@@ -111,9 +111,9 @@ class Fleet:
     place : str
         Path or URL of the drives, or of a store of their summaries.
     database : VehicleDatabase
-        Layout and DBC, or what stands for them.
+        Layout and DBC; without a layout one that is made from the branches and inputs of the frames.
     has_layout : bool
-        Whether there is a layout, as the node needs one.
+        Whether the user gave a layout: without it no parameter files for the node are written.
     in_memory : bool
         Whether it was made of data frames; its place is then a temporary folder that is deleted with the fleet.
     """
@@ -244,7 +244,7 @@ class CalibratedVehicle:
 
 
 class _Calibrator:
-    """Base of both calibrators: scikit-learn's methods, and what was learned in attributes that end in ``_``."""
+    """Base of the two calibrators: scikit-learn's methods, and what was learned in attributes that end in ``_``."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     parameters_: pd.DataFrame
@@ -391,7 +391,7 @@ class FleetCalibrator(_Calibrator):
     workers : int
         Number of processes; the result does not depend on it.
     scheduler : str or None
-        Address of a Dask scheduler that is used instead.
+        Address of a Dask scheduler whose workers are used instead of processes of this computer.
     verbose : bool
         Whether progress is shown on standard error.
 
@@ -406,7 +406,7 @@ class FleetCalibrator(_Calibrator):
     left_out_ : dict of str to str
         Vehicles that could not be calibrated, and why.
     notices_ : list of str
-        What the user should know of the fleet as a whole.
+        What may be wrong about the fleet as a whole, its readings or trusted vehicles, and signals that were not used.
 
     Examples
     --------
@@ -481,7 +481,8 @@ class JunctionCalibrator(_Calibrator):
     Attributes
     ----------
     parameters_, vehicles_, left_out_, notices_
-        As in :class:`FleetCalibrator`; gain errors and offsets are reported of all sensors.
+        As in :class:`FleetCalibrator`; gain errors and offsets are reported also of sensors in which no fault is
+        suspected.
 
     Examples
     --------

@@ -53,7 +53,7 @@ LEAST_OWN = 1e-9
 LEAST_SAID = 0.005
 """Least probability of a cause that a notice names. [1]"""
 LEFT_OUT_CAUSES = ("spikes", "outliers")
-"""Causes of findings whose samples are not in the sums: they do not concern the other branches of the vehicle."""
+"""Causes of findings whose samples are left out of the summary: they do no harm to the vehicle's other branches."""
 LINEAR_CAUSES = (*LEFT_OUT_CAUSES, "noise", "switching")
 """Causes of findings with which a sensor still has a gain and an offset."""
 VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
@@ -71,9 +71,9 @@ class FleetReference:
     order : tuple of int
         Branches in the order of the estimator, the one that moves most first: branch k there is ``branches[order[k]]``.
     feed : int
-        Place in that order of the branch that feeds the others, and any load without a sensor.
+        Place of the feeding branch in that order.
     read_out : ndarray of shape (M + 1, K)
-        Of the fleet model: ideal currents over the inputs, branches in their own order. [A]
+        Read-out of the fleet model: ideal currents over the inputs, branches in their own order. [A]
     usual_correlation : ndarray of shape (3K, 3K)
         Usual correlation of the evidence rows that come from drives. [1]
     models : tuple of FaultModel
@@ -91,7 +91,7 @@ class FleetReference:
     carried : bool
         Whether enough trusted vehicles carry the reference, so that the fleet may be small.
     agreeing : tuple of float
-        Share of the vehicles whose slopes agree, of each branch in ``branches``. [1]
+        For each branch in ``branches``, share of the vehicles whose slopes agree. [1]
     variants : tuple of float
         Logarithms of the factors on all currents of two variants of the vehicle; empty if there is only one. [1]
     distrusted : mapping of int to str
@@ -124,7 +124,7 @@ class FleetReference:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether nothing may be corrected with this reference, as a small fleet is compared with itself."""
+        """Whether no vehicle but a trusted one may be corrected, as a small fleet is compared with itself."""
         return not self.carried and self.vehicles < FEWEST_VEHICLES
 
     @property
@@ -215,7 +215,7 @@ def learn_fleet(
     Parameters
     ----------
     summaries : sequence of DriveSummary
-        Of N vehicles, with the same inputs and branches.
+        Summaries of N vehicles, with the same inputs and branches.
     full_scale_a : float
         Full scale of the junction. [A]
     branches : sequence of str
@@ -241,6 +241,8 @@ def learn_fleet(
     ------
     FleetError
         If there is no vehicle, or in most of them a branch has the wrong sign or unit.
+    DriveError
+        If the summaries were made with different filter banks.
     """
     if not summaries:
         raise FleetError("no vehicle to learn the fleet's reference from")
@@ -384,9 +386,9 @@ def estimate_vehicles(
     Parameters
     ----------
     summaries : sequence of DriveSummary
-        Of N vehicles.
+        Summaries of N vehicles.
     reference : FleetReference
-        Of their fleet.
+        Reference of their fleet.
     readings : ndarray of shape (2, 2, N, K), or None
         Direct readings of their sensors, see :func:`calibrator.estimator.readings.bench_readings`.
     trusted : ndarray of bool of shape (N,) or None
@@ -447,22 +449,23 @@ def estimate_vehicles(
 
 
 def reported_evidence(rows: EvidenceRows, found: SensorEstimate, spread: Spread) -> Array:
-    """Return the evidence rows in the units of the sensors, and what the estimates predict for them, for a report.
+    """Return for a report what each evidence row measured, how uncertain it is, and what the estimate predicts.
 
     Parameters
     ----------
     rows : EvidenceRows
-        Of N vehicles with K branches.
+        Evidence of N vehicles with K branches.
     found : SensorEstimate
-        Of the same vehicles.
+        Estimate of the same vehicles.
     spread : Spread
         Model spread of their fleet; the centre of the junction constant includes the load without a sensor.
 
     Returns
     -------
     ndarray of shape (N, 3, 5K)
-        Measured value, its standard deviation, and what the estimate predicts; NaN for the first two where a row is
-        unknown. ``evidence`` in the details of ``run.json`` names the rows: ratios [1], then constants [A].
+        Measured value, standard deviation of a faultless vehicle's row (sampling errors and model spread), prediction.
+        The first two are NaN where a row is unknown. 3K - 1 ratios [1] (slopes, gain ratios, gain readings), then
+        2K + 1 constants [A], as ``evidence`` in the details of ``run.json`` names them.
     """
     order, scale_a, at = list(found.order), found.full_scale_a, rows.places
     gain, offset_a, hardware_a = (
@@ -518,7 +521,7 @@ def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[lis
 
 
 def _unfit(findings: Sequence[SensorFinding], branches: Sequence[str]) -> list[bool]:
-    """Return for each branch whether a finding concerns it: spikes and outliers concern one, other findings all."""
+    """Return for each branch whether a finding concerns it: spikes and outliers only their own, others every branch."""
     everywhere = any(each.cause not in LEFT_OUT_CAUSES or each.branch is None for each in findings)
     return [everywhere or any(each.branch == name for each in findings) for name in branches]
 

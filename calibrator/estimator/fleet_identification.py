@@ -5,8 +5,8 @@ inputs alone, so noise of the sensors leaves no bias. Fit and simulation of held
 
 Candidate banks are the plain inputs; low-passes whose time constants are spaced evenly in their logarithm; and poles of
 systems of several orders, identified from some vehicles together: as they are, or each replaced by several poles about
-it, which suit vehicles whose own pole is a little off. Of those about as good as the best on held-out blocks the
-smallest is taken.
+it, which suit vehicles whose own pole is a little off. Of the banks that simulate held-out blocks nearly as well as the
+best one, the smallest is taken.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -41,7 +41,7 @@ POOLED_VEHICLES = 8
 FOLDS = 5
 """Every fifth block is held out, as the published method holds out 20 %."""
 FIRST_HELD_OUT = 2
-"""Index of the first block that is held out: three blocks are enough to have one to judge by, amid the others."""
+"""Index of the first block that is held out: a vehicle with three blocks has one to be judged by."""
 ORDERS = (1, 2, 3, 4, 5, 6, 8)
 """Orders of the pooled systems: a power train as seen at 10 Hz has few modes. [1]"""
 LOW_PASSES = (1, 2, 4, 6)
@@ -112,7 +112,7 @@ def choose_filter_bank(vehicles: Sequence[Sequence[Samples]], *, period_s: float
     Returns
     -------
     FilterBank
-        Of the inputs of the drives.
+        Filters of the inputs of the drives.
 
     Raises
     ------
@@ -182,9 +182,9 @@ class IdentificationReport:
     snr_db : DataFrame
         Simulation signal-to-noise ratio on held-out blocks, vehicles by branches; NaN where it is not known. [dB]
     left_out : mapping of str to str
-        Why other vehicles could not be used.
+        Vehicles that could not be used, and why.
     notices : tuple of str
-        What else the user should know.
+        Branches and inputs of the layout that are not used, and why.
     """
 
     bank: FilterBank

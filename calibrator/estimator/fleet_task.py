@@ -42,8 +42,8 @@ __all__ = ["FleetTask", "calibrate_bucket", "learn_task"]
 LEAST_PROBABILITY = 1e-4
 """Least probability of the explanations near a bench reading: below it the drives contradict the reading. [1]"""
 MOVED_SD, MOVED_PROBABILITY = 4.0, 1e-3
-"""Standard deviations within which earlier and new faults of a sensor are the same [1]; a sensor has moved if the
-explanations near the earlier faults are less probable than this. [1]"""
+"""Number of standard deviations up to which new faults of a sensor count as equal to the earlier ones [1]; sensors have
+moved if explanations with faults equal to the earlier ones are together less probable than the second number. [1]"""
 AT_ONCE = 32
 """Number of vehicles of a bucket that are estimated together: more take more memory at a time. [1]"""
 NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
@@ -106,7 +106,7 @@ class FleetTask:
             return {vehicles[0].vehicle: advice if isinstance(error, UserError) else internal_error(error)}
 
     def choices(self, vehicle: str) -> tuple[object, ...]:
-        """Return the user's choices that decide on the parameters of a vehicle, beside its drives."""
+        """Return the user's choices on which the parameters of a vehicle depend, beside its drives."""
         settings = self.identity.settings
         bench = [self.bench.get((vehicle, branch)) for branch in self.branches]
         return settings.harm_limit, settings.load, settings.expected_faults, vehicle in settings.trusted, bench
@@ -155,7 +155,7 @@ def learn_task(
     task : FleetTask
         For every vehicle of the fleet.
     notices : list of str
-        What the user should know.
+        What may be wrong about the fleet, its trusted vehicles and its bench readings, one line each.
     """
     layout, settings = identity.database.layout, identity.settings
     learning = np.array([vehicle.vehicle not in settings.hold_out for vehicle in vehicles])
@@ -212,7 +212,7 @@ def _distrust(vehicles: Sequence[VehicleSummary], trusted: Mask, reference: Flee
 
 
 def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: BenchTable) -> dict[tuple[str, str], str]:
-    """Find bench readings that the drives contradict (a slip, or of another vehicle), with a notice for each."""
+    """Find bench readings that the drives contradict (misread, or of another vehicle), with a notice for each."""
     named, branches = {vehicle for vehicle, _ in bench}, task.branches
     checked = [vehicle for vehicle in vehicles if vehicle.vehicle in named]
     if not checked:
@@ -243,12 +243,17 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
     store, task : SummaryStore, FleetTask
         The store, and what was learnt from it.
     previous : Path or None
-        Earlier result to go on from.
+        Earlier result: vehicles without new drives keep its parameters, unless the user's choices for them changed.
 
     Returns
     -------
     bytes
         Content of a part file of the result (Parquet): parameters, and which vehicles were left out and why.
+
+    Raises
+    ------
+    UserError
+        If the earlier result is not there, or it or the store cannot be read.
     """
     if previous is not None and not (previous / PARTS).is_dir():
         raise FleetError(

@@ -97,6 +97,11 @@ class Junction:
     full_scale_a : float
         Nominal maximum current; offsets are compared in fractions of it. [A]
 
+    Raises
+    ------
+    FleetError
+        If there are not 2 to 16 branches with different names, or the full scale is not a positive number.
+
     Examples
     --------
     >>> Junction(branches=["battery", "motor", "heater"], full_scale_a=400.0).branches

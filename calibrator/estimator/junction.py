@@ -1,16 +1,16 @@
 """Estimate the sensors of one junction by itself, from its recordings and from what is known of some of its sensors.
 
-No fleet is needed. Every vehicle gives K - 1 gain ratios and one constant of the junction law (M8),
+No fleet is needed. Every vehicle gives K - 1 gain ratios and one constant of the junction law, (M8) of docs/method.md,
 
     log(-g_k) = lambda_1 - lambda_k,    c = o_1 - sum over k > 1 of g_k o_k + (1 + d_1) l,    lambda = log(1 + d),
 
 with the offsets o and the load l that no branch measures. They are linear in the unknowns (lambda, o, l), except that
-gains multiply a load or a charge, where they are linearised again; so recordings of one car with different meters are
-one system of equations. Ratios do not give the scale of the gains: it comes from sensors that are known. Offsets come
-from known sensors, zero-current windows, a declared load, or a charge balance. As no fleet shows what is usual, the
-gain of a sensor that is not known is open: its prior is a wide Gaussian. Its offset is absent (a narrow Gaussian: no
-zero is exact) or present, of any size; each choice is one explanation. What stays open is reported with its standard
-deviation, and is not corrected.
+gains multiply a load or a charge, where they are linearised again; so recordings of one car that has another sensor
+("meter") in one branch each time, as at different chargers, are one system of equations. Ratios do not give the scale
+of the gains: it comes from sensors that are known. Offsets come from known sensors, zero-current windows, a declared
+load, or a charge balance. As no fleet shows what is usual, the gain of a sensor that is not known is open: its prior is
+a wide Gaussian. Its offset is absent (a narrow Gaussian: no zero is exact) or present, of any size; each choice is one
+explanation. What stays open is reported with its standard deviation, and is not corrected.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +56,7 @@ DRAWS, FEWEST_DRAWS = 8192, 64
 """Draws in all, shared by weight of the explanations, and fewest of one: the usual harm limit of 0.001 is 8 draws."""
 USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
 """Usual misfit, due to curvature of good sensors, and usual residual of the sum, due to noise and switched loads, over
-full scale; and spread between cars of the logarithm of the latter's square. [1]"""
+full scale; and spread between cars of the logarithm of the square of that residual. [1]"""
 STEPS = 2
 """Gauss-Newton steps for the gains that multiply charges and loads: after the first one the ratios tell them."""
 STILL = 0.003
@@ -68,7 +68,7 @@ SEEN = 3.0
 
 
 class JunctionLaw(NamedTuple):
-    """K rows of the junction law (M8) of one vehicle: log(-g) of K - 1 branches, then c over full scale. [1]"""
+    """K rows of a vehicle's junction law, (M8) of docs/method.md: log(-g) of K - 1 branches, c over full scale. [1]"""
 
     order: list[int]
     """Numbers of the K branches, the one that moves most first: the rows are log(-g) of ``order[1:]``."""
@@ -121,8 +121,8 @@ class JunctionKnowledge(NamedTuple):
     load: UnmeasuredLoad | None
     """Load that no branch measures; None: not known."""
     charge_a: Mapping[str, tuple[float, float, float]]
-    """By branch: mean current over all drives as measured, the same by its charge, and standard deviation of the
-    latter. [A]"""
+    """By branch: mean current over all drives as measured, mean current that the known charge makes, and standard
+    deviation of the latter. [A]"""
     meter: str | None
     """Branch that has another sensor in each of the N vehicles, which are recordings of one car then."""
 
@@ -138,7 +138,7 @@ class _System:
     places : ndarray of int of shape (N, K)
         Number of the sensor of each vehicle and branch: vehicles have all sensors in common except the meters.
     names : list of S str
-        Of the sensors.
+        Names of the sensors.
     laws : list of N JunctionLaw
         The junction laws.
     known : list of int
@@ -323,7 +323,8 @@ def estimate_junction(
     Returns
     -------
     estimate : FleetEstimate
-        In the form of a fleet's; drifts and offsets are means of the posterior, also where no fault is suspected.
+        In the form of a fleet's; drifts and offsets are means of the posterior, also where no fault is suspected; an
+        offset is 0 where the gain alone is corrected.
     laws : list of N JunctionLaw
         The junction laws.
     deciding : list of N str
@@ -409,7 +410,10 @@ def estimate_junction(
 
 
 def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a: float) -> list[list[SensorFinding]]:
-    """Find per vehicle what gain errors and offsets do not explain; without a fleet no finding names the sensor."""
+    """Find per vehicle what gain errors and offsets do not explain, other than noise.
+
+    Without a fleet no finding names the sensor.
+    """
     K = len(branches)
     usual = UsualMisfits(
         misfit_a=np.full(len(CAUSES), USUAL_MISFIT * scale_a),
@@ -438,7 +442,7 @@ def named_ratios(law: JunctionLaw, branches: Sequence[str]) -> dict[str, tuple[f
 def _explanations(points: Points, branches: Sequence[str], scale_a: float) -> list[Explanation]:
     """List explanations by falling probability, each with its mean faults above :data:`SEEN` deviations.
 
-    Explanations in which the same faults are that clear are merged.
+    Explanations in which the same faults are above it count as one, with the sizes of the most probable of them.
     """
     K, found = len(branches), dict[bytes, tuple[float, Array, Mask]]()
     for number in range(points.explanation[-1] + 1):

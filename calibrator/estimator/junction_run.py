@@ -52,7 +52,7 @@ LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
 """Least valid data [s], shortest block [s], number of blocks of a short recording, and by how many the blocks must
 outnumber the branches, so that uncertainties can be estimated."""
 FULL_BLOCK = 10
-"""Number of samples of a block where there are enough."""
+"""Least number of samples of a block, unless the recording is short."""
 MOST_MISSING = 0.05
 """Share of a recording without samples of a branch up to which its charge is integrated. [1]"""
 JUMP = 0.02
@@ -74,7 +74,7 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
     Parameters
     ----------
     drives : sequence of Drive
-        Of one vehicle.
+        Drives of one vehicle.
     branches : sequence of str
         Names of the K branches.
     database : VehicleDatabase
@@ -88,7 +88,7 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
     Raises
     ------
     DriveError
-        If a branch is missing, or there is too little valid data.
+        If a branch is missing, a value is impossible, or there is too little valid data.
     """
     layout = at_pace(database.layout, drives)
     for drive in drives:
@@ -140,7 +140,7 @@ def _without_jumps(drives: Sequence[Samples], unknown: Sequence[str], layout: La
 
 
 def _same_error(parameters: VehicleParameters, known: Collection[str]) -> list[str]:
-    """Return a notice if all gains are off alike against the only known one, which may be wrong then; else nothing."""
+    """Return a notice if all gains deviate alike from the only known one, which may itself be wrong then; else []."""
     others = [branch for name, branch in parameters.branches.items() if name not in known]
     drifts = np.array([branch.drift for branch in others])
     sds = np.array([branch.drift_sd for branch in others], dtype=float)
@@ -156,14 +156,14 @@ def _same_error(parameters: VehicleParameters, known: Collection[str]) -> list[s
 def calibrate_junctions(
     fleet: FleetSource, identity: RunIdentity, *, workers: Workers
 ) -> tuple[Equipment, bytes, dict[str, object], list[str]]:
-    """Calibrate each vehicle by itself; with a meter all together, as they are recordings of one car.
+    """Calibrate each vehicle by itself; with option --meter all together, as they are recordings of one car.
 
     Parameters
     ----------
     fleet : FleetSource
         The recordings.
     identity : RunIdentity
-        Identity of the run, with the user's choices; trusted are branches whose sensor is right.
+        Identity of the run, with the user's choices; ``trusted`` are here names of branches whose sensor is right.
     workers : Workers
         Processes or cluster that read the drives, if there are many.
 
@@ -177,7 +177,7 @@ def calibrate_junctions(
     details : dict of str to JSON values
         Gain ratios and constants, for the record of the run.
     notices : list of str
-        What the user should know.
+        What was found for each of a few vehicles, and known values that contradict each other.
 
     Raises
     ------
@@ -254,7 +254,7 @@ def _read(
     left_out = dict(fleet.left_out)
 
     def usable(make: Callable[[Any], _Made], items: Iterable[tuple[str, Any]]) -> dict[str, _Made]:
-        """Apply ``make`` to the item of each vehicle; leave out those where it fails, with the reason."""
+        """Apply ``make`` to the item of each vehicle; leave out those where it fails; FleetError if all do."""
         found = dict[str, _Made]()
         for vehicle, item in items:
             try:

@@ -8,9 +8,9 @@ expectation maximisation on the fleet's own evidence, (M14) of docs/method.md:
                    model spread
 
 The likelihood has several maxima, as a cluster of faulty vehicles can be mistaken for the reference. So it is climbed
-from several clusters of the evidence, and all models that explain the fleet about as well are kept, with their
-probabilities. What a whole fleet shares in the junction's constant may be a load without a sensor or an offset of the
-sensors of a branch: each is a model of its own.
+from several clusters of the evidence, and all models that explain the fleet nearly as well as the best one are kept,
+with their probabilities. What a whole fleet shares in the junction's constant may be a load without a sensor or an
+offset of the sensors of a branch: each is a model of its own.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ __all__ = ["LEAST_SHARED", "centre_rows", "learn_fault_models"]
 MOST_LEARNT, MOST_STARTED = 200, 60
 """Most vehicles that a model is learnt from, and that starts are tried on; more change it less than faults do. [1]"""
 START_ROUNDS, ROUNDS, PRIOR_STEPS = 2, 5, 6
-"""Rounds of each start, of the best ones after that, and steps of the prior in each round."""
+"""Rounds of learning from each start, further rounds of the best results, and steps of the prior in each round."""
 MOST_COMMON = 3
 """Clusters of all slopes to start from: slopes of a vehicle with a hardware fault agree with each other, too. [1]"""
 MOST_ZEROS, MOST_CHOICES = 3, 1000
@@ -88,7 +88,8 @@ FIRST_DISPERSION = 4.0
 TAIL_DEGREES = 8.0
 """Degrees of freedom of Student's t, the distribution of vehicles in each row: those far off count less. [1]"""
 COUNT_VEHICLES = 2.5
-"""Weight of the distribution (20) of sparse faults against the fleet's own numbers of faults, in vehicles."""
+"""Weight of the distribution of sparse faults, equation (20) of the paper, against the fleet's own numbers of faults,
+in vehicles."""
 OTHERS_STEPS, LEAST_OTHERS = 3, 1e-3
 """Steps of :func:`_tally`, and least share of each count that is left when a vehicle's own faults are taken out. [1]"""
 USED_FITS = 16
@@ -117,8 +118,8 @@ LEAST_RANGE = (2.0, 1.2)
 """Least ratio of the upper to the lower bound of drifts and of offsets. Vehicles that all have the same drift would be
 the reference; all sensors of a branch may have the same offset, where the load is declared. [1]"""
 SIZE_FAULTS, ANY_SIZE = 1.0, TAIL_DENSITY * np.gradient(GRID)
-"""Weight, in faults, of a fault of any size that is added when bounds are learnt: a single fault would make them close
-about it. And the log-uniform probability of its size at :data:`~calibrator.estimator.prior.GRID`."""
+"""Weight, in faults, of a fault of any size that is added when bounds are learnt: a single fault would narrow them to
+its own size. And the log-uniform probability of its size at :data:`~calibrator.estimator.prior.GRID`."""
 SIZE_STARTS = ((0.004, 1.0), (0.03, 0.4), (0.1, 0.2))
 """Bounds from which the prior is climbed again: several small faults together can look like fewer large ones."""
 
@@ -151,7 +152,7 @@ def learn_fault_models(
     Parameters
     ----------
     rows : EvidenceRows
-        Of N vehicles.
+        Evidence of N vehicles.
     feed : int
         Number of the branch that carries loads without a sensor, in the order of the rows.
     fixed : ndarray of shape (5K,) or None
@@ -244,8 +245,8 @@ class _Learner:
         """Propose intercepts of vehicles without faults, each of shape (K,), that add up to the junction's constant.
 
         All but one are centres of clusters. The first proposal has the densest clusters, and the feeding branch takes
-        what is left. Further proposals have about as many votes of vehicles as the best one, as a cluster of few may be
-        chance.
+        what is left. Further proposals have nearly as many votes of vehicles as the best one, as a cluster of few may
+        be chance.
         """
         K = self.rows.branches
         most = min(MOST_ZEROS, int(MOST_CHOICES ** (1.0 / K)))
@@ -372,7 +373,7 @@ class _Learner:
     def variants(self, references: Sequence[FaultModel]) -> list[FaultModel]:
         """Make of each model one per cause of what vehicles share (loads, offsets or gains of a branch's sensors).
 
-        Return those that explain the fleet about as well, with their probabilities.
+        Return those that explain the fleet nearly as well as the best one, with their probabilities.
         """
         K, at = self.rows.branches, self.at
         found = [
@@ -457,7 +458,10 @@ class _Learner:
         return [of_first] if np.count_nonzero(broken) > 1 else [of_first, of_others]
 
     def with_modes(self, model: FaultModel) -> FaultModel:
-        """Return the model with all priors that explain the fleet about as well, learnt from several starts."""
+        """Return the model with all priors that explain the fleet nearly as well as the best one.
+
+        They are learnt from several starts.
+        """
         if self.known is not None:
             return model
         draws = explain(self.rows, model, feed=self.feed)
@@ -554,7 +558,7 @@ class _Learner:
         return grouped if gain > GROUP_GAIN else prior
 
     def _next_spread(self, draws: Draws, weight: Array, spread: Spread) -> Spread:
-        """Update centre, covariance and dispersion from the residuals of the explanations, (M14a) and (M14b)."""
+        """Update centre, covariance and dispersion from residuals of explanations, (M14a), (M14b) of docs/method.md."""
         rows, b, N = self.rows, self.at.intercepts, len(self.rows)
         of_fit = weight.sum(axis=(2, 3))
         top = np.argsort(-of_fit, axis=1, kind="stable")[:, :USED_FITS]
@@ -569,7 +573,7 @@ class _Learner:
         left = row_residuals(evidence, theta)
 
         def counted(square: Array, variance: Array) -> Array:
-            """Return the weights w of Student's t, row by row (M14a), shape (N, Q, r)."""
+            """Return the weights w of Student's t, row by row, shape (N, Q, r), (M14a) of docs/method.md."""
             return share[:, :, None] * (TAIL_DEGREES + 1.0) / (TAIL_DEGREES + square / variance)
 
         def expected(prior_covariance: Array, gain: Array) -> tuple[Array, Array]:

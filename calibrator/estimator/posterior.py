@@ -91,7 +91,7 @@ LOAD_GIVES_NONE = 100.0
 GAIN, OFFSET, LOAD = 0, 1, 2
 """Rows of ``Prior.log_density``."""
 NO_SIZE = len(GRID)
-"""Place of the size of a parameter that is zero."""
+"""Index that stands for the size of a parameter that is zero; other sizes have an index of ``GRID``."""
 NEGLIGIBLE = 1e-15
 """Weight of a draw below which no density of the sizes makes it matter. [1]"""
 LOG_FIRST, LOG_STEP = float(np.log(GRID[0])), float(np.log(GRID[1] / GRID[0]))
@@ -115,7 +115,8 @@ class Evidence(NamedTuple):
     shared : ndarray of shape (2K + 1,)
         What all sensors of a branch share: K offsets, in fractions of full scale, which the centre includes, and K
         values log(1 + d). The last entry is 1 if what a group of vehicles shares is an offset of the feeding sensor,
-        and 0 if it is a load: seen through a gain error an offset has another size, but a load has not (M16).
+        and 0 if it is a load: seen through a gain error an offset has another size, but a load has not, (M16) of
+        docs/method.md.
     precision, precision_relative : ndarray of shape (N, 5K, 5K)
         Inverse covariance of all rows, and of the relative rows alone, with zeros in the others.
     log_scale : ndarray of shape (N,)
@@ -202,7 +203,7 @@ def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> F
     Parameters
     ----------
     evidence : Evidence
-        Of N vehicles.
+        Evidence of N vehicles.
     log_prior : ndarray of shape (K + 1, 2K + 1)
         Rough logarithm of the prior probability of one support, by its numbers of hardware and sensor faults; it
         decides which supports are looked at closely.
@@ -239,7 +240,10 @@ def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> F
 
 
 def row_residuals(evidence: Evidence, theta: Array) -> Array:
-    """Return the rows of N vehicles minus what Q sets of parameters (N, Q, P) predict (M11), shape (N, Q, 5K)."""
+    """Return the rows of N vehicles minus what Q sets of parameters (N, Q, P) predict, shape (N, Q, 5K).
+
+    Equation (M11) of docs/method.md.
+    """
     left = np.empty((*theta.shape[:2], evidence.values.shape[1]))
     _all_residuals(evidence, theta, left)
     return left
@@ -255,7 +259,7 @@ def _all_residuals(evidence: Evidence, theta: Array, left: Array) -> None:
 
 @inner
 def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
-    """Fill e with the residuals of vehicle j: its rows minus what the parameters predict, (M11)."""
+    """Fill e with the residuals of vehicle j: its rows minus what the parameters predict, (M11) of docs/method.md."""
     y, means, centre = evidence.values[j], evidence.means[j], evidence.centre
     shared, feed, K = evidence.shared, evidence.feed, len(evidence.values[j]) // 5
     c, oh_last = 3 * K - 1, 0.0  # first of the intercepts; hardware offset of the last branch
@@ -519,7 +523,10 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
 def _terms(
     draws: Draws, prior: "_Tables", j: int, q: int, m: int, places: Integers, kinds: Integers
 ) -> tuple[float, int]:
-    """Return a draw's log weight without its n sizes and the feeding branch, and n; fill their places and kinds."""
+    """Return a draw's log weight, still without the densities of its fault sizes, and the number n of these sizes.
+
+    Their places and kinds are filled in. Offset and load of the feeding branch are left to :func:`_feeding`.
+    """
     fits, place = draws.fits, draws.place[j, q, m]
     K = place.shape[0] // 3
     n = 0
@@ -534,7 +541,7 @@ def _terms(
 def _feeding(
     draws: Draws, prior: "_Tables", j: int, q: int, m: int, g: int, places: Integers, kinds: Integers, n: int
 ) -> tuple[float, int]:
-    """Return the log prior of the feeding branch's constant in group g (0: no group), and n with its size, if any.
+    """Return the log prior of the feeding branch's constant in group g (0: no group), and n, one more if it has a size.
 
     It is -inf if the draw is impossible in the group.
     """
@@ -584,14 +591,14 @@ def _tables(prior: Prior) -> _Tables:
 
 
 def weigh(draws: Draws, prior: Prior) -> tuple[Array, Array]:
-    """Weight the draws by a prior (M17).
+    """Weight the draws by a prior, equation (M17) of docs/method.md.
 
     Parameters
     ----------
     draws : Draws
-        Of N vehicles.
+        Draws of N vehicles.
     prior : Prior
-        Of their fleet, with g groups.
+        Prior of their fleet, with g groups.
 
     Returns
     -------
@@ -670,7 +677,7 @@ def fault_sizes(draws: Draws, prior: Prior, kind: int, *, every: int = 4) -> Fau
     Parameters
     ----------
     draws, prior : Draws, Prior
-        Of the fleet.
+        Draws and prior of the fleet.
     kind : int
         :data:`GAIN` or :data:`OFFSET`.
     every : int
@@ -679,7 +686,7 @@ def fault_sizes(draws: Draws, prior: Prior, kind: int, *, every: int = 4) -> Fau
     Returns
     -------
     FaultSizes
-        Of draws that are not negligible with any density.
+        Sizes in draws that are not negligible with any density.
     """
     weight, _, feeding = _weighed(draws, prior)
     at = ParameterPlaces(prior.branches)
@@ -730,9 +737,10 @@ class FaultModel:
     probability : float
         Probability of this model among all that are kept.
     spread : Spread
-        Of vehicles without faults.
+        Model spread of vehicles without faults.
     priors : tuple of (float, Prior)
-        Priors of the faults that explain the fleet about as well, with their probabilities; the first is the best.
+        All priors of the faults that explain the fleet nearly as well as the best one, with their probabilities; the
+        first is the best.
     log_evidence : float
         Log evidence of the vehicles that it was learnt from.
     """

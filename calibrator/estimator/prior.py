@@ -155,7 +155,9 @@ def _sparse(K: int) -> Array:
 
 
 def sparse_counts(tally: Array) -> Array:
-    """Fit the most probable distribution of sparse faults (M13) to a fleet, by expectation maximisation.
+    """Fit the most probable distribution of sparse faults to a fleet by expectation maximisation.
+
+    Equation (M13) of docs/method.md.
 
     Parameters
     ----------

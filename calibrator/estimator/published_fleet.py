@@ -1,7 +1,7 @@
 """The published method [1]_ on a real fleet: models -> unity drive -> fleet mean -> faults -> parameter files.
 
-The model of a vehicle is identified on the first 80 % of the valid samples of each drive. The rest says how well it
-simulates, and may serve as the unity drive.
+The model of a vehicle is identified on the first 80 % of the valid samples of each drive. The last 20 % show how well
+it simulates, and may serve as the unity drive.
 
 Parameters that leave a larger Kirchhoff sum than no correction at all are written down, but marked not to be applied,
 and the verdict is 'cannot tell': whatever they are, they do not explain this vehicle's sensors.
@@ -72,9 +72,9 @@ def calibrate_fleet_published(
         Content of a part file of the result (Parquet): parameters of every vehicle that could be used, and why the
         others could not.
     details : dict of str to JSON values
-        For the record of the run.
+        Unity drive and simulation SNR, for the record of the run.
     notices : tuple of str
-        What the user should know.
+        A notice if the fleet is small for this method.
 
     Raises
     ------
@@ -126,7 +126,10 @@ def calibrate_fleet_published(
 def _without_misfits(
     vehicles: Sequence[VehicleModel], hold_out: frozenset[str], branches: Sequence[str], left_out: dict[str, str]
 ) -> list[VehicleModel]:
-    """Keep vehicles whose models fit their last 20 % about as well as the fleet's do; add others to ``left_out``."""
+    """Keep vehicles whose models simulate their last 20 % well; add the others to ``left_out``.
+
+    The simulation error of each branch may be at most :data:`MISFIT` times its median over the fleet.
+    """
     usual_a = _median_error_a([vehicle for vehicle in vehicles if vehicle.vehicle not in hold_out] or vehicles)
     kept: list[VehicleModel] = []
     for vehicle in vehicles:

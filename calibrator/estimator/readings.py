@@ -115,7 +115,7 @@ def with_knowledge(
     Parameters
     ----------
     rows : EvidenceRows
-        Of N vehicles.
+        Evidence of N vehicles.
     readings : ndarray of shape (2, 2, N, K), or None
         Direct readings of their sensors, see :func:`bench_readings`, branches in the vehicles' own order.
     trusted : ndarray of bool of shape (N,)
@@ -273,7 +273,7 @@ def merge_readings(
     Returns
     -------
     readings : ndarray of shape (2, 2, N, K)
-        Weighted means of both, see :func:`bench_readings`; NaN where they contradict each other.
+        Weighted means of bench and window readings, see :func:`bench_readings`; NaN where they contradict each other.
     notices : list of str
         Sensors whose readings contradict each other, and readings that could not be used.
     """
@@ -303,7 +303,7 @@ def untrusted_vehicles(
 ) -> dict[int, str]:
     """Find trusted vehicles whose measured currents break the junction law, so that some sensor must be faulty.
 
-    They are not compared with other vehicles: where most of a fleet share an offset, the trusted ones would stand out.
+    Trusted vehicles are judged alone: compared with a fleet of which most share an offset, they would stand out.
 
     Parameters
     ----------

@@ -60,7 +60,7 @@ MOST_NAMED = 1000
 """Largest number of vehicles that a report names one by one; all of them are in ``results.parquet``."""
 PARTS, FILES, ROWS = "buckets", "params", "results.parquet"
 LEFT_OUT = "left out"
-"""What the rows have as verdict of a vehicle without parameters, or of a file whose vehicle is unclear."""
+"""Verdict in the rows of a vehicle without parameters, or of a file whose vehicle is unclear."""
 REMEDY = "name a folder that 'calibrator calibrate --out' wrote"
 Rows = list[dict[str, Any]]
 
@@ -99,7 +99,7 @@ SCHEMA = pa.schema([*_NAMES, *(_column(name, unit) for name, unit in _UNITS.item
 _EVIDENCE = ["evidence_value", "evidence_sd", "evidence_explained"]
 _ONCE = ["drives", "parameters", *_EVIDENCE]
 """Columns that have values only in a vehicle's first row: digest of the drives' files, text of the parameter file, and
-the rows of evidence named in ``run.json``: their values, standard deviations, and what the estimate makes of them."""
+the rows of evidence named in ``run.json``: their values, standard deviations, and what the estimate predicts."""
 PART_SCHEMA = pa.schema(
     [*SCHEMA, *(pa.field(name, pa.list_(pa.float32()) if name in _EVIDENCE else pa.string()) for name in _ONCE)]
 )
@@ -116,7 +116,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     branches: list[str]
     model_inputs: list[str]
     settings: dict[str, Any]
-    """What the user chose: branches and held-out vehicles; for the posterior method also harm limit, trust, loads"""
+    """What the user chose: branches, held-out vehicles; for the posterior method also harm limit, trust, load, etc."""
     created: str
     details: dict[str, Any]
     """What the method records of its run: reference and hyper-parameters of a fleet, gain ratios and constants of
@@ -240,7 +240,7 @@ def complete_result(
     Parameters
     ----------
     result, out : Path
-        The folder, and how it will be called.
+        Temporary folder of the result, and the path that it will have.
     identity : RunIdentity
         Identity of the run.
     equipment : Equipment
@@ -248,7 +248,7 @@ def complete_result(
     details : mapping of str to JSON values
         What the method records of its run.
     notices : sequence of str
-        What the user should know.
+        Notices of the method for the user, one line each.
     others : mapping of str to str
         Why files whose vehicle is unclear are in none of the parts.
     buckets : int
@@ -257,7 +257,7 @@ def complete_result(
     Returns
     -------
     CalibrationReport
-        Of all vehicles of the result.
+        Report on all vehicles of the result.
 
     Raises
     ------
@@ -391,7 +391,7 @@ def read_results(result: Path) -> Rows:
 
 
 def result_rows(result: Path, columns: list[str]) -> pa.Table:
-    """Read some columns of ``results.parquet`` in a result folder; FleetError if it is no result."""
+    """Read columns of ``results.parquet`` in a result folder; FleetError if it is no result, or lacks one of them."""
     path = result / ROWS
     try:
         found = pq.read_table(path, columns=columns, use_threads=False)
@@ -438,7 +438,7 @@ def deployed_rms_a(applied: Mask, *, measured_a: Array, corrected_a: Array) -> A
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationReport:
-    """What a calibration found, in short; of each kind at most :data:`MOST_NAMED` vehicles are named."""
+    """Summary of a calibration, for people and as JSON; each list names at most :data:`MOST_NAMED` vehicles."""
 
     result: str
     """Folder; empty: not written."""
@@ -525,7 +525,7 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
     Returns
     -------
     CalibrationReport
-        Of all vehicles of the result.
+        Report on all vehicles of the result.
     """
     rows = pd.read_parquet(result / ROWS, use_threads=False)
     rows = rows[rows["branch"].notna()].astype({"applied": bool, "hardware_fault": bool})
@@ -535,7 +535,7 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
     suspected, moved = vehicles[vehicles["hardware_fault"]], rows[rows["moved"].notna()]
 
     def said(rows: pd.DataFrame, text: Callable[[pd.DataFrame], str]) -> dict[str, str]:
-        """Return a text on each of the first vehicles."""
+        """Return a text on each of the first :data:`MOST_NAMED` vehicles."""
         return {str(name): text(mine) for name, mine in islice(rows.groupby("vehicle", sort=False), MOST_NAMED)}
 
     def corrected(mine: pd.DataFrame) -> str:

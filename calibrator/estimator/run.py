@@ -81,8 +81,8 @@ def calibrate_fleet(
     workers : Workers
         Processes or cluster that compute it.
     since : Path or None
-        Earlier result to go on from: vehicles without new drives, and with the same settings, keep its parameters. The
-        fleet is then a store of summaries that holds the earlier drives as well.
+        Earlier result: vehicles without new drives keep its parameters, unless a choice of the user that concerns them
+        has changed. The fleet is then a store of summaries that holds the earlier drives as well.
 
     Returns
     -------
@@ -167,7 +167,8 @@ def _require_summaries_enough(place: str | Path, settings: CalibrationSettings, 
 def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) -> AtOnce | None:
     """Return the function of the published method or of single junctions; None if the fleet is compared with itself.
 
-    Each vehicle is calibrated by itself if there is only one, if what is known is about branches, or if the user asks.
+    Each vehicle is calibrated by itself if there is only one, if the user asks for it, or if the user names trusted
+    branches, a charge or a meter.
     """
     if settings.method is Method.PUBLISHED:
         from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second)
@@ -202,7 +203,7 @@ def _require_named(settings: CalibrationSettings, problems: Problems, place: str
 
 
 def _summarised(fleet: FleetSource, folder: str, identity: RunIdentity, workers: Workers) -> SummaryStore:
-    """Summarise the drives of a fleet into a new store; slips in names and readings are reported before that."""
+    """Summarise the drives of a fleet into a new store; wrong names and bench readings are refused before that."""
     database, settings, problems = identity.database, identity.settings, _problems(fleet)
     limit_s, scale_a = settings.time_limit_s, database.layout.full_scale_a
     _require_named(settings, problems, f"fleet {fleet.name}")

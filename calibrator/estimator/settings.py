@@ -124,7 +124,7 @@ class RunIdentity:
     database : VehicleDatabase
         DBC and layout that the parameters belong to.
     settings : CalibrationSettings
-        The user's choices, such as the method by which they are found.
+        The user's choices, such as the method of estimation.
     fleet, created : str
         Name of the fleet; time of the run, ISO 8601.
     """

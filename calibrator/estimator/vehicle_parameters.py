@@ -105,7 +105,7 @@ def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_
     Returns
     -------
     JunctionResidual
-        Of sum_k i_m,k and sum_k (i_m,k - o_k) / gain_k over all valid samples.
+        RMS and mean of sum_k i_m,k and sum_k (i_m,k - o_k) / gain_k over all valid samples.
     """
     weight = np.broadcast_to(1.0 / gain, (len(moments), gain.shape[1]))
     corrected = np.column_stack([weight, -weight @ offset_a])

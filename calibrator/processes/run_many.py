@@ -137,7 +137,7 @@ def run_many(
     Raises
     ------
     FleetError
-        If an item killed its process twice, or the cluster cannot be reached.
+        If an item killed its process twice, or the cluster cannot be reached or has another version of this package.
     """
     if workers.scheduler is None and workers.processes == 1:
         with threadpool_limits(1):  # as in other processes, because sums depend on the number of threads
@@ -232,7 +232,7 @@ def _outcomes(
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """A pickled function, the longest time for an item [s] (None: items are trusted, no limits), and our version."""
+    """A pickled function, longest time for an item [s] (None: items are trusted, no limits), and package version."""
 
     function: bytes
     limit_s: float | None
@@ -256,7 +256,10 @@ class _Processes:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
     def run(self, job: _Job, item: Any) -> Any:
-        """Run the function of a job on an item; return its result, or Failed if the item was lost."""
+        """Run the function of a job on an item; return its result, or Failed if its process died or took too long.
+
+        An exception of the function is raised here.
+        """
         try:
             process = self._idle.get_nowait()
         except Empty:

@@ -1,9 +1,9 @@
 """Classify vehicles: is the vehicle itself faulty, and is any of its sensors? Section III-B of [1]_.
 
-Two rules use the features (5) and (6): a threshold, and decision trees that learn from an artificial fleet. The truth
-about a real fleet is not known, so the artificial fleet imitates it: it has the real fleet's reference as ideal
-currents, the sparsity and magnitudes that are expected, the simulation error of the models on held-out data, and the
-error that the mean of as many vehicles has when the fleet is not symmetric.
+Two rules use the features, equations (5) and (6) of [1]_: a threshold, and decision trees that learn from an artificial
+fleet. The truth about a real fleet is not known, so the artificial fleet imitates it: it has the real fleet's reference
+as ideal currents, the sparsity and magnitudes that are expected, the simulation error of the models on held-out data,
+and the error that the mean of as many vehicles has when the fleet is not symmetric.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -49,12 +49,13 @@ class Classification:
 
 
 def decision_criterion(features: Array) -> Array:
-    """Compute the criterion eta of (7): the estimated mean square of what hardware faults add to the currents.
+    """Compute eta of equation (7) of the paper: the estimated mean square of what hardware faults add to the currents.
 
     Parameters
     ----------
     features : ndarray of shape (N, K + 1)
-        (5) and (6), ``features`` of :class:`~calibrator.published.evidence.FleetEvidence`. [A^2]
+        Equations (5) and (6) of the paper, ``features`` of :class:`~calibrator.published.evidence.FleetEvidence`.
+        [A^2]
 
     Returns
     -------
@@ -66,7 +67,7 @@ def decision_criterion(features: Array) -> Array:
 
 
 def classify_by_threshold(features: Array) -> Classification:
-    """Classify vehicles by a threshold on the criterion, (7) with delta_h of (27).
+    """Classify vehicles by a threshold on the criterion, equations (7) and (27) of the paper.
 
     The paper gives no threshold for sensor faults, so every vehicle is taken to have some: their sizes are then
     estimated for all vehicles, and come out nearly zero for healthy sensors.
@@ -74,7 +75,7 @@ def classify_by_threshold(features: Array) -> Classification:
     Parameters
     ----------
     features : ndarray of shape (N, K + 1)
-        Features of the whole fleet, (5) and (6). [A^2]
+        Features of the whole fleet, equations (5) and (6) of the paper. [A^2]
 
     Returns
     -------
@@ -96,7 +97,8 @@ def classify_by_trees(learnt: Array, truth: Faults, features: Array) -> Classifi
     Parameters
     ----------
     learnt : ndarray of shape (N', K + 1)
-        Features (5) and (6) of an artificial fleet made like the fleet to be classified. [A^2]
+        Features, equations (5) and (6) of the paper, of an artificial fleet made like the fleet to be classified.
+        [A^2]
     truth : Faults
         Faults of the N' vehicles of the artificial fleet.
     features : ndarray of shape (N, K + 1)
@@ -112,7 +114,9 @@ def classify_by_trees(learnt: Array, truth: Faults, features: Array) -> Classifi
 
 
 def expected_features(faults: Faults, i_s: Array, simulation_error_a: Array, *, reference_vehicles: int) -> Array:
-    """Compute the features (5) and (6) of vehicles with given faults, from the moments of the ideal currents.
+    """Compute the features of vehicles with given faults from the moments of the ideal currents.
+
+    Features are those of equations (5) and (6) of the paper.
 
     Parameters
     ----------
@@ -123,7 +127,7 @@ def expected_features(faults: Faults, i_s: Array, simulation_error_a: Array, *, 
     simulation_error_a : ndarray of shape (K,)
         Standard deviation of the simulation error. [A]
     reference_vehicles : int
-        Each group of so many consecutive vehicles has its mean as reference (3).
+        Each group of so many consecutive vehicles has its mean as reference, equation (3) of the paper.
 
     Returns
     -------
@@ -159,7 +163,7 @@ def classify_by_expected_trees(
     Parameters
     ----------
     features : ndarray of shape (N, K + 1)
-        Features (5) and (6) of the real fleet. [A^2]
+        Features of the real fleet, equations (5) and (6) of the paper. [A^2]
     reference : ndarray of shape (T, K)
         Fleet reference. [A]
     simulation_error_a : ndarray of shape (K,)

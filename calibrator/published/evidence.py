@@ -1,7 +1,6 @@
-"""Evidence on each vehicle from its simulation on the unity drive: the regression (15), and the features (5), (6).
+"""Evidence on each vehicle from its simulation on the unity drive: regression (15) and features (5), (6) of [1]_.
 
-Symbols: N vehicles, K branches, T samples of the unity drive. Currents are positive into the junction. Equations are
-those of [1]_.
+Symbols: N vehicles, K branches, T samples of the unity drive. Currents are positive into the junction.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -24,15 +23,15 @@ class FleetEvidence:
     Attributes
     ----------
     slopes : ndarray of shape (N, K)
-        a_k of (15): simulated over reference current. [1]
+        a_k of equation (15) of the paper: simulated over reference current. [1]
     intercepts_a : ndarray of shape (N, K)
-        b_k of (15). [A]
+        b_k of equation (15) of the paper. [A]
     slope_variances, intercept_variances_a2 : ndarray of shape (N, K)
         Variances of slopes and intercepts if residuals are not correlated in time. [1], [A^2]
     deviation_a2 : ndarray of shape (N, K)
-        Mean square of simulated minus reference current, (5). [A^2]
+        Mean square of simulated minus reference current, equation (5) of the paper. [A^2]
     junction_a2 : ndarray of shape (N,)
-        Mean square of the sum of the measured currents, (6). [A^2]
+        Mean square of the sum of the measured currents, equation (6) of the paper. [A^2]
     """
 
     slopes: Array
@@ -44,12 +43,12 @@ class FleetEvidence:
 
     @property
     def features(self) -> Array:
-        """f_1 to f_K+1 of each vehicle, (5) and (6), shape (N, K + 1). [A^2]"""
+        """Features f_1 to f_K+1 of each vehicle, equations (5) and (6) of the paper, shape (N, K + 1). [A^2]"""
         return np.column_stack([self.deviation_a2, self.junction_a2])
 
 
 def fleet_mean(simulated: Iterable[Array]) -> Array:
-    """Estimate the ideal currents by the mean of the fleet's simulations, (3) and (24).
+    """Estimate the ideal currents by the mean of the fleet's simulations, equations (3) and (24) of the paper.
 
     Parameters
     ----------
@@ -75,7 +74,7 @@ def fleet_mean(simulated: Iterable[Array]) -> Array:
 
 
 def collect_evidence(simulated: Iterable[Array], reference: Array, junction_a2: Array) -> FleetEvidence:
-    """Compare each vehicle's simulation with the fleet reference, (5) and (15).
+    """Compare each vehicle's simulation with the fleet reference, equations (5) and (15) of the paper.
 
     Parameters
     ----------
@@ -84,7 +83,8 @@ def collect_evidence(simulated: Iterable[Array], reference: Array, junction_a2: 
     reference : ndarray of shape (T, K)
         Fleet reference. [A]
     junction_a2 : ndarray of shape (N,)
-        Mean square of the sum of each vehicle's measured currents, (6): 0 for faultless sensors. [A^2]
+        Mean square of the sum of each vehicle's measured currents, equation (6) of the paper: 0 for faultless sensors.
+        [A^2]
 
     Returns
     -------

@@ -2,9 +2,9 @@
 
 In case 1 (nothing is faulty) and 2 (only hardware) there are no sensor parameters. In case 3 (only sensors) they follow
 directly from slopes and intercepts. In case 4 (both) quadratic basis pursuit (18) finds the sparsest faults that
-explain slopes and intercepts, by lifting [2]_. With the unknowns x = (d_h, o_h,1 .. o_h,K-1, D_m, o_m, 1) each equation
-of (15) is a quadratic form x' Q_i x = y_i, which is linear in the matrix X = x x'. Without the condition that X has
-rank 1 this is a convex problem:
+explain slopes and intercepts, by lifting [2]_; numbers of equations are those of [1]_. With the unknowns
+x = (d_h, o_h,1 .. o_h,K-1, D_m, o_m, 1) each equation of (15) is a quadratic form x' Q_i x = y_i, which is linear in
+the matrix X = x x'. Without the condition that X has rank 1 this is a convex problem:
 
     min  trace X + lambda |X|_1    s.t.  sum_i (trace(Q_i X) - y_i)^2 <= epsilon,  X_nn = 1,  X positive semidefinite
 
@@ -35,7 +35,8 @@ cp: Any = cvxpy  # its type hints leave out the atoms
 L1_WEIGHT = 1.0
 """lambda, the weight of the L1 norm; the result is the same from 1 to 100, and wrong at 0. [1]"""
 EPSILON_SHARE = 0.25
-"""epsilon of (18) over the sum of the variances of slopes and intercepts; results hardly change from 0.05 to 4. [1]"""
+"""epsilon of equation (18) of the paper over the sum of the variances of slopes and intercepts; results hardly change
+from 0.05 to 4. [1]"""
 SMALLEST_RADIUS = 1e-6
 """Least bound on the norm of the residual: below it the solver's own accuracy decides. [1]"""
 LEAST_DEVIATION = 1e-9
@@ -51,7 +52,7 @@ class BasisPursuitError(Exception):
 
 
 def quadratic_forms(branches: int) -> Array:
-    """Build the matrices Q_i of (16), those of the slopes first, then those of the intercepts.
+    """Build the matrices Q_i of equation (16) of the paper: those of the slopes, then those of the intercepts.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ def quadratic_forms(branches: int) -> Array:
     Returns
     -------
     ndarray of shape (2K, 3K + 1, 3K + 1)
-        Symmetric; x' Q_i x is the i-th slope or intercept of (15) for x = (d_h, o_h,1 .. o_h,K-1, D_m, o_m, 1).
+        Symmetric; x' Q_i x is the i-th slope or intercept, equation (15) of the paper, for
+        x = (d_h, o_h,1 .. o_h,K-1, D_m, o_m, 1).
     """
     K, one = branches, 3 * branches
     Q = np.zeros((2 * K, one + 1, one + 1))
@@ -76,7 +78,7 @@ def quadratic_forms(branches: int) -> Array:
 
 
 class BasisPursuit:
-    """Quadratic basis pursuit (18) for K branches; the problem is built once and solved for many vehicles.
+    """Quadratic basis pursuit, equation (18) of the paper, for K branches: built once, solved for many vehicles.
 
     Parameters
     ----------
@@ -102,7 +104,7 @@ class BasisPursuit:
         y : ndarray of shape (2K,)
             Slopes a [1], then intercepts b in fractions of full scale [1].
         epsilon : float
-            Sum of squared residuals of (15) that is allowed. [1]
+            Sum of squared residuals of equation (15) of the paper that is allowed. [1]
 
         Returns
         -------
@@ -160,7 +162,7 @@ def _refit(forms: Array, x: Array, y: Array, deviations: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Recovery:
-    """What the method found for N vehicles.
+    """What the published method found for N vehicles.
 
     Attributes
     ----------

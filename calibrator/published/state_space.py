@@ -90,7 +90,7 @@ class StateSpaceModel:
     snr_db: Array
 
     def simulate(self, inputs: Array, *, initial_state: Array | None = None) -> Array:
-        """Simulate the currents for given inputs, (2) in [1]_.
+        """Simulate the currents for given inputs, equation (2) of the paper.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ def identify_model(
     Returns
     -------
     StateSpaceModel
-        With poles inside the unit circle, and its simulation SNR on this drive.
+        Model with poles inside the unit circle, and with its simulation SNR on this drive.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def identify_model(
 
 
 def choose_order(inputs: Array, currents: Array, *, valid: Mask | None = None) -> int:
-    """Choose the smallest order that simulates held-out samples about as well as the best order does.
+    """Choose the smallest order that simulates held-out samples nearly as well as the best order does.
 
     Models of all :data:`ORDERS` are fitted on the first 80 % of the samples and simulated on the rest. The error of an
     order is its error power in dB, averaged over the channels; the smallest order within 0.2 dB of the least error is
@@ -322,7 +322,7 @@ class VehicleModel:
     duration_s : float
         Valid data of all drives. [s]
     model : StateSpaceModel
-        Model (2) from inputs to measured currents.
+        Model from inputs to measured currents, equation (2) of the paper.
     snr_db : ndarray of shape (K,)
         Simulation signal-to-noise ratio on held-out data. [dB]
     simulation_error_a : ndarray of shape (K,)
@@ -433,14 +433,15 @@ def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpace
 def evidence_of_models(
     vehicles: Sequence[VehicleModel], in_reference: Sequence[bool]
 ) -> tuple[FleetEvidence, Array, VehicleModel]:
-    """Simulate all vehicles on the longest held-out drive, the unity drive (2), and compare them with their mean.
+    """Simulate all vehicles on the unity drive, the longest held-out drive, and compare them with their mean.
 
     Parameters
     ----------
     vehicles : sequence of N VehicleModel
-        With K branches.
+        Models of the vehicles, with K branches.
     in_reference : sequence of N bool
-        Whether a vehicle counts in the fleet reference (3), their mean, and its held-out drive may be the unity drive.
+        Whether a vehicle counts in the fleet reference (the mean, equation (3) of the paper) and its held-out drive may
+        be the unity drive.
 
     Returns
     -------

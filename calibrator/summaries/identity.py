@@ -40,7 +40,7 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     layout, layout_sha256, dbc_sha256 : str
         Name of the layout, and digests of layout and DBC.
     equipment : Equipment
-        Branches and inputs of the fleet, and those of the layout that the store does not use.
+        Branches and inputs of the fleet, and notices on those of the layout that the store does not use.
     bank : FilterBank
         Filters of the fleet inputs.
     buckets : int
@@ -155,6 +155,6 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
 
 
 class _Versioned(msgspec.Struct):
-    """What the files of all versions have."""
+    """What the identity files of all schema versions have in common."""
 
     schema_version: int

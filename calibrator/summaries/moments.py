@@ -159,7 +159,7 @@ class DriveSummary:
 
 
 def add_up(summaries: Sequence[DriveSummary]) -> DriveSummary:
-    """Return the summary of the drives of one or more summaries with the same branches, block after block.
+    """Join one or more summaries with the same branches into one, which has their blocks one after the other.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Summarise the drives of a fleet into a store: each drive is read only once, and only its summary is passed on.
 
 The store is its own checkpoint: a bucket is written when all its vehicles are read, and a killed run leaves only
-complete files. A recording counts once. If two vehicles have the same recording, it counts for neither, as it is
-unclear to which it belongs.
+complete files. A recording that a vehicle has twice counts once. If two vehicles have the same recording, it counts for
+neither, as it is unclear to which it belongs.
 """
 
 import hashlib
@@ -163,6 +163,11 @@ def add_drives(
     -------
     SummariseReport
         What was added and left out. A vehicle whose drives cannot be used gets a record that says why.
+
+    Raises
+    ------
+    UserError
+        If the store cannot be read or written.
     """
     report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
     outcomes = try_many_shown(
@@ -256,7 +261,7 @@ def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners) -> Iterator
 
 
 def _is_known(record: Record, known: Iterable[Record]) -> bool:
-    """Check whether the store says already that these drives cannot be used, and why: they are tried in each run."""
+    """Check whether the store says already why these drives, which are tried in each run, cannot be used."""
     what = record.drives, record.sources, record.problem
     return any(what == (each.drives, each.sources, each.problem) for each in known)
 

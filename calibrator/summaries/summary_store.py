@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 MOST_FILES, LAST_NUMBER = 32, 99_999
-"""Most files of a bucket, which are merged then, as each is opened to read it; last number of such a file. [1]"""
+"""More files of a bucket than this are merged, as each is opened to read it; largest number of a file. [1]"""
 _FILE = re.compile(r"[0-9]{5}-[0-9]{5}\.parquet")
 
 
@@ -150,7 +150,10 @@ class SummaryStore:
         self._files.write(f"{bucket:05d}-{number:05d}.parquet", encode_records(list(records), self.identity))
 
     def compact(self, bucket: int) -> None:
-        """Merge the files of a bucket into one; a run that is killed meanwhile leaves both, which count once."""
+        """Merge the files of a bucket into one.
+
+        If the program is killed midway, old and new files stay, and no record counts twice.
+        """
         with self.storage.locked():
             self._merge(bucket)
 
@@ -237,7 +240,7 @@ def open_store(
 class StoreReport:
     """What a store holds: size in bytes, duration in hours, and faults by vehicle or bucket.
 
-    `unusable` of the vehicles cannot be calibrated.
+    ``unusable`` is the number of vehicles that cannot be calibrated.
     """
 
     store: str
@@ -286,7 +289,7 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
     Raises
     ------
     FleetError
-        If there is no store at the place.
+        If there is no store at the place, or it has a Parquet file with a name that none of its files can have.
     """
     store, owners = existing_store(place), dict[str, str]()
     about, buckets = store.identity, store.buckets()

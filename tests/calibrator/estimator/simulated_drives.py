@@ -19,12 +19,12 @@ READ_OUT_A = np.array([[-60.0, 40.0, 15.0], [50.0, -35.0, -10.0], [10.0, -5.0, -
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """How the vehicles drive.
+    """Length, noise and errors of simulated drives.
 
     Attributes
     ----------
     samples : int
-        Per drive, one a second.
+        Number of samples of a drive, one a second.
     memory : float
         Correlation of neighbouring samples of the inputs, and of the model error. [1]
     noise_a : float
@@ -43,7 +43,7 @@ class Conditions:
 
 
 def read_out_of(branches: int) -> Array:
-    """Ideal currents per unit of each input, shape (3, K); with two branches the others flow through the second."""
+    """Ideal currents per unit of each input, shape (3, K); of two branches the second balances the first."""
     K = branches
     W = READ_OUT_A.T[:, : min(K, 3)].copy()
     if K == 2:
@@ -59,7 +59,7 @@ def coloured(rng: np.random.Generator, samples: int, columns: int, memory: float
 
 
 def drive_of(rng: np.random.Generator, faults: Faults, conditions: Conditions) -> Samples:
-    """One drive of one vehicle (faults without leading N)."""
+    """One drive of one vehicle, whose ``faults`` are arrays of shape (K,) or ()."""
     K, T = len(faults.drift), conditions.samples
     u = coloured(rng, T, INPUTS, conditions.memory) + np.array([0.5, 0.2, 0.0])
     error = conditions.model_error_a * coloured(rng, T, K, conditions.memory)

@@ -23,7 +23,7 @@ SCALE_A = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Errors:
-    """Standard deviations of slopes, gain ratios, constants at the means, and of readings of both; inf: unread. [1]"""
+    """Standard deviations of slopes, gain ratios, constants at the means, gain and offset readings; inf: unread. [1]"""
 
     slope: float = 0.002
     ratio: float = 0.0005
@@ -33,7 +33,7 @@ class Errors:
     offset_read: float = np.inf
 
     def of_rows(self, K: int) -> Array:
-        """Of each row at the means, shape (5K,)."""
+        """Standard deviation of each row, constants taken at the means, shape (5K,)."""
         relative = [self.slope] * K + [self.ratio] * (K - 1) + [self.gain_read] * K
         sd = np.array([*relative, *[self.intercept] * K, self.junction, *[self.offset_read] * K])
         return np.asarray(np.minimum(sd, np.sqrt(UNKNOWN_VARIANCE)))
@@ -54,18 +54,18 @@ def rows_of(
     load: Array | float = 0.0,
     currents: Array | None = None,
 ) -> EvidenceRows:
-    """Rows of a fleet, as lines through noisy means: whatever is wrong about a ratio turns its constant.
+    """Rows of a fleet, as lines through noisy means: an error of a slope or ratio also changes its constant.
 
     Parameters
     ----------
     faults : Faults
-        Of N vehicles, offsets in fractions of full scale.
+        Faults of N vehicles, offsets in fractions of full scale.
     seed : int
-        Of the errors.
+        Seed of the errors.
     errors : Errors or None
         Standard deviations that are stated; None: those of a good drive.
     noise : float
-        Errors over the stated ones. [1]
+        Size of the actual errors over the stated standard deviations. [1]
     load : ndarray of shape (N,) or float
         Load that no branch measures; the first branch carries it.
     currents : ndarray of shape (K,) or None

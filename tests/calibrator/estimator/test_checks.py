@@ -76,7 +76,9 @@ def checked(summaries: Sequence[DriveSummary], K: int) -> list[tuple[SensorFindi
 @pytest.mark.parametrize("K", [2, 3])
 @pytest.mark.parametrize("branch", [0, 1])
 @pytest.mark.parametrize("cause", CAUSES)
-def test_nonlinear_sensor_is_found_and_named(cause: str, branch: int, K: int) -> None:
+def test_misfit_of_one_sensor_is_found_with_its_cause_and_blames_no_other_sensor(
+    cause: str, branch: int, K: int
+) -> None:
     found = checked(a_fleet(K, CAUSES[cause], branch), K)
     if (cause, branch, K) == ("clipped", 1, 3):
         cause, branch = "switching", -1  # the clipping level is visible in no single other current
@@ -94,7 +96,7 @@ def test_switched_load_is_found_without_blaming_a_sensor(K: int) -> None:
     assert "load without a sensor" in found[BAD][0].text
 
 
-def test_load_proportional_to_a_current_is_mentioned_beside_two_gains() -> None:
+def test_finding_of_a_gain_that_differs_by_sign_also_names_a_load_proportional_to_a_current() -> None:
     faults = no_faults(9, 2)
     drives = [a_drive(10 + j, faults.take(j), None) for j in range(9)]
     loaded = drives[BAD].currents_a.copy()

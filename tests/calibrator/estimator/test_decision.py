@@ -64,7 +64,7 @@ def test_confidence_is_the_probability_of_being_recovered(sd: float) -> None:
 
 
 def test_harm_probability_equals_that_of_simulated_currents() -> None:
-    """(25) on drawn true currents, against the moments of (M19)."""
+    """Equation (25) of the paper on drawn true currents, against (M19) of docs/method.md, which uses their moments."""
     rng = np.random.default_rng(1)
     estimate = np.array([0.1, -0.08, 0.03, -0.02])
     found = points([(1.0, estimate.tolist())], sd=0.03, draws=400)
@@ -88,7 +88,7 @@ def test_confidence_adds_up_explanations_within_tolerance() -> None:
     assert confidence == pytest.approx(0.6)
 
 
-def test_harm_counts_once_over_several_drives_and_needs_a_correction() -> None:
+def test_harm_on_two_drives_is_at_most_the_sum_of_both_and_0_without_a_correction() -> None:
     found, estimate = points(TWO_EXPLANATIONS, sd=0.05), np.array([0.12, 0.0, 0.0, 0.0])
     still = np.zeros((1, K)), np.full((1, K), 1e-4)
     one, other = (harm_probability(found, estimate, *drive) for drive in ((MEAN, SQUARE), still))
@@ -114,7 +114,7 @@ def explained(
     return model, draws, weigh(draws, prior)[0]
 
 
-def test_fault_models_are_averaged_by_their_probabilities() -> None:
+def test_posterior_mean_is_averaged_over_fault_models_by_their_probabilities() -> None:
     truth = random_faults(3, vehicles=2, branches=K)
     shared = np.array([0.0, 0.01, 0.0, 0.02, 0.0])
 
@@ -141,7 +141,7 @@ def group_prior() -> Prior:
 
 
 @pytest.mark.parametrize("of_sensor", [False, True])
-def test_estimated_offset_includes_the_group_constant_only_if_of_sensors(of_sensor: bool) -> None:
+def test_estimated_offset_includes_the_group_constant_only_if_it_is_an_offset_of_sensors(of_sensor: bool) -> None:
     truth = no_faults(1, K)
     truth.offset_a[0, 0], truth.drift[0, 0] = (0.18 if of_sensor else 0.15), 0.1
     prior, shared = group_prior(), np.append(np.zeros(4), of_sensor)
@@ -165,7 +165,7 @@ def test_shared_offset_is_no_more_certain_than_sensor_resolution() -> None:
 
 
 VARIANCE = 0.04
-"""Of the currents, in squares of full scale."""
+"""Variance of the currents, in squares of full scale."""
 
 
 def moments(rows: EvidenceRows) -> dict[str, Any]:
@@ -183,14 +183,16 @@ def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[
 
 
 def worse(deployed: Faults, faults: Faults) -> Mask:
-    """Whether any branch of a vehicle is worse on another drive."""
+    """Whether correction by ``deployed`` makes any branch of a vehicle worse on another drive, shape (N,)."""
     mean = np.full(faults.drift.shape, 0.05)
     return harmed(deployed, faults, mean_a=mean, mean_square_a2=mean**2 + VARIANCE)
 
 
 @pytest.mark.parametrize("magnitude", [(0.01, 0.05), (0.3, 0.6), pytest.param((0.05, 0.25), marks=pytest.mark.long)])
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_faults_of_any_size_are_recovered_and_corrected(K: int, magnitude: tuple[float, float]) -> None:
+def test_nine_in_ten_vehicles_are_recovered_for_faults_of_any_size_and_none_is_harmed(
+    K: int, magnitude: tuple[float, float]
+) -> None:
     faults = random_faults(1, vehicles=40, branches=K, magnitude=magnitude)
     found, deployed = estimated(faults, seed=1)
     estimate = replace(no_faults(40, K), drift=found.drift, offset_a=found.offset_a)
@@ -230,7 +232,7 @@ def test_standard_deviations_match_the_actual_errors() -> None:
     assert (within > 3.5).mean() < 0.02
 
 
-def test_vehicle_without_information_has_no_confidence() -> None:
+def test_vehicle_of_which_no_row_is_known_has_a_confidence_of_0() -> None:
     """As with drives of a minute: the prior alone is no evidence."""
     rows = rows_of(no_faults(2, K), seed=1)
     covariance = rows.covariance.copy()

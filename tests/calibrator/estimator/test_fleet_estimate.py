@@ -63,7 +63,7 @@ def test_faults_beyond_the_limits_are_estimated_but_not_corrected(
     (-1.0, "1 A in branch battery goes with +1 A in branch motor"),
     (0.1, "1 A in branch motor goes with -10 A in branch battery"),
 ])  # fmt: skip
-def test_wrong_sign_or_unit_in_most_vehicles_is_refused_and_nothing_is_learnt_from_it_in_a_few(
+def test_wrong_sign_or_unit_is_refused_in_most_vehicles_and_not_learnt_from_in_a_few(
     summaries: Summaries, factor: float, told: str
 ) -> None:
     def wrong(summary: DriveSummary) -> DriveSummary:
@@ -81,7 +81,7 @@ def test_wrong_sign_or_unit_in_most_vehicles_is_refused_and_nothing_is_learnt_fr
     np.testing.assert_array_equal(found.read_out, learned(few[4:]).read_out)
 
 
-def test_offset_of_all_battery_sensors_is_reported_and_harms_no_vehicle(truth: Faults) -> None:
+def test_offset_of_all_battery_sensors_gives_a_notice_and_corrections_harm_no_vehicle(truth: Faults) -> None:
     batch = replace(truth, offset_a=truth.offset_a + np.array([12.0, 0.0]))
     summaries = summaries_of(batch, Conditions(model_error_a=0.3), seed=4)
     learnt = learned(summaries)
@@ -97,7 +97,9 @@ def test_offset_of_all_battery_sensors_is_reported_and_harms_no_vehicle(truth: F
     ("vehicles", "branch", "gain"),
     [(5, 0, 0.1), (12, 1, 0.02), *(pytest.param(8, *each, marks=pytest.mark.long) for each in ((1, -0.09), (0, 0.03)))],
 )
-def test_gain_error_shared_by_a_branch_is_reported_but_not_corrected(vehicles: int, branch: int, gain: float) -> None:
+def test_gain_error_shared_by_all_sensors_of_a_branch_gives_a_notice_and_is_not_corrected(
+    vehicles: int, branch: int, gain: float
+) -> None:
     batch = no_faults(vehicles, K)
     batch.drift[:, branch] = gain
     summaries = summaries_of(batch, Conditions(samples=900), seed=vehicles)
@@ -107,7 +109,7 @@ def test_gain_error_shared_by_a_branch_is_reported_but_not_corrected(vehicles: i
 
 
 @pytest.mark.parametrize("larger", [0.0, 0.1])
-def test_two_variants_of_the_vehicle_are_reported(larger: float) -> None:
+def test_two_variants_of_the_vehicle_give_a_notice_and_a_finding_per_vehicle(larger: float) -> None:
     fleet = no_faults(12, K)
     fleet.hardware_drift[6:] = larger
     summaries = summaries_of(fleet, Conditions(samples=900, model_error_a=0.3), seed=6)
@@ -181,13 +183,15 @@ def test_trusted_vehicles_set_the_reference_of_a_fleet_with_a_shared_offset() ->
 
 
 @pytest.mark.parametrize(("trusted", "doubt"), [(None, True), (first(2, 4), True), (first(3, 4), False)])
-def test_three_trusted_vehicles_set_the_reference_of_a_small_fleet(trusted: Mask | None, doubt: bool) -> None:
+def test_reference_of_a_small_fleet_is_in_doubt_unless_three_vehicles_are_trusted(
+    trusted: Mask | None, doubt: bool
+) -> None:
     learnt = learned(drives("none")[:4], trusted=trusted)
     assert (learnt.vehicles, learnt.in_doubt) == (4, doubt)
     assert any("few for a fleet" in text for text in learnt.notices) == doubt
 
 
-def test_trusted_vehicle_with_contradicting_sensors_is_not_trusted() -> None:
+def test_trusted_vehicle_that_breaks_the_junction_law_is_not_trusted() -> None:
     reference, found = trusting(drives("drift"), first(4))
     assert list(reference.distrusted) == [0]
     assert found.fault_probability[0].max() > 0.9
@@ -221,7 +225,7 @@ def test_expected_share_and_known_distribution_of_the_faults_are_used() -> None:
     assert learned(summaries, known=prior).models[0].prior is prior
 
 
-def test_untrusted_and_insufficient_trusted_vehicles_are_reported() -> None:
+def test_notices_name_vehicles_that_lose_trust_and_say_that_too_few_are_left() -> None:
     shown = SimpleNamespace(offset_a=np.array([5.0, NAN]), sd_a=np.array([0.1, NAN]))
     vehicles = cast("Any", [SimpleNamespace(vehicle=f"V{j}", zero_current=shown) for j in range(2)])
     known = {"branches": NAMES, "full_scale_a": SCALE_A}

@@ -60,7 +60,7 @@ MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift":
     ),
     ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
 ])  # fmt: skip
-def test_faults_are_estimated_within_their_deviations_and_corrected(
+def test_faults_are_estimated_within_3_sd_and_only_sure_branches_are_corrected(
     fault: dict[str, Any], known: dict[str, Any], corrected: set[str]
 ) -> None:
     rows = found(recording(**fault), **known).loc["vehicle"]
@@ -100,7 +100,7 @@ def test_gain_of_a_branch_that_is_off_stays_undetermined() -> None:
     assert not rows.corrected["heater"]
 
 
-def test_gain_ratios_without_a_trusted_sensor_correct_nothing(motor_off: pd.DataFrame) -> None:
+def test_nothing_is_corrected_without_a_trusted_sensor_and_gain_ratios_are_shown(motor_off: pd.DataFrame) -> None:
     calibrator = JunctionCalibrator().fit(motor_off, JUNCTION)
     assert not calibrator.parameters_.corrected.any()
     assert calibrator.parameters_.gain_error_sd.min() > 0.1
@@ -108,7 +108,9 @@ def test_gain_ratios_without_a_trusted_sensor_correct_nothing(motor_off: pd.Data
     assert any("0.95" in notice and "battery / motor" in notice for notice in calibrator.notices_)
 
 
-def test_unusable_vehicle_leaves_the_others_calibrated_as_in_python(motor_off: pd.DataFrame, tmp_path: Path) -> None:
+def test_command_leaves_out_unusable_vehicles_and_calibrates_the_other_as_python_does(
+    motor_off: pd.DataFrame, tmp_path: Path
+) -> None:
     for name, frame in {"good": motor_off, "short": motor_off.iloc[:20], "empty": motor_off.iloc[:0]}.items():
         (tmp_path / "cars" / name).mkdir(parents=True)
         frame.rename_axis("time_s").to_csv(tmp_path / "cars" / name / "drive.csv")
@@ -126,7 +128,7 @@ def test_unusable_vehicle_leaves_the_others_calibrated_as_in_python(motor_off: p
     assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
 
 
-def test_offset_of_one_of_two_has_two_explanations() -> None:
+def test_offset_that_either_of_two_sensors_may_have_gives_two_explanations() -> None:
     calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(
         recording(offset_a=(0.0, 6.0, 0.0)), JUNCTION
     )
@@ -165,8 +167,8 @@ def switched(frame: pd.DataFrame, rms_a: float) -> None:
 
 
 @pytest.mark.parametrize(("spoil", "share"), [(bent, 0.002), (switched, 0.008)])
-def test_misfit_is_found_from_the_documented_size(spoil: Any, share: float) -> None:
-    """Of full scale, RMS; see docs/junction.md."""
+def test_misfit_of_the_documented_smallest_size_is_found_and_nothing_is_corrected(spoil: Any, share: float) -> None:
+    """Sizes are RMS, in fractions of full scale, as docs/junction.md states them."""
     for seed in (300, 301):
         frame = recording(seed, gain=(0.0, 0.1, 0.0))
         spoil(frame, share * 400.0)
@@ -175,7 +177,7 @@ def test_misfit_is_found_from_the_documented_size(spoil: Any, share: float) -> N
         assert not calibrator.parameters_.corrected.any()
 
 
-def test_meters_of_one_car_are_estimated_together() -> None:
+def test_sensors_of_one_car_at_several_meters_are_estimated_together() -> None:
     """The battery is known by the first meter, so the second meter is known by the battery."""
     junction = Junction(branches=["battery", "charger"], full_scale_a=400.0)
     frames = {}
@@ -194,14 +196,16 @@ BATTERY_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "dri
 
 
 @pytest.mark.parametrize("known", [{"trusted": ["battery"]}, {"readings": BATTERY_READ}])
-def test_only_known_sensor_is_reported_if_its_gain_error_would_explain_all_others(known: dict[str, Any]) -> None:
+def test_notice_is_given_if_a_gain_error_of_the_only_known_sensor_would_explain_all_others(
+    known: dict[str, Any],
+) -> None:
     wrong = JunctionCalibrator(**known).fit(recording(gain=(0.05, 0.0, 0.0), seconds=1200.0), JUNCTION)
     assert any("against battery: a gain error of its own of +5." in notice for notice in wrong.notices_)
     right = JunctionCalibrator(**known).fit(recording(gain=(0.0, 0.05, 0.0), seconds=1200.0), JUNCTION)
     assert not any("against battery" in notice for notice in right.notices_)
 
 
-def test_contradicting_trusted_sensors_correct_nothing() -> None:
+def test_nothing_is_corrected_if_trusted_sensors_contradict_each_other() -> None:
     calibrator = JunctionCalibrator(trusted=["battery", "motor"]).fit(recording(gain=(0.0, 0.05, 0.2)), JUNCTION)
     assert any("contradicts itself" in notice for notice in calibrator.notices_)
     assert not calibrator.parameters_.corrected.any()
@@ -213,7 +217,7 @@ def test_contradicting_trusted_sensors_correct_nothing() -> None:
     (lambda motor: motor.where(motor > 0.0, 1.1 * motor), "sign"),
     (lambda motor: motor * (1.0 + 0.0005 * motor.abs()), "saturating"),
 ])  # fmt: skip
-def test_nonlinear_sensor_is_reported_and_not_corrected(change: Any, cause: str) -> None:
+def test_nonlinear_sensor_gives_a_finding_without_branch_and_nothing_is_corrected(change: Any, cause: str) -> None:
     frame = recording()
     calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame.assign(motor=change(frame["motor"])), JUNCTION)
     findings = calibrator.vehicles_["vehicle"].parameters.findings
@@ -260,7 +264,7 @@ def test_noise_and_loads_are_not_taken_for_nonlinear_sensors(spoil: Any, causes:
         assert {each.cause for each in calibrator.vehicles_["vehicle"].parameters.findings} == causes
 
 
-def test_gain_errors_lie_within_their_standard_deviations() -> None:
+def test_errors_of_estimated_gains_match_their_standard_deviations() -> None:
     """Gains of twelve junctions are within their deviation about as often as normal errors, and never far outside."""
     errors = []
     for seed in range(12):
@@ -290,7 +294,7 @@ def test_gain_errors_lie_within_their_standard_deviations() -> None:
         for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
     ),
 ])  # fmt: skip
-def test_mistake_in_calling_the_junction_calibrator_is_one_line(
+def test_junction_calibrator_refuses_wrong_arguments_and_data_with_one_line(
     motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str
 ) -> None:
     with pytest.raises((FleetError, DriveError, ContradictionError), match=match) as raised:

@@ -31,7 +31,7 @@ def learned(rows: EvidenceRows) -> FaultModel:
 
 
 def shared_by(models: list[FaultModel]) -> dict[tuple[int, ...], float]:
-    """Probability of each set of shared errors: places of offsets, of gains and of a group's offset."""
+    """Probability of each set of shared errors, given by their places in :attr:`.Spread.shared`."""
     found: dict[tuple[int, ...], float] = {}
     for model in models:
         cause = tuple(np.flatnonzero(np.abs(model.spread.shared) > learning.LEAST_SHARED).tolist())
@@ -92,7 +92,7 @@ def test_uncertain_gain_ratios_are_not_taken_for_a_shared_gain_error(bias: float
 
 
 @pytest.mark.parametrize("vague", [0.0005, 0.04])
-def test_gain_error_shared_in_one_branch_is_not_given_to_a_branch_of_uncertain_gain_ratio(vague: float) -> None:
+def test_shared_gain_error_is_not_attributed_to_a_branch_of_uncertain_gain_ratio(vague: float) -> None:
     faults = no_faults(16, 4)
     faults.drift[:, 0] = 0.05
     faults.drift[3, 1], faults.offset_a[5, 2] = -0.12, 0.1
@@ -122,7 +122,7 @@ def test_doubtful_gain_ratios_reveal_no_shared_gain_error() -> None:
     np.testing.assert_allclose(models[0].spread.mean[rows.places.ratios], [0.05, 0.0], atol=0.002)
 
 
-def test_gain_errors_of_a_tenth_of_the_gain_can_be_learnt_from() -> None:
+def test_prior_is_learnt_from_sensors_that_read_only_a_tenth_of_the_current() -> None:
     """As where half of the vehicles report a branch in another unit."""
     faults = no_faults(12, 3)
     faults.drift[:5, 2] = -0.9
@@ -130,7 +130,7 @@ def test_gain_errors_of_a_tenth_of_the_gain_can_be_learnt_from() -> None:
 
 
 def test_load_in_a_single_vehicle_does_not_make_loads_probable() -> None:
-    """It may be an offset of the feeding branch as well, of which the other vehicles have none either."""
+    """What it shows may also be an offset of the feeding sensor; the other vehicles have neither."""
     faults = no_faults(8, 2)
     faults.offset_a[0, 0] = 0.03
     rows = rows_of(faults, seed=11)
@@ -141,7 +141,7 @@ def test_load_in_a_single_vehicle_does_not_make_loads_probable() -> None:
     assert loaded < 0.9
 
 
-def test_offset_of_all_sensors_and_load_of_all_vehicles_are_about_as_probable_if_nothing_tells_them_apart() -> None:
+def test_constant_shared_by_all_vehicles_is_more_probably_a_load_but_may_be_an_offset() -> None:
     faults = no_faults(12, 3)
     faults.offset_a[:, 0] = 0.015
     causes = shared_by(learn_fault_models(rows_of(faults, seed=12), feed=0))
@@ -159,7 +159,7 @@ def test_negative_junction_constant_is_an_offset_shared_by_a_branch(K: int) -> N
 
 
 @pytest.mark.parametrize(("offset", "load"), [(0.02, 0.0), (0.15, None)])
-def test_branch_of_a_shared_offset_stays_open_if_it_is_not_a_load(offset: float, load: float | None) -> None:
+def test_branch_of_a_shared_offset_stays_undecided_if_it_cannot_be_a_load(offset: float, load: float | None) -> None:
     """The load is declared, or the offset is larger than any load that a fleet shares."""
     faults = no_faults(12, 3)
     faults.offset_a[:, 1] += offset
@@ -256,7 +256,7 @@ def test_vehicles_sharing_a_constant_form_a_group_of_open_cause(of_sensor: bool)
 
 
 def test_batch_offset_with_different_gains_is_not_taken_for_a_load() -> None:
-    """The sensors read the same offset; the loads that it would be differ."""
+    """The sensors read the same offset; loads in its place would differ between the vehicles."""
     faults = no_faults(8, 2)
     faults.drift[:3, 0], faults.offset_a[:3, 0] = [-0.2, -0.1, 0.15], 0.03
     faults.drift[3, 1], faults.offset_a[4, 1] = 0.1, 0.2
@@ -267,7 +267,7 @@ def test_batch_offset_with_different_gains_is_not_taken_for_a_load() -> None:
 
 
 @pytest.mark.parametrize(("K", "branch"), [(3, 0), pytest.param(3, 2, marks=pytest.mark.long), (2, 1)])
-def test_shared_gain_error_is_found_but_not_in_which_of_two_branches(K: int, branch: int) -> None:
+def test_shared_gain_error_is_attributed_to_one_of_three_branches_but_not_of_two(K: int, branch: int) -> None:
     gain, faults = 0.08, random_faults(14, vehicles=16, branches=K)
     faults.drift[:, branch] = (1.0 + gain) * (1.0 + faults.drift[:, branch]) - 1.0
     rows = rows_of(faults, seed=14)

@@ -36,7 +36,7 @@ from tests.calibrator.estimator.simulated_rows import (
 BRANCHES = pytest.mark.parametrize("K", [2, 3, 4])
 LOG_LOAD = -4.0
 READ = Errors(gain_read=0.01, offset_read=0.001)
-"""Every row says something."""
+"""Errors with which every row is known, those of bench readings included."""
 
 
 def fitted(evidence: posterior.Evidence) -> posterior.Fits:
@@ -132,7 +132,7 @@ VAGUE = Errors(slope=0.02, ratio=0.02, intercept=0.01, junction=0.01)
 
 
 def paper_prior(K: int, *totals: int) -> Prior:
-    """Of vehicles with so many faults in all, each number as likely, half of them without a hardware fault."""
+    """Prior where each of ``totals`` is an equally likely number of faults; half the vehicles have sound hardware."""
     counts = np.zeros((K + 1, 2 * K + 1))
     for n in totals:
         chosen = np.array([on for on in all_supports(K) if 3 * K not in on and len(on) == n], dtype=int)
@@ -219,7 +219,7 @@ def test_posterior_weights_equal_integration_on_a_grid() -> None:
 
 @pytest.mark.parametrize("kind", [posterior.GAIN, posterior.OFFSET])
 @pytest.mark.parametrize("every", [1, 4])
-def test_evidence_of_fault_sizes_equals_that_of_the_weights(kind: int, every: int) -> None:
+def test_evidence_for_other_densities_of_fault_sizes_equals_that_of_weighing_anew(kind: int, every: int) -> None:
     prior = paper_prior(2, 0, 1, 2)
     draws = drawn(rows_of(random_faults(9, vehicles=20, branches=2, sparsity=70.0), seed=9), prior)
     slabs = [Slab(low=low, high=high, tail=0.02) for low, high in ((0.02, 0.3), (0.05, 0.25), (0.1, 0.5))]
@@ -230,7 +230,7 @@ def test_evidence_of_fault_sizes_equals_that_of_the_weights(kind: int, every: in
     assert np.argmax(found) == np.argmax(exact) == 1
 
 
-def test_posterior_of_a_load_equals_a_grid_and_is_never_negative() -> None:
+def test_posterior_of_a_load_equals_integration_on_a_grid_and_has_no_negative_loads() -> None:
     prior = Prior(
         counts=paper_prior(2, 0, 1).counts,
         gain=Slab(low=0.05, high=0.25, tail=1e-6),

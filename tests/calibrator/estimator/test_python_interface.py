@@ -73,7 +73,7 @@ def test_package_exports_its_interface_and_imports_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_coarse_steps_of_a_small_current_are_no_gain_error() -> None:
+def test_rounding_of_a_small_current_is_not_taken_for_a_gain_error() -> None:
     """Rounding to 2 A in a heater's 0 to 14 A makes its gain ratio too small by 1.5 % in every vehicle."""
     given = {}
     for number in range(8):
@@ -198,7 +198,7 @@ def test_log_converts_to_a_data_frame_usable_for_a_fleet(two_vehicles: Path) -> 
     assert len(FleetCalibrator().fit(Fleet.from_frames(recorded, junction)).vehicles_) == 2
 
 
-def test_internal_error_in_one_vehicle_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_in_one_vehicle_leaves_it_out_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     failing_for("V2", ZeroDivisionError("by nothing"), monkeypatch)
     with pytest.warns(RuntimeWarning, match="left out: V2: internal error: ZeroDivisionError: by nothing"):
         found = FleetCalibrator().fit(Fleet.from_frames(frames(), JUNCTION))
@@ -230,7 +230,7 @@ def test_several_frames_per_vehicle_and_missing_samples_are_accepted() -> None:
     assert "at least 120 s are needed" in found.left_out_["V8"]
 
 
-def test_readings_and_trust_contradicted_by_drives_are_reported() -> None:
+def test_readings_and_trust_contradicted_by_drives_give_notices() -> None:
     given = {**frames(8), "V4": frame(4, gain_error=0.1), "V5": frame(5, gain_error=0.1)}
     offset = pd.DataFrame({"vehicle": ["V3"], "branch": "motor", "offset_a": 40.0, "offset_sd_a": 0.1})
     readings = pd.concat([bench_rows(["V4", "V7"], 0.1), offset])  # the reading of V7 is of V4

@@ -76,9 +76,7 @@ def test_table_of_readings_may_have_any_column_order_and_empty_cells(tmp_path: P
     ([HEADER, 'V1,"' + 200_000 * "x"], r"not a table of bench readings: field larger than field limit"),
     ([HEADER, "V1,motor,0,0.1,,,,7"], r"line 2: more cells than the 6 columns of the header"),
 ])  # fmt: skip
-def test_mistake_in_a_table_of_readings_is_reported_with_its_line(
-    tmp_path: Path, lines: list[str], message: str
-) -> None:
+def test_mistake_in_a_table_of_readings_is_refused_and_named(tmp_path: Path, lines: list[str], message: str) -> None:
     with pytest.raises(FleetError, match=message):
         read(tmp_path, *lines)
 
@@ -92,7 +90,7 @@ def test_trusted_vehicle_with_a_faulty_bench_reading_is_refused(tmp_path: Path, 
     read(tmp_path, HEADER, "V1,battery,0.001,0.002,0.1,0.2", trusted=("V1",))
 
 
-def test_readings_are_combined_or_all_dropped_if_contradictory() -> None:
+def test_bench_and_window_readings_are_averaged_or_both_dropped_if_contradictory() -> None:
     shown = {"V1": (4.9, 0.1), "V2": (5.0, 0.1), "V3": (NAN, NAN)}  # by the battery sensor with open contactors
     windows = (ZeroCurrent(offset_a=np.array([o, NAN]), sd_a=np.array([sd, NAN])) for o, sd in shown.values())
     summaries = [SimpleNamespace(vehicle=name, zero_current=each) for name, each in zip(shown, windows, strict=True)]

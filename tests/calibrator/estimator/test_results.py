@@ -54,7 +54,9 @@ def test_error_for_a_vehicle_that_the_result_lacks_gives_its_name(result: Path, 
         results.written_of(result, name)
 
 
-def test_command_writes_parameter_files(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_params_command_writes_the_files_of_all_named_vehicles_or_none(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["params", str(result), "v1", "v2", "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.splitlines() == [str(tmp_path / "out" / f"{name}.json") for name in ("v1", "v2")]
     assert read_parameters(tmp_path / "out" / "v2.json").branches["motor"].offset_a == 1.0
@@ -74,7 +76,7 @@ def test_vehicle_with_invalid_parameters_is_left_out(tmp_path: Path, database: V
     assert reason.endswith("; look at its recordings")
 
 
-def test_folder_that_is_not_a_result_is_named(tmp_path: Path) -> None:
+def test_folder_that_is_not_a_result_is_refused_and_named(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match=r"run\.json: not a result of 'calibrator calibrate': No such file"):
         results.read_run(tmp_path)
     with pytest.raises(FleetError, match=r"results\.parquet: not a result of 'calibrator calibrate'"):

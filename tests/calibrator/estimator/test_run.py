@@ -98,7 +98,7 @@ def left_out(chunk: bytes) -> dict[str, str]:
 
 
 def rewritten(store: SummaryStore, folder: Path, bucket: int, records: Mapping[str, Sequence[Record]]) -> SummaryStore:
-    """A store with one bucket of other content."""
+    """Make a new store that has these records in one bucket, and no others."""
     other = SummaryStore(storage=open_storage(Path(mkdtemp(dir=folder))), identity=store.identity)
     other.append(bucket, [record for items in records.values() for record in items])
     return other
@@ -120,7 +120,7 @@ def test_result_has_every_vehicle_once_in_order(result: Path) -> None:
     assert {path.name for path in result.iterdir()} == {"params", "buckets", "results.parquet", "run.json"}
 
 
-def test_result_is_the_same_for_any_number_of_workers(
+def test_results_with_one_and_with_two_workers_are_identical(
     store: SummaryStore, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run, "WORTH_PROCESSES", 1)
@@ -164,7 +164,9 @@ def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_place_without_a_fleet_is_refused(store: SummaryStore, tmp_path: Path) -> None:
+def test_empty_store_or_name_and_folder_with_drives_and_summaries_are_refused(
+    store: SummaryStore, tmp_path: Path
+) -> None:
     shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
     shutil.copytree(store.url, tmp_path / "both")
     (tmp_path / "both" / "drives").mkdir()
@@ -241,7 +243,9 @@ def test_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
     assert left_out(chunk)[bad].startswith(reason)
 
 
-def test_internal_error_exits_with_70(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_in_one_vehicle_exits_with_70_and_calibrates_the_others(
+    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     failing_for("V012", ZeroDivisionError("by nothing"), monkeypatch)
     done = calibrator(*words(store.url, tmp_path / "out"))
     assert done.returncode == 70
@@ -278,7 +282,7 @@ def test_option_since_recalibrates_changed_vehicles_and_detects_moved_sensors(
     assert abs(battery["offset_a"] - faults.offset_a[0, 0]) <= 4.0 * battery["offset_sd_a"]
 
 
-def test_option_since_recalibrates_what_another_choice_concerns(
+def test_option_since_recalibrates_only_vehicles_that_a_changed_option_concerns(
     store: SummaryStore, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1800000000")  # stands in parameters that are found anew
@@ -296,7 +300,9 @@ def test_option_since_recalibrates_what_another_choice_concerns(
         assert {name for name in old if old[name] != now[name]} == concerned
 
 
-def test_vehicle_removed_from_the_store_is_named(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+def test_option_since_leaves_out_vehicles_removed_from_the_store_and_names_them(
+    store: SummaryStore, result: Path, tmp_path: Path
+) -> None:
     """Also if it was the only one of its bucket."""
     shutil.copytree(store.url, tmp_path / "store")
     gone = {name for name in (f"V{j:03d}" for j in range(VEHICLES)) if store.bucket_of(name) == fullest(store)}

@@ -38,7 +38,7 @@ def of(
 def estimate(
     *explanations: Explanation, held_back: tuple[str, str] = ("", ""), findings: tuple[SensorFinding, ...] = ()
 ) -> FleetEstimate:
-    """Of one vehicle, whose most probable explanation is the estimate."""
+    """Make the estimate of one vehicle: its most probable explanation."""
 
     def both(values: dict[str, float]) -> Array:
         return np.array([[values.get(name, 0.0) for name in NAMES]])
@@ -163,6 +163,6 @@ def test_reported_evidence_without_noise_equals_that_of_the_true_faults() -> Non
     np.testing.assert_allclose(sd[names.index("offset read battery")], 0.001 * scale)
 
 
-def test_gain_error_of_100_percent_or_more_is_impossible() -> None:
+def test_gain_error_above_100_percent_is_refused_as_impossible() -> None:
     assert impossible(estimate(of(1.0, drift=(0.9, 0))), 0, NAMES) == ""
     assert "its motor sensor reads 2.2 times the current" in impossible(estimate(of(1.0, drift=(0, 1.2))), 0, NAMES)

@@ -65,7 +65,7 @@ class DaskCluster:
 
 
 def gated(number: int, folder: Path) -> int:
-    """Wait from the third item on until a file is there."""
+    """Return the number; from the third item on wait until the file ``go`` is there."""
     while number >= 2 and not (folder / "go").exists():
         time.sleep(0.02)
     return number

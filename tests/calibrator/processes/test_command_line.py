@@ -41,7 +41,7 @@ IMPORTING = (
     (START.format("--version") + SWALLOWED, INTERRUPTED, f"{interrupted_message([])}\n"),
     (START.format("summarise") + IMPORTING, INTERRUPTED, f"{interrupted_message(['summarise'])}\n"),
 ], ids=["base install", "Ctrl-C during start-up", "Ctrl-C during imports"])  # fmt: skip
-def test_failure_to_start_is_reported_in_one_line(code: str, exit_code: int, said: str) -> None:
+def test_missing_package_or_ctrl_c_at_start_ends_with_one_line(code: str, exit_code: int, said: str) -> None:
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert (run.returncode, run.stdout, run.stderr) == (exit_code, "", said)
 

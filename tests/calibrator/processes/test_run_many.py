@@ -159,7 +159,7 @@ def test_item_that_kills_its_worker_twice_ends_the_run_with_a_reason() -> None:
 
 
 @pytest.mark.parametrize("workers", [ONE, TWO])
-def test_error_of_an_item_is_raised_in_order(workers: Workers) -> None:
+def test_error_of_an_item_is_raised_when_its_result_is_due(workers: Workers) -> None:
     with closing(run_many(refused, range(5), workers)) as results:
         assert [next(results) for _ in range(2)] == [0, 1]
         with pytest.raises(ValueError, match="number 2"):
@@ -173,7 +173,7 @@ print(list(try_many(abs, [-1, -2], Workers())))
 """
 
 
-def test_memory_limit_of_the_shell_is_respected() -> None:
+def test_try_many_works_under_a_memory_limit_of_the_shell() -> None:
     command = ["bash", "-c", 'ulimit -d 3000000 && exec "$@"', "-", sys.executable, "-c", LIMITED]
     assert subprocess.run(command, capture_output=True, check=True, text=True).stdout == "[(-1, 1), (-2, 2)]\n"
 

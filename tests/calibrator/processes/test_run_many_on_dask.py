@@ -82,7 +82,7 @@ def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("is_fetching", [False, True])
-def test_loss_of_all_workers_is_reported(
+def test_loss_of_all_workers_ends_the_run_with_an_error_that_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], is_fetching: bool
 ) -> None:
     """Such as workers without this package; Dask itself waits forever for results that were lost with their worker."""
@@ -109,7 +109,7 @@ def test_loss_of_all_workers_is_reported(
     assert "the scheduler has no worker now; waiting 2 s for one" in capsys.readouterr().err
 
 
-def test_server_that_is_not_a_dask_scheduler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_server_that_is_not_a_dask_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CONNECT_S", 2.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
 

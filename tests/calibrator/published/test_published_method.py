@@ -89,7 +89,7 @@ def test_variances_of_slopes_and_intercepts_match_white_noise() -> None:
     assert intercept_score.std() == pytest.approx(1.0, abs=0.06)
 
 
-def test_threshold_is_a_third_of_the_fleets_spread() -> None:
+def test_threshold_of_hardware_faults_is_a_third_of_the_sd_of_the_criterion_over_the_fleet() -> None:
     eta = np.array([0.0, 1.0, 2.0, 9.0])
     found = classify.classify_by_threshold(np.column_stack([eta, np.zeros(4), np.zeros(4)]))
     np.testing.assert_array_equal(found.hardware, eta > eta.std(ddof=1) / 3.0)
@@ -121,7 +121,7 @@ def test_failed_optimisation_of_a_vehicle_does_not_stop_the_fleet() -> None:
 @pytest.mark.parametrize(
     ("perfect", "least"), [(True, 0.9), (False, 0.8)], ids=["perfect classifier", "decision trees"]
 )
-def test_symmetric_fleet_is_recovered_through_noise(perfect: bool, least: float) -> None:
+def test_most_vehicles_of_a_symmetric_fleet_are_recovered_through_noise(perfect: bool, least: float) -> None:
     faults = fleet(120)
     evidence, reference = evidence_of_noisy(faults, 0.05)
     classes = classify.classify_by_truth(faults)

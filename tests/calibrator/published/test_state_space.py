@@ -57,7 +57,7 @@ def recording(order: int, snr_db: float, seed: int) -> tuple[Array, Array, Array
 
 
 @pytest.mark.parametrize("kind", A_OF_KIND)
-def test_simulation_follows_the_state_equations_from_steady_state(kind: str) -> None:
+def test_simulation_follows_the_state_equations_and_starts_in_steady_state_by_default(kind: str) -> None:
     model, expected = model_with(A_OF_KIND[kind], 2), []
     inputs, x = np.random.default_rng(1).normal(size=(50, 2)), model.x0
     for u in inputs:
@@ -109,7 +109,7 @@ def test_samples_outside_the_mask_are_not_used() -> None:
 
 
 @pytest.mark.parametrize("growth", [1.004, 1.0])
-def test_identified_models_of_growth_and_pure_noise_are_stable(growth: float) -> None:
+def test_models_identified_from_growing_currents_and_from_pure_noise_are_stable(growth: float) -> None:
     inputs, noise = smooth_inputs(9, 2000), np.random.default_rng(10).normal(size=(2000, 2))
     currents = noise if growth == 1.0 else growth ** np.arange(2000.0)[:, None] * [1.0, -1.0] + inputs[:, :2]
     for order in (1, 2, 4, 8):

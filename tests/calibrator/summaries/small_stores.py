@@ -40,7 +40,7 @@ def random_faults(vehicles: int, seed: int = 0) -> Faults:
 
 
 def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",), *, shown_a: float = np.nan) -> Record:
-    """A record; the motor showed so many amperes with open contactors."""
+    """A record; the motor sensor showed ``shown_a`` with open contactors."""
     K = len(BRANCHES)
     found = VehicleSummary(
         vehicle=name,

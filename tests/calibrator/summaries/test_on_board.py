@@ -25,11 +25,11 @@ from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
 MINUTES = 13.0
 OPEN_S = 14.0
-"""So long the contactors are open first."""
+"""Time for which the contactors are open at the start. [s]"""
 BATCH = 5
-"""Blocks that the node adds."""
+"""Number of blocks that the node adds up into one."""
 OTHER_ID = 0x7A5
-"""Of frames that the layout does not name."""
+"""Identifier of frames that the layout does not name."""
 
 
 def recorded_drive(seed: int = 1) -> Drive:
@@ -76,7 +76,7 @@ def stored(place: Path) -> VehicleSummary:
 
 
 def replay(log: Path, summary: OnBoardSummary, bus: can.BusABC) -> None:
-    """Play a log with its own time stamps, each frame after one of others; the node looks every 20 ms of the log."""
+    """Play a log with its own time stamps, each frame after one of :data:`OTHER_ID`; the node looks every 20 ms."""
     looked_s = 0.0
     for message in read_frames(log).messages():
         bus.send(can.Message(timestamp=message.timestamp, arbitration_id=OTHER_ID))
@@ -165,7 +165,7 @@ def test_unusable_on_board_record_is_left_out(folder: Path, tmp_path: Path, caps
     assert len(stored(tmp_path / "store").summary.moments) == 6
 
 
-def test_unknown_vehicle_is_refused(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_on_board_summary_without_a_vehicle_name_is_refused(tmp_path: Path, database: VehicleDatabase) -> None:
     options = argparse.Namespace(summary=tmp_path, vehicle=None)
     with pytest.raises(UserError, match="--summary: it is not known which vehicle this is; give --vehicle"):
         on_board_summary(options, {}, database, None, print)

@@ -146,7 +146,7 @@ def test_duplicate_recording_of_a_vehicle_counts_once(fleet: SmallFleet) -> None
     assert fleet.total("V1").duration_s < 301.0
 
 
-def test_short_drive_counts_if_its_vehicle_has_others(fleet: SmallFleet) -> None:
+def test_short_drive_is_used_only_if_its_vehicle_has_other_drives(fleet: SmallFleet) -> None:
     fleet.write("V1")
     fleet.add()
     for vehicle in ("V1", "V2"):
@@ -167,7 +167,7 @@ def put(name: str, value: float) -> Change:
     (put("battery", -np.inf), "drive a: branch battery shows inf A"),
     (put("speed", np.nan), "drive a: input speed has values that are no numbers"),
 ])  # fmt: skip
-def test_impossible_values_of_a_drive_are_reported(fleet: SmallFleet, change: Change, message: str) -> None:
+def test_impossible_values_of_a_drive_are_refused_and_named(fleet: SmallFleet, change: Change, message: str) -> None:
     fleet.write("V1", change=change)
     with pytest.raises(DriveError, match=re.escape(message)):
         read_vehicle_summary(find_fleet(fleet.drives).vehicles["V1"], EQUIPMENT, fleet.database)

@@ -60,7 +60,7 @@ def test_sum_of_summaries_equals_the_summary_of_all_drives() -> None:
     assert both.bank == together.bank
 
 
-def test_blocks_are_added_up_with_their_means_and_without_unknown_temperatures() -> None:
+def test_shortened_summary_adds_up_moments_and_averages_noise_and_known_temperatures() -> None:
     drive = a_drive(4, samples=120)
     warm_c = np.where(drive.time_s < 30.0, np.nan, 20.0 + 0.1 * drive.time_s)
     whole = summarise_samples([drive], period_s=PERIOD_S, temperatures_c=[warm_c])
@@ -76,7 +76,7 @@ def test_blocks_are_added_up_with_their_means_and_without_unknown_temperatures()
     )
 
 
-def test_summaries_of_different_banks_do_not_add_up() -> None:
+def test_adding_up_summaries_of_different_filter_banks_is_refused() -> None:
     drive = a_drive(2)
     plain, filtered = (summarise_samples([drive], period_s=PERIOD_S, bank=bank) for bank in (None, a_bank(3.0)))
     with pytest.raises(DriveError, match=r"made with 2 filter banks \(.*\); expected one"):
@@ -196,7 +196,7 @@ def drive(*, open_s: tuple[float, float] = (0.0, 30.0), noise_a: float = 0.4, st
 
 
 def shifted(plain: Drive, by_a: Array | float) -> Drive:
-    """The same drive with more on all currents."""
+    """The same drive with ``by_a`` added to all currents. [A]"""
     branches = {name: replace(current, value=current.value + by_a) for name, current in plain.branches.items()}
     return replace(plain, branches=branches)
 

@@ -66,7 +66,9 @@ def test_summary_files_are_readable_by_duckdb(store: SummaryStore) -> None:
     assert seconds == pytest.approx(VEHICLES * 1800.0)
 
 
-def test_added_records_are_separate_files_until_compacted(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_records_stay_files_of_their_own_until_compacted_and_none_counts_twice_after_a_kill(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
     store = small_store(tmp_path / "store", database, random_faults(4))
     bucket = store.bucket_of("V001")
     before = {path.name: path.read_bytes() for path in (tmp_path / "store" / "buckets").iterdir()}
@@ -127,7 +129,9 @@ def test_failed_drive_does_not_invalidate_other_records_of_its_vehicle() -> None
 
 
 @pytest.mark.parametrize("damage", [b"", b"PAR1", b"x" * 5000])
-def test_damaged_bucket_is_named(tmp_path: Path, database: VehicleDatabase, damage: bytes) -> None:
+def test_damaged_file_of_a_bucket_is_refused_and_named(
+    tmp_path: Path, database: VehicleDatabase, damage: bytes
+) -> None:
     store = small_store(tmp_path, database, no_faults(2, 2))
     path = next((tmp_path / "buckets").iterdir())
     path.write_bytes(damage)
@@ -186,7 +190,7 @@ def test_changed_byte_in_a_bucket_is_detected(own_store: SummaryStore) -> None:
     assert list(look_at_store(own_store.url, whole=True).faults) == [f"bucket {bucket:05d}"]
 
 
-def test_bucket_copied_from_another_is_refused(own_store: SummaryStore) -> None:
+def test_file_copied_from_another_bucket_is_refused(own_store: SummaryStore) -> None:
     first, second = own_store.buckets()[:2]
     folder = Path(own_store.url) / "buckets"
     shutil.copy(folder / own_store.files(first)[0], folder / own_store.files(second)[0])
