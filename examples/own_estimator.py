@@ -2,8 +2,9 @@
 An estimator of your own in the paper's table 1
 ===============================================
 
-It takes the place of a method, also on recorded drives (``docs/experiments.md``). This one holds every vehicle for
-sound, so a line of simulated over reference current (15) that is not the fleet's usual one is its sensor's fault.
+It takes the place of a method, also on recorded drives (``docs/experiments.md``). This one holds every vehicle's
+hardware for sound: where the line of simulated over reference current, equation (15) of the paper, is not the fleet's
+usual one, it blames the sensor.
 """
 
 import numpy as np

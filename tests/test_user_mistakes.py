@@ -138,7 +138,7 @@ MISTAKES = [
     ("ecu-node run LAYOUT --channel nobus0 UNSIGNED", 1, "socketcan nobus0: cannot open the bus: "),
     ("ecu-node run NONE --channel nobus0 UNSIGNED", 1, "none.toml: cannot read the layout: No such"),
 ]
-"""Command, exit code, and some of the words."""
+"""Command, exit code, and some words of its error line."""
 
 
 @pytest.fixture

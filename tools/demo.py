@@ -136,7 +136,7 @@ def faulty_vehicles(truth: FleetTruth) -> list[str]:
 
 
 def corrected_vehicle(result: Path, held_out: list[str]) -> str:
-    """Return the first held-out vehicle that may be corrected, else the first of all; say why those before may not."""
+    """Return the first held-out vehicle that is corrected, else the first; print why those before are not."""
     for name in held_out:
         found = read_parameters(result / "params" / f"{name}.json")
         if found.verdict == "corrected":

@@ -3,7 +3,7 @@
 
 Source: Steinstraeter, Buberger, Trifonov, "Battery and Heating Data in Real Driving Cycles", IEEE DataPort,
 DOI 10.21227/6jr9-5235. The car measures the battery current and the powers of heater and air conditioning; there is no
-inverter and no DC/DC current. Into the junction, with V the battery voltage and (19) of the paper:
+inverter and no DC/DC current. Into the junction, with V the battery voltage and equation (19) of the paper:
 
     i_battery   = -(Battery Current)                          discharge is negative in the file
     i_auxiliary = -(heater power + air conditioning power) / V

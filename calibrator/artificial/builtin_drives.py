@@ -1,8 +1,8 @@
 """Drives without any recording: a fastsim vehicle on its own cycles, cut and joined into different trips.
 
 fastsim (NREL) gives speed and mechanical and electrical motor power at 1 Hz for a battery-electric car on the UDDS and
-HWFET cycles. This module adds what else the junction of such a car carries: heater, air conditioning, the converter
-to the low-voltage net, a rear motor that takes a share of the torque, and the battery that carries the sum.
+HWFET cycles. This module adds the other branches of such a car's junction: heater and air conditioning, the converter
+to the low-voltage net, a rear motor that takes a share of the torque, and the battery, which supplies all of them.
 
 Currents are positive into the junction.
 """
@@ -108,7 +108,7 @@ def builtin_trip(rng: np.random.Generator, *, duration_s: float, name: str) -> G
     rng : numpy.random.Generator
         Source of chance: which parts of the cycles, in which style, and how the auxiliaries are used.
     duration_s : float
-        Least duration. [s]
+        Least duration, to within a second. [s]
     name : str
         Name of the trip.
 
@@ -180,7 +180,10 @@ def _microtrips() -> list[Array]:
 
 
 def _drive(speed_ms: Array) -> tuple[Array, Array, Array, Array]:
-    """Drive speeds at 1 Hz; return speed [m/s], mechanical and electrical motor power [W], charge [1] at 10 Hz."""
+    """Let the fastsim vehicle follow speeds [m/s] given at 1 Hz.
+
+    Return at 10 Hz: speed [m/s], mechanical and electrical motor power [W], state of charge [1].
+    """
     fastsim = _fastsim()
     seconds = np.arange(float(len(speed_ms)))
     vehicle = fastsim.Vehicle.from_resource(VEHICLE)
@@ -223,7 +226,7 @@ def _lag(demand: Array, time_constant_s: float) -> Array:
 
 
 def _fastsim() -> ModuleType:
-    """Return the fastsim package; FleetError says how to get it."""
+    """Return the fastsim package; if it is not installed, FleetError says how to install it."""
     try:
         import fastsim  # noqa: PLC0415
     except ImportError:

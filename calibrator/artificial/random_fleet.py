@@ -76,7 +76,7 @@ def nonzero_count(branches: int, sparsity: float) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class FaultSettings:
-    """How the faults of a fleet are drawn, (20) and (22) in [1]_.
+    """How the faults of a fleet are drawn, equations (20) and (22) of [1]_.
 
     Attributes
     ----------
@@ -87,9 +87,9 @@ class FaultSettings:
     balanced : bool
         No hardware faults in half of the vehicles; else any vehicle may have one.
     symmetric : bool
-        Vehicles come in groups of four whose measured currents have the ideal current as their mean (22).
+        Vehicles come in fours whose measured currents have the ideal current as their mean, equation (22) of [1]_.
     sign_bias : float
-        Faults are positive with probability 0.5 + sign_bias, 0 to 0.5: what a common cause does to a fleet. [1]
+        0 to 0.5: faults are positive with probability 0.5 + sign_bias, as a cause common to the fleet would do. [1]
     """
 
     sparsity: float
@@ -99,7 +99,7 @@ class FaultSettings:
     sign_bias: float = 0.0
 
     def draw(self, rng: np.random.Generator, *, vehicles: int, branches: int, full_scale_a: float) -> Faults:
-        """Draw the fault parameters of a fleet, in random order.
+        """Draw the fault parameters of a fleet, its vehicles in random order.
 
         Parameters
         ----------
@@ -115,8 +115,8 @@ class FaultSettings:
         Raises
         ------
         FleetError
-            If a symmetric fleet is wanted whose size is no multiple of 4, or whose faults have a preferred sign; or if
-            the sign bias is not between 0 and 0.5.
+            If the size of a symmetric fleet is no multiple of 4 or its sign bias not 0, or if any sign bias is not
+            between 0 and 0.5.
         """
         if not 0.0 <= self.sign_bias <= 0.5 or (self.symmetric and self.sign_bias):
             raise FleetError(f"a sign bias of {self.sign_bias:g}: expected 0 to 0.5, and 0 for a symmetric fleet")
@@ -139,7 +139,7 @@ class FaultSettings:
 def _sparse_values(
     rng: np.random.Generator, vehicles: int, parameters: int, nonzero: int, magnitude: tuple[float, float]
 ) -> Array:
-    """Return rows in which ``nonzero`` random entries are U(a, b) with random sign, (20) in [1]_, and the others 0."""
+    """Return rows of 0 but for ``nonzero`` random entries: U(a, b) with random sign, equation (20) of [1]_."""
     rank = np.argsort(np.argsort(rng.random((vehicles, parameters)), axis=1), axis=1)
     sign = rng.choice([-1.0, 1.0], size=(vehicles, parameters))
     return np.where(rank < nonzero, sign * rng.uniform(*magnitude, size=(vehicles, parameters)), 0.0)

@@ -1,7 +1,7 @@
 """Artificial fleet: CAN logs that vehicles with known faults would write, and the truth beside them.
 
-Per vehicle a trip of the ideal vehicle becomes true currents (11), then measured ones (13), each branch with its own
-delay and noise, sampled by its own message at its own instants, quantised by the DBC. Equations are those of [1]_.
+Per vehicle a trip of the ideal vehicle becomes true currents, equation (11) of [1]_, then measured ones, equation (13),
+each branch with its own delay and noise, sampled by its own message at its own instants, quantised by the DBC.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -38,7 +38,7 @@ __all__ = ["FleetPlan", "Vehicle", "branch_frame_times", "simulate_fleet", "vehi
 WRITTEN_DOWN = ("seed", "sparsity", "magnitude", "balanced", "symmetric", "common_drive", "noise")
 """Fields of the plan that are also written into the truth."""
 JITTER = 0.02
-"""Standard deviation of a frame's instant in cycle times: a lightly loaded bus. [1]"""
+"""Standard deviation of how early or late a frame is sent, in cycle times: as on a lightly loaded bus. [1]"""
 DEFAULT_CYCLE_MS = 100
 LOG_NAME = "drive.log.gz"
 
@@ -56,7 +56,7 @@ class Vehicle:
     faults : Faults
         Faults of this vehicle alone (no leading N).
     noise_a : float
-        Standard deviation of each sensor sample. [A]
+        Standard deviation of the noise of each sensor sample. [A]
     delay_s : ndarray of shape (K,)
         By how much later than it flows each current is measured. [s]
     unmeasured_a : float
@@ -91,6 +91,13 @@ def vehicle_frames(
     -------
     list of FrameSeries
         One series per message of the DBC that carries a branch of the vehicle or an input.
+
+    Raises
+    ------
+    FleetError
+        If the layout makes a branch of the vehicle from power and voltage, not from a current signal.
+    DatabaseError
+        If a signal of these messages is a float in the DBC.
     """
     i, layout = _true_currents(vehicle, trip), database.layout
     messages: dict[str, list[tuple[str, str]]] = {}
@@ -143,14 +150,17 @@ def _write_vehicle(
 
 
 def _true_currents(vehicle: Vehicle, trip: GroundTruth) -> Array:
-    """Return the true currents of the vehicle's branches, (T, K); the first also gives the unmeasured load. [A]"""
+    """Return the true currents of the vehicle's branches, (T, K); the first also supplies the unmeasured load. [A]"""
     i = true_currents(trip.matrix_a(), vehicle.faults)
     i[:, 0] += vehicle.unmeasured_a
     return i
 
 
 def branch_frame_times(rng: np.random.Generator, database: VehicleDatabase, branch: str, trip: GroundTruth) -> Array:
-    """Return the instants at which a branch's own message is sent on a trip, shape (n,). [s]"""
+    """Return the instants on a trip at which the message with a branch's current is sent, shape (n,). [s]
+
+    FleetError if the branch is made from power and voltage.
+    """
     return _frame_times(rng, database, split_signal(_current_signal(database.layout.find_branch(branch)))[0], trip)
 
 
@@ -230,7 +240,8 @@ def simulate_fleet(
     Raises
     ------
     FleetError
-        If the folder is not empty or the plan does not fit the trips.
+        If the folder is not empty, the trips have fewer branches than the plan, the faults cannot be drawn as planned
+        (see ``FaultSettings.draw``), or a branch is made from power and voltage.
     """
     layout = database.layout
     branches = choose_branches(layout, trips.branches, plan.currents)
@@ -270,6 +281,6 @@ def _draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -
 
 
 def _trip_of(trips: TripSource, vehicle: Vehicle, number: int, purpose: TripPurpose, layout: Layout) -> GroundTruth:
-    """Return the trip of vehicle ``number`` with its branches; one of them is minus the sum of the others (19)."""
+    """Return the trip of vehicle ``number``, its balance branch minus the sum of the others, equation (19) of [1]_."""
     branches = vehicle.branches
     return with_branches(trips.trip(number, purpose), branches, balance_branch(layout, branches))

@@ -1,7 +1,7 @@
 """Trips of the ideal vehicle, from which artificial vehicles are made: of the built-in vehicle, or recorded drives.
 
-Recorded currents do not sum to zero, so one branch is set to minus the sum of the others, (19) of [1]_. Results for
-that branch are therefore not independent of the other sensors of the recording.
+Recorded currents do not sum to zero, so one, the balance branch, is set to minus the sum of the others, equation (19)
+of [1]_. Results for that branch therefore depend on the other sensors of the recording.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -51,7 +51,7 @@ def choose_branches(layout: Layout, available: Sequence[str], count: int) -> tup
     Raises
     ------
     FleetError
-        If the recordings have fewer branches, or the count is below 2.
+        If the recordings have less than two or less than ``count`` branches of the layout, or the count is below 2.
     """
     names = [name for name in layout.branch_names if name in available]
     if len(names) < 2:
@@ -68,14 +68,20 @@ def choose_branches(layout: Layout, available: Sequence[str], count: int) -> tup
 
 
 def with_branches(trip: GroundTruth, branches: Sequence[str], balance: str) -> GroundTruth:
-    """Return the trip with some of its branches; one of them, ``balance``, is minus the sum of the others (19)."""
+    """Return the trip with these branches only; ``balance`` becomes minus the sum of the others.
+
+    That is equation (19) of [1]_.
+    """
     kept = {name: trip.currents_a[name] for name in branches}
     kept[balance] = -np.sum([kept[name] for name in branches if name != balance], axis=0)
     return GroundTruth(name=trip.name, period_s=trip.period_s, currents_a=kept, inputs=trip.inputs)
 
 
 def balance_branch(layout: Layout, branches: Sequence[str]) -> str:
-    """Return the branch that is minus the sum of the others: the one that the layout names, or else the last (19)."""
+    """Return which branch becomes minus the sum of the others, equation (19) of [1]_.
+
+    It is the one that the layout marks with ``balance``, if it is among the branches, else the last of them.
+    """
     return next((branch.name for branch in layout.branch if branch.balance and branch.name in branches), branches[-1])
 
 
@@ -95,7 +101,8 @@ def ground_truth_from_drive(drive: Drive, period_s: float) -> GroundTruth | None
     Returns
     -------
     GroundTruth or None
-        The trip over the span that all channels cover; None if it is empty or a channel has no good sample.
+        The trip over the span that all channels cover; None if that span is empty, a channel has no good sample, or
+        the drive has no branch.
     """
     channels = {**drive.branches, **drive.inputs}
     if not drive.branches or any(not channel.good.any() for channel in channels.values()):
@@ -199,9 +206,9 @@ class BuiltinTrips:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedTrips:
-    """Recorded trips: to learn from, one per vehicle if there are enough, else joined ones; to test on, joined ones.
+    """Recorded trips. Each vehicle learns from a recording of its own if there are enough, else from joined pieces.
 
-    No piece of a recording is in both trips of a vehicle; a single recording is cut in time.
+    Trips to test on are always joined pieces. No piece is in both trips of a vehicle: a single recording is cut in two.
 
     Attributes
     ----------
@@ -313,7 +320,8 @@ def choose_trips(
     seed : int
         Seed of the trips.
     duration_s, unseen_s : float
-        Least length of each built-in trip to learn from, and length of each trip to test on. [s]
+        Least length of each built-in trip to learn from, and length of each trip to test on (a built-in one may be
+        longer). [s]
     common : bool
         Whether all vehicles drive the same trip.
 
@@ -325,7 +333,8 @@ def choose_trips(
     Raises
     ------
     FleetError
-        If no drive of the store is usable, or the built-in vehicle lacks what the layout names.
+        If no drive of the store is usable, or if the built-in vehicle has less than two branches or no model input of
+        the layout.
     """
     if drives == "builtin":
         notices = _builtin_notices(layout)
@@ -337,7 +346,10 @@ def choose_trips(
 
 
 def _builtin_notices(layout: Layout) -> tuple[str, ...]:
-    """Return a notice of model inputs that the built-in vehicle lacks; FleetError without inputs or two branches."""
+    """Return a notice that names the layout's model inputs that the built-in vehicle lacks; empty if it has them all.
+
+    FleetError if the vehicle has none of them, or less than two branches of the layout.
+    """
     inputs, missing = choose_inputs(layout, BUILTIN_INPUTS)
     common = [name for name in layout.branch_names if name in BUILTIN_BRANCHES]
     if len(common) < 2 or not inputs:

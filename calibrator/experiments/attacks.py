@@ -23,7 +23,7 @@ from calibrator.faults import Faults
 __all__ = ["WORLDS", "Attack", "World", "draw_attack"]
 
 MOVING = 2
-"""Number of branches that move: battery and motor, the first two of the layout."""
+"""Number of branches whose current varies much: battery and motor, the first two of the layout."""
 HZ = 10.0
 """Samples per second of recorded trips; lengths of bursts and switching loads are counted in them. [1/s]"""
 REFERENCE_C = 25.0
@@ -39,7 +39,7 @@ class Scene:
     size : float
         Size of the effect, in the unit that its world needs; of either sign for effects on sensors.
     full_scale_a, peak_a : float
-        Full scale of the junction, and the sensor's greatest magnitude in the recording. [A]
+        Full scale of the junction; greatest magnitude of the affected sensor in the recording (0 for loads). [A]
     progress, temperature_c : ndarray of shape (T,)
         Time since the start over the drive's length [1], 1 on the unseen drive; temperature of the sensors [degC].
     rng : numpy.random.Generator
@@ -67,7 +67,7 @@ class World:
     causes : tuple of str
         A finding is right if it names one of these causes; empty: findings are not judged.
     magnitude : tuple of float or None
-        Range of the fault magnitudes of all vehicles [1]; None: that of the case.
+        Range of the fault magnitudes of all vehicles [1]; None: as the case of the experiment says.
     truth : callable or None
         From drift, offset [A] and size of n affected sensors, each (n,), to their new drift and offset, still linear.
     hardware : callable or None
@@ -201,7 +201,7 @@ def draw_attack(name: str, vehicles: int, *, full_scale_a: float, seed: int) -> 
 
 
 def _on_off(scene: Scene, samples: int, seconds: tuple[float, float], duty: float = 0.5) -> Array:
-    """Return a signal of 1 and 0 by turns, shape (samples,): 1 for random times, and for the share ``duty`` in all."""
+    """Return a signal that jumps between 1 and 0 at random instants, shape (samples,); its mean is about ``duty``."""
     lengths_s = scene.rng.uniform(*seconds, (2 * int(samples / HZ / seconds[0]) + 2,))
     state = np.arange(len(lengths_s)) % 2 == int(scene.rng.random() < duty)
     lengths_s[~state] *= (1.0 - duty) / duty
@@ -224,7 +224,7 @@ def _low_pass(x: Array, time_constant_s: float) -> Array:
 
 
 def _mean(x: Array, scene: Scene) -> Array:
-    """Return the mean of a current over the last seconds, as many as the size says."""
+    """Return the moving mean of a current over the last ``scene.size`` seconds."""
     samples = round(HZ * abs(scene.size))
     return np.asarray(uniform_filter1d(x, samples, mode="nearest", origin=(samples - 1) // 2))
 
@@ -240,7 +240,7 @@ def _later_gain(d: Array, o: Array, size: Array) -> tuple[Array, Array]:
 
 
 def _earlier(x: Array, scene: Scene, part: Array) -> Array:
-    """Return what is measured when the gain has made only ``part`` (0 to 1) of its change, from x, after all of it."""
+    """Return what is measured while the gain has made only ``part`` (0 to 1) of its change; x has the whole change."""
     return x * (1.0 + scene.size * part) / (1.0 + scene.size)
 
 
@@ -316,4 +316,6 @@ WORLDS = {
         share=0.5, size=(0.1, 0.1), causes=("variant",), hardware=lambda d_h, size: (1.0 + d_h) * (1.0 + size) - 1.0
     ),
 }
-"""Worlds by the names that the tables show; the share of the vehicles is in the name where it is not 30 %."""
+"""Worlds by the names that the tables show; the share of affected vehicles is in the name where it is not 30 %.
+
+``faults 30-60 %`` affects none of them, but changes the size of all faults."""

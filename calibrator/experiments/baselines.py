@@ -59,7 +59,10 @@ def best_subset(trial: Trial) -> Faults:
 
 
 def lasso(trial: Trial) -> Faults:
-    """Return the faults, without shrinkage, of the LASSO path's support of least Bayesian information criterion."""
+    """Return the faults of that support on the LASSO path whose Bayesian information criterion is least.
+
+    Their values are those of least squares in this support, not shrunk.
+    """
     linear = _LeastSquares(trial)
     y = linear.whitened(np.zeros((len(linear.whiten), linear.design.shape[1])))
     support = np.zeros(y.shape, bool)
@@ -74,7 +77,7 @@ def lasso(trial: Trial) -> Faults:
 def fleet_median(trial: Trial) -> Faults:
     """Return as sensor faults what is farther than :data:`BEYOND` robust standard deviations from the fleet's median.
 
-    Compared are slopes and intercepts (15) of each vehicle over the fleet model.
+    Compared are each vehicle's slopes and intercepts, equation (15) of the paper, here over the fleet model.
     """
     rows, order = _evidence_rows(trial)
 

@@ -1,8 +1,9 @@
 """Trials in which all vehicles make one drive, sections IV-A to IV-D of [1]_.
 
 The evidence rows of the default come from simulations over the fleet reference, and from the junction law. The
-reference is not the mean r of the fleet (3), which an asymmetric fleet shifts, but c_0 r + c_1 with the densest cluster
-of slopes and of intercepts as c_0 and c_1, branch by branch. Slopes and intercepts a, b over r become
+reference is not the fleet mean r, equation (3) of [1]_, which an asymmetric fleet shifts, but c_0 r + c_1, where c_0
+and c_1 are the centres of the densest clusters of slopes and of intercepts, branch by branch. Slopes a and intercepts
+b over r become
 
     a' = a / c_0,    b' = b - a c_1 / c_0
 
@@ -40,7 +41,7 @@ FULL_SCALE_A = 400.0
 GAIN_VARIANCE, CONSTANT_VARIANCE = 1e-10, 1e-12
 """Variances given to the exact junction law: above rounding, far below any fault. [1]"""
 ROUNDS = 3
-"""Times that the reference is improved, as vehicles agree more closely over a better one; more change nothing. [1]"""
+"""Rounds in which the reference is improved: over a better one vehicles agree better; more rounds do nothing. [1]"""
 LEAST_SD = 1e-6
 """Least standard deviation of slopes [1] and intercepts [A], for simulations without noise."""
 
@@ -91,7 +92,7 @@ class CommonDrive:
 
 
 def builtin_common_drive(duration_s: float, branches: int = 2) -> CommonDrive:
-    """Make the common drive with the built-in vehicle, all its inputs as in ``dbc/hv_powertrain.toml``.
+    """Make the common drive with the built-in vehicle and the model inputs of ``dbc/hv_powertrain.toml``.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ def builtin_common_drive(duration_s: float, branches: int = 2) -> CommonDrive:
     Raises
     ------
     FleetError
-        If the number of branches is another one, or fastsim is not installed.
+        If the number of branches is not 2 to 5, or fastsim is not installed.
     """
     if not 2 <= branches <= len(BUILTIN_BRANCHES):
         raise FleetError(f"{branches} branches: the built-in vehicle has 2 to {len(BUILTIN_BRANCHES)}")
@@ -136,9 +137,10 @@ class CommonCase(FaultSettings):
     vehicles : int
         Fleet size N, a multiple of 4 for a symmetric fleet.
     snr_db : float
-        Signal-to-noise ratio of the artificial simulation (26). [dB]
+        Signal-to-noise ratio of the artificial simulation, equation (26) of [1]_. [dB]
     state_space : bool
-        Whether vehicles are simulated by state-space models (2) trained on 80 % of the drive; else artificially (23).
+        Whether vehicles are simulated by state-space models, equation (2) of [1]_, trained on 80 % of the drive; else
+        artificially, as measured currents with white noise, equation (23).
     """
 
     vehicles: int = 1000
@@ -185,8 +187,11 @@ def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
 def _simulation(
     drive: CommonDrive, truth: Faults, case: CommonCase, purpose: Purpose, seed: int
 ) -> Callable[[], Iterable[Array]]:
-    """Return a function that yields each vehicle's measured currents with white noise (23), the same at each call."""
-    noise_a = np.sqrt(10.0 ** (-case.snr_db / 10.0) * np.mean(drive.unity[:, 0] ** 2))  # (26), with the power of i_s,1
+    """Return a function that yields each vehicle's artificial simulation, the same at each call.
+
+    It is the measured currents with white noise, equation (23) of [1]_, each of shape (T - T_1, K). [A]
+    """
+    noise_a = np.sqrt(10.0 ** (-case.snr_db / 10.0) * np.mean(drive.unity[:, 0] ** 2))  # (26) of [1], power of i_s,1
 
     def simulate() -> Iterator[Array]:
         for j, measured in enumerate(_measured(drive.unity, truth)):
@@ -196,7 +201,7 @@ def _simulation(
 
 
 def _state_space_simulations(drive: CommonDrive, truth: Faults) -> Iterator[Array]:
-    """Yield each vehicle's simulation on the unity drive by a state-space model (2); all models have the same order."""
+    """Yield each vehicle's simulation on the unity drive by its state-space model, all of the same order. [A]"""
     start, order = drive.unity_start, None
     for measured in _measured(drive.i_s, truth):
         if order is None:
@@ -206,18 +211,18 @@ def _state_space_simulations(drive: CommonDrive, truth: Faults) -> Iterator[Arra
 
 
 def _measured(i_s: Array, truth: Faults) -> Iterator[Array]:
-    """Yield the measured currents (21) of one vehicle after the other, each of shape (T, K). [A]"""
+    """Yield each vehicle's measured currents, equation (21) of [1]_, shape (T, K). [A]"""
     for slope, intercept in zip(*slopes_and_intercepts(truth), strict=True):
         yield slope * i_s + intercept
 
 
 def _junction_a2(drive: CommonDrive, truth: Faults) -> Array:
-    """Return the mean square of the sum of each vehicle's measured currents (6), shape (N,). [A^2]"""
+    """Return the mean square of each vehicle's junction sum, equation (6) of [1]_, shape (N,). [A^2]"""
     return np.array([np.mean(measured.sum(axis=1) ** 2) for measured in _measured(drive.unity, truth)])
 
 
 def _unseen(ideal_a: Array, truth: Faults) -> UnseenDrive:
-    """Return the unseen drive of N vehicles that have the same ideal currents (T, K), and true currents by (11)."""
+    """Return the unseen drive of N vehicles with the same ideal currents (T, K); true ones by equation (11) of [1]_."""
     gain, constant = 1.0 + truth.hardware_drift[:, None], truth.hardware_offset_a
     mean_a, mean_square_a2 = ideal_a.mean(axis=0), np.mean(ideal_a**2, axis=0)
     i2 = gain**2 * mean_square_a2 + 2.0 * gain * constant * mean_a + constant**2
@@ -225,7 +230,10 @@ def _unseen(ideal_a: Array, truth: Faults) -> UnseenDrive:
 
 
 def measured_moments(i_s: Array, truth: Faults) -> tuple[Array, Array]:
-    """Return mean (N, K) [A] and covariance (N, K, K) [A^2] of the measured currents (14) of ideal ones (T, K)."""
+    """Return mean (N, K) [A] and covariance (N, K, K) [A^2] of the measured currents that faults make of i_s (T, K).
+
+    The measured currents are those of equation (14) of [1]_.
+    """
     slope, intercept = slopes_and_intercepts(truth)
     centred = i_s - i_s.mean(axis=0)
     covariance = centred.T @ centred / len(i_s)
@@ -270,7 +278,7 @@ def common_rows(
 
 
 def _over_cluster(evidence: FleetEvidence, reference_mean_a: Array) -> tuple[Array, Array, Array]:
-    """Return slopes a' (N, K), intercepts b' (N, K) [A], see the top, and the covariance of the two (N, K, 2, 2)."""
+    """Return a' (N, K) and b' (N, K) [A] of the module's docstring, and the covariance of each pair (N, K, 2, 2)."""
     slope, intercept_a = evidence.slopes, evidence.intercepts_a
     covariance = np.empty((*slope.shape, 2, 2))
     covariance[..., 0, 0] = np.maximum(evidence.slope_variances, LEAST_SD**2)

@@ -30,7 +30,7 @@ ALL = "all together"
 """Series of the rows of a result in which all settings count together; their x is NaN."""
 
 BUILTIN_TRIPS, BUILTIN_DURATION_S = 27, 1500.0
-"""As many trips as a summer of recordings has [1], each as long as recorded ones are in the median [s]."""
+"""Number of built-in trips [1] and their length [s]: as many as usable summer trips of the BMW i3, of median length."""
 QUICK_VEHICLES, QUICK_TRIPS, QUICK_DURATION_S, QUICK_REPETITIONS = 20, 8, 300.0, 2
 DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
 """Layout of the examples that come with the source; it fits the built-in vehicle."""
@@ -38,7 +38,7 @@ DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """One point of an experiment.
+    """One setting of an experiment: how its fleets are made, and its place in the tables.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Setting:
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """One row of the table.
+    """One experiment, a row of ``TABLE``.
 
     Attributes
     ----------
@@ -170,7 +170,8 @@ REAL = tuple(
         ),
     )
 )
-"""Settings on recorded trips: the main four, balanced and with any vehicle; other sizes of faults; with a load."""
+"""Settings on recorded trips: ``MAIN``, with hardware faults in half of the vehicles and in any; other sizes of faults;
+with a load that no branch measures."""
 
 TABLE = (
     Experiment(

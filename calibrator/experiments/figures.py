@@ -33,7 +33,7 @@ Values = Mapping[str, NDArray[Any]]
 
 
 class FigureKind(NamedTuple):
-    """Meaning of a figure, function that makes it of its values, and whether it is so rare that counts are shown."""
+    """Meaning of a figure, function that makes it from its values, and whether it is so rare that counts are shown."""
 
     meaning: str
     merged: Callable[[NDArray[Any]], Any] = np.mean
@@ -73,7 +73,7 @@ FIGURES = {
     ),
     "failed": FigureKind("share of vehicles whose optimisation failed"),
 }
-"""Figures in the order of the columns; pages explain them by the same words."""
+"""Figures in the order of the columns of tables; pages of results explain them in these words."""
 
 
 def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
@@ -180,10 +180,10 @@ def _interval(values: NDArray[Any]) -> tuple[float, float]:
 
 
 def tenths_of(values: Values) -> pd.DataFrame:
-    """Count vehicles by tenths of their confidence, and deployed parameters by tenths of their integral transforms.
+    """Count vehicles by tenths of confidence, deployed parameters by tenths of their probability integral transform.
 
     Returns a row per tenth: its lower end ``low``; number of ``vehicles`` in it, their mean ``confidence`` and the
-    share of them that is ``recovered`` (NaN of none); number of parameters in it, ``pit``.
+    share of them that is ``recovered`` (NaN of none); number of parameters whose transform is in it, ``pit``.
     """
     pairs, pit = (values.get(name, np.zeros((0, 2))) for name in ("ece", "pit"))
     number = np.minimum((pairs[:, 0] * len(TENTHS)).astype(int), len(TENTHS) - 1)
@@ -195,7 +195,7 @@ def tenths_of(values: Values) -> pd.DataFrame:
 
 
 def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
-    """Return the expected calibration error of vehicles by tenths [1], and what it is by chance if they are exact."""
+    """Return the expected calibration error by tenths of the confidence, and that of exact ones by chance. [1]"""
     vehicles, confidence = tenths["vehicles"].to_numpy(float), tenths["confidence"].to_numpy(float)
     error = vehicles * np.abs(confidence - tenths["recovered"].to_numpy(float))
     chance = np.sqrt(2.0 / np.pi * vehicles * confidence * (1.0 - confidence))

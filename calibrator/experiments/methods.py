@@ -65,7 +65,7 @@ def _posterior(trial: Trial, *, known: bool = False) -> Estimate:
 
 
 def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float) -> Estimate:
-    """Run the default for vehicles that all make one drive: from their rows, and without a check of fit."""
+    """Run the default for vehicles that all make one drive: from their evidence rows, without looking for findings."""
     feed = int(np.argmax(np.median(recorded.mean_a, axis=0)))
     models = learn_fault_models(recorded.rows, feed=feed, known=known)
     mean = recorded.mean_a / full_scale_a
@@ -143,8 +143,8 @@ def require_estimate(method: str, estimate: Estimate, truth: Faults) -> Estimate
     Raises
     ------
     FleetError
-        If it is no estimate, an array has another shape or type, or values that are not finite, a
-        confidence is outside 0 to 1, or there are findings of another number of vehicles.
+        If it is no :class:`Estimate`, its faults are no :class:`Faults`, an array has a wrong shape or type or values
+        that are not finite, a confidence is outside 0 to 1, or findings are given but not for exactly N vehicles.
     """
     if not isinstance(estimate, Estimate):
         raise FleetError(f"method '{method}': estimate() returned {type(estimate).__name__}, expected an Estimate")

@@ -95,7 +95,7 @@ def _names(result: ExperimentResult) -> list[str]:
 
 
 def _effort(result: ExperimentResult) -> str:
-    """Return repetitions, seed and drive, and what made the result, as a sentence."""
+    """Return as a sentence: repetitions, seed and drive of a result, and the version and machine that made it."""
     settings, made = result.settings, f"; {result.made}" if result.made else ""
     times = counted(int(settings["repetitions"]), "repetition")
     return f"{times}, seed {settings['seed']}, drive {settings['drive']}{made}."
@@ -165,7 +165,7 @@ def _markdown(table: pd.DataFrame) -> str:
 
 
 def write_page(folder: Path, result: ExperimentResult) -> None:
-    """Write NAME.json, NAME.md and NAME.png into a folder, and beside it ``FOLDER.md``, the heads of all its pages."""
+    """Write NAME.json, NAME.md and NAME.png into a folder, and beside the folder the heads of its pages, FOLDER.md."""
     name = result.experiment.name
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / f"{name}.json", f"{result.to_json()}\n".encode())

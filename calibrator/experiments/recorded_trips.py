@@ -1,7 +1,8 @@
 """Trials in which each trip, recorded or of the built-in vehicle, is a vehicle with faults of its own.
 
-The ideal currents are those of the trip; faults (11) and (13), an unmeasured load, the world of an attack, sensor noise
-and the steps of the DBC signals are put on top of them. The model of a vehicle is imperfect here, as it is in the car.
+The ideal currents are those of the trip. Put on top of them are faults, equations (11) and (13) of the paper, an
+unmeasured load, the world of an attack, sensor noise and the steps of the DBC signals. The model that is identified of
+a vehicle is imperfect here, as it is for a real car.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,7 +39,7 @@ __all__ = [
 NOISE = 0.001
 """Standard deviation of the sensor noise, in fractions of full scale. [1]"""
 FEWEST_TRIPS = 4
-"""Fewer vehicles are no fleet."""
+"""Least number of trips, each of which is a vehicle: fewer are no fleet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,18 +103,20 @@ class RecordedFleet:
         return replace(self, name=f"the first {duration_s:g} s of {len(taken)} of {self.name}", trips=taken)
 
     def with_branches(self, count: int) -> tuple[GroundTruth, ...]:
-        """Return the trips with ``count`` currents, one of which is minus the sum of the others (19).
+        """Return the trips with the first ``count`` branches of the layout that they have; the rest are dropped.
+
+        The balance branch becomes minus the sum of the other kept ones, equation (19) of the paper.
 
         Raises
         ------
         FleetError
-            If the trips have fewer branches.
+            If the count is below 2, or the trips have less than ``count`` branches of the layout.
         """
         names = choose_branches(self.database.layout, tuple(self.trips[0].currents_a), count)
         return tuple(with_branches(trip, names, balance_branch(self.database.layout, names)) for trip in self.trips)
 
     def inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
-        """Return the inputs of vehicle model and fleet model that a trip has or can give, by name, each shape (T,)."""
+        """Return a trip's inputs of vehicle model and fleet model by name, also derived ones, each of shape (T,)."""
         layout, values = self.database.layout, dict(trip.inputs)
         for item in layout.derived:
             if layout.base_inputs([item.name]) <= values.keys():
@@ -143,7 +146,7 @@ def read_fleet(store: Path, database: VehicleDatabase) -> RecordedFleet:
 
 
 def builtin_fleet(database: VehicleDatabase, *, trips: int, duration_s: float) -> RecordedFleet:
-    """Make trips of the built-in vehicle, in place of recordings; the layout must use its names.
+    """Make trips of the built-in vehicle, in place of recordings; the layout must name branches and inputs as it does.
 
     Parameters
     ----------
@@ -153,6 +156,11 @@ def builtin_fleet(database: VehicleDatabase, *, trips: int, duration_s: float) -
         Number of trips.
     duration_s : float
         Least duration of each. [s]
+
+    Raises
+    ------
+    FleetError
+        If there are less than four trips, they have no model input of the layout, or fastsim is not installed.
     """
     made = tuple(
         builtin_trip(random_stream(Purpose.CALIBRATION_TRIP, 0, k), duration_s=duration_s, name=f"builtin-{k}")
@@ -174,7 +182,8 @@ class RecordedCase(FaultSettings):
     world : str
         World that affects some vehicles, of :data:`~calibrator.experiments.attacks.WORLDS`; empty: none.
     own_prior : ComparedMethod or None
-        Method that first learns its prior from this fleet; faults are then drawn from that prior, so that it is right.
+        Method that first learns its prior from this fleet; the faults of the trial are then drawn from that prior, so
+        that the method's assumption is right. None: faults are drawn as the settings say.
     vehicles, minutes : int or None, float or None
         Number of vehicles and length of their drives, each of which starts at a random instant of the trips and goes
         on from trip to trip. Without minutes each trip is a vehicle; without vehicles there are as many as trips.
@@ -202,7 +211,7 @@ class RecordedCase(FaultSettings):
 
     @property
     def faults(self) -> FaultSettings:
-        """How the faults are drawn; a world may change their magnitude."""
+        """How the faults are drawn: as this case says, with the magnitudes of its world if that has some."""
         own = WORLDS[self.world].magnitude if self.world else None
         return self if own is None else replace(self, magnitude=own)
 
@@ -291,7 +300,7 @@ def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial
 
 
 def _runs(fleet: RecordedFleet, minutes: float, vehicles: int, seed: int) -> tuple[GroundTruth, ...]:
-    """Make a drive of so many minutes for each vehicle, from a random start on; several may use the same trips."""
+    """Make a drive of ``minutes`` for each vehicle, from a random start on; vehicles may share parts of trips."""
     trips, samples, runs = fleet.trips, int(60.0 * minutes / fleet.period_s), []
     for number in range(vehicles):
         rng = random_stream(Purpose.START_OF_RUN, seed, number)
@@ -356,7 +365,10 @@ def _sampled(fleet: RecordedFleet, trip: GroundTruth, i_m: Array, rng: np.random
 def _delayed(
     fleet: RecordedFleet, case: RecordedCase, trip: GroundTruth, i_m: Array, rng: np.random.Generator
 ) -> tuple[Samples, Array]:
-    """Return aligned samples of a vehicle whose branches are late, and its ``delay_error_s``, shape (K - 1,). [s]"""
+    """Return aligned samples of a vehicle whose branches are late, and the errors of its delays, (K - 1,). [s]
+
+    The errors are a row of :attr:`VehicleSamples.delay_error_s`.
+    """
     names, layout = tuple(trip.currents_a), fleet.database.layout
     delay_s = rng.uniform(0.0, case.delay_max_s or 0.0, size=len(names))
     inputs = {name: _channel(trip.time_s, x) for name, x in trip.inputs.items()}
@@ -378,7 +390,7 @@ def _channel(time_s: Array, value: Array) -> Channel:
 
 
 def _shown_a(fleet: RecordedFleet, names: Sequence[str], i_m: Array, rng: np.random.Generator) -> Array:
-    """Return what the sensors of branches show of measured currents (T, K): with noise, in steps of the signals. [A]"""
+    """Return measured currents (T, K) with sensor noise, rounded to the steps of their signals in the DBC. [A]"""
     seen = i_m + NOISE * fleet.full_scale_a * rng.standard_normal(i_m.shape)
     steps_a = np.array([fleet.database.current_step_a(name) for name in names])  # 0: no step
     safe = np.where(steps_a > 0.0, steps_a, 1.0)
@@ -391,7 +403,10 @@ def _summaries(samples: Sequence[Samples], fleet: RecordedFleet) -> list[DriveSu
 
 
 def _published_evidence(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetEvidence:
-    """Identify a model (2) of each vehicle, and return the evidence of its simulation on the longest held-out drive."""
+    """Identify a state-space model of each vehicle; return the evidence of simulations on the longest held-out drive.
+
+    The models are those of equation (2) of the paper.
+    """
     vehicles = [
         identify_vehicle(
             [drive.with_inputs(fleet.database.layout.model_inputs)],

@@ -65,11 +65,11 @@ def score_result(result: Path, truth_file: Path) -> dict[str, float]:
         )
 
     def found(name: str) -> Array:
-        """A column of the result, shape (N, K)."""
+        """One column of the result, shape (N, K)."""
         return np.asarray(rows[name].unstack("branch").loc[known, truth.branches].to_numpy(dtype=float))
 
     def true(name: str) -> Array:
-        """A field of the true vehicles, shape (N, K)."""
+        """One field of the truth about the vehicles, shape (N, K)."""
         return np.array([[getattr(truth.vehicles[v], name)[branch] for branch in truth.branches] for v in known])
 
     by_branch, applied = ("hardware_offset_a", "drift", "offset_a"), found("applied")

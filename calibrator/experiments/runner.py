@@ -63,8 +63,9 @@ def run_experiment(
     Raises
     ------
     FleetError
-        If methods or settings cannot be told apart in a table, the fleet has too few branches or is of the other kind,
-        or a method returns what cannot be judged.
+        If there are no methods or settings, or two have the same name or place in a table; the fleet has too few
+        branches, or is not what the experiment needs (common drive or recorded trips); there are no repetitions; or a
+        method returns what cannot be judged.
     """
     methods, settings = tuple(experiment.methods if methods is None else methods), experiment.settings
     names, places = [method.name for method in methods], [(setting.series, setting.x) for setting in settings]

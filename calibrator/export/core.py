@@ -181,7 +181,10 @@ def branch_values(database: VehicleDatabase, branch: Branch, fault: SensorFault)
 
 
 def scaled_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> BranchValues:
-    """Return the numbers of :func:`branch_values`, unchecked; ExportError only if they need more fractional bits."""
+    """Return the numbers of :func:`branch_values` without a check of their size.
+
+    ExportError only if they need more fractional bits than the core has.
+    """
     if not fault.applied:
         return _PASSED
     signals = branch_signals(database, branch, Mode.GATEWAY)
@@ -226,7 +229,7 @@ def image_bytes(checked: Checked, order: Literal["little", "big"]) -> bytes:
 
 
 def _all_values(checked: Checked) -> list[BranchValues]:
-    """Return the numbers of all branches, in the order of the layout, if the node takes layout and DBC."""
+    """Return the numbers of all branches, in the order of the layout; raises as :func:`image_bytes` does."""
     database = checked.database
     wire(database, InForce(parameters=checked.parameters), start_s=0.0, mode=Mode.GATEWAY)
     return [branch_values(database, branch, checked.parameters.fault(branch.name)) for branch in database.layout.branch]
@@ -297,7 +300,10 @@ def find_image(elf: Path, database: VehicleDatabase) -> Image:
 
 
 def intel_hex(address: int, data: bytes) -> str:
-    """Return data at an address as Intel HEX, in records of at most 32 bytes that cross no multiple of 32."""
+    """Return data at an address as Intel HEX, in records of at most 32 bytes that cross no multiple of 32.
+
+    ExportError if the data reach beyond the 32 bits of HEX addresses.
+    """
     if address + len(data) > 1 << 32:
         raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; HEX reaches to 0xFFFFFFFF, link it below")
 

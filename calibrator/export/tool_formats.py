@@ -94,7 +94,7 @@ def characteristics(checked: Checked) -> list[Characteristic]:
     Raises
     ------
     ExportError
-        If a number of the C core is not exact in floating point, which tools use.
+        If a number of the C core is not exact in floating point, which tools use, or does not fit into its integers.
     """
     found = [Characteristic("HV.parameter_set", "number of the parameter set", "", "-", checked.parameters.number)]
     for branch in checked.database.layout.branch:
@@ -167,7 +167,7 @@ def dcm_text(checked: Checked) -> str:
     Raises
     ------
     ExportError
-        If a text has a character, or a number digits, that the format cannot hold.
+        If a text has a character that the format cannot hold, or in the cases of :func:`characteristics`.
     """
     return rendered(
         "parameters.dcm",
@@ -197,7 +197,7 @@ def cdfx_text(checked: Checked) -> str:
     Raises
     ------
     ExportError
-        If a number of the C core is not exact in floating point, as for :func:`characteristics`.
+        In the cases of :func:`dcm_text`.
     """
     rows = [(f"HV.{key}", key, "ASCII", "general", "", value) for key, value in _notes(checked).items()]
     for item in characteristics(checked):

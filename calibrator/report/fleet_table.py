@@ -28,7 +28,7 @@ from calibrator.terminal.text import few_reasons
 from ecu_node.parameters import Explanation, SensorFinding
 
 OPEN_GAIN, OPEN_OFFSET = 0.1, 0.05
-"""Standard deviations beyond which a gain, and an offset over full scale, are not known. [1]"""
+"""A gain, or an offset over full scale, counts as not known if its standard deviation is above this or missing. [1]"""
 
 __all__ = ["FleetTable", "ParameterDetails", "read_details", "read_fleet_table"]
 
@@ -46,9 +46,9 @@ class FleetTable:
     columns : mapping of str to ndarray of shape (N, K)
         Columns of ``results.parquet``, in its order of the vehicles that have parameters: numbers (NaN where the method
         gives none), flags, texts (empty where there is none). What belongs to the vehicle as a whole is the same in all
-        K places. Added are: whether a sensor is ``faulty``, that is corrected, held back, or found without a
-        probability; its error at full scale, ``error_a`` [A]; and whether its gain (``open_gain``) or its offset
-        (``open_offset``) is not known, as its standard deviation is too large.
+        K places. Added are: whether a sensor is ``faulty``, that is whether a fault was found in it that is corrected,
+        held back, or has no probability; its error at full scale, ``error_a`` [A]; and whether its gain
+        (``open_gain``) or its offset (``open_offset``) is not known, as its standard deviation is too large.
     left_out : mapping of str to str
         Vehicles without parameters, or files whose vehicle is unclear, with the reason.
     """
@@ -136,7 +136,7 @@ class ParameterDetails(msgspec.Struct, frozen=True):
     explanations: list[Explanation] = []
     """Competing explanations, the most probable first; empty where only one was left."""
     findings: list[SensorFinding] = []
-    """Findings of the check of fit."""
+    """Findings in the recordings of the vehicle."""
 
 
 def read_details(table: FleetTable, listed: NDArray[np.int64]) -> tuple[dict[int, ParameterDetails], list[str], Array]:

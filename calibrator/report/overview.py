@@ -38,7 +38,7 @@ UNDECIDED = ("cannot tell", "not enough data")
 """Verdicts after which more data would decide."""
 NO_REASON = "more recordings, a reading at zero current or a bench check would decide"
 MOST_QUESTIONS = 3
-"""Most questions of one kind that are asked one by one."""
+"""Most different questions, of vehicles held back for the same reasons, that are listed one by one."""
 SIGMAS = 3.0
 """Standard deviations that a margin covers; 1 in 370 is beyond if errors are Gaussian. [1]"""
 QUANTILE = 0.999
@@ -105,7 +105,7 @@ def _spread(values: Array) -> dict[str, float]:
 
 
 def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> list[dict[str, Any]]:
-    """Return what parameters cannot mend, hardware first, what many vehicles share last; the more probable come first.
+    """Return what no parameters can correct: hardware first, what many vehicles share last; each by probability.
 
     Parameters
     ----------
@@ -207,12 +207,13 @@ def battery_margin(
     Returns
     -------
     dict or None
-        The arguments, and numbers of ``vehicles`` whose sensor is known, of the others (``not_known``), which do not
-        count further, and of known ones that are ``corrected``. Margins [A]: one for all vehicles as measured
-        (``common_before_a``) and after correction (``common_after_a``), and the difference (``common_gain_a``); what
-        correction saves if each vehicle has its own margin, in the median of those corrected (``own_gain_a``, None
-        without any); ``largest``: up to 5 vehicles not corrected that need the largest margins, with these. None if
-        the sensor is known in no vehicle.
+        The arguments; number of ``vehicles`` whose sensor has a known gain and offset, how many of these are
+        ``corrected``, and number of the other vehicles (``not_known``), for which no margin is made. Margins [A]: one
+        for all vehicles as measured (``common_before_a``) and after correction (``common_after_a``), and the
+        difference (``common_gain_a``); what correction saves if each vehicle has its own margin, in the median of
+        those corrected (``own_gain_a``, None without any). ``largest``: names and margins of up to 5 vehicles, not
+        corrected, that need the largest margins, more than half of ``common_after_a``. None if the sensor is known in
+        no vehicle.
     """
     k, limit_a = table.branches.index(branch), limit_a or table.run.full_scale_a
     known = np.flatnonzero(~(table["open_gain"] | table["open_offset"])[:, k])

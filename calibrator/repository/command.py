@@ -50,7 +50,7 @@ def _open(folder: Path) -> "Repository":
 
 
 def _alone(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command, made to wait until no other one writes to the repository."""
+    """Return the command, made to wait until no other command writes to the repository."""
 
     @wraps(command)
     def waiting(folder: Path, **options: object) -> None:

@@ -116,6 +116,11 @@ class Repository:
             New or empty folder.
         roles : mapping of str to NewKeys
             Keys for each of :data:`ROLES`.
+
+        Raises
+        ------
+        RepositoryStateError
+            If the folder exists and is not empty.
         """
         if folder.exists() and any(folder.iterdir()):
             raise RepositoryStateError(f"{folder}: exists and is not empty; choose another folder")
@@ -219,7 +224,10 @@ class Repository:
         return len(bins), lifted
 
     def revoke(self, vehicles: Sequence[str], digest: str | None) -> None:
-        """Stage the revocation of one file per vehicle: its latest, or the one with this SHA-256 (hexadecimal)."""
+        """Stage the revocation of one file per vehicle: its latest, or the one with this SHA-256 (hexadecimal).
+
+        RepositoryStateError if a vehicle has no such file here, or it is revoked already; then nothing is staged.
+        """
         bins: dict[str, Targets] = {}
         for vehicle in vehicles:
             path = target_path(vehicle)
@@ -244,7 +252,10 @@ class Repository:
         return int(self._latest("root").roles[role].threshold)
 
     def rotate(self, role: str, new: NewKeys) -> None:
-        """Stage a root in which a role has new keys and, if the role is targets, all metadata that these must sign."""
+        """Stage a root in which a role has new keys; if the role is targets, also targets and all published bins.
+
+        These must then be signed with the new keys.
+        """
         root: Root = self._latest("root")
         for keyid in list(root.roles[role].keyids):
             root.revoke_key(keyid, role)
@@ -293,7 +304,7 @@ class Repository:
             return expiry_of(path.read_bytes())
 
     def sign(self, signers: Sequence[Signer]) -> Iterator[str]:
-        """Sign all staged metadata, role by role as one iterates; roles that lack signatures go into :attr:`waiting`.
+        """Sign all staged metadata, a role per iteration; roles that lack signatures then are in :attr:`waiting`.
 
         Parameters
         ----------
@@ -308,7 +319,7 @@ class Repository:
         Raises
         ------
         RepositoryStateError
-            If a key belongs to no role.
+            If a key belongs to no role, or metadata cannot be read or written.
         """
         root, targets, live = self._latest("root"), self._latest("targets"), self._live("root")
         known = {*root.keys, *(live.keys if live else ()), *(targets.delegations.keys if targets.delegations else ())}
@@ -335,7 +346,7 @@ class Repository:
             yield role
 
     def publish(self, signers: Sequence[Signer]) -> None:
-        """Publish what :meth:`sign` has signed; if it lacks signatures, publish only a new snapshot and timestamp.
+        """Publish what is staged; if some of it still lacks signatures, publish only a new snapshot and timestamp.
 
         Parameters
         ----------
@@ -362,7 +373,7 @@ class Repository:
         self._put_in_place(root, {} if self.waiting else self._staged_versions, signers)
 
     def _put_in_place(self, root: Root, staged: Mapping[str, int], signers: Sequence[Signer]) -> None:
-        """Publish what is staged, timestamp last: until then vehicles see no change, and a rerun continues."""
+        """Publish what is staged, timestamp last: until then vehicles see at most a new root, and a rerun continues."""
         for role, version in staged.items():
             content = (self._staged / f"{role}.json").read_bytes()
             _write(self._metadata / f"{version}.{role}.json", content)
@@ -388,7 +399,10 @@ class Repository:
                 (self._metadata / f"{version - 2}.{role}.json").unlink(missing_ok=True)
 
     def bundle(self, vehicle: str) -> bytes:
-        """Return the content of one file with all that a vehicle needs to update from any earlier version."""
+        """Return the content of one file with all that a vehicle needs to update from any earlier version.
+
+        RepositoryStateError if its parameters are not published, the metadata has expired, or files are damaged.
+        """
         path, until = target_path(vehicle), self.valid_until
         if until is not None and until <= datetime.now(UTC):
             raise RepositoryStateError(

@@ -1,6 +1,6 @@
 """Progress on stderr: a bar with count and time left on a terminal, a line now and then elsewhere.
 
-A command of several passes says which of them each bar is. Nothing of this goes to standard output.
+Where a command makes several passes, each bar says of which pass it is. Nothing of this goes to standard output.
 """
 
 import math
@@ -111,7 +111,7 @@ def _moving(bars: Progress, label: str, total: int | None, unit: str) -> Callabl
 
 
 def shown(items: Iterable[_Item], label: str, total: int, unit: str) -> Iterator[_Item]:
-    """Yield items as they come, and show a bar that counts those that are done; a single one needs no bar."""
+    """Yield items as they come, and show a bar that counts those that are done; no bar for a single item."""
     if total <= 1:
         yield from items
         return

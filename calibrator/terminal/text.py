@@ -82,12 +82,12 @@ def reasons_text(title: str, reasons: Mapping[str, str], most: int = 10) -> str:
 
 
 def left_out_text(left_out: Mapping[str, str]) -> str:
-    """Format the reasons for leaving things out, one line per reason; empty if there are none."""
+    """Format why vehicles or files are left out, one line per reason; empty if there are none."""
     return reasons_text("left out", left_out, most=len(left_out))
 
 
 def end_if_internal(left_out: Mapping[str, str]) -> None:
-    """If internal errors made some be left out, name the first few and end the command with exit code 70."""
+    """If vehicles are left out because of internal errors, name the first few and end the command with exit code 70."""
     failed = {name: why.removeprefix(INTERNAL) for name, why in left_out.items() if why.startswith(INTERNAL)}
     if failed:
         lines = "; ".join(told_once(failed.items())[:MOST_REASONS])

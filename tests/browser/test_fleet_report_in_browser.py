@@ -90,7 +90,7 @@ def test_report_opens_without_an_error_and_loads_nothing_from_the_network(page: 
     assert "run" not in page.title
 
 
-def test_the_table_shows_the_numbers_of_the_result(page: webdriver.Chrome, result: Path) -> None:
+def test_table_of_vehicles_shows_the_numbers_of_the_result(page: webdriver.Chrome, result: Path) -> None:
     stored = [row for row in pq.read_table(result / "results.parquet").to_pylist() if row["branch"] == "battery"]
     shown = {row[0]: row for row in rows(page)}
     assert set(shown) == {row["vehicle"] for row in stored}
@@ -104,7 +104,7 @@ def test_the_table_shows_the_numbers_of_the_result(page: webdriver.Chrome, resul
         assert cells[8] == "30.0 min"
 
 
-def test_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
+def test_both_explanations_of_an_ambiguous_offset_are_shown_with_their_probabilities(page: webdriver.Chrome) -> None:
     text = vehicle_text(page, "V4")
     assert "battery 0.00 ± 2.00 +8.00 ± 2.00 (60 %) or none (40 %)" in text
     assert "60.0 % +8.00 A no fault no fault" in text
@@ -121,7 +121,9 @@ def test_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
     assert peaks[0][2] > peaks[1][2], "the more probable, the larger"
 
 
-def test_alternatives_are_drawn(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
+def test_competing_explanations_are_drawn_in_the_figure_of_sensors(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
     vehicles = six_vehicles(database)
     rivals = [vehicles[3].explanations[0], Explanation(probability=0.4, offset_a={"battery": -12.0})]
     vehicles[3] = replace(vehicles[3], explanations=rivals)
@@ -138,7 +140,9 @@ def test_alternatives_are_drawn(browser: webdriver.Chrome, database: VehicleData
     assert layout["yaxis"]["range"] == pytest.approx([-13.2, 13.2])
 
 
-def test_unknown_values_are_not_zero(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
+def test_undetermined_values_are_shown_as_not_known_instead_of_zero(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
     lost = replace(sensor(), drift_sd=None, offset_sd_a=None, fault_probability=None, delay_s=None)
     items = [
         vehicle(database, "V1", lost, lost, verdict="cannot tell"),
@@ -203,7 +207,9 @@ def test_heading_levels_are_in_order_and_controls_have_names(page: webdriver.Chr
     assert "at hand" in page.title
 
 
-def test_report_of_a_single_vehicle_opens(browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path) -> None:
+def test_report_of_a_single_vehicle_without_stored_evidence_opens_without_errors(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
     rivals = [Explanation(probability=0.6), Explanation(probability=0.4, offset_a={"motor": 2.2})]
     mixed = replace(sensor(0.0, 0.9, sd=0.011), identifiable=False)
     item = vehicle(database, "car", sensor(0.1, 4.0, apply=True), mixed, explanations=rivals)

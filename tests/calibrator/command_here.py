@@ -1,4 +1,4 @@
-"""The calibrator's command line in this process: starting Python takes longer than most of them."""
+"""The calibrator's command line in this process: starting Python takes longer than most commands."""
 
 import fcntl
 import json
@@ -39,7 +39,7 @@ def reported(*arguments: object) -> Any:
 
 
 def refused(*arguments: object, code: int = 1) -> str:
-    """The only line of a command that is refused."""
+    """Error line of a command that must be refused with this exit code; it may print nothing else."""
     done = calibrator(*arguments)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (code, "", 1), done.stderr
     return done.stderr

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
 UNIT = DEPLOY / "ecu-node@.service"
 LARGEST_EXPOSURE = 1.5
-"""Of 10, where 10 is a service that may do everything."""
+"""Largest exposure allowed by ``systemd-analyze security``; 10 is a service that may do everything."""
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_unit_has_few_privileges_according_to_systemd(analyze: str, unit: Path) 
     assert result.returncode == 0, result.stdout
 
 
-def test_node_accepts_the_command_line_of_the_unit(capsys: pytest.CaptureFixture[str]) -> None:
+def test_node_accepts_the_command_line_of_the_systemd_unit(capsys: pytest.CaptureFixture[str]) -> None:
     """With the example environment only the missing layout keeps the node from running."""
     values = dict(re.findall(r"(?m)^(\w+)=(.*)$", (DEPLOY / "ecu-node.env").read_text()))
     (line,) = re.findall(r"(?m)^ExecStart=(.*)$", UNIT.read_text())

@@ -100,8 +100,8 @@ def test_every_code_of_the_status_is_documented_with_its_number(kind: type[IntEn
     assert in_dbc - documented == set()
 
 
-def test_overlay_signals_of_the_layout_document_suffice(tmp_path: Path) -> None:
-    """They are put in as the document says, and a template of the layout then fits."""
+def test_overlay_signals_copied_from_the_layout_document_pass_ecu_node_check(tmp_path: Path) -> None:
+    """The signals are put into DBC and layout as the document says; ``ecu-node check`` then has no warning."""
     document = (ROOT / "docs" / "layout.md").read_text()
     layout = re.findall(r"(?s)```toml\n(.*?)```", document.partition("\n## ")[0])[0]
     section = document.partition("\n## Signals for the corrected currents\n")[2].partition("\n## ")[0]

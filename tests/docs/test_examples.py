@@ -1,4 +1,4 @@
-"""The examples are short, run, and show what their pages say."""
+"""The examples run, and show what their pages say."""
 
 import runpy
 from pathlib import Path
@@ -28,19 +28,19 @@ def test_trusted_battery_corrects_the_motor_of_one_car(run: Any) -> None:
     assert names["sums"].corrected.std() < 0.2 * names["sums"].measured.std()
 
 
-def test_chargers_disagree_with_one_battery(run: Any) -> None:
+def test_two_chargers_example_finds_the_gain_ratio_of_battery_and_each_charger(run: Any) -> None:
     ratio = 1.0 / (1.0 + run("two_chargers.py")["found"].gain_error)  # battery over charger
     assert ratio["circontrol"] == pytest.approx(0.988, abs=0.003)
     assert ratio["efacec"] == pytest.approx(1.012, abs=0.003)
 
 
-def test_spreadsheet_in_german_is_calibrated(run: Any) -> None:
+def test_spreadsheet_example_in_german_format_is_calibrated(run: Any) -> None:
     rows = run("from_a_spreadsheet.py")["calibrator"].parameters_.set_index("branch")
     assert rows.gain_error["motor"] == pytest.approx(-0.05, abs=0.001)
     assert rows.corrected["motor"]
 
 
-def test_node_removes_the_offset_from_another_drive(run: Any) -> None:
+def test_node_of_the_replay_example_reduces_the_kirchhoff_sum_of_another_drive(run: Any) -> None:
     sums = pd.read_csv(run("replay_and_node.py")["out"] / "sums.csv").filter(regex="^sum")
     before, after = (float((sums[name] ** 2).mean() ** 0.5) for name in sums)
     assert before > 40.0

@@ -1,4 +1,4 @@
-"""The example of an estimator of one's own is short, and does what its page says."""
+"""The example of an estimator of one's own runs beside the built-in methods, and so does the program of its page."""
 
 import re
 import runpy

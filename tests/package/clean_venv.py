@@ -106,7 +106,7 @@ def new_venv(folder: Path, wheel: Path, *extras: str, interpreter: str = sys.exe
 
 
 def pins(constraints: str) -> str:
-    """Pins of a constraints file without their hashes: the wheel itself has none in it."""
+    """Pins of a constraints file without hashes: with them pip would want one of the built wheel, too."""
     return "\n".join(pin.strip() for pin in _PIN.findall(constraints)) + "\n"
 
 

@@ -34,7 +34,7 @@ def wheel() -> Path:
 
 @pytest.fixture(scope="session")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """Makes the environment of some extras, once."""
+    """Function from extras to a clean environment with the wheel and them, made once."""
     folder = tmp_path_factory.mktemp("environments")
     made: dict[tuple[str, ...], CleanVenv] = {}
 
@@ -78,5 +78,5 @@ def fleet(installed: Installed, car: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def drive(fleet: Path) -> Path:
-    """One log of these."""
+    """The log of one vehicle of the fleet."""
     return fleet / "logs" / VEHICLE / "drive.log.gz"

@@ -11,7 +11,7 @@ from tests.package.clean_venv import ROOT
 
 PACKAGES = ("calibrator", "ecu_node")
 LEFT_OUT = {"__pycache__", ".venv", "build", "dist", "api", "gallery", "sg_execution_times.rst"}
-"""Folders and files that are made, and not kept."""
+"""Generated folders and files, which are not part of the repository."""
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ def test_each_extra_alone_installs_without_conflicts(installed: Installed, extra
 
 
 @pytest.mark.parametrize("interpreter", os.environ.get("HV_PYTHONS", "").split() or [sys.executable])
-def test_calibrator_extra_covers_all_steps(
+def test_calibrator_extra_suffices_from_logs_to_parameters_reports_and_exports(
     interpreter: str, wheel: Path, car: Path, fleet: Path, drive: Path, tmp_path: Path
 ) -> None:
     """From logs to parameters, reports and exports."""
@@ -57,7 +57,9 @@ def test_calibrator_extra_covers_all_steps(
     assert (checked.returncode, checked.stderr) == (0, "")
 
 
-def test_update_extra_takes_what_the_calibrator_published(installed: Installed, car: Path, tmp_path: Path) -> None:
+def test_update_extra_lets_a_vehicle_take_what_the_calibrator_published(
+    installed: Installed, car: Path, tmp_path: Path
+) -> None:
     off_board, on_board = installed("calibrator"), installed("update")
     calibrator(off_board, tmp_path, "repository", "key", "anna", "--no-passphrase", "--out", ".")
     roles = [word for role in ("root", "targets", "snapshot", "timestamp") for word in (f"--{role}", "anna.pub")]
@@ -85,7 +87,9 @@ def test_c_core_of_the_wheel_compiles_with_its_export(installed: Installed, car:
     subprocess.run(["gcc", "-std=c99", f"-I{core}", "-c", *sources], cwd=tmp_path, check=True)
 
 
-def test_cluster_calibrates_on_workers(installed: Installed, car: Path, fleet: Path, tmp_path: Path) -> None:
+def test_cluster_extra_calibrates_through_a_dask_scheduler(
+    installed: Installed, car: Path, fleet: Path, tmp_path: Path
+) -> None:
     venv, file = installed("cluster"), tmp_path / "scheduler.json"
     code = (
         "import sys, time; from distributed import LocalCluster\n"

@@ -1,4 +1,4 @@
-"""The wheel without extras: every command of the node works, and no other package is there."""
+"""The wheel without extras: only its dependencies are installed, and the node checks a parameter file and runs."""
 
 import json
 import re
@@ -37,7 +37,7 @@ def test_node_only_install_checks_a_parameter_file(node: CleanVenv, car: Path) -
     assert json.loads(done.stdout)["branches"]["battery"]["applied"] is True
 
 
-def test_node_runs_on_a_virtual_bus_until_it_is_ended(node: CleanVenv, car: Path) -> None:
+def test_node_runs_on_a_virtual_bus_until_sigterm(node: CleanVenv, car: Path) -> None:
     bus = ("--interface", "virtual", "--channel", "drive")
     options = ("--unsigned", "--params", "V001.json", *LAYOUT, "--vehicle", VEHICLE, *bus)
     program = (

@@ -27,7 +27,7 @@ def calibrator(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[st
 
 
 def test_documented_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> None:
-    """Those of docs/first_minutes.md."""
+    """The commands are those of docs/first_minutes.md."""
     made = calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "my_car.toml"])
     assert (made.returncode, made.stdout.partition(";")[0]) == (
         0,
@@ -122,8 +122,13 @@ def test_doctor_finds_each_injected_mistake_and_no_other(
 
 
 @pytest.mark.parametrize("trip", ["TripA07", "TripA24"])
-def test_doctor_finds_i3_trips_sound_and_an_inverted_motor_wrong(trip: str, i3_store: Path, tmp_path: Path) -> None:
-    """Its motor current is what the others leave, so the sum is exact; the voltage tells motor from battery."""
+def test_doctor_finds_no_error_in_i3_trips_and_names_an_inverted_motor(
+    trip: str, i3_store: Path, tmp_path: Path
+) -> None:
+    """The motor current of these trips is minus the sum of the others, so the junction sum is exactly 0.
+
+    Which sign is wrong, that of battery or motor, follows from the voltage.
+    """
     database = vehicle_database(LAYOUT)
     drive = next(d for d in iterate_drives(i3_store, database.layout) if d.name == trip)
     write_drive_log(tmp_path / "trip.log.gz", drive, database)

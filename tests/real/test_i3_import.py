@@ -16,7 +16,10 @@ from ecu_node.layout import read_layout
 from tests.real.conftest import LAYOUT
 
 STUCK_HEATER = {"TripA03", "TripA05", "TripA06", "TripA13", "TripA18"}
-"""Known from the energy balance. TripA20, also said to be implausible, agrees with its balance but for the defaults."""
+"""Trips with a stuck heater signal, known from the energy balance.
+
+TripA20, also said to be implausible, agrees with its energy balance except where the signal reads its default.
+"""
 
 
 @pytest.mark.long
@@ -59,10 +62,13 @@ LONG = pytest.mark.long
         pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=False, world=""), 0.01, marks=LONG),
     ],
 )
-def test_fleet_is_corrected_and_not_harmed(
+def test_enough_vehicles_with_faulty_sensors_are_corrected_and_none_is_harmed(
     trips: RecordedFleet, vehicles: int | None, case: RecordedCase, least: float
 ) -> None:
-    """Of four fleets of some vehicles, or of all, so many of the faulty ones; no vehicle is made worse."""
+    """At least the share ``least`` of the vehicles with faulty sensors is corrected, and no corrected one gets worse.
+
+    There are four fleets. Each has so many ``vehicles``, drawn from the trips; None: all trips.
+    """
     found = []
     for seed in range(420, 424):
         some = np.random.default_rng(seed).permutation(len(trips.trips))[:vehicles]

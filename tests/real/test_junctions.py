@@ -15,7 +15,7 @@ def stations(i3_charges: Path) -> JunctionCalibrator:
     return JunctionCalibrator(meter="charger", trusted=["battery"]).fit(i3_charges / "car", i3_charges / "layout.toml")
 
 
-def test_charging_stations_differ_by_their_gains(stations: JunctionCalibrator) -> None:
+def test_gain_ratio_of_the_battery_to_each_charging_station_is_found(stations: JunctionCalibrator) -> None:
     """At 124 A the battery reads 2.5 A less than one station, and 1.0 A more than the other."""
     rows = stations.parameters_.set_index(["vehicle", "branch"]).xs("charger", level="branch")
     ratio = 1.0 / (1.0 + rows.gain_error)  # battery over charger
@@ -26,7 +26,7 @@ def test_charging_stations_differ_by_their_gains(stations: JunctionCalibrator) -
 
 
 def test_two_trusted_stations_that_differ_are_reported_as_a_contradiction(i3_charges: Path, tmp_path: Path) -> None:
-    """Two meters that are both called right differ by 2.4 %: that is said, and nothing is corrected."""
+    """Two meters, both declared as trusted, differ by 2.4 %: the contradiction is reported, and nothing corrected."""
     done = command(
         "calibrate", i3_charges / "car", "--layout", i3_charges / "layout.toml",
         "--meter", "charger", "--trusted", "charger", "--out", tmp_path / "r",
@@ -36,8 +36,10 @@ def test_two_trusted_stations_that_differ_are_reported_as_a_contradiction(i3_cha
     assert not pd.read_parquet(tmp_path / "r" / "results.parquet").applied.any()
 
 
-def test_offset_of_a_station_needs_the_load_of_the_car(i3_charges: Path, stations: JunctionCalibrator) -> None:
-    """After the plug the car draws 0.7 to 0.9 A that no branch measures: declared, they leave no offset."""
+def test_offset_of_a_station_is_known_only_if_the_load_of_the_car_is_declared(
+    i3_charges: Path, stations: JunctionCalibrator
+) -> None:
+    """Between plug and battery the car draws 0.7 to 0.9 A that no branch measures; once declared, no offset is left."""
     knowing = JunctionCalibrator(meter="charger", trusted=["battery"], load=(0.8, 0.1))
     open_, declared = stations.parameters_, knowing.fit(i3_charges / "car", i3_charges / "layout.toml").parameters_
     assert (open_[open_.branch == "charger"].offset_sd_a > 1.0).all()
@@ -47,7 +49,7 @@ def test_offset_of_a_station_needs_the_load_of_the_car(i3_charges: Path, station
 
 
 def test_rear_inverter_reads_two_percent_less_than_the_battery(tesla: Path) -> None:
-    """As least squares say; the front one hardly moved, and its gain stays open."""
+    """Least squares on the same samples agree; the front inverter's current hardly varied, so its gain is not known."""
     found = JunctionCalibrator(trusted=["battery"]).fit(tesla / "drive.log.gz", tesla / "tesla_model3.toml")
     rows = found.parameters_.set_index("branch")
     frame = read_log(tesla / "drive.log.gz", tesla / "tesla_model3.toml").to_frame().dropna()

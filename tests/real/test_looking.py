@@ -29,7 +29,7 @@ def test_kirchhoff_sum_of_car_and_station_is_their_difference(name: str, mean_a:
     assert found["expected"]["in_band"]["before"] < 0.3
 
 
-def test_doctor_reports_constant_currents_of_a_charge_as_hint(i3_charges: Path) -> None:
+def test_doctor_reports_constant_currents_of_a_charge_but_no_error(i3_charges: Path) -> None:
     doctor = examined(i3_charges / "layout.toml", i3_charges / "car" / "efacec" / "2019_efacaec_mida.csv.gz")
     assert doctor.errors == []
     (still,) = doctor.findings("stands still")

@@ -13,7 +13,7 @@ from tests.ecu_node.junctions import Junction, three_branches
 COLUMNS = (7, 8, 15)
 """Battery voltage [V], battery current [A], heating power [kW]."""
 PERIOD_S = 0.1
-"""Of the recordings. [s]"""
+"""Sample period of the recordings. [s]"""
 HOURS = float(os.environ.get("HV_WATCH_HOURS", "0.2"))
 """Simulated time; ``make soak`` takes 24 h. [h]"""
 
@@ -63,7 +63,7 @@ def warming(junction: Junction) -> None:
 
 
 def watched(folder: Path, paths: list[Path], duration_s: float, period_s: float, seed: int) -> Junction:
-    """A node with a right set that has ridden through some drives."""
+    """The junction of a node with right parameters, after it has driven some recorded drives."""
     junction = Junction(three_branches(folder), sd_a=1.2, sd_per_a=0.012, period_s=period_s, seed=seed)
     warming(junction)
     junction.run(duration_s, RecordedDrives(paths, seed))
@@ -71,7 +71,9 @@ def watched(folder: Path, paths: list[Path], duration_s: float, period_s: float,
 
 
 @pytest.mark.parametrize("period_s", [0.02, 0.1])
-def test_right_set_stays_in_force_on_real_drives(tmp_path: Path, shared_data: Path, period_s: float) -> None:
+def test_node_with_right_parameters_keeps_correcting_on_real_drives(
+    tmp_path: Path, shared_data: Path, period_s: float
+) -> None:
     paths = sorted((shared_data / "bmw_i3_summer").glob("*.csv.gz"))[3 : 6 if HOURS < 1.0 else None]
     junction = watched(tmp_path, paths, 3600.0 * HOURS, period_s, seed=1)
     assert junction.corrector.latched_branches == ()
@@ -79,7 +81,9 @@ def test_right_set_stays_in_force_on_real_drives(tmp_path: Path, shared_data: Pa
 
 
 @pytest.mark.parametrize("name", ["battery", "motor"])
-def test_sensor_that_breaks_on_real_drives_is_named_within_100_ms(tmp_path: Path, shared_data: Path, name: str) -> None:
+def test_branch_whose_sensor_breaks_on_real_drives_is_latched_within_100_ms(
+    tmp_path: Path, shared_data: Path, name: str
+) -> None:
     paths = sorted((shared_data / "bmw_i3_summer").glob("*.csv.gz"))[3:4]
     drives = RecordedDrives(paths, seed=1)
     junction = Junction(three_branches(tmp_path), sd_a=1.2, sd_per_a=0.012, period_s=0.02)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 NODE_PACKAGES = {"_typeshed", "can", "cantools", "e2e", "fastcrc", "msgspec"}
-"""What the base install has, and what only type checkers see."""
+"""Packages of the base install, and one that only type checkers see."""
 NODE_EXTRAS = {"update": {"cryptography", "tuf", "securesystemslib", "urllib3"}}
 """What packages or modules of this name may import besides: an extra brings it, and only their commands need it."""
 ENTRIES = {"__init__", "__main__", "cli"}
-"""They import every package, to start it."""
+"""Modules that may import every package, as they start the program."""
 
 
 def imported(path: Path) -> Iterator[str]:
@@ -34,7 +34,7 @@ def test_node_imports_only_its_base_install_and_not_the_calibrator() -> None:
     assert heavy == []
 
 
-def test_packages_import_only_packages_listed_before_them() -> None:
+def test_packages_import_only_those_listed_before_them_in_the_architecture_document() -> None:
     page = (ROOT / "docs" / "architecture.md").read_text()
     rows = re.findall(r"(?m)^\| (`.+?`) \|", page.partition("| package of `calibrator`")[2])
     level = {package: number for number, row in enumerate(rows) for package in re.findall(r"`(\w+)`", row)}

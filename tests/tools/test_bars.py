@@ -1,4 +1,4 @@
-"""The bars of a release are compared with what experiments and benchmarks have left."""
+"""The bars of a release (limits in bars.toml) are compared with the results of experiments and benchmarks."""
 
 import json
 from contextlib import nullcontext
@@ -22,7 +22,7 @@ def bench_rows(folder: Path, **ratios: float) -> Path:
     return path
 
 
-def test_bars_of_the_recorded_experiments_are_met_or_known_to_be_missed(
+def test_recorded_experiments_meet_the_bars_of_the_release_or_miss_them_as_known(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):  # nothing was measured but one reader
@@ -33,7 +33,7 @@ def test_bars_of_the_recorded_experiments_are_met_or_known_to_be_missed(
 
 
 @pytest.mark.parametrize(("ratio", "verdict"), [(25.0, "met"), (24.9, "MISSED")])
-def test_benchmark_that_misses_its_bar_is_named(
+def test_benchmark_ratio_below_its_bar_is_marked_as_missed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], ratio: float, verdict: str
 ) -> None:
     with pytest.raises(SystemExit, match="bars are missed that"):
@@ -42,7 +42,7 @@ def test_benchmark_that_misses_its_bar_is_named(
     assert line.split()[-1] == verdict
 
 
-def test_shares_of_several_rows_are_pooled_by_their_cases(tmp_path: Path) -> None:
+def test_shares_of_several_rows_are_averaged_by_their_numbers_of_cases(tmp_path: Path) -> None:
     rows = [("K=2", 0.5, 10), ("K=3", 0.0, 30), ("other", 1.0, 99)]
     figures = [
         {"series": series, "x": 80.0, "method": "posterior", "figure": "harmed", "value": value, "of": of}
@@ -56,7 +56,7 @@ def test_shares_of_several_rows_are_pooled_by_their_cases(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("mark", "expected"), [("", None), ("-dirty", "figures of 0123456789ab-dirty; expected")])
-def test_figures_are_of_one_commit_without_changes(
+def test_figures_made_with_uncommitted_changes_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mark: str, expected: str | None
 ) -> None:
     (tmp_path / "bars.toml").write_text('bars = [["bench", "BLF.*", "ratio", ">= 25"]]')

@@ -1,4 +1,4 @@
-"""Benchmarks give a figure of every kind at small size, of work that succeeded; its size is not tested."""
+"""Benchmarks run at small size and give all their figures; how large the figures are is mostly not tested."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ def test_benchmark_compares_both_modes_of_the_node_with_cantools() -> None:
     assert all(row.ratio is not None and "cantools" in (row.peer or "") for row in found)
 
 
-def test_benchmark_measures_start_time_and_memory_of_a_real_process() -> None:
+def test_benchmark_measures_start_time_and_memory_of_a_running_node() -> None:
     found = process_rows(3000)
     assert [row.unit for row in found] == ["s", "MiB", "MiB"]
     start_s, memory_mib, growth_mib = (row.value for row in found)

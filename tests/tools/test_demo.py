@@ -9,7 +9,9 @@ from ecu_node.errors import UserError
 
 
 @pytest.mark.long
-def test_the_demo_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_demo_runs_its_five_steps_and_draws_its_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     for name, value in {"VEHICLES": 8, "BRANCHES": 2, "SECONDS": 1.0}.items():
         monkeypatch.setattr(demo, name, value)
     out = tmp_path / "demo"

@@ -1,4 +1,4 @@
-"""Recorded trips of a BMW i3 become drives; what of a file cannot be used is labelled, and said."""
+"""Recorded trips of a BMW i3 become drives; samples that cannot be used are labelled as not good, with a notice."""
 
 import gzip
 import json
@@ -20,7 +20,7 @@ from tests.ecu_node.vehicles import LAYOUT
 SAMPLES = 600
 IDLE_W = 500.0
 OF_HEATER = ("auxiliary", "motor", "heater_demand")
-"""Channels for which the power of the heater is needed."""
+"""Channels that are computed from the power of the heater."""
 
 
 def columns(**changes: Any) -> dict[str, Array]:
@@ -103,7 +103,7 @@ def test_currents_are_positive_into_the_junction_and_sum_to_zero(tmp_path: Path,
     ],
     ids=["default and its ramps", "heater above battery", "heater within battery", "empty cell", "out of range"],
 )
-def test_what_cannot_be_used_is_labelled_with_what_is_computed_from_it(
+def test_unusable_cells_are_labelled_as_not_good_in_every_channel_computed_from_them(
     changes: dict[str, Any], bad: dict[str, Any], notice: str | None, tmp_path: Path, database: VehicleDatabase
 ) -> None:
     trip = imported(write_csv(tmp_path / "a.csv", columns(**changes)), database)
@@ -113,7 +113,9 @@ def test_what_cannot_be_used_is_labelled_with_what_is_computed_from_it(
     assert any(text.startswith(notice) for text in trip.notices) if notice else not trip.notices
 
 
-def test_files_that_cannot_be_used_are_refused(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_files_without_a_column_usable_values_or_10_s_of_samples_are_refused(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
     path = write_csv(tmp_path / "a.csv", columns(), "Battery V", "Batery V")
     words = r"a\.csv: there is no column 'Battery Voltage \[V\]'; the columns are 'Batery V"
     with pytest.raises(LogError, match=words):
@@ -141,7 +143,7 @@ def test_bad_file_does_not_stop_the_import_but_sets_the_exit_code(tmp_path: Path
     assert "1 trips imported, 0.0 h; 0 already there; 2 left out" in done.stdout
 
 
-def test_a_layout_without_these_branches_is_refused(tmp_path: Path) -> None:
+def test_layout_without_a_branch_of_the_recordings_is_refused(tmp_path: Path) -> None:
     text = LAYOUT.read_text().replace('name = "auxiliary"', 'name = "heater"')
     (tmp_path / "l.toml").write_text(text.replace('"hv_powertrain.dbc"', f'"{LAYOUT.with_suffix(".dbc")}"'))
     path = write_csv(tmp_path / "A.csv", columns())

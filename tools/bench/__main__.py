@@ -1,4 +1,4 @@
-"""Benchmarks, each with its peer in the same run; the table is also written as JSON.
+"""Benchmarks, many beside a peer (another way to do the same) in the same run; the table is also written as JSON.
 
 python -m bench [GROUP] [--quick]        (in tools/)
 """

@@ -1,4 +1,4 @@
-"""The bars of a release (``bars.toml``) beside the figures that experiments and benchmarks left.
+"""The bars of a release, limits that its figures must meet (``bars.toml``), beside the figures that were measured.
 
     python -m bench.bars        (in tools/, after experiments and benchmarks)
 
@@ -32,7 +32,7 @@ def meets(value: float, bar: str) -> bool:
 
 
 class Bars:
-    """Looks up the figures that bars are about.
+    """Looks up the figures of experiments and benchmarks that bars limit.
 
     Parameters
     ----------
@@ -50,7 +50,12 @@ class Bars:
     def figure(  # noqa: PLR0911 (each figure has its own rule)
         self, where: str, rows: str, figure: str, bar: str
     ) -> tuple[float, str]:
-        """Return a figure, NaN if it was not measured, and what is behind it: number of cases and 95 % interval."""
+        """Return the figure of a row of ``bars.toml``, NaN if it was not measured, and what is behind it as text.
+
+        The row gives the experiment or "bench" (``where``), a pattern of names of ``rows``, the figure, and its bar. Of
+        several rows shares are pooled; other figures, and "each SHARE", are those of the row farthest from the bar. The
+        text has counts, for pooled shares also the 95 % interval; for benchmarks it is empty.
+        """
         worst = COMPARISONS[bar.split(maxsplit=1)[0]][1]
         if where == "bench":
             return self._benchmark(rows, figure, worst), ""

@@ -32,7 +32,7 @@ from ecu_node.parameters import BranchParameters
 CORE = Path(ecu_node.__file__).parent / "c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
 RECORD = Struct("<IBB64s")
-"""A frame: identifier (bit 31 set: it has 29 bits), length, result (0 as it was, 1 changed, 2 held back), payload."""
+"""A frame: identifier (bit 31 set: 29 bits), length, result (0 unchanged, 1 changed, 2 not passed on), payload."""
 
 _HERE = Path(__file__).parent
 SILENCE = 255
@@ -40,7 +40,7 @@ SILENCE = 255
 
 
 def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
-    """Make a vehicle with faults in all sensors but that of branch "passed"; the default layout uses the whole core."""
+    """Make a vehicle with faults in all sensors but that of branch "passed"; the default layout uses the core fully."""
     database, rng = read_database(read_layout(layout)), Random(1)
     limit, offset_a = database.layout.limits.drift, 0.1 * database.layout.full_scale_a
     faults = {
@@ -54,9 +54,10 @@ def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:
 
 
 def frames(database: VehicleDatabase, rng: Random, count: int) -> Iterator[tuple[int, bytes | None]]:
-    """Yield identifier and payload of frames as on a bus, and worse.
+    """Yield identifier and payload of random frames, most of them valid.
 
-    Counters jump, bits are changed, payloads are cut; a payload of None is a silence. Bit 31 marks 29-bit identifiers.
+    In some a counter jumps, a bit is changed, or the payload is cut; a payload of None is a silence. Bit 31 of the
+    identifier is set if it has 29 bits.
     """
     messages = []
     for key, message in received(database).items():

@@ -1,7 +1,7 @@
 """Fleets of the benchmarks: simulated ones, and large ones that are made from few simulated vehicles.
 
-Faults change currents linearly, (11) and (13) of the paper. So the summaries of a few vehicles without faults can be
-turned into those of any number of vehicles with faults, without reading a drive.
+Faults change currents linearly, equations (11) and (13) of the paper. So the summaries of a few vehicles without faults
+can be turned into those of any number of vehicles with faults, without reading a drive.
 """
 
 import subprocess

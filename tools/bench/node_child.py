@@ -18,7 +18,7 @@ _PATIENCE_S = 5.0
 
 
 def main() -> None:
-    """Run the node until the thread beside it has seen enough."""
+    """Run the node until the thread beside it has sent all its frames, or failed."""
     job = json.loads(sys.argv[1])
     threading.Thread(target=_send, args=(job,), daemon=True).start()
     from ecu_node.cli import run_ecu_node  # noqa: PLC0415  # its start is measured

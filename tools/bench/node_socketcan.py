@@ -46,7 +46,7 @@ FIGURES = {"rate": "frames/s", "latency, median": "us", "latency, 99.9 %": "us"}
 QUIET_S = 0.5
 """If no frame comes for this long, none is on its way. [s]"""
 LATENCY_SHARE = 10
-"""The latency is measured with one frame, sent alone, for each so many frames that measure the rate."""
+"""For every so many frames that measure the rate, one frame, sent alone, measures the latency."""
 
 
 def rows(frames: int) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Cost of summaries made on board: drives of an artificial fleet, 230 frames a second, are replayed to their code."""
+"""Cost of summaries made on board, measured with the frames of an artificial fleet's drives, 230 a second."""
 
 import tempfile
 import time

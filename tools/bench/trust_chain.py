@@ -47,7 +47,7 @@ LEAST_DIFFERENCE_A = 0.02
 LOOK_EVERY_S = 0.1
 """Time between two looks of the node at the junction. [s]"""
 WRONG = ("signs_turned", "of_another_vehicle")
-"""Kinds of wrong sets."""
+"""Kinds of wrong parameter sets: the own one with its signs turned, and that of another vehicle."""
 
 
 def main(

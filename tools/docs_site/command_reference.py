@@ -45,7 +45,7 @@ def command_help(program: str, *path: str) -> Iterator[tuple[str, str]]:
     Yields
     ------
     name, text : str
-        Such as ``calibrator keys new`` and its help; a command comes before its own commands.
+        Such as ``calibrator repository key`` and its help; a command comes before its own commands.
     """
     text = _printed(program, [*path, "--help"])
     yield " ".join((program, *path)), text

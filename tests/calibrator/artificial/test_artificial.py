@@ -49,7 +49,7 @@ def decoded(database: VehicleDatabase, noise_a: float, message: str, signal: str
     return item.time_s, np.array(values, dtype=float)
 
 
-def test_frames_contain_true_currents_with_fault_delay_and_noise(database: VehicleDatabase) -> None:
+def test_frames_hold_the_true_currents_with_fault_delay_and_noise_of_each_sensor(database: VehicleDatabase) -> None:
     instants = []
     for name, message, signal, sign in BRANCHES:
         time_s, value = decoded(database, 0.0, message, signal)

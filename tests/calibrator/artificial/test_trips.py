@@ -69,7 +69,7 @@ def test_recorded_drive_becomes_a_trip_over_the_span_of_all_channels() -> None:
     assert ground_truth_from_drive(without_good, 0.1) is None
 
 
-def test_no_recording_serves_both_calibration_and_judging() -> None:
+def test_no_piece_of_a_recording_is_in_both_the_calibration_and_the_unseen_trip_of_a_vehicle() -> None:
     trips = [recorded(float(k)) for k in range(4)]
     enough = RecordedTrips(seed=0, recorded=trips, vehicles=4, unseen_s=30.0)
     for k in range(4):
@@ -92,7 +92,7 @@ def test_builtin_trip_obeys_the_junction_law_and_has_all_channels(database: Vehi
     assert set(trip.inputs) == {item.name for item in database.layout.input} - NOT_MODELLED
 
 
-def test_builtin_trips_without_fastsim_report_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_builtin_trip_without_fastsim_is_refused_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fastsim", None)  # makes its import fail
     with pytest.raises(FleetError, match=r"need fastsim; .*: pip install 'hv-current-correction\[demo\]'$"):
         builtin_trip(np.random.default_rng(0), duration_s=60.0, name="trip")
@@ -102,7 +102,9 @@ def chosen(drives: str, layout: Layout) -> TripSource:
     return choose_trips(drives, layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
 
 
-def test_drives_without_good_samples_are_left_out_and_named(database: VehicleDatabase, tmp_path: Path) -> None:
+def test_drives_without_good_samples_are_left_out_and_named_in_a_notice(
+    database: VehicleDatabase, tmp_path: Path
+) -> None:
     for name, good in (("fine", True), ("stuck", False)):
         branches = {
             branch: Channel(time_s=np.arange(100) * 0.1, value=np.ones(100), good=np.full(100, usable))
@@ -123,7 +125,7 @@ def renamed(layout: Layout, *, branches: bool = False, inputs: Sequence[str] = (
     return msgspec.structs.replace(layout, branch=branch, derived=derived)
 
 
-def test_names_of_a_layout_that_the_builtin_vehicle_lacks_are_reported(database: VehicleDatabase) -> None:
+def test_layout_without_builtin_branches_is_refused_and_missing_inputs_give_a_notice(database: VehicleDatabase) -> None:
     with pytest.raises(FleetError, match=r"two or more branches named battery, motor, .* or give --drives a store"):
         chosen("builtin", renamed(database.layout, branches=True))
     (notice,) = chosen("builtin", renamed(database.layout, inputs=["heater_demand"])).notices
@@ -145,7 +147,9 @@ def free_parameters(faults: Faults) -> Array:
 
 
 @pytest.mark.parametrize(("branches", "sparsity", "count"), [(3, 60.0, 4), (2, 60.0, 2), (5, 20.0, 12)])
-def test_every_vehicle_has_as_many_faults_as_the_paper_counts(branches: int, sparsity: float, count: int) -> None:
+def test_number_of_nonzero_fault_parameters_follows_from_the_sparsity_level(
+    branches: int, sparsity: float, count: int
+) -> None:
     faults = draw(branches=branches, sparsity=sparsity)
     assert np.all(np.count_nonzero(free_parameters(faults), axis=1) == count)
 
@@ -173,7 +177,7 @@ def test_fault_sizes_lie_in_their_range_and_signs_follow_the_bias(bias: float, p
     ({"sign_bias": 0.2, "symmetric": True}, "and 0 for a symmetric fleet"),
     ({"vehicles": 6, "symmetric": True}, "needs a multiple of 4 vehicles, not 6"),
 ])  # fmt: skip
-def test_fleet_that_cannot_be_drawn_is_refused(changes: dict[str, Any], message: str) -> None:
+def test_impossible_sign_bias_or_size_of_a_symmetric_fleet_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(FleetError, match=message):
         draw(**{"vehicles": 4} | changes)
 

@@ -26,13 +26,13 @@ def smooth_drive(branches: int = 2, samples: int = 6000) -> CommonDrive:
 
 
 def small_fleet(trips: int = 12, samples: int = 3000) -> RecordedFleet:
-    """Trips of a car of which the model explains nearly all, with what it needs for two or three branches."""
+    """Trips of a car with three branches, whose currents follow from the model's inputs but for a small rest."""
     made = tuple(_trip(np.random.default_rng(k), f"trip-{k}", samples) for k in range(trips))
     return RecordedFleet(name="small", trips=made, database=read_database(read_layout(LAYOUT)))
 
 
 def write_store(folder: Path, trips: Iterable[GroundTruth], *, lacking: Collection[str] = ()) -> Path:
-    """A drive store of trips as ``calibrator import`` leaves it; the third may lack channels."""
+    """A drive store of trips as ``calibrator import`` leaves it; the third trip lacks the channels ``lacking``."""
     for number, trip in enumerate(trips):
         channels = {
             name: Channel(time_s=trip.time_s, value=x, good=np.isfinite(x))
@@ -62,5 +62,5 @@ def _trip(rng: np.random.Generator, name: str, samples: int) -> GroundTruth:
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Random numbers that change within seconds, of a deviation of about a sixth."""
+    """Random numbers that change within seconds, with mean 0 and a standard deviation of about 1/6."""
     return np.asarray(lfilter([0.05], [1.0, -0.95], rng.normal(size=shape), axis=0))

@@ -20,7 +20,7 @@ CASE = CommonCase(vehicles=100)
 
 
 def rates(case: CommonCase, *methods: ComparedMethod, figure: str = "recovery_rate") -> list[float]:
-    """Figure of some methods on one trial."""
+    """Value of a figure for each method, all on the same trial."""
     trial = common_trial(smooth_drive(), case, 0)
     judged = [figure_rows([judge(method.estimate(trial), trial)])[0].set_index("figure") for method in methods]
     return [float(figures.loc[figure, "value"]) for figures in judged]
@@ -40,13 +40,13 @@ def test_state_space_models_of_a_symmetric_fleet_give_the_slopes_of_the_faults()
     np.testing.assert_allclose(trial.evidence.intercepts_a, b, atol=1e-3)
 
 
-def test_number_of_branches_that_the_builtin_vehicle_lacks_is_refused() -> None:
+def test_common_drive_with_more_branches_than_the_builtin_vehicle_has_is_refused() -> None:
     with pytest.raises(FleetError, match="9 branches: the built-in vehicle has 2 to 5"):
         builtin_common_drive(60.0, branches=9)
 
 
 @pytest.mark.long
-def test_recovery_rate_rises_with_sparsity_snr_and_better_classifiers() -> None:
+def test_better_classifiers_raise_f2_and_sparsity_and_snr_raise_the_recovery_rate() -> None:
     f2 = rates(CASE, PERFECT, TREE, THRESHOLD, figure="f2")
     assert f2[0] == 1.0
     assert f2 == sorted(f2, reverse=True)
@@ -64,7 +64,7 @@ def test_recovery_rate_rises_with_sparsity_snr_and_better_classifiers() -> None:
     assert rates(CASE, POSTERIOR, figure="harmed") < [0.05]
 
 
-def test_asymmetric_fleet_defeats_the_mean_reference_but_not_the_default() -> None:
+def test_asymmetric_fleet_defeats_the_published_method_but_not_the_default() -> None:
     published, default = rates(replace(CASE, vehicles=60, symmetric=False, sign_bias=0.4), PERFECT, POSTERIOR)
     assert published < 0.3
     assert default > 0.8

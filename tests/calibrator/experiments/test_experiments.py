@@ -39,7 +39,7 @@ def snr() -> ExperimentResult:
 
 
 def only(result: ExperimentResult, column: str, value: object) -> ExperimentResult:
-    """Rows of a result with this value alone."""
+    """The result with only those rows that have this value in a column."""
     figures, tenths = (table[table[column] == value] for table in (result.figures, result.tenths))
     return replace(result, figures=figures, tenths=tenths)
 
@@ -74,7 +74,9 @@ def test_new_experiment_needs_one_table_row_and_is_checked_before_it_runs(fleet:
 @pytest.mark.parametrize(
     "name", ["delay", *(pytest.param(n, marks=pytest.mark.long) for n in EXPERIMENTS if n not in {"delay", "snr"})]
 )
-def test_experiments_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
+def test_each_experiment_runs_at_small_size_and_writes_json_page_and_picture(
+    name: str, fleet: RecordedFleet, tmp_path: Path
+) -> None:
     row = EXPERIMENTS[name].small()
     result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")
@@ -126,7 +128,7 @@ def test_tables_compare_the_paper_with_methods_and_explain_columns(snr: Experime
         assert not any(absent in text for absent in ("confidence", "calibration error", "delays", "failed:"))
 
 
-def test_trials_of_all_settings_count_together(snr: ExperimentResult) -> None:
+def test_rows_called_all_together_pool_the_trials_of_all_settings(snr: ExperimentResult) -> None:
     rows = snr.figures[snr.figures["method"] == POSTERIOR.name].set_index(["series", "figure"])
     rates = [snr.value("recovery_rate", x=x, method=POSTERIOR.name) for x in (10.0, 20.0)]
     assert rows.loc[(ALL, "recovery_rate"), "value"] == pytest.approx(np.mean(rates))
@@ -154,7 +156,9 @@ NO_TABLE = "^snr: methods .*; expected methods with names of their own, and sett
     ({"methods": ()}, NO_TABLE),
     ({"methods": (PERFECT, POSTERIOR, PERFECT)}, "^snr: methods published/perfect, posterior, published/perfect;"),
 ])  # fmt: skip
-def test_experiment_that_cannot_give_a_table_is_refused(change: dict[str, Any], message: str) -> None:
+def test_experiment_on_wrong_drives_or_without_distinct_settings_and_methods_is_refused(
+    change: dict[str, Any], message: str
+) -> None:
     with pytest.raises(FleetError, match=message):
         run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive())
 
@@ -171,19 +175,19 @@ def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
     assert (EXPERIMENTS["asymmetry"].repetitions, small.repetitions) == (3, 2)
 
 
-def test_settings_are_chosen_by_a_text_in_their_name() -> None:
+def test_experiment_is_restricted_to_settings_with_a_text_in_their_name_which_must_exist() -> None:
     kept = EXPERIMENTS["attacks"].only("cubic").small().settings
     assert [(each.series, each.x) for each in kept] == [("cubic 5-20 %", 2.0), ("cubic 5-20 %", 3.0)]
     ran = CliRunner().invoke(app, ["experiment", "asymmetry", "--only", "0.3"])
     assert "asymmetry: no setting has '0.3' in its name; there are 0, 0.2, 0.4, 0.5" in str(ran.exception)
 
 
-def test_number_of_vehicles_without_length_of_their_drives_is_refused() -> None:
+def test_recorded_case_with_a_number_of_vehicles_but_no_minutes_is_refused() -> None:
     with pytest.raises(FleetError, match="40 vehicles, and each trip is one: give minutes as well"):
         RecordedCase(vehicles=40)
 
 
-def test_experiment_command_runs_and_records(tmp_path: Path) -> None:
+def test_experiment_command_writes_json_page_and_picture_or_lists_all_experiments(tmp_path: Path) -> None:
     out = ("--out", str(tmp_path / "results"))
     ran = CliRunner().invoke(app, ["experiment", "snr", "--quick", "--repetitions", "1", "--workers", "1", *out])
     assert ran.exit_code == 0, ran.output

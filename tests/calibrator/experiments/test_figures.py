@@ -53,7 +53,10 @@ def one_of(*, drift: Array, truth: Array) -> tuple[Estimate, Trial]:
 
 
 def two_vehicles(*, drift: float, harm_second: float) -> tuple[Estimate, Trial]:
-    """Two vehicles with a drift of 0.1 in their first branch, and an estimate."""
+    """An estimate of two vehicles whose first branch has a drift of 0.1, and their trial.
+
+    It finds ``drift`` there, and ``harm_second`` in the second branch of the second vehicle, whose sensor is sound.
+    """
     found = np.array([[drift, 0.0], [drift, harm_second]])
     return one_of(drift=found, truth=np.array([[0.1, 0.0], [0.1, 0.0]]))
 
@@ -86,7 +89,7 @@ def test_vehicle_with_a_worsened_branch_is_harmed(
         assert figures["worst_a"].value == pytest.approx(rms_a * (1.0 - 1.0 / 1.2))
 
 
-def test_uncorrected_branch_does_no_harm() -> None:
+def test_uncorrected_branch_does_not_count_as_harmed() -> None:
     estimate, trial = two_vehicles(drift=0.1, harm_second=0.2)
     only_first = replace(estimate, corrected=estimate.corrected & np.array([True, False]))
     assert figures_of(judge(only_first, trial))["harmed"].value == 0.0
@@ -103,7 +106,7 @@ def test_shares_have_exact_binomial_intervals() -> None:
     assert np.isnan(figures_of({"confidence": np.array([0.3])})["confidence"].low)
 
 
-def test_correct_standard_deviations_give_normal_scores() -> None:
+def test_correct_standard_deviations_give_the_coverage_of_a_normal_distribution() -> None:
     rng, true = np.random.default_rng(0), np.full((4000, 2), 0.2)
     sd = rng.uniform(0.01, 0.03, true.shape)
     estimate, trial = one_of(drift=true + sd * rng.standard_normal(sd.shape), truth=true)

@@ -26,7 +26,10 @@ def shown_as(result: ExperimentResult, name: str) -> ExperimentResult:
 
 @pytest.fixture(scope="module")
 def equal() -> ExperimentResult:
-    """All series and methods the same, at the ends of the scale, of 30 vehicles each; the default knows it."""
+    """Recovery rates of 0 and 1, the same for all series and both methods, of 30 vehicles each.
+
+    Only the default has a confidence.
+    """
     tables = []
     for series, (x, rate), method in product(BIASES, ((20.0, 0.0), (2000.0, 1.0)), (PERFECT, POSTERIOR)):
         within = np.full(30, rate > 0.0)

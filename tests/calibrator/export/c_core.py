@@ -1,4 +1,4 @@
-"""The C core compared with the node: frames and codes in, and the first that gives different results."""
+"""The C core compared with the node: both get the same frames and codes, and the first result that differs is named."""
 
 from array import array
 from collections.abc import Iterable, Iterator
@@ -38,12 +38,12 @@ def check_frames(checked: Checked, program: Path, rng: Random, count: int) -> in
     Returns
     -------
     int
-        How many were changed.
+        Number of frames that the node changed.
 
     Raises
     ------
     ValueError
-        If they differ in one frame, naming it.
+        If node and core make something different of a frame; the message names it.
     """
     given = list(frames(checked.database, rng, count))
     wanted = list(by_the_node(checked, given))
@@ -56,12 +56,15 @@ def check_frames(checked: Checked, program: Path, rng: Random, count: int) -> in
 
 
 def all_codes(checked: Checked, program: Path, *, voltage: int | None = None, bits: int = 24) -> int:
-    """Compare all codes of all branches of up to so many bits, and return how many they were.
+    """Compare what node and core make of every code of each branch whose signal has at most ``bits`` bits.
+
+    With a voltage (code) only branches that are a power are compared, without one only the others. Returns the number
+    of codes.
 
     Raises
     ------
     ValueError
-        If node and core differ in one, naming it.
+        If node and core make something different of a code; the message names it.
     """
     total = 0
     for number, branch in enumerate(checked.database.layout.branch):
@@ -84,7 +87,7 @@ def all_codes(checked: Checked, program: Path, *, voltage: int | None = None, bi
 
 
 def widths(folder: Path) -> Iterator[Checked]:
-    """Vehicles that have between them signals of 8 to 24 bits, signed and unsigned, with names at an end."""
+    """Vehicles with signals of all widths from 8 to 24 bits, signed and unsigned, whose highest code is no value."""
     for lengths in (range(8, 14), range(14, 20), range(20, 25)):
         messages, tables, branches = [], [], []
         for number, (length, sign) in enumerate(product(lengths, "+-"), start=1):
@@ -99,7 +102,7 @@ def widths(folder: Path) -> Iterator[Checked]:
 
 
 def drawn_vehicles(rng: Random, folder: Path) -> Iterator[Checked]:
-    """Random vehicles without end, of which the core has room for all signals and knows all protections."""
+    """Endless random vehicles, whose numbers fit into the core and whose E2E profiles it knows."""
     while True:
         database, parameters = draw_vehicle(rng, folder, ("P01", "P02"))
         checked = Checked(name="drawn", digest="0" * 64, parameters=parameters, database=database)

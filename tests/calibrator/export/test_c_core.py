@@ -1,4 +1,4 @@
-"""The C core gives the same bits as the node, is plain C99 within MISRA C:2012, and takes any calibration."""
+"""The C core gives the same bits as the node, is plain C99 within MISRA C:2012, and is harmed by no calibration."""
 
 import os
 import re
@@ -18,7 +18,7 @@ from tests.calibrator.export.exports import checked_with, needs
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
 
 PARTS = range(-(-int(os.environ.get("HV_FRAMES", "100000")) // 100_000))
-"""Of the random frames: 100,000 each."""
+"""Numbers of the parts into which ``HV_FRAMES`` random frames are divided, 100,000 frames each."""
 SANITIZED = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
@@ -87,7 +87,7 @@ def test_c_core_deviates_only_from_the_documented_misra_rule(tmp_path: Path) -> 
 
 
 @needs("gcc")
-def test_c_core_passes_frames_through_with_a_foreign_or_erased_calibration(tmp_path: Path) -> None:
+def test_c_core_passes_frames_through_if_the_calibration_is_not_of_its_layout(tmp_path: Path) -> None:
     checked = vehicle()
     text = c_text(checked)
     build(checked, tmp_path)

@@ -43,7 +43,9 @@ def test_export_replaces_a_different_file_only_with_replace(form: str, params: P
     assert (out.read_bytes(), len(list(out.parent.iterdir()))) == (content, 1)
 
 
-def test_parameters_that_do_not_fit_are_refused(params: Path, tmp_path: Path, make_database: MakeDatabase) -> None:
+def test_export_refuses_parameters_of_another_vehicle_or_layout(
+    params: Path, tmp_path: Path, make_database: MakeDatabase
+) -> None:
     more = ("--format", "c", "--output", tmp_path / "out")
     with pytest.raises(ParameterError, match=r"v1\.json: parameters are for vehicle 'v1', this is 'v7'"):
         raise refused(params, *more, "--vehicle", "v7")
@@ -52,7 +54,9 @@ def test_parameters_that_do_not_fit_are_refused(params: Path, tmp_path: Path, ma
     assert not (tmp_path / "out").exists()
 
 
-def test_e2e_profile_unknown_to_the_c_core_is_reported(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_export_to_c_gives_a_notice_about_e2e_profiles_that_the_c_core_lacks(
+    make_database: MakeDatabase, tmp_path: Path
+) -> None:
     layout = SMALL_LAYOUT + '\n[e2e]\nprofile = "P05"\noffset = 4\nmessages = ["Pair"]\n'
     database = make_database(layout)
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), tmp_path / "v1.json")
@@ -100,7 +104,7 @@ def renamed(checked: Checked, vehicle: str) -> Checked:
     return dataclasses.replace(checked, parameters=replace(checked.parameters, vehicle=vehicle))
 
 
-def test_cdfx_follows_the_order_of_the_dtd_and_keeps_its_values(checked: Checked) -> None:
+def test_cdfx_follows_the_order_of_the_dtd_and_holds_the_values_of_the_parameters(checked: Checked) -> None:
     document = ET.fromstring(cdfx_text(checked))
     for element in document.iter():
         tags, order = [child.tag for child in element], ORDER.get(element.tag, [])

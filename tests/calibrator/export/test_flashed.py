@@ -1,6 +1,7 @@
 """Exports for calibration tools, read by independent readers and flashed into a compiled program.
 
-Each format alone lets a program linked with another vehicle's calibration give the same bits as the node.
+A program that was linked with another calibration gives the same bits as the node once HEX is flashed into
+it, or the values of DCM or CDFX at the addresses of the A2L.
 """
 
 import xml.etree.ElementTree as ET
@@ -28,7 +29,7 @@ pytestmark = needs("gcc")
 
 @pytest.fixture(scope="module")
 def vehicles(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Checked]:
-    """A program with a calibration that corrects nothing, and a vehicle that it is to be flashed for."""
+    """A program with a calibration that corrects nothing, and the parameters of the vehicle to be flashed into it."""
     folder = tmp_path_factory.mktemp("flash")
     checked = vehicle()
     write_parameters(parameters_for(checked.database, i8=(0.0, 0.0)), folder / "none.json")
@@ -73,7 +74,7 @@ def test_hex_file_flashed_into_the_program_gives_the_right_correction(
 
 
 @pytest.mark.parametrize("form", ["dcm", "cdfx"])
-def test_dcm_and_cdfx_flashed_by_the_a2l_give_the_right_correction(
+def test_dcm_and_cdfx_flashed_at_the_addresses_of_the_a2l_give_the_right_correction(
     form: str, vehicles: tuple[Path, Checked], tmp_path: Path
 ) -> None:
     program, checked = vehicles
@@ -119,7 +120,7 @@ def test_a2l_is_the_same_for_all_vehicles_of_a_layout(vehicles: tuple[Path, Chec
 
 
 @pytest.mark.parametrize("address", [0, 0xFFF0, 0x00FF_FFF0, 0x8000_FFF1, (1 << 32) - 656])
-def test_hex_file_can_hold_any_32_bit_address(address: int) -> None:
+def test_hex_file_holds_data_at_any_32_bit_address_and_is_refused_beyond(address: int) -> None:
     data = Random(1).randbytes(656)
     file = bincopy.BinFile()
     file.add(intel_hex(address, data))
@@ -152,7 +153,9 @@ def test_program_without_a_matching_calibration_symbol_is_refused(
         find_image(program, make_database())
 
 
-def test_numbers_too_large_for_calibration_tools_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
+def test_numbers_with_more_digits_than_calibration_tools_have_are_refused(
+    make_database: MakeDatabase, tmp_path: Path
+) -> None:
     dbc = Path(make_database().layout.dbc_path).read_text().replace("[-3000|3000]", "[-0.3|0.3]")
     database = make_database(dbc=dbc)
     checked = checked_with(database, parameters_for(database, battery=(0.051, 0.0)), tmp_path)

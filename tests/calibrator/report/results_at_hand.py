@@ -37,7 +37,7 @@ RUN = results.RunRecord(
 def sensor(
     drift: float = 0.0, offset_a: float = 0.0, *, apply: bool = False, held_back: str | None = None, sd: float = 0.001
 ) -> BranchParameters:
-    """A sensor with a fault, known to sd of the gain, and to 100 A times as much."""
+    """A sensor with this fault; its gain error has the standard deviation ``sd``, its offset 100 A times ``sd``."""
     faulty = drift != 0.0 or offset_a != 0.0
     return BranchParameters(
         drift=drift,
@@ -82,7 +82,7 @@ def vehicle(
 
 
 def six_vehicles(database: VehicleDatabase) -> list[VehicleParameters]:
-    """One of each kind."""
+    """Two corrected, two without sensor fault (one with a hardware fault), two held back for different reasons."""
     make, sound, corrected = partial(vehicle, database), sensor(), partial(sensor, apply=True)
     hardware = HardwareFault(suspected=True, drift=-0.06, offset_a={"battery": 2.0, "motor": -2.0}, probability=0.97)
     rivals = [
@@ -133,7 +133,7 @@ def write_result(
 
 
 def six_vehicle_result(folder: Path, database: VehicleDatabase) -> Path:
-    """The six vehicles, with one left out whose name and reason are code, and one sensor that moved."""
+    """The six vehicles, and one left out, whose name and reason are HTML code; one sensor has moved."""
     return write_result(
         folder,
         six_vehicles(database),

@@ -90,7 +90,7 @@ def test_next_steps_combine_vehicles_that_the_same_measurement_would_decide(
     ]
 
 
-def test_next_step_for_tables_is_correction_by_kirchhoff_not_a_node(result: Path) -> None:
+def test_next_step_of_a_result_from_tables_is_to_correct_them_with_kirchhoff(result: Path) -> None:
     text = (result / "run.json").read_text()
     no_dbc = f'"dbc_sha256": "{hashlib.sha256(b"").hexdigest()}"'
     (result / "run.json").write_text(text.replace('"dbc_sha256": ""', no_dbc))
@@ -108,7 +108,7 @@ def test_result_whose_rows_do_not_match_its_run_file_is_refused(result: Path) ->
         read_fleet_table(result)
 
 
-def test_damaged_result_is_named(result: Path) -> None:
+def test_damaged_results_parquet_is_refused_and_named(result: Path) -> None:
     (result / "results.parquet").write_bytes(b"PAR1")
     with pytest.raises(FleetError, match=r"results\.parquet: not a result of .*; name a folder"):
         read_fleet_table(result)
@@ -118,7 +118,7 @@ def test_damaged_result_is_named(result: Path) -> None:
 
 
 DOUBT_A = SIGMAS * np.hypot(400.0 * 0.001, 0.1)
-"""Of a sensor that is known to 0.1 % and 0.1 A. [A]"""
+"""Margin for a sensor without error whose gain is known to 0.1 % and offset to 0.1 A (standard deviations). [A]"""
 
 
 Margin = Callable[..., tuple[Any, str]]
@@ -126,7 +126,7 @@ Margin = Callable[..., tuple[Any, str]]
 
 @pytest.fixture
 def margin(tmp_path: Path, database: VehicleDatabase) -> Margin:
-    """The margin of a fleet with some battery sensors, and the text of its page."""
+    """Function from battery sensors to the margin of a fleet with them, and the text of its page."""
 
     def of(*batteries: BranchParameters, **options: Any) -> tuple[Any, str]:
         items = [vehicle(database, f"V{j}", battery, sensor()) for j, battery in enumerate(batteries, start=1)]

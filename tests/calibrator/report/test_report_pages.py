@@ -71,7 +71,7 @@ def test_report_page_shows_its_numbers_without_javascript(result: Path) -> None:
     assert "1 because it is beyond the limits of the layout" in text
 
 
-def test_page_of_a_very_large_fleet_lists_only_vehicles_with_a_fault(
+def test_page_of_a_very_large_fleet_lists_only_part_of_its_vehicles_and_says_so(
     result: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(page_module, "MOST_SENSORS", 11)
@@ -121,7 +121,7 @@ def test_findings_appear_in_the_workshop_list_and_with_the_vehicle(tmp_path: Pat
     assert "Workshop list" not in visible(report_page(result, "V1")[0])
 
 
-def test_vehicle_left_out_is_shown_with_its_reason(result: Path) -> None:
+def test_report_of_a_left_out_or_unknown_vehicle_is_refused_with_the_reason(result: Path) -> None:
     with pytest.raises(FleetError, match="it was left out: cannot be read"):
         report_page(result, f"log of {EVIL}")
     with pytest.raises(FleetError, match="no vehicle 'V99' in it"):

@@ -10,7 +10,7 @@ from calibrator.terminal.text import Notice, few_reasons, figure, left_out_text,
 from tests.calibrator.screen import Screen
 
 
-def test_progress_in_a_log_is_lines_with_remaining_time(
+def test_progress_without_a_terminal_is_printed_as_lines_with_the_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter([0.0, 5.0, 11.0, 12.0, 40.0, 41.0])
@@ -26,7 +26,7 @@ def test_progress_in_a_log_is_lines_with_remaining_time(
     ]
 
 
-def test_progress_of_several_passes_is_numbered(
+def test_progress_of_each_pass_shows_its_number_and_the_number_of_passes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("calibrator.terminal.progress.WORTH_A_LINE_S", 0.0)
@@ -93,7 +93,7 @@ def test_first_five_reasons_are_listed_and_the_rest_counted() -> None:
     assert few_reasons(reasons) == f"{five}; and 2 more"
 
 
-def test_same_reason_of_many_vehicles_is_one_line() -> None:
+def test_reason_that_many_vehicles_share_is_printed_on_one_line() -> None:
     reasons = dict.fromkeys((f"V{k:03}" for k in range(1, 45)), "too short")
     line = "V001, V002, V003, V004, V005, V006 and 38 more: too short"
     assert left_out_text(reasons) == f"left out:\n  {line}"

@@ -44,7 +44,7 @@ def hello() -> None:
     (["fail", "user", "more\nlines"], 2, "prog fail: Got unexpected extra argument"),
     (["fly"], 2, "prog: No such command 'fly'; see 'prog --help'"),
 ])  # fmt: skip
-def test_error_of_a_command_is_one_line(
+def test_error_of_a_command_is_printed_on_one_line_and_sets_the_exit_code(
     arguments: list[str], code: int, text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_app(app, "prog", arguments) == code
@@ -93,14 +93,16 @@ def test_help_of_every_command_fits_80_columns_and_has_an_example(
 
 
 def number_options(command: Any, *words: str) -> Iterator[list[str]]:
-    """Words that call each option that is a number."""
+    """Names of commands and option, as they are typed, of each option that takes a number."""
     for name, each in getattr(command, "commands", {}).items():
         yield from number_options(each, *words, name)
     yield from ([*words, option.opts[0]] for option in command.params if option.metavar == "NUMBER")
 
 
 @pytest.mark.parametrize("given", ["few", "nan", "inf"])
-def test_every_number_option_has_bounds_that_are_checked_first(given: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_number_option_refuses_words_nan_and_inf_and_names_its_bounds(
+    given: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = [*number_options(get_command(calibrator_app))]
     assert len(options) > 20
     for words in options:
@@ -108,7 +110,9 @@ def test_every_number_option_has_bounds_that_are_checked_first(given: str, capsy
         assert re.search(f"'{words[-1]}': {given}: expected a (whole )?number from .* to", capsys.readouterr().err)
 
 
-def test_ctrl_c_ends_a_tool_with_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_ends_a_tool_with_one_line_and_exit_code_130(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     tool = command_app()
 
     @tool.command()
