@@ -1,0 +1,144 @@
+"""The watch on a junction whose frames are made by hand: which verdict it gives, and on which branches."""
+
+import math
+import struct
+from collections import deque
+from collections.abc import Callable
+from fractions import Fraction
+
+import pytest
+
+from ecu_node.core.correction import AS_IT_IS, SensorFault
+from ecu_node.core.junction import Frames, HeardSignal, JunctionWatch, LiveBranch, Movement
+from ecu_node.core.signals import BitPlace, Codes, PlacedSignal
+from ecu_node.core.status import Reason
+from ecu_node.parameters import JunctionResidual
+
+PLACE = BitPlace(first=0, end=2, order="little", shift=0, length=16, signed=True)
+PERIOD_S = 1 / 32
+
+
+def codes(scale: Fraction) -> Codes:
+    return Codes(name="signal", place=PLACE, scale=scale, offset=Fraction(0), lowest=-32767, highest=32767, named={})
+
+
+def frame(time_s: float, code: int) -> tuple[float, bytearray]:
+    return time_s, bytearray(struct.pack("<h", code))
+
+
+def live(
+    name: str, frames: Frames, *, fault: SensorFault, unit: Fraction, delay_s: float = 0.0, **more: HeardSignal
+) -> LiveBranch:
+    branch = LiveBranch(name=name, codes=codes(unit), sign=1, timeout_s=0.5, **more)
+    branch.follow(PlacedSignal(place=PLACE), frames)
+    branch.take(fault, correcting=AS_IT_IS, passing=AS_IT_IS, delay_s=delay_s, expected_since_s=None)
+    return branch
+
+
+class Watched:
+    """A junction of which each branch sends 32 frames a second, and its watch; all currents are into the junction."""
+
+    def __init__(self, *, margin_a: float = 1.0, faults: dict[str, SensorFault] | None = None, **expected: float):
+        names, none = ("battery", "motor", "heater"), SensorFault()
+        self.frames: dict[str, Frames] = {name: deque() for name in names}
+        branches = [
+            live(name, self.frames[name], fault=(faults or {}).get(name, none), unit=Fraction(1, 100)) for name in names
+        ]
+        self.watch = JunctionWatch(branches, window_s=8.0, margin_a=margin_a, full_scale_a=400.0)
+        self.watch.restart(JunctionResidual(**{"measured_a": 0.0, "corrected_a": 0.0} | expected))
+
+    def run(self, seconds: float, shown_a: Callable[[float], dict[str, float]]) -> None:
+        """Send what the sensors show until a time or a verdict; a branch that is not named is silent."""
+        for step in range(round(seconds / PERIOD_S)):
+            now_s = step * PERIOD_S
+            for name, value in shown_a(now_s).items():
+                self.frames[name].append(frame(now_s, round(100.0 * value)))
+            self.watch.look(now_s)
+            if self.watch.verdict is not None:
+                return
+
+
+def test_movement_of_a_power_is_the_current_that_a_right_sensor_would_show() -> None:
+    """In steps of 1/8 s; the sensor is one step late, and shows 25 % too much; one code is 100 W."""
+    shown = enumerate([100, 0, 70, 10, 60, 65, 1000])
+    voltage = HeardSignal(codes(Fraction(1)), 9.0)
+    volts: Frames = deque([frame(0.25, 200)])
+    voltage.follow(PlacedSignal(place=PLACE), volts)
+    power = live(
+        "motor",
+        deque(frame(1.0 + 0.125 * step, code) for step, code in shown),
+        fault=SensorFault(drift=0.25, offset_a=3.0),
+        unit=Fraction(100),
+        delay_s=0.125,
+        voltage=voltage,
+    )
+    per_code_a = 100.0 / 200.0 / 1.25
+    assert power.movement(1.375, 0.25, 3) == Movement(60 * per_code_a, 60 * per_code_a, 0.0)
+    assert power.movement(1.375, 0.25, 5) == Movement(70 * per_code_a, 70 * per_code_a, 5 * per_code_a)
+    volts.append(frame(0.5, 0))
+    assert power.movement(1.375, 0.25, 3) == Movement(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("load_a", [0.0, 30.0])
+def test_sums_count_from_the_load_that_parameters_expect(load_a: float) -> None:
+    """Right sensors, one of which is corrected by 3 A: no deviation that could not be, but worse than as measured."""
+    junction = Watched(faults={"motor": SensorFault(offset_a=-3.0)}, expected_a=load_a, corrected_sd_a=1.0)
+    junction.run(9.0, lambda _: {"battery": 50.0 + load_a, "motor": -50.0})
+    assert junction.watch.verdict == (Reason.CORRECTION_WORSE, ())
+
+
+def test_right_sums_are_never_worse_than_measured_ones() -> None:
+    junction = Watched(margin_a=0.5)
+    junction.run(9.0, lambda _: {"battery": 50.0, "motor": -50.0})
+    assert junction.watch.verdict is None
+
+
+@pytest.mark.parametrize(("sd_per_a", "verdict"), [(0.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (0.1, None)])
+def test_gain_error_shows_where_the_current_changes_its_sign(
+    sd_per_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
+) -> None:
+    def swinging(time_s: float) -> dict[str, float]:
+        motor_a = 100.0 * math.sin(3.0 * time_s)
+        return {
+            "battery": -1.1 * motor_a - 11.0 * math.sin(5.0 * time_s),
+            "motor": motor_a,
+            "heater": 10.0 * math.sin(5.0 * time_s),
+        }
+
+    junction = Watched(corrected_sd_a=1.0, corrected_sd_per_a=sd_per_a)
+    junction.run(7.0, swinging)
+    assert junction.watch.verdict == verdict
+
+
+def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_named_after_it() -> None:
+    """The heater is first heard after a second."""
+
+    def noisy(time_s: float) -> dict[str, float]:
+        step = round(time_s / PERIOD_S)
+        motor_a, heater_a, noise_a = (
+            100.0 * math.sin(3.0 * time_s),
+            (3.0, 3.0, -3.0, -3.0)[step % 4],
+            3.0 * (-1) ** step,
+        )
+        shown = {"battery": -motor_a - heater_a, "motor": 1.1 * motor_a + noise_a}
+        return shown | {"heater": heater_a} if time_s > 1.0 else shown
+
+    junction = Watched(corrected_sd_a=1.0, corrected_sd_per_a=0.0)
+    junction.run(7.0, noisy)
+    assert junction.watch.verdict == (Reason.SUM_IMPLAUSIBLE, ("motor", "battery"))
+
+
+@pytest.mark.parametrize(("still_a", "verdict"), [(1.5, None), (3.0, (Reason.BRANCH_STUCK, ("heater",)))])
+def test_current_that_never_changes_is_stuck_unless_it_is_small(
+    still_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
+) -> None:
+    """The sum varies by what no gain error explains; the motor is first heard after half a second."""
+
+    def varying(time_s: float) -> dict[str, float]:
+        motor_a = 100.0 * math.sin(3.0 * time_s) if time_s > 0.5 else 0.0
+        shown = {"battery": -motor_a + 15.0 * math.sin(11.0 * time_s), "heater": still_a}
+        return shown | {"motor": motor_a} if time_s > 0.5 else shown
+
+    junction = Watched(corrected_sd_a=15.0)
+    junction.run(9.0, varying)
+    assert junction.watch.verdict == verdict
