@@ -49,7 +49,10 @@ LEAST_WEIGHT = 0.2
 
 
 def best_subset(trial: Trial) -> Faults:
-    """Return the faults of the support that has the least Bayesian information criterion of all supports."""
+    """Return for each vehicle the faults of the support with the least Bayesian information criterion.
+
+    All supports are tried but the one with all parameters.
+    """
     linear = _LeastSquares(trial)
     P = linear.design.shape[1]
     supports = np.array([bits for bits in itertools.product((False, True), repeat=P) if sum(bits) < P], bool)

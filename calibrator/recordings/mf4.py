@@ -41,7 +41,7 @@ def read_mf4(path: Path) -> Frames:
     Parameters
     ----------
     path : Path
-        The uncompressed file.
+        The file, unpacked if it came as .gz or in a .zip; blocks that are compressed within it are read as well.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
     Parameters
     ----------
     path : Path
-        The uncompressed file.
+        The file, unpacked if it came as .gz or in a .zip; blocks that are compressed within it are read as well.
 
     Returns
     -------

@@ -256,7 +256,8 @@ def layout_from_branches(text: str, *, table: Table | None = None) -> VehicleDat
     ----------
     text : str
         Branches separated by commas, as ``battery=Ibat,-motor=Imot``: name and column, or the column alone. A minus
-        marks a current that is positive out of the junction. Quotients such as ``-motor=Pmot/Ubat`` are formulas [A].
+        marks a current that is positive out of the junction. With a table, an item that is no column and contains
+        ``+ - * /``, such as ``-motor=Pmot/Ubat``, is a formula. [A]
     table : Table, optional
         The table, from which full scale and time-outs are taken, and in which the columns must exist.
 
@@ -268,7 +269,7 @@ def layout_from_branches(text: str, *, table: Table | None = None) -> VehicleDat
     Raises
     ------
     LayoutError
-        If the text does not name two branches or more.
+        If the text does not name two branches or more, or a formula cannot be evaluated.
     LogError
         If the table has no such column.
     """

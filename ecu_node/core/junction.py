@@ -435,7 +435,7 @@ _Verdict = tuple[Reason, tuple[str, ...]]
 
 
 class _Moment(NamedTuple):
-    """One instant of the junction; the expected sum is already subtracted from the sums."""
+    """One instant of the junction (no statistical moment); the expected sum is already subtracted from the sums."""
 
     time_s: float
     corrected_a: float
@@ -463,7 +463,10 @@ class _Window:
             self._sums = [total - term for total, term in zip(self._sums, old, strict=True)]
 
     def means(self, share: float) -> list[float] | None:
-        """Return the means of the moments' ``terms``; None until this share of the window is filled, by ten moments."""
+        """Return the mean of each of the moments' ``terms`` over the window.
+
+        None while the window holds fewer than ten moments, or they span less than `share` of its length.
+        """
         moments = self.moments
         if len(moments) < _LEAST_LOOKS or moments[-1].time_s - moments[0].time_s < share * self._length_s:
             return None

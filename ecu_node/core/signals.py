@@ -76,7 +76,7 @@ def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float
 def factor_of(unit: str, known: Mapping[str, float], what: str) -> float:
     """Return the factor from a unit to the base unit, 1 for an empty text.
 
-    If the unit is not known, DatabaseError says that `what` is in it.
+    Raises DatabaseError if the unit is not known: "`what` is in 'V'; expected A, mA, kA".
     """
     if not unit:
         return 1.0

@@ -186,7 +186,7 @@ def test_code_for_not_available_is_found_by_its_name(names: dict[int, str]) -> N
     assert not_available_code(current(names=names), "test") == 5
 
 
-def test_named_code_at_zero_current_is_refused() -> None:
+def test_named_code_that_stands_for_0_a_is_refused() -> None:
     with pytest.raises(DatabaseError, match="the code of 0 of signal I is named 'Off'"):
         writable_range(current(names={0: "Off"}), "test")
 

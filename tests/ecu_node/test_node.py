@@ -290,7 +290,7 @@ def test_bus_whose_sending_fails_is_opened_again(database: VehicleDatabase, peer
     assert corrector.counters.reopened == 1
 
 
-def test_kernel_filter_passes_only_branches_voltages_and_own_frames(make_database: MakeDatabase) -> None:
+def test_kernel_filter_passes_only_ids_of_branches_voltages_and_own_messages(make_database: MakeDatabase) -> None:
     with overlay_bus(make_database(), "filters") as bus:
         filters = bus.filters or []
     assert {(item["can_id"], item["can_mask"], item["extended"]) for item in filters} == {

@@ -227,7 +227,7 @@ def run(*methods: ComparedMethod) -> ExperimentResult:
     return run_experiment(EXPERIMENTS["classifier"].small(), smooth_drive(), methods=methods, repetitions=1)
 
 
-def test_table_shows_own_methods_and_the_first_available_confidence() -> None:
+def test_table_shows_users_methods_and_the_confidence_of_the_default_or_first_that_has_one() -> None:
     sure = Own(change=lambda estimate: replace(estimate, confidence=np.full(N, 0.8)))
     result = run(PERFECT, Own("silent"), sure)
     table = headline(result)

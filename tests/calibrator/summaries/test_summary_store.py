@@ -170,7 +170,7 @@ def test_rows_with_columns_of_another_store_are_refused(own_store: SummaryStore,
 
 
 @pytest.mark.parametrize("name", ["../../evil", "", "-V1", "Vä"])
-def test_unusable_vehicle_name_is_refused(own_store: SummaryStore, name: str) -> None:
+def test_unusable_vehicle_name_in_a_bucket_is_refused(own_store: SummaryStore, name: str) -> None:
     bucket = fullest(own_store)
     spoil(own_store, bucket, {"vehicle": name})
     expected = rf"parquet: vehicle {re.escape(repr(name))} cannot be used; .* not starting with a dash, dot"
