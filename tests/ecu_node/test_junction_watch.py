@@ -8,7 +8,7 @@ from fractions import Fraction
 
 import pytest
 
-from ecu_node.core.correction import AS_IT_IS, SensorFault
+from ecu_node.core.correction import AS_IT_IS, IntegerPlan, SensorFault
 from ecu_node.core.junction import Frames, HeardSignal, JunctionWatch, LiveBranch, Movement
 from ecu_node.core.signals import BitPlace, Codes, PlacedSignal
 from ecu_node.core.status import Reason
@@ -18,8 +18,9 @@ PLACE = BitPlace(first=0, end=2, order="little", shift=0, length=16, signed=True
 PERIOD_S = 1 / 32
 
 
-def codes(scale: Fraction) -> Codes:
-    return Codes(name="signal", place=PLACE, scale=scale, offset=Fraction(0), lowest=-32767, highest=32767, named={})
+def codes(scale: Fraction, *named: int) -> Codes:
+    names = dict.fromkeys(named, "Reserved")
+    return Codes(name="signal", place=PLACE, scale=scale, offset=Fraction(0), lowest=-32767, highest=32767, named=names)
 
 
 def frame(time_s: float, code: int) -> tuple[float, bytearray]:
@@ -47,15 +48,25 @@ class Watched:
         self.watch = JunctionWatch(branches, window_s=8.0, margin_a=margin_a, full_scale_a=400.0)
         self.watch.restart(JunctionResidual(**{"measured_a": 0.0, "corrected_a": 0.0} | expected))
 
-    def run(self, seconds: float, shown_a: Callable[[float], dict[str, float]]) -> None:
+    def run(self, seconds: float, shown_a: Callable[[float], dict[str, float]], *, period_s: float = PERIOD_S) -> None:
         """Send what the sensors show until a time or a verdict; a branch that is not named is silent."""
-        for step in range(round(seconds / PERIOD_S)):
-            now_s = step * PERIOD_S
+        for step in range(round(seconds / period_s)):
+            self.now_s = now_s = step * period_s
             for name, value in shown_a(now_s).items():
                 self.frames[name].append(frame(now_s, round(100.0 * value)))
             self.watch.look(now_s)
             if self.watch.verdict is not None:
                 return
+
+
+def test_ordinary_codes_have_no_names_and_are_not_clipped() -> None:
+    branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
+    branch.codes = codes(Fraction(1), -32767, 32767, 32766)
+    assert branch.ordinary_codes() == (-32766, 32765)
+    branch.plan = IntegerPlan(gain=2, bias=20, shift=1, lowest=-100, highest=100)
+    assert branch.ordinary_codes() == (-110, 90)
+    branch.plan = IntegerPlan(gain=-2, bias=0, shift=1, lowest=-100, highest=100)
+    assert branch.ordinary_codes() == (1, 0)
 
 
 def test_movement_of_a_power_is_the_current_that_a_right_sensor_would_show() -> None:
@@ -141,4 +152,31 @@ def test_current_that_never_changes_is_stuck_unless_it_is_small(
 
     junction = Watched(corrected_sd_a=15.0)
     junction.run(9.0, varying)
+    assert junction.watch.verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("jump_a", "period_s", "looks"), [(50.0, 1 / 32, 3), (50.0, 1 / 128, 5), (-21.0, 1 / 32, 3), (19.0, 1 / 32, None)]
+)
+def test_jump_lasts_for_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
+    jump_a: float, period_s: float, looks: int | None
+) -> None:
+    junction = Watched(corrected_sd_a=1.0)
+    junction.run(
+        2.0,
+        lambda now_s: {"battery": 50.0 + (jump_a if now_s >= 1.0 else 0.0), "motor": -45.0, "heater": -5.0},
+        period_s=period_s,
+    )
+    assert junction.watch.verdict == (None if looks is None else (Reason.SUM_IMPLAUSIBLE, ("battery",)))
+    assert looks is None or junction.now_s == 1.0 + (looks - 1) * period_s
+
+
+@pytest.mark.parametrize(
+    ("still_a", "verdict"), [(5.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (20.0, (Reason.BRANCH_STUCK, ("heater",)))]
+)
+def test_branch_that_does_not_follow_another_ones_rise_is_stuck_if_it_carries_half_of_the_sum(
+    still_a: float, verdict: tuple[Reason, tuple[str, ...]]
+) -> None:
+    junction = Watched(corrected_sd_a=1.0)
+    junction.run(2.0, lambda now_s: {"battery": still_a + 96.0 * max(now_s - 1.0, 0.0), "heater": -still_a})
     assert junction.watch.verdict == verdict
