@@ -61,8 +61,8 @@ class Watched:
 
 def test_ordinary_codes_have_no_names_and_are_not_clipped() -> None:
     branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
-    branch.codes = codes(Fraction(1), -32767, 32767, 32766)
-    assert branch.ordinary_codes() == (-32766, 32765)
+    branch.codes = codes(Fraction(1), -32767, 32767)
+    assert branch.ordinary_codes() == (-32766, 32766)
     branch.plan = IntegerPlan(gain=2, bias=20, shift=1, lowest=-100, highest=100)
     assert branch.ordinary_codes() == (-110, 90)
     branch.plan = IntegerPlan(gain=-2, bias=0, shift=1, lowest=-100, highest=100)
