@@ -40,7 +40,7 @@ def export(
     params: Annotated[Path, typer.Argument(help="Parameter file.")],
     layout: LayoutOption,
     format_: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
-    output: Annotated[Path, typer.Option("--output", "--out", help="File to write.")],
+    output: Annotated[Path, typer.Option("--out", "--output", help="File to write.")],
     elf: Annotated[
         Path | None, typer.Option("--elf", help="The control unit's linked program, for hex and a2l.")
     ] = None,
@@ -73,7 +73,7 @@ def export(
         content = intel_hex(image.address, image_bytes(checked, image.order))
     require_possible_file(output)
     if output.exists() and not replace and output.read_bytes() != content.encode():
-        raise ExportError(f"{output}: exists; choose another --output, or replace it with --replace")
+        raise ExportError(f"{output}: exists; choose another --out, or replace it with --replace")
     write_files({output: content.encode()})
     notices = []
     if format_ is ExportFormat.C and (foreign := foreign_protection(database)):

@@ -36,7 +36,7 @@ def test_export_replaces_a_different_file_only_with_replace(form: str, params: P
         assert (run.exit_code, run.stderr, run.stdout) == (0, "", f"{out}\n")
     content = out.read_bytes()
     out.write_text("mine")
-    with pytest.raises(ExportError, match="exists; choose another --output, or replace it with --replace"):
+    with pytest.raises(ExportError, match="exists; choose another --out, or replace it with --replace"):
         raise refused(*arguments)
     assert out.read_text() == "mine"
     assert export(*arguments, "--replace").exit_code == 0
