@@ -189,12 +189,15 @@ def read_drive_file(path: Path, layout: Layout) -> Drive:
         about = _about(table.schema)
         _check_identity(about, str(path), layout)
         channels: dict[str, dict[str, Channel]] = {"branch": {}, "input": {}}
-        for row in table.to_pandas(use_threads=False).itertuples():
-            if not len(row.time_s) == len(row.value) == len(row.good):
+        columns = [
+            [item.values.to_numpy(zero_copy_only=False).astype(of_type) for item in table[column]]
+            for column, of_type in (("time_s", np.float64), ("value", np.float64), ("good", np.bool_))
+        ]
+        names = table["kind"].to_pylist(), table["name"].to_pylist()
+        for kind, name, time_s, value, good in zip(*names, *columns, strict=True):
+            if not len(time_s) == len(value) == len(good):
                 raise ValueError("a channel has columns of different lengths")
-            channels[row.kind][row.name] = Channel(
-                time_s=row.time_s.astype(np.float64), value=row.value.astype(np.float64), good=row.good.astype(np.bool_)
-            )
+            channels[kind][name] = Channel(time_s=time_s, value=value, good=good)
         vehicle, name = str(about["vehicle"]), str(about["drive"])
     return Drive(vehicle=vehicle, name=name, branches=channels["branch"], inputs=channels["input"])
 
