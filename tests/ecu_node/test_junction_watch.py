@@ -28,9 +28,15 @@ def frame(time_s: float, code: int) -> tuple[float, bytearray]:
 
 
 def live(
-    name: str, frames: Frames, *, fault: SensorFault, unit: Fraction, delay_s: float = 0.0, **more: HeardSignal
+    name: str,
+    frames: Frames,
+    *,
+    fault: SensorFault,
+    unit: Fraction,
+    delay_s: float = 0.0,
+    voltage: HeardSignal | None = None,
 ) -> LiveBranch:
-    branch = LiveBranch(name=name, codes=codes(unit), sign=1, timeout_s=0.5, **more)
+    branch = LiveBranch(name=name, codes=codes(unit), sign=1, timeout_s=0.5, voltage=voltage)
     branch.follow(PlacedSignal(place=PLACE), frames)
     branch.take(fault, correcting=AS_IT_IS, passing=AS_IT_IS, delay_s=delay_s, expected_since_s=None)
     return branch
