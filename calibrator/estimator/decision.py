@@ -36,6 +36,7 @@ __all__ = [
     "estimate_rows",
     "group_centres",
     "harm_probability",
+    "moments_of",
     "posterior_points",
     "recovery_probability",
 ]
@@ -213,7 +214,7 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
         Posterior of one vehicle.
     estimate : ndarray of shape (2K,)
         Drifts [1] and offsets in fractions of full scale that the branches would be corrected with.
-    mean, mean_square : ndarray of shape (D, K)
+    mean, mean_square : ndarray of shape (D, K), or of shape (D, n, K) if they differ between the points
         Moments of the true currents on D drives, in fractions of full scale and their squares.
 
     Returns
@@ -229,6 +230,12 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
         worse |= alpha**2 * square + 2.0 * alpha * beta * m + beta**2 > d**2 * square + 2.0 * d * o * m + o**2
     harm = points.weight @ (worse & ((d_hat != 0.0) | (o_hat != 0.0)))
     return np.asarray(np.minimum(harm, 1.0))
+
+
+def moments_of(factor: Array, mean: Array, mean_square: Array, added: Array) -> Array:
+    """Return mean and mean square of the currents factor * x + added, stacked, from those of the currents x."""
+    square = factor**2 * np.maximum(mean_square, mean**2) + 2.0 * factor * added * mean + added**2
+    return np.stack([factor * mean + added, square])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -362,7 +369,7 @@ def estimate_rows(
     mean, mean_square : ndarray of shape (N, K)
         Mean and mean square of the measured currents, over full scale and its square.
     usual : ndarray of shape (2, K)
-        Mean, and mean square, on the usual drive of the fleet, in the same units.
+        Mean, and mean square, of the ideal currents on the usual drive of the fleet, in the same units.
     order : sequence of int or None
         Branches in the order of the rows: branch k of the rows is branch ``order[k]`` of the vehicles; None: branch k.
     full_scale_a : float
@@ -388,12 +395,12 @@ def estimate_rows(
     hardware_probability = np.zeros(N)
     for j, found in enumerate(points):
         estimate[j], confidence[j] = best_estimate(found, smallest)
-        drift, offset = estimate[j, :K], estimate[j, K:]
-        own = (mean[j] - offset) / (1.0 + drift)
-        own_square = np.maximum((mean_square[j] - 2.0 * offset * mean[j] + offset**2) / (1.0 + drift) ** 2, own**2)
-        harm[j] = harm_probability(
-            found, estimate[j], np.stack([own, usual[0]]), np.stack([own_square, np.maximum(usual[1], usual[0] ** 2)])
-        )
+        # Each point has true currents of its own, i = (i_m - o) / (1 + d) on the vehicle's drives, and on the usual one
+        # i = (1 + d_h) i_s + o_h. Their mean decides whether a gain error and an offset beside it add up or cancel.
+        gain, hardware_gain = 1.0 + found.faults[:, :K], 1.0 + found.hardware[:, :1]
+        own = moments_of(1.0 / gain, mean[j], mean_square[j], -found.faults[:, K:] / gain)
+        drives = np.stack([own, moments_of(hardware_gain, usual[0], usual[1], found.hardware[:, 1:])], axis=1)
+        harm[j] = harm_probability(found, estimate[j], *drives)
         sd[j] = _central_sd(found, estimate[j])
         all_shared = (estimate[j] != 0.0) & np.isclose(sd[j], 0.0, atol=1e-9)  # one value in all draws
         sd[j, all_shared] = RESOLUTION

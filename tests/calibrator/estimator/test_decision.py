@@ -221,6 +221,35 @@ def test_corrections_harm_no_vehicle_despite_a_batch_fault_or_a_load(shared: str
     assert shared == "gain" or np.abs(found.offset_a[:, 1] - faults.offset_a[:, 1]).max() < 0.01
 
 
+def test_harm_counts_the_true_currents_that_each_explanation_has_by_itself() -> None:
+    """On the vehicle's own drives the measured currents are known, and on the usual one the ideal ones."""
+    faults = random_faults(5, vehicles=12, branches=3, magnitude=(0.1, 0.3))
+    rows = rows_of(faults, seed=5)
+    about = moments(rows)
+    found = estimate_rows(rows, learn_fault_models(rows, feed=0), feed=0, **about)
+
+    def two(mean: Array, square: Array) -> Array:
+        """Currents of two instants, with this mean and mean square."""
+        return np.stack([mean - (sd := np.sqrt(square - mean**2)), mean + sd])[:, None]
+
+    def gets_worse(true: Array, measured: Array, estimate: Array) -> Mask:
+        corrected = (measured - estimate[3:]) / (1.0 + estimate[:3])
+        before, after = (((shown - true) ** 2).mean(axis=0) for shown in (measured, corrected))
+        return np.asarray(after > before + 1e-12)
+
+    for j, posterior in enumerate(found.points):
+        d, o = posterior.faults[:, :3], posterior.faults[:, 3:]
+        estimate = np.concatenate([found.drift[j], found.offset_a[j]])
+        measured = two(about["mean"][j], about["mean_square"][j])
+        usual = (1.0 + posterior.hardware[:, :1]) * two(*about["usual"]) + posterior.hardware[:, 1:]
+        worse_on = gets_worse((measured - o) / (1.0 + d), measured, estimate)
+        worse_on |= gets_worse(usual, (1.0 + d) * usual + o, estimate)
+        corrected = (estimate[:3] != 0.0) | (estimate[3:] != 0.0)
+        expected = posterior.weight @ (worse_on & corrected)
+        np.testing.assert_allclose(found.harm_probability[j], expected, atol=1e-6)
+    assert found.harm_probability.max() > 0.01
+
+
 def test_standard_deviations_match_the_actual_errors() -> None:
     faults = random_faults(6, vehicles=80, branches=2)
     found, _ = estimated(faults, seed=6)
