@@ -205,7 +205,7 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
     return np.asarray(points.weight @ near)
 
 
-def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: Array) -> Array:
+def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: Array, *, least: float = 0.0) -> Array:
     """Compute for each branch the probability that its correction makes it worse, (M19) of docs/method.md.
 
     Parameters
@@ -216,6 +216,8 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
         Drifts [1] and offsets in fractions of full scale that the branches would be corrected with.
     mean, mean_square : ndarray of shape (D, K), or of shape (D, n, K) if they differ between the points
         Moments of the true currents on D drives, in fractions of full scale and their squares.
+    least : float
+        By how much a root mean square error must grow to count, in fractions of full scale.
 
     Returns
     -------
@@ -227,7 +229,8 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
     alpha, beta = (1.0 + d) / (1.0 + d_hat) - 1.0, (o - o_hat) / (1.0 + d_hat)
     worse = np.zeros(d.shape, bool)
     for m, square in zip(mean, mean_square, strict=True):
-        worse |= alpha**2 * square + 2.0 * alpha * beta * m + beta**2 > d**2 * square + 2.0 * d * o * m + o**2
+        before, after = (g**2 * square + 2.0 * g * c * m + c**2 for g, c in ((d, o), (alpha, beta)))
+        worse |= np.sqrt(np.maximum(after, 0.0)) > np.sqrt(np.maximum(before, 0.0)) + least
     harm = points.weight @ (worse & ((d_hat != 0.0) | (o_hat != 0.0)))
     return np.asarray(np.minimum(harm, 1.0))
 

@@ -25,7 +25,14 @@ from scipy.stats import norm, qmc
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.checks import CAUSES, UsualMisfits, find_misfits
-from calibrator.estimator.decision import FleetEstimate, Points, decided, harm_probability, recovery_probability
+from calibrator.estimator.decision import (
+    FleetEstimate,
+    Points,
+    decided,
+    harm_probability,
+    moments_of,
+    recovery_probability,
+)
 from calibrator.estimator.evidence import junction_regression, stack_summaries
 from calibrator.estimator.readings import CONTRADICTION, TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.estimator.settings import SUSPECTED
@@ -42,6 +49,8 @@ MOST_RATIO, SURE_SD = 3.0, 0.1
 """Gain ratio that no two sensors have, and standard deviation below which a ratio is sure enough to be refused. [1]"""
 OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD = 0.3, 0.2, 0.04
 """Standard deviations before anything is known: of lambda, and over full scale of an offset and of a load. [1]"""
+LEAST_HARM = 0.0005
+"""Growth of an error over full scale that counts as harm: beside an open offset any correction does a little. [1]"""
 FAULT_SHARE = 0.2
 """Probability of a gain error, and of an offset, before anything is known. [1]"""
 LEAST_FAULT = 0.02
@@ -352,11 +361,12 @@ def estimate_junction(
     for j, vehicle in enumerate(vehicles):
         faults = np.concatenate([np.expm1(draws[:, places[j]]), draws[:, S + places[j]]], axis=1)
         points.append(Points(faults, weight, posterior.explanation))
-        own = (vehicle.summary.mean_a / scale_a - offset[j]) / (1.0 + drift[j])
-        spread = vehicle.summary.variance_a2 / scale_a**2 / (1.0 + drift[j]) ** 2
-        estimate, true = np.append(drift[j], offset[j]), (own[None], (own**2 + spread)[None])
-        harm[j] = harm_probability(points[j], estimate, *true)
-        harm_of_gain[j] = harm_probability(points[j], np.append(drift[j], np.zeros(K)), *true)
+        measured, gain = vehicle.summary.mean_a / scale_a, 1.0 + faults[:, :K]
+        square = measured**2 + vehicle.summary.variance_a2 / scale_a**2
+        true = moments_of(1.0 / gain, measured, square, -faults[:, K:] / gain)[:, None]
+        estimate, gain_only = np.append(drift[j], offset[j]), np.append(drift[j], np.zeros(K))
+        harm[j] = harm_probability(points[j], estimate, *true, least=LEAST_HARM)
+        harm_of_gain[j] = harm_probability(points[j], gain_only, *true, least=LEAST_HARM)
         confidence[j] = recovery_probability(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
     # Where it is open which sensor has an offset, the gain alone may be corrected.
     gain_alone = (harm >= harm_limit) & (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED)
