@@ -1,7 +1,7 @@
 """Errors a user can cause. Each message is one line: what, where, what was expected, what to do.
 
 The command line turns every :class:`UserError` into that line and exit code 1; what it makes of other exceptions says
-:func:`ecu_node.program.end_of`.
+``ecu_node.program.end_of``.
 """
 
 __all__ = ["BusError", "DatabaseError", "LayoutError", "ParameterError", "UserError", "printable", "shown_name"]

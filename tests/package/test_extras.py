@@ -115,7 +115,7 @@ def test_extra_bench_suffices_to_compare_the_posterior_with_basis_pursuit(instal
     command = ("-m", "bench", "posterior", "--quick")
     done = installed("bench").run("python", *command, folder=unpacked / "tools")
     assert done.returncode == 0, done.stderr
-    found = json.loads((unpacked / "tools" / "build" / "bench.json").read_text())
+    found = json.loads((unpacked / "build" / "bench.json").read_text())
     assert any("basis pursuit" in (row["peer"] or "") for row in found)
 
 
