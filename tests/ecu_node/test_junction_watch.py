@@ -104,6 +104,17 @@ def test_sums_count_from_the_load_that_parameters_expect(load_a: float) -> None:
     assert junction.watch.verdict == (Reason.CORRECTION_WORSE, ())
 
 
+@pytest.mark.parametrize(("offset_a", "verdict"), [(2.4, None), (2.6, (Reason.CORRECTION_WORSE, ()))])
+def test_margin_grows_by_what_the_calibrator_itself_saw_the_correction_make_worse(
+    offset_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
+) -> None:
+    """A margin of 0.5 A, and 2 A more in the parameter file."""
+    fault = {"motor": SensorFault(offset_a=-offset_a)}
+    junction = Watched(margin_a=0.5, faults=fault, measured_a=1.0, corrected_a=3.0, corrected_sd_a=1.0)
+    junction.run(9.0, lambda _: {"battery": 50.0, "motor": -50.0})
+    assert junction.watch.verdict == verdict
+
+
 def test_right_sums_are_never_worse_than_measured_ones() -> None:
     junction = Watched(margin_a=0.5)
     junction.run(9.0, lambda _: {"battery": 50.0, "motor": -50.0})
