@@ -80,7 +80,7 @@ bench-quick: setup       ## the same at small sizes, within five minutes
 experiments: setup       ## docs/results anew, the repetitions of each from SEED on; TRIPS=folder of the recorded BMW i3 trips (half an hour)
 	$(BIN)/python tools/import_bmw_i3.py $(TRIPS) --layout dbc/hv_powertrain.toml --out build/i3
 	$(BIN)/calibrator experiment all --seed $(SEED) --drives build/i3 --layout dbc/hv_powertrain.toml --out build/results
-	cp -r build/results build/results.md docs/ # all at once, so that each says of which commit it is, unchanged
+	cp -r build/results build/results.md docs/ # only now: once a result has changed, git calls the commit dirty
 
 soak: setup              ## the node at the full load of a CAN FD bus, 10^7 frames; its watch on 24 h of real drives (hours)
 	PYTHONPATH=tools $(BIN)/python -m bench node --out build/soak.json

@@ -1,6 +1,6 @@
 """Errors a user can cause. Each message is one line: what, where, what was expected, what to do.
 
-The command line turns every :class:`UserError` into that line and exit code 1; what it makes of other exceptions says
+The command line turns every :class:`UserError` into that line and exit code 1; for other exceptions see
 ``ecu_node.program.end_of``.
 """
 

@@ -31,12 +31,12 @@ __all__ = [
     "Points",
     "RowsEstimate",
     "SensorEstimate",
+    "affine_moments",
     "best_estimate",
     "decided",
     "estimate_rows",
     "group_centres",
     "harm_probability",
-    "moments_of",
     "posterior_points",
     "recovery_probability",
 ]
@@ -235,7 +235,7 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
     return np.asarray(np.minimum(harm, 1.0))
 
 
-def moments_of(factor: Array, mean: Array, mean_square: Array, added: Array) -> Array:
+def affine_moments(factor: Array, mean: Array, mean_square: Array, added: Array) -> Array:
     """Return mean and mean square of the currents factor * x + added, stacked, from those of the currents x."""
     square = factor**2 * np.maximum(mean_square, mean**2) + 2.0 * factor * added * mean + added**2
     return np.stack([factor * mean + added, square])
@@ -372,7 +372,7 @@ def estimate_rows(
     mean, mean_square : ndarray of shape (N, K)
         Mean and mean square of the measured currents, over full scale and its square.
     usual : ndarray of shape (2, K)
-        Mean, and mean square, of the ideal currents on the usual drive of the fleet, in the same units.
+        The same two of the fleet's usual drive: medians over its vehicles, which count as ideal currents.
     order : sequence of int or None
         Branches in the order of the rows: branch k of the rows is branch ``order[k]`` of the vehicles; None: branch k.
     full_scale_a : float
@@ -401,8 +401,8 @@ def estimate_rows(
         # Each point has true currents of its own, i = (i_m - o) / (1 + d) on the vehicle's drives, and on the usual one
         # i = (1 + d_h) i_s + o_h. Their mean decides whether a gain error and an offset beside it add up or cancel.
         gain, hardware_gain = 1.0 + found.faults[:, :K], 1.0 + found.hardware[:, :1]
-        own = moments_of(1.0 / gain, mean[j], mean_square[j], -found.faults[:, K:] / gain)
-        drives = np.stack([own, moments_of(hardware_gain, usual[0], usual[1], found.hardware[:, 1:])], axis=1)
+        own = affine_moments(1.0 / gain, mean[j], mean_square[j], -found.faults[:, K:] / gain)
+        drives = np.stack([own, affine_moments(hardware_gain, usual[0], usual[1], found.hardware[:, 1:])], axis=1)
         harm[j] = harm_probability(found, estimate[j], *drives)
         sd[j] = _central_sd(found, estimate[j])
         all_shared = (estimate[j] != 0.0) & np.isclose(sd[j], 0.0, atol=1e-9)  # one value in all draws

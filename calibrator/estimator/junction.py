@@ -28,9 +28,9 @@ from calibrator.estimator.checks import CAUSES, UsualMisfits, find_misfits
 from calibrator.estimator.decision import (
     FleetEstimate,
     Points,
+    affine_moments,
     decided,
     harm_probability,
-    moments_of,
     recovery_probability,
 )
 from calibrator.estimator.evidence import junction_regression, stack_summaries
@@ -49,8 +49,6 @@ MOST_RATIO, SURE_SD = 3.0, 0.1
 """Gain ratio that no two sensors have, and standard deviation below which a ratio is sure enough to be refused. [1]"""
 OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD = 0.3, 0.2, 0.04
 """Standard deviations before anything is known: of lambda, and over full scale of an offset and of a load. [1]"""
-LEAST_HARM = 0.0005
-"""Growth of an error over full scale that counts as harm: beside an open offset any correction does a little. [1]"""
 FAULT_SHARE = 0.2
 """Probability of a gain error, and of an offset, before anything is known. [1]"""
 LEAST_FAULT = 0.02
@@ -363,10 +361,11 @@ def estimate_junction(
         points.append(Points(faults, weight, posterior.explanation))
         measured, gain = vehicle.summary.mean_a / scale_a, 1.0 + faults[:, :K]
         square = measured**2 + vehicle.summary.variance_a2 / scale_a**2
-        true = moments_of(1.0 / gain, measured, square, -faults[:, K:] / gain)[:, None]
+        true = affine_moments(1.0 / gain, measured, square, -faults[:, K:] / gain)[:, None]
         estimate, gain_only = np.append(drift[j], offset[j]), np.append(drift[j], np.zeros(K))
-        harm[j] = harm_probability(points[j], estimate, *true, least=LEAST_HARM)
-        harm_of_gain[j] = harm_probability(points[j], gain_only, *true, least=LEAST_HARM)
+        # Growth within the accuracy of the constant c is no harm: while offsets are open, a right gain can do that.
+        harm[j] = harm_probability(points[j], estimate, *true, least=LAW_OFFSET_SD)
+        harm_of_gain[j] = harm_probability(points[j], gain_only, *true, least=LAW_OFFSET_SD)
         confidence[j] = recovery_probability(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
     # Where it is open which sensor has an offset, the gain alone may be corrected.
     gain_alone = (harm >= harm_limit) & (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED)

@@ -114,7 +114,7 @@ class Outline(NamedTuple):
 def drives_digest(records: Sequence[Record], choices: object) -> str:
     """Return a digest of the usable drives of a vehicle and of the user's choices for it.
 
-    It changes when a drive is added or its file changes, and with what the choices are printed as.
+    It changes when a drive is added, when its file changes, and when the ``repr`` of the choices changes.
     """
     known = sorted(
         pair for record in records if record.found for pair in zip(record.drives, record.sources, strict=True)

@@ -46,6 +46,31 @@ def motor_off() -> pd.DataFrame:
 MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
 
 
+@pytest.mark.long
+def test_corrections_of_random_junctions_raise_no_error_by_more_than_the_accuracy_of_zero() -> None:
+    """600 cars with a gain error of the motor, offsets and loads that may be there, and a trusted battery sensor."""
+    rng, growth_a = np.random.default_rng(5), []
+    for case in range(600):
+        gain, seed = rng.choice([-1.0, 1.0]) * rng.uniform(0.02, 0.15), int(rng.integers(10**6))
+        load_a, mean_a = rng.choice([0.0, 0.0, 3.0, 20.0]), rng.choice([0.0, 20.0, 60.0, -40.0])
+        sizes_a = rng.choice([-1.0, 1.0], 3) * 10.0 ** rng.uniform(-0.3, 1.5, 3)
+        offset_a = np.where(rng.random(3) < 0.25, sizes_a, 0.0) * [0.0, 1.0, case % 3 != 2]
+        known: dict[str, Any] = [{}, {"load": (load_a, 0.2)}, {"trusted": ["battery", "heater"]}][case % 3]
+        measured = recording(seed, gain=(0.0, gain, 0.0), offset_a=tuple(offset_a), load_a=load_a, seconds=120.0)
+        true = recording(seed, load_a=load_a, seconds=120.0)  # and the same noise
+        for frame, factor in ((measured, 1.0 + gain), (true, 1.0)):
+            frame["battery"] += mean_a
+            frame["motor"] -= factor * mean_a
+        rows = found(measured, **({"trusted": ["battery"]} | known)).loc["vehicle"]
+        for name, row in rows[rows.corrected].iterrows():
+            shown = measured[name], (measured[name] - row.offset_a) / (1.0 + row.gain_error)
+            before, after = (np.sqrt(np.mean((each - true[name]) ** 2)) for each in shown)
+            growth_a.append(after - before)
+    assert len(growth_a) > 150
+    assert np.max(growth_a) < 0.0005 * 400.0
+    assert np.count_nonzero(np.array(growth_a) > 0.0) <= 2
+
+
 @pytest.mark.parametrize(("fault", "known", "corrected"), [
     ({"gain": (0.0, 0.05, 0.0)}, {"trusted": ["battery"]}, {"motor"}),
     ({"gain": (0.03, 0.05, 0.0)}, {"readings": MOTOR_READ}, {"battery", "motor"}),
