@@ -55,20 +55,20 @@ def test_corrections_of_random_junctions_raise_no_error_by_more_than_the_accurac
         load_a, mean_a = rng.choice([0.0, 0.0, 3.0, 20.0]), rng.choice([0.0, 20.0, 60.0, -40.0])
         sizes_a = rng.choice([-1.0, 1.0], 3) * 10.0 ** rng.uniform(-0.3, 1.5, 3)
         offset_a = np.where(rng.random(3) < 0.25, sizes_a, 0.0) * [0.0, 1.0, case % 3 != 2]
-        known: dict[str, Any] = [{}, {"load": (load_a, 0.2)}, {"trusted": ["battery", "heater"]}][case % 3]
+        more: list[dict[str, Any]] = [{}, {"load": (load_a, 0.2)}, {"trusted": ["battery", "heater"]}]
         measured = recording(seed, gain=(0.0, gain, 0.0), offset_a=tuple(offset_a), load_a=load_a, seconds=120.0)
         true = recording(seed, load_a=load_a, seconds=120.0)  # and the same noise
         for frame, factor in ((measured, 1.0 + gain), (true, 1.0)):
             frame["battery"] += mean_a
             frame["motor"] -= factor * mean_a
-        rows = found(measured, **({"trusted": ["battery"]} | known)).loc["vehicle"]
+        rows = found(measured, **({"trusted": ["battery"]} | more[case % 3])).loc["vehicle"]
         for name, row in rows[rows.corrected].iterrows():
             shown = measured[name], (measured[name] - row.offset_a) / (1.0 + row.gain_error)
             before, after = (np.sqrt(np.mean((each - true[name]) ** 2)) for each in shown)
             growth_a.append(after - before)
     assert len(growth_a) > 150
     assert np.max(growth_a) < 0.0005 * 400.0
-    assert np.count_nonzero(np.array(growth_a) > 0.0) <= 2
+    assert np.mean(np.array(growth_a) > 0.0) < 0.02
 
 
 @pytest.mark.parametrize(("fault", "known", "corrected"), [
