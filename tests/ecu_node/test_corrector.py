@@ -8,7 +8,7 @@ from typing import Any
 from weakref import ref
 
 import pytest
-from e2e.p01 import e2e_p01_check
+from e2e.p01 import e2e_p01_check, e2e_p01_protect
 from msgspec.structs import replace
 
 from ecu_node.bus.wiring import InForce, Mode, put_in_force, wire
@@ -538,6 +538,23 @@ def test_message_with_half_of_its_frames_corrupt_is_not_used_at_all(database: Ve
     assert set(found[5:]) == {Quality.INVALID}
     assert at_20_ms(database, corrector, 1.4, 2.0)[-1] == Quality.CORRECTED
     assert corrector.state() == CORRECTING
+
+
+def test_branch_in_the_first_byte_of_an_invalid_message_is_not_used(make_database: MakeDatabase) -> None:
+    one_byte = SMALL_DBC.replace("Battery : 7|16@0- (0.1,0) [-3000|3000]", "Battery : 0|8@1- (3,0) [-300|300]", 1)
+    one_byte = one_byte.replace('VAL_ 256 Battery -32768 "SNA";\n', "")
+    header = '\n[e2e]\nprofile = "P01"\nmessages = ["Pair"]\noffset = 4\n'
+    database = make_database(SMALL_LAYOUT + header, one_byte)
+    corrector = corrector_for(database, battery=(0.5, 0.0))
+    found = []
+    for number in range(20):
+        frame = bytearray(database.message("Pair").encode({"Battery": 150.0, "Motor": 0.0}))
+        frame[5] = number % 15
+        e2e_p01_protect(frame, PAIR.identifier, offset=4, increment_counter=False)
+        frame[-1] ^= number % 2
+        found += answers(corrector, Frame(PAIR, bytes(frame)), 0.02 * number)
+    values = decoded(database, "PairOut", found[-1].data)
+    assert (values["Battery"], values["Quality"]) == (-3276.8, Quality.INVALID)
 
 
 def test_message_with_a_tenth_of_its_frames_corrupt_loses_only_these(database: VehicleDatabase) -> None:
