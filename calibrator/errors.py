@@ -40,12 +40,12 @@ def naming(shown: str, copy: Path) -> Iterator[None]:
 
 
 class LogError(UserError):
-    """A log file cannot be used (unreadable, truncated, empty, none of the signals in it).
+    """A log or table cannot be used: missing, damaged or empty, of no known format, without branches, or ambiguous.
 
     Attributes
     ----------
     what, remedy : str
-        The two parts of the message: what is wrong, and what to do, empty if `what` says it.
+        What is wrong, and what to do; `remedy` is empty if `what` also tells what to do.
     """
 
     def __init__(self, what: str, remedy: str = "") -> None:

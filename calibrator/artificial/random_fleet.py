@@ -55,9 +55,9 @@ def random_stream(purpose: Purpose, *numbers: int) -> np.random.Generator:
 def nonzero_count(branches: int, sparsity: float) -> int:
     """Return how many of the fault parameters of one vehicle are not zero.
 
-    The paper counts 3K + 1 parameters in its example (K = 3, S = 60: 4 of 10) but draws the 3K that its footnote 1
-    keeps; a share of these 3K gives the same 4. With K = 2, S = 60 these are 2 of 6. The 3 of 6 that a share of
-    3K + 1 would give fit the paper's share of hardware faults, but not its recovery (docs/published_method.md).
+    This is the share 1 - S / 100 of 3K parameters, rounded: K = 3, S = 60 gives 4 of 9, K = 2 gives 2 of 6. The paper's
+    example takes the share of 3K + 1 (4 of 10), but it draws only the 3K of its footnote 1. With K = 2 a share of
+    3K + 1 would give 3: that fits its share of hardware faults, but not its recovery (docs/published_method.md).
 
     Parameters
     ----------

@@ -58,9 +58,9 @@ class Vehicle:
     noise_a : float
         Standard deviation of the noise of each sensor sample. [A]
     delay_s : ndarray of shape (K,)
-        By how much later than it flows each current is measured. [s]
+        Delay of each sensor: what it shows now flowed so much earlier. [s]
     unmeasured_a : float
-        Load that no branch measures; the first branch (the source) carries it. [A]
+        Load that no branch measures; the first branch, which feeds the others, carries it. [A]
     """
 
     name: str

@@ -47,7 +47,10 @@ def doctor(
 
 
 def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
-    """Return the report as text: tables of branches and inputs, findings, next steps; lines may be long."""
+    """Return the report as text: tables of branches and inputs, findings, which commands are ready; lines may be long.
+
+    `steps` has for each command why it is not ready, empty if it is, as :func:`.readiness` returns it.
+    """
     seconds, frames = sum(log.duration_s for log in facts.logs), sum(log.report.frames for log in facts.logs)
     reasons: dict[str, list[str]] = {}
     for name, why in steps.items():
@@ -85,7 +88,10 @@ def _next_commands(facts: "Facts", ready: Sequence[str]) -> list[str]:
 
 
 def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
-    """Return the report as JSON: facts by branch and input, findings with their figures, next steps."""
+    """Return the report as JSON: branches, inputs, sum, findings, and which commands are ready.
+
+    `steps` has for each command why it is not ready, empty if it is, as :func:`.readiness` returns it.
+    """
     sum_a, channels = facts.junction.sum_a, facts.channels
     rows = channels.drop(columns=["is_branch", "needed", "good"]).set_index("name", drop=False)
     total = None

@@ -40,7 +40,8 @@ class ExaminedLog:
     report : RecordingReport
         Counts of its frames, and what could not be used.
     drive : Drive or LogError
-        Its branches and inputs of the layout, or the error that it has no branch.
+        Its branches and inputs of the layout, or the error why there is no drive: the log has no branch, or a message
+        comes on several buses.
     duration_s : float
         From the first to the last frame. [s]
     """

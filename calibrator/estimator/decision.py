@@ -108,8 +108,8 @@ def group_centres(models: Sequence[FaultModel]) -> Array:
 def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]]) -> list[FleetPoints]:
     """Return the posterior of each of N vehicles as weighted points, over all fault models that explain their fleet.
 
-    Each model comes with the draws of the vehicles under it, and their weights (N, Q, M, 1 + g) as :func:`.weigh`
-    returns them.
+    Each model comes with the draws of the N vehicles under it, M from each of Q explanations, and with their weights as
+    :func:`.weigh` returns them: shape (N, Q, M, 1 + g), for no group and for each of the g groups of the model.
     """
     centres, parts = group_centres([model for model, _, _ in models]), []
     for i, (model, draws, weights) in enumerate(models):
@@ -312,8 +312,8 @@ class RowsEstimate(SensorEstimate):
     points : sequence of N FleetPoints
         Posterior of each vehicle.
     supports : sequence of N sequences of (float, ndarray of shape (3K + 1,))
-        Explanations by falling probability, each as its probability, hardware drift, K hardware offsets, K drifts and K
-        offsets; branches and units are those of the points.
+        Explanations by falling probability, each with its probability [1] and its hardware drift, K hardware offsets, K
+        drifts and K offsets; drifts [1], offsets in fractions of full scale, branches in the order of ``order``.
     """
 
     points: Sequence[FleetPoints]

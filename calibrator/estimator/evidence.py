@@ -871,17 +871,18 @@ def row_design(branches: int, feed: int) -> Array:
 
 
 def evidence_names(branches: Sequence[str]) -> list[str]:
-    """Return the names of the 5K rows for people, such as "slope battery" or "gain ratio battery / motor".
+    """Return a readable name for each of the 5K rows, such as "slope battery" or "gain ratio battery / motor".
 
     Parameters
     ----------
     branches : sequence of str
-        The K branches; the first is the one that moves most, for which the junction law is solved.
+        The K branches; the first is the one whose current varies most, for which the junction law is solved.
 
     Returns
     -------
     list of str
-        3K - 1 names of rows of ratios [1], then 2K + 1 of constants [A].
+        K slopes, K - 1 gain ratios and K gain readings [1]; then K intercepts, the junction constant and K offset
+        readings [A].
     """
     first = branches[0]
     return [

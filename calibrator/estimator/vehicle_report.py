@@ -35,7 +35,10 @@ def explained_faults(explanation: Explanation, branches: Sequence[str]) -> Array
 
 
 def explained(parameters: VehicleParameters) -> str:
-    """Return some lines for people: what was found for a vehicle, why, and what would decide what is open."""
+    """Return the result of a vehicle as readable text: verdict, faults, explanations, findings, sum of the junction.
+
+    If explanations remain that the data cannot tell apart, it also says which further evidence would.
+    """
     confidence, hardware, residual = parameters.confidence, parameters.hardware_fault, parameters.junction_residual
     sure = "" if confidence is None else f" (confidence {confidence:.2f})"
     lines = [f"{parameters.vehicle}: {parameters.verdict}{sure}"]

@@ -152,7 +152,15 @@ class CommonCase(FaultSettings):
 
 
 def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
-    """Make the trial of N vehicles on the unity drive; the same seed gives the same trial."""
+    """Make the trial of the ``case.vehicles`` vehicles on the unity part of the common drive; a seed gives one trial.
+
+    Corrections are judged on ``drive.unseen``.
+
+    Raises
+    ------
+    FleetError
+        If a fleet of mirrored pairs has no multiple of 4 vehicles, or its sign bias does not fit.
+    """
     junction: dict[str, Any] = {"branches": drive.i_s.shape[1], "full_scale_a": drive.full_scale_a}
     truth = case.draw(random_stream(Purpose.FAULTS, seed), vehicles=case.vehicles, **junction)
     simulate = _simulation(drive, truth, case, Purpose.SIMULATION_ERROR, seed)

@@ -72,16 +72,17 @@ class Experiment:
     repetitions : int
         Trials per setting, if a run does not say how many.
     drive_s : float
-        Length of the common drive; an hour has 7,200 samples of unity drive at 10 Hz, the paper does not say. [s]
+        Length of the common drive. Its last 20 % are the unity drive: 7,200 samples at 10 Hz of an hour. The paper does
+        not say how many it had. [s]
     paper : mapping
         What the paper prints: ``{(60.0, "published/tree"): {"f2": 0.84}}`` by (x, method), then figure.
     note : str
         Remark on the settings.
     shown : tuple of str
-        Figures of the default that stand beside the recovery rates of all methods, by the names of
+        Figures of the default method that stand beside the recovery rates of all methods, by the names of
         :data:`calibrator.experiments.figures.FIGURES`.
     panels : tuple of str
-        Figures that its picture shows.
+        Figures that its picture shows, a panel each.
     """
 
     name: str

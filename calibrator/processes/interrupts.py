@@ -58,5 +58,5 @@ def _descendants(process: str = "self") -> list[int]:
 
 
 def importing() -> AbstractContextManager[None]:
-    """Let Ctrl-C end the program at once while the block imports what a command needs; no file is open yet."""
+    """Let Ctrl-C end the process with one line and without cleanup while the block, which opens no file, imports."""
     return ending_at_interrupt(interrupted_message(sys.argv[1:]))

@@ -197,10 +197,11 @@ def _position(item: Candidate, judged: Sequence[Candidate]) -> str:
 
 
 def close_sum(judged: Sequence[Candidate], voltage: Candidate | None) -> list[Candidate]:
-    """Make currents of unknown place branches, alone or in pairs, if the sum varies far less with them.
+    """Turn currents whose place is unknown into branches, one or two at a time, if the sum varies far less with them.
 
-    The battery's current is fitted by the other branches, each with a gain. With the added current all gains must be
-    near 1, which excludes copies of a branch, and the residual must be less than half of that without it.
+    The battery's current is fitted by the other branches, each with a gain. With the added currents all gains must be
+    within a factor of 1.3 of 1, which excludes copies of a branch, and less than half of the residual must be left.
+    Nothing changes if there is no battery, or no second branch.
 
     Parameters
     ----------

@@ -186,7 +186,10 @@ class SignalSource(ABC):
 
     @abstractmethod
     def unit(self, signal_name: str) -> str:
-        """Return the unit of a signal; empty if neither DBC nor recording states one."""
+        """Return the unit of a signal; empty if none is stated. DatabaseError if the DBC lacks the signal.
+
+        The unit of the DBC comes first (without a DBC, that of the branch in the layout), then that of the column.
+        """
 
     @abstractmethod
     def found_and_expected(self) -> str:
@@ -197,7 +200,7 @@ class SignalSource(ABC):
         """Return the report on the recording, given its channels by name."""
 
     def recording(self, vehicle: str, name: str) -> Recording:
-        """Return the drive under these names, with its report; raise LogError if the recording holds no branch."""
+        """Return the drive under these names, with its report; LogError if it has no branch or one on several buses."""
         layout = self.database.layout
         branches = {branch.name: self.branch(branch, branch.source) for branch in layout.branch}
         if not any(channel.time_s.size for channel in branches.values()):

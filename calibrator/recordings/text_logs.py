@@ -285,7 +285,10 @@ def _quiet() -> Iterator[list[LogRecord]]:
 
 
 def parse_candump(text: bytes) -> tuple[Frames, NDArray[np.uint8]]:
-    """Parse lines of ``candump -L``, ended by LF or CRLF; return frames in the order of lines, and each line's kind."""
+    """Parse lines of ``candump -L``, ended by LF or CRLF; return the data frames in their order, and the lines' kinds.
+
+    Each line, blank and damaged ones too, is ``NOTHING``, ``DATA``, ``ERROR``, ``REMOTE`` or ``DAMAGED``.
+    """
     text = text if text.endswith(b"\n") else text + b"\n"
     lines, found, fd = text.count(b"\n"), -1, False
     while found < 0:

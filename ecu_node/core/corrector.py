@@ -125,7 +125,8 @@ class OwnMessage:
     key, fd, protection
         As given.
     data : bytearray
-        Payload of the message as it was made last; each one is a new object.
+        Payload that was made last; before the first one, zeros with the start of the protection. The next payload is a
+        new object, so one that was handed out does not change.
     branches : dict of LiveBranch to Written
         The branches that are written into it.
     """
@@ -249,7 +250,7 @@ class Source:
         if self._take(payload, now_s, ways) > _LAST_USABLE:
             if not self.branches:
                 return payload
-            self._counters.held_back += 1
+            self._counters.not_passed_on += 1
             return None
         made = ways.in_place(payload, payload, now_s)
         if made == payload:
@@ -384,9 +385,10 @@ class Corrector:
         self.latch(Reason.NONE)
 
     def look(self, now_s: float) -> None:
-        """Judge the whole junction; fall back to passing through if a branch is stale or stuck, or the sums are wrong.
+        """Judge the whole junction; latch passing through if a branch is stale or stuck, or the sums are wrong.
 
-        Must be called every 20 ms for a jump to be seen within 0.1 s.
+        That all branches are silent is no fault: the vehicle sleeps. Must be called every 20 ms, so that a jump of the
+        corrected sum is seen within 0.1 s.
         """
         self._looked_s = now_s
         if self.counters.foreign != self._foreign:

@@ -106,8 +106,8 @@ class Counters:
     """Frames that a gateway passed on from the vehicle to the sensors' bus, but not those that the kernel carries."""
     not_returned: int = 0
     """Frames from the vehicle's bus that the sensors' bus did not take."""
-    held_back: int = 0
-    """Frames of branches that failed their end-to-end check, so that a gateway did not pass them on."""
+    not_passed_on: int = 0
+    """Frames of branches that failed their end-to-end check, so that a gateway stopped them."""
     corrupt: int = 0
     """Frames with a wrong CRC or an impossible counter."""
     repeated: int = 0

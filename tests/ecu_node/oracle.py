@@ -166,7 +166,7 @@ class Oracle:
             if is_new:
                 return self._rewritten(message, own, data, sent)
             expected = [] if own else [(identifier, data)]
-            return None if sent == expected else f"a frame that is {check.name} was not held back or left alone"
+            return None if sent == expected else f"a frame that is {check.name} was not stopped or left alone"
         if not is_new:
             return f"a frame that is {check.name} was answered" if sent else None
         if receiver is not None and receiver.state is E2EState.INVALID:

@@ -652,8 +652,8 @@ def test_frame_with_repeated_or_jumped_counter_is_not_used(
     corrector, take = corrector_for(database, mode, battery=(0.25, 5.0)), TAKE[mode]
     found = [bool(take(corrector, battery(database, counter), 0.02 * k)) for k, counter in enumerate(sent)]
     assert found == [number != unused for number in range(len(sent))]
-    held_back = "held back 1, " if mode is Mode.GATEWAY and unused is not None else ""
-    assert corrector.counters.text().endswith(f", {held_back}{counted}")
+    stopped = "not passed on 1, " if mode is Mode.GATEWAY and unused is not None else ""
+    assert corrector.counters.text().endswith(f", {stopped}{counted}")
 
 
 @pytest.mark.parametrize("mode", Mode)
@@ -663,5 +663,5 @@ def test_frame_with_wrong_crc_is_counted_and_otherwise_ignored(database: Vehicle
     frames = (first, damaged(second), second, third, Frame(BATTERY, b""))
     used = [bool(take(corrector, frame, 0.02 * k)) for k, frame in enumerate(frames)]
     assert used == [True, False, True, True, False]
-    used_as = "answers 3" if mode is Mode.OVERLAY else "rewritten 3, held back 2"
+    used_as = "answers 3" if mode is Mode.OVERLAY else "rewritten 3, not passed on 2"
     assert corrector.counters.text() == f"frames in 5, {used_as}, corrupt 2"

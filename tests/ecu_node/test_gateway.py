@@ -96,7 +96,7 @@ def test_message_without_branches_is_forwarded_even_if_corrupt(make_database: Ma
     corrector = gateway_for(database, heater=(0.25, -2.0))
     spoilt = Frame(NET, b"\x00\x01\x40\x9c")
     assert passed_on(corrector, spoilt, 0.0) == spoilt.data
-    assert (corrector.counters.corrupt, corrector.counters.held_back) == (1, 0)
+    assert (corrector.counters.corrupt, corrector.counters.not_passed_on) == (1, 0)
 
 
 def test_gateway_refuses_a_named_code_within_the_range_of_a_branch(make_database: MakeDatabase) -> None:

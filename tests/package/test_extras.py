@@ -37,7 +37,6 @@ def test_each_extra_alone_installs_without_conflicts(installed: Installed, extra
 def test_calibrator_extra_suffices_from_logs_to_parameters_reports_and_exports(
     interpreter: str, wheel: Path, car: Path, fleet: Path, drive: Path, tmp_path: Path
 ) -> None:
-    """From logs to parameters, reports and exports."""
     venv, result = new_venv(tmp_path / "environment", wheel, "calibrator", interpreter=interpreter), tmp_path / "result"
     layout = ("--layout", car / "my_car.toml")
     calibrator(venv, tmp_path, "import", fleet / "logs", *layout, "--out", "store")

@@ -44,13 +44,14 @@ def test_doctor_reports_no_error_at_the_end_of_a_charge(i3_charges: Path) -> Non
     assert "19 of 153 frames (12 %) cannot be used: not available 19" in doctor.findings("bad frames")[0].text
 
 
-def test_most_of_the_tesla_sum_is_a_constant(tesla: Path) -> None:
-    """Steps of 0.5 kW in both powers are 1.4 A each; a gain error of 2 % explains a third of how the sum varies."""
+def test_constant_makes_92_percent_of_the_mean_square_of_the_tesla_sum(tesla: Path) -> None:
+    """What varies is small: steps of 0.5 kW in the powers are 1.4 A each, and a gain error of 2 % explains a third."""
     found = kirchhoff(tesla / "drive.log.gz", "--layout", tesla / "tesla_model3.toml")
     assert found["expected"]["parts_a"]["quantisation"] == pytest.approx(0.55, abs=0.02)
     before = found["residual"]["before"]
     assert before["constant"] == pytest.approx(0.92, abs=0.02)
     assert before["alone"]["battery"]["gain_error"] == pytest.approx(0.020, abs=0.003)
+    assert before["alone"]["battery"]["gain_share"] == pytest.approx(0.34, abs=0.03)
     assert "motor_front" not in before["alone"]  # it moves less than its steps
 
 

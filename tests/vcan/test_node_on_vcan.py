@@ -182,8 +182,8 @@ def test_gateway_changes_currents_and_crcs_and_nothing_else(
             assert player.wait() == 0
         total = len(frames_of(drive)) + 260
         sent = here.wait_for_frames(total)
-        held_back = INSTANTS // 10
-        arrived_at_least = total - held_back
+        stopped = INSTANTS // 10
+        arrived_at_least = total - stopped
         wait_until(
             lambda: sum(item.identifier != f"{STATUS:03X}" for item in there.frames) >= arrived_at_least,
             "all frames on the other bus",
@@ -199,5 +199,5 @@ def test_gateway_changes_currents_and_crcs_and_nothing_else(
     assert len(back[0]) == 60
     assert back[0] == back[1]
     assert here.frames == sent, "nothing comes back, and the status stays where it belongs"
-    counted = f"forwarded {len(after['branches'])}, held back {held_back}, corrupt {held_back}"
+    counted = f"forwarded {len(after['branches'])}, not passed on {stopped}, corrupt {stopped}"
     assert node.messages.endswith(f"{counted}\n")

@@ -182,7 +182,7 @@ def test_impossible_sign_bias_or_size_of_a_symmetric_fleet_is_refused(changes: d
         draw(**{"vehicles": 4} | changes)
 
 
-def test_random_streams_are_reproducible_and_differ_by_purpose_and_numbers() -> None:
+def test_random_streams_are_reproducible_and_differ_by_purpose_seed_and_further_numbers() -> None:
     numbers = [(), (0,), (7,), (7, 0), (7, 0, 0), (0, 7)]
     first, again = ([random_stream(p, *n).random() for p, n in product(Purpose, numbers)] for _ in range(2))
     assert first == again

@@ -230,7 +230,7 @@ def test_evidence_for_other_densities_of_fault_sizes_equals_that_of_weighing_ane
     assert np.argmax(found) == np.argmax(exact) == 1
 
 
-def test_posterior_of_a_load_equals_integration_on_a_grid_and_has_no_negative_loads() -> None:
+def test_probability_of_a_load_equals_integration_on_a_grid_and_negative_loads_have_no_weight() -> None:
     prior = Prior(
         counts=paper_prior(2, 0, 1).counts,
         gain=Slab(low=0.05, high=0.25, tail=1e-6),

@@ -337,7 +337,7 @@ def test_table_whose_columns_are_signals_of_the_database_serves_as_a_log(tmp_pat
     succeeded("kirchhoff", tmp_path / "x.csv", "--layout", layout.path)
 
 
-def test_branches_given_by_the_user_are_written_unchanged(table: Path) -> None:
+def test_branches_given_by_the_user_keep_their_sign_and_need_no_confirmation(table: Path) -> None:
     layout = found(table, "--branches", "-battery=Batteriestrom,-motor=Motorstrom [A]")
     assert layout.path.read_text().count("# confirm:") == 2  # full scale, voltage
     assert signed(layout) == {"battery": ("Batteriestrom [A]", -1), "motor": ("Motorstrom [A]", -1)}

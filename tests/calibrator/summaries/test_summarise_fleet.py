@@ -146,7 +146,7 @@ def test_duplicate_recording_of_a_vehicle_counts_once(fleet: SmallFleet) -> None
     assert fleet.total("V1").duration_s < 301.0
 
 
-def test_short_drive_is_used_only_if_its_vehicle_has_other_drives(fleet: SmallFleet) -> None:
+def test_short_drive_is_used_only_if_all_drives_of_its_vehicle_are_long_enough_together(fleet: SmallFleet) -> None:
     fleet.write("V1")
     fleet.add()
     for vehicle in ("V1", "V2"):
