@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def write_result(document: Any, text: str, *, as_json: bool) -> None:
-    """Print a result, as JSON or as a text for people; errors are those of :func:`write_output`."""
+    """Print a result, as JSON or as readable text; errors are those of :func:`write_output`."""
     if as_json:
         write_output(json.dumps(document, indent=2))
     else:

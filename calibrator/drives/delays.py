@@ -14,7 +14,7 @@ sensor has nearly the same power in e whatever the phase of its frames, and does
 effect of wild samples.
 
 A delay is a property of the vehicle. To avoid local minima it is first searched on a grid of lags, and then refined by
-Newton steps, both in the few minutes in which the branches move most. One or two steps on all drives make it exact, and
+Newton steps, both in the few minutes in which the currents vary most. One or two steps on all drives make it exact, and
 the spread between blocks of time gives its uncertainty. A branch that changes too little to show its delay is flagged.
 """
 
@@ -53,7 +53,7 @@ BLOCK_S = 10.0
 FEWEST_BLOCKS = 6
 """Fewer blocks do not give a useful standard deviation. [1]"""
 SEARCHED_BLOCKS = 60
-"""Blocks in which delays are searched: ten minutes in which the branches move most. [1]"""
+"""Blocks in which delays are searched: ten minutes in which the currents vary most. [1]"""
 HOPELESS = 3.0
 """If the standard deviation of a delay, in the searched blocks, exceeds the largest allowed this many times, the delay
 is no longer estimated: it would wander and distort those of the other branches. [1]"""
@@ -152,7 +152,7 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
     drives : sequence of Drive
         Drives of one vehicle; a drive with too few good samples of a branch adds nothing.
     branches : sequence of str
-        Names of the K branches that meet at the junction; the first, the reference, should be the one that moves most.
+        Names of the K branches that meet at the junction; the current of the first, the reference, should vary most.
     max_sd_s : float
         Largest standard deviation of a delay that counts as known. [s]
 
@@ -267,7 +267,7 @@ def _stretches(complete: Sequence[tuple[ChargeCurve, ...]], band: Band) -> tuple
 
 
 def _most_telling(stretches: Sequence[_Stretch], band: Band, blocks: int) -> Sequence[_Stretch]:
-    """Return the stretches with only those blocks in which the branches move most.
+    """Return the stretches with only those blocks in which the currents vary most.
 
     A branch's movement in a block counts as a share of its total, so that small branches count as much as large ones.
     """

@@ -120,8 +120,8 @@ class UsualMisfits:
 class _Checked:
     """Checks of N vehicles with fit sums: junction law, currents over the fleet model, and what each cause explains.
 
-    The residual of the law is r = y - g^T z: y the branch that moves most, z the others and 1. B blocks, M inputs, K
-    branches, p = M + K + 1 columns (inputs, currents, 1), L levels of a current, C causes.
+    The residual of the law is r = y - g^T z: y the branch whose current varies most, z the others and 1. B blocks, M
+    inputs, K branches, p = M + K + 1 columns (inputs, currents, 1), L levels of a current, C causes.
 
     Attributes
     ----------

@@ -352,7 +352,7 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
     Parameters
     ----------
     fleet : FleetMoments
-        Moments of N vehicles; the first branch should be the one that moves most.
+        Moments of N vehicles; the first branch should be the one whose current varies most.
 
     Returns
     -------
@@ -391,7 +391,7 @@ def ratios_in_doubt(fleet: FleetMoments) -> Mask:
     Parameters
     ----------
     fleet : FleetMoments
-        Moments of N vehicles; the first branch should be the one that moves most.
+        Moments of N vehicles; the first branch should be the one whose current varies most.
 
     Returns
     -------

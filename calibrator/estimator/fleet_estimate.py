@@ -69,7 +69,8 @@ class FleetReference:
     branches : tuple of str
         Names of the K branches, in the vehicles' own order.
     order : tuple of int
-        Branches in the order of the estimator, the one that moves most first: branch k there is ``branches[order[k]]``.
+        Branches in the order of the estimator, in which the one whose current varies most is first: branch k there is
+        ``branches[order[k]]``.
     feed : int
         Place of the feeding branch in that order.
     read_out : ndarray of shape (M + 1, K)

@@ -199,7 +199,7 @@ class IdentificationReport:
         return dumps({**vars(self), "bank": bank, "branches": branches, "snr_db": snr_db})
 
     def as_text(self) -> str:
-        """The report for people."""
+        """The report as readable text."""
         rows = [
             [branch, *(f"{value:.1f}" if np.isfinite(value) else "-" for value in (median_db, worst_db)), vehicle]
             for branch, median_db, worst_db, vehicle in self._by_branch().itertuples()

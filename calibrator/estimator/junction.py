@@ -78,7 +78,7 @@ class JunctionLaw(NamedTuple):
     """K rows of a vehicle's junction law, (M8) of docs/method.md: log(-g) of K - 1 branches, c over full scale. [1]"""
 
     order: list[int]
-    """Numbers of the K branches, the one that moves most first: the rows are log(-g) of ``order[1:]``."""
+    """Numbers of the K branches, the one whose current varies most first: the rows are log(-g) of ``order[1:]``."""
     value: Array
     """Values of the rows, shape (K,)."""
     covariance: Array

@@ -438,7 +438,7 @@ def deployed_rms_a(applied: Mask, *, measured_a: Array, corrected_a: Array) -> A
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationReport:
-    """Summary of a calibration, for people and as JSON; each list names at most :data:`MOST_NAMED` vehicles."""
+    """Summary of a calibration, as text and as JSON; each list names at most :data:`MOST_NAMED` vehicles."""
 
     result: str
     """Folder; empty: not written."""
@@ -469,7 +469,7 @@ class CalibrationReport:
         return dumps(vars(self))
 
     def as_text(self) -> str:
-        """The report for people."""
+        """The report as readable text."""
         run, details = self.run, self.run.details
         load_a = details.get("declared_load_a", 0.0)
         by_branch = {

@@ -325,10 +325,10 @@ def _together(good_s: Sequence[Array], time_s: Array) -> Mask:
 def _shares(
     currents_a: pd.DataFrame, slope: Array, noise_a: Array, mean_a: float
 ) -> tuple[dict[str, Any] | None, Array, Array]:
-    """Return shares in the sum, delays relative to the branch that moves most (K,) [s], and the unexplained rest [A].
+    """Return shares in the sum, delays relative to the most varying current (K,) [s], and the unexplained rest [A].
 
     The sum holds the noise of each branch, too: its variance is taken out of both sides of the regression on the gains.
-    The branch that moves most is left out of the regressions, since an error of its gain cannot be told from the same
+    The most varying current is left out of the regressions, since an error of its gain cannot be told from the same
     error of all others.
     """
     a = currents_a.to_numpy()

@@ -47,7 +47,7 @@ class ImportReport:
         return dumps({**vars(self), "drives": drives})
 
     def as_text(self) -> str:
-        """The report for people; a notice that several drives share appears once."""
+        """The report as readable text; a notice that several drives share appears once."""
         rows = [(d.vehicle, d.name, f"{d.duration_s:.1f}", ", ".join(d.branches)) for d in self.drives]
         notices = [f"  {line}" for line in merged_notices({(d.vehicle, d.name): d.notices for d in self.drives})]
         parts = [

@@ -80,7 +80,7 @@ class SummariseReport:
         return dumps(vars(self))
 
     def as_text(self) -> str:
-        """The report for people."""
+        """The report as readable text."""
         parts = [
             "\n".join(f"notice: {notice}" for notice in self.notices),
             left_out_text(self.left_out),

@@ -260,7 +260,7 @@ class StoreReport:
         return dumps(vars(self))
 
     def as_text(self) -> str:
-        """The report for people."""
+        """The report as readable text."""
         lines = [
             f"{self.store}: {counted(self.vehicles, 'vehicle')}, {self.unusable} of them without usable drives; "
             f"{counted(self.drives, 'drive')}, {self.hours:.1f} h; {counted(self.files, 'file')}, "

@@ -74,7 +74,7 @@ def clear_faults(folder: Path) -> None:
 
 
 def faults_text(faults: list[Fault]) -> str:
-    """Return the entries as text for people."""
+    """Return the entries as readable text."""
     lines = []
     for fault in faults:
         which = f" ({' or '.join(fault.branches)})" if fault.branches else ""

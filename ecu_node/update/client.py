@@ -296,7 +296,7 @@ def _without_revoked(state: VehicleState, offer: _Offer, now: datetime) -> tuple
 def _judged(
     state: VehicleState, offer: _Offer, source: str, database: VehicleDatabase, now: datetime
 ) -> tuple[VehicleState, str, str]:
-    """Decide on the set that is offered; return the new state, the event, such as "on trial", and a text for people."""
+    """Decide on the set that is offered; return the new state, the event, such as "on trial", and a text about it."""
     if offer.sha256 in offer.facts.revoked:
         return state, "nothing new", f"what the repository has for vehicle {state.vehicle} is revoked"
     try:

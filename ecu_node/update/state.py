@@ -2,7 +2,7 @@
 
 All of it is one file, ``state.json``, which is replaced whole: after a power cut at any moment the state is the old or
 the new one. Its first line is the SHA-256 of the rest, so that a bit that the disk has changed is noticed.
-``decisions.log`` is a log for people: one line of JSON for each decision.
+``decisions.log`` has one line of JSON for each decision, to be read by people.
 """
 
 import errno
