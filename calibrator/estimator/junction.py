@@ -2,14 +2,15 @@
 
 No fleet is needed. Every vehicle gives K - 1 gain ratios and one constant of the junction law, (M8) of docs/method.md,
 
-    log(-g_k) = lambda_1 - lambda_k,    c = o_1 - sum over k > 1 of g_k o_k + (1 + d_1) l,    lambda = log(1 + d),
+    -g_k = exp(lambda_1 - lambda_k),    c = o_1 - sum over k > 1 of g_k o_k + (1 + d_1) l,    lambda = log(1 + d),
 
-with the offsets o and the load l that no branch measures. They are linear in the unknowns (lambda, o, l), except that
-gains multiply a load or a charge, where they are linearised again; so recordings of one car that has another sensor
-("meter") in one branch each time, as at different chargers, are one system of equations. Ratios do not give the scale
-of the gains: it comes from sensors that are known. Offsets come from known sensors, zero-current windows, a declared
-load, or a charge balance. As no fleet shows what is usual, the gain of a sensor that is not known is open: its prior is
-a wide Gaussian. Its offset is absent (a narrow Gaussian: no zero is exact) or present, of any size; each choice is one
+with the offsets o and the load l that no branch measures. They are linearised in the unknowns (lambda, o, l), so
+recordings of one car that has another sensor ("meter") in one branch each time, as at different chargers, are one
+system of equations. The ratio of a branch whose current hardly varies is wrong by much, and c by that times the mean
+current; their covariance says so, for g and c themselves, not for logarithms. Ratios do not give the scale of the
+gains: it comes from sensors that are known. Offsets come from known sensors, zero-current windows, a declared load, or
+a charge balance. As no fleet shows what is usual, the gain of a sensor that is not known is open: its prior is a wide
+Gaussian. Its offset is absent (a narrow Gaussian: no zero is exact) or present, of any size; each choice is one
 explanation. What stays open is reported with its standard deviation, and is not corrected.
 """
 
@@ -64,8 +65,8 @@ DRAWS, FEWEST_DRAWS = 8192, 64
 USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
 """Usual misfit, due to curvature of good sensors, and usual residual of the sum, due to noise and switched loads, over
 full scale; and spread between cars of the logarithm of the square of that residual. [1]"""
-STEPS = 2
-"""Gauss-Newton steps for the gains that multiply charges and loads: after the first one the ratios tell them."""
+STEPS = 6
+"""Gauss-Newton steps for the gains in ratios, charges and loads: ratios between 1/3 and 3 need no more. [1]"""
 STILL = 0.003
 """Standard deviation of all currents, over full scale, up to which the car stands still. [1]"""
 SOUND_GAIN_SD, SOUND_OFFSET_SD = 0.01, 0.0025
@@ -75,10 +76,10 @@ SEEN = 3.0
 
 
 class JunctionLaw(NamedTuple):
-    """K rows of a vehicle's junction law, (M8) of docs/method.md: log(-g) of K - 1 branches, c over full scale. [1]"""
+    """K rows of a vehicle's junction law, (M8) of docs/method.md: -g of K - 1 branches, c over full scale. [1]"""
 
     order: list[int]
-    """Numbers of the K branches, the one whose current varies most first: the rows are log(-g) of ``order[1:]``."""
+    """Numbers of the K branches, the one whose current varies most first: the rows are -g of ``order[1:]``."""
     value: Array
     """Values of the rows, shape (K,)."""
     covariance: Array
@@ -109,14 +110,18 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
                     f"branch {branches[order[0]]}, expected -1 A; check sign and unit of branch {branches[k]} or "
                     f"{branches[order[0]]}"
                 )
-        ratio = np.clip(ratio, 1.0 / MOST_RATIO, MOST_RATIO)
     constant_sd_a = float(np.hypot(np.sqrt(covariance[-1, -1]), LAW_OFFSET_SD * scale_a))
-    unit = np.append(1.0 / ratio, 1.0 / scale_a)
+    unit = np.append(np.ones(K - 1), 1.0 / scale_a)
     # an error of a ratio turns the line about the mean current, and so moves the constant
-    jacobian = np.vstack([np.eye(K - 1), ratio * mean_a[others] / scale_a]) * LAW_GAIN_SD
+    jacobian = np.vstack([np.eye(K - 1), mean_a[others] / scale_a]) * LAW_GAIN_SD * _possible(ratio)
     covariance = covariance * np.outer(unit, unit) + jacobian @ jacobian.T
     covariance[-1, -1] += LAW_OFFSET_SD**2
-    return JunctionLaw(order, np.append(np.log(ratio), constant_a / scale_a), covariance, (constant_a, constant_sd_a))
+    return JunctionLaw(order, np.append(ratio, constant_a / scale_a), covariance, (constant_a, constant_sd_a))
+
+
+def _possible(ratio: Array) -> Array:
+    """Return gain ratios with those that no two sensors have, which are not sure, moved to the nearest possible one."""
+    return np.clip(ratio, 1.0 / MOST_RATIO, MOST_RATIO)
 
 
 class JunctionKnowledge(NamedTuple):
@@ -172,43 +177,40 @@ class _System:
         of_gain = np.array(self.known) < S
         value, sd = np.array([each[1:] for each in given]).reshape(-1, 2).T
         design = np.zeros((N * K + len(known.charge_a) + len(given), 2 * S + N))
-        for j, law in enumerate(self.laws):
-            first, *others = self.places[j][law.order].tolist()
-            ratios, constant = range(j * K, (j + 1) * K - 1), (j + 1) * K - 1
-            design[ratios, first], design[ratios, others] = 1.0, -1.0
-            design[constant, [S + first, *(S + s for s in others)]] = np.append(1.0, np.exp(law.value[:-1]))
-            design[constant, 2 * S + j] = 1.0
-            design[constant, first] = load.mean_a / scale_a  # (1 + d_1) l
         charges = np.array([*known.charge_a.values()]).reshape(-1, 3) / scale_a  # mean measured = (1 + d) true + o
         charged = [branches.index(name) for name in known.charge_a]
         for i, k in enumerate(charged, start=N * K):
-            design[i, [k, S + k]] = charges[i - N * K, 1], 1.0
+            design[i, S + k] = 1.0
         design[range(len(design) - len(given), len(design)), self.known] = 1.0
         self.design = design
-        self.y = np.concatenate(
-            [
-                *(law.value for law in self.laws),
-                charges[:, 0] - charges[:, 1],
-                np.where(of_gain, np.log1p(np.where(of_gain, value, 0.0)), value / scale_a),
-            ]
-        )
+        known_x = np.where(of_gain, np.log1p(np.where(of_gain, value, 0.0)), value / scale_a)
+        self.y = np.append(np.zeros(len(design) - len(given)), known_x)
         self.covariance = block_diag(
             *(law.covariance for law in self.laws),
             np.diag(charges[:, 2] ** 2 + LAW_OFFSET_SD**2),
             np.diag(np.where(of_gain, sd / (1.0 + value), sd / scale_a) ** 2),
         )
         self.open_sd = np.repeat([OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD], [S, S, N])
+        found: Array = np.zeros(2 * S + N)
+        for j, law in enumerate(self.laws):
+            design[(j + 1) * K - 1, S + self.places[j, law.order[0]]] = 1.0
+            found[self.places[j][law.order[1:]]] = -np.log(_possible(law.value[:-1]))
         for _ in range(STEPS):  # 1 + d = exp(lambda), linear about the lambda that is found
-            found = self.condition(self.open_sd)[0]
+            for j, law in enumerate(self.laws):
+                first, *others = self.places[j][law.order].tolist()
+                ratios, constant = slice(j * K, (j + 1) * K - 1), (j + 1) * K - 1
+                gain, log_ratio = np.exp(found[first]), found[first] - found[others]
+                ratio = np.exp(log_ratio)
+                design[ratios, first], design[ratios, others] = ratio, -np.diag(ratio)
+                self.y[ratios] = law.value[:-1] - ratio + ratio * log_ratio
+                design[constant, [S + s for s in others]] = ratio
+                design[constant, [first, 2 * S + j]] = gain * load.mean_a / scale_a, gain  # (1 + d_1) l
+                self.y[constant] = law.value[-1] + design[constant, first] * found[first]
             for i, k in enumerate(charged, start=N * K):
                 measured, true, _ = charges[i - N * K]
                 design[i, k] = true * np.exp(found[k])
                 self.y[i] = measured - design[i, k] * (1.0 - found[k])
-            for j, law in enumerate(self.laws):
-                first, constant = int(self.places[j, law.order[0]]), (j + 1) * K - 1
-                gain = np.exp(found[first])
-                design[constant, [first, 2 * S + j]] = gain * load.mean_a / scale_a, gain
-                self.y[constant] = law.value[-1] + design[constant, first] * found[first]
+            found = self.condition(self.open_sd)[0]
 
     def condition(self, sd: Array, without: int | None = None) -> tuple[Array, Array, float]:
         """Return mean (P,) and covariance (P, P) of x, and log evidence, for a prior of standard deviations (P,).
@@ -440,11 +442,11 @@ def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a
 def named_ratios(law: JunctionLaw, branches: Sequence[str]) -> dict[str, tuple[float, float]]:
     """Return K - 1 gain ratios (value, standard deviation) by name "a / b", where branch a comes before b. [1]"""
     first, *others = law.order
-    ratios, sds = np.exp(law.value[:-1]).tolist(), np.sqrt(np.diagonal(law.covariance)[:-1]).tolist()
+    ratios, sds = _possible(law.value[:-1]).tolist(), np.sqrt(np.diagonal(law.covariance)[:-1]).tolist()
     found = {}
     for k, ratio, sd in sorted(zip(others, ratios, sds, strict=True)):
         above, below, value = (first, k, ratio) if first < k else (k, first, 1.0 / ratio)
-        found[f"{branches[above]} / {branches[below]}"] = (value, value * sd)
+        found[f"{branches[above]} / {branches[below]}"] = (value, value * sd / ratio)
     return found
 
 

@@ -23,13 +23,15 @@ def recording(
     gain: tuple[float, float, float] = (0.0, 0.0, 0.0),
     offset_a: tuple[float, float, float] = (0.0, 0.0, 0.0),
     load_a: float = 0.0,
+    heater_a: float | None = None,
     seconds: float = SECONDS,
 ) -> pd.DataFrame:
-    """Three currents of a drive; what no branch measures flows out of the junction."""
+    """Three currents of a drive; what no branch measures flows out of the junction. None: the heater switches."""
     rng, time_s = np.random.default_rng(seed), np.arange(0.0, seconds, PERIOD_S)
     motor_a = 40.0 * np.convolve(rng.normal(size=len(time_s) + 19), np.full(20, 0.22), "valid")
-    heater_a = 12.0 * np.repeat(rng.integers(0, 2, len(time_s) // 150 + 1), 150)[: len(time_s)]
-    true_a = np.stack([motor_a + heater_a + load_a, -motor_a, -heater_a], axis=1)
+    switched_a = 12.0 * np.repeat(rng.integers(0, 2, len(time_s) // 150 + 1), 150)[: len(time_s)]
+    heated_a = switched_a if heater_a is None else np.full(len(time_s), heater_a)
+    true_a = np.stack([motor_a + heated_a + load_a, -motor_a, -heated_a], axis=1)
     measured_a = true_a * (1.0 + np.array(gain)) + offset_a + rng.normal(0.0, 0.2, true_a.shape)
     return pd.DataFrame(measured_a, columns=list(JUNCTION.branches), index=time_s)
 
@@ -56,8 +58,9 @@ def test_corrections_of_random_junctions_raise_no_error_by_more_than_the_accurac
         sizes_a = rng.choice([-1.0, 1.0], 3) * 10.0 ** rng.uniform(-0.3, 1.5, 3)
         offset_a = np.where(rng.random(3) < 0.25, sizes_a, 0.0) * [0.0, 1.0, case % 3 != 2]
         more: list[dict[str, Any]] = [{}, {"load": (load_a, 0.2)}, {"trusted": ["battery", "heater"]}]
-        measured = recording(seed, gain=(0.0, gain, 0.0), offset_a=tuple(offset_a), load_a=load_a, seconds=120.0)
-        true = recording(seed, load_a=load_a, seconds=120.0)  # and the same noise
+        car: dict[str, Any] = {"load_a": load_a, "seconds": 120.0, "heater_a": 50.0 if case % 4 == 3 else None}
+        measured = recording(seed, gain=(0.0, gain, 0.0), offset_a=tuple(offset_a), **car)
+        true = recording(seed, **car)  # and the same noise
         for frame, factor in ((measured, 1.0 + gain), (true, 1.0)):
             frame["battery"] += mean_a
             frame["motor"] -= factor * mean_a
@@ -123,6 +126,16 @@ def test_gain_of_a_branch_that_is_off_stays_undetermined() -> None:
     assert rows.gain_error_sd["heater"] > 0.1
     assert rows.gain_error_sd["motor"] < 0.01
     assert not rows.corrected["heater"]
+
+
+@pytest.mark.parametrize(("heater_a", "drift"), [(40.0, 0.0), (100.0, 0.0), (-80.0, 0.0), (100.0, -0.3), (60.0, 0.2)])
+def test_branch_with_a_constant_current_gives_no_other_branch_an_offset(heater_a: float, drift: float) -> None:
+    """Its gain ratio says nothing, and is far from 1; the constant of the junction law turns with it."""
+    frame = recording(gain=(drift, 0.0, 0.0), heater_a=heater_a)
+    row = found(frame, trusted=["motor", "heater"], load=(0.0, 0.2)).loc["vehicle", "battery"]
+    assert abs(row.gain_error - drift) < 4.0 * row.gain_error_sd < 0.02
+    assert abs(row.offset_a) < 4.0 * row.offset_sd_a < 1.0
+    assert row.corrected == bool(drift)
 
 
 def test_nothing_is_corrected_without_a_trusted_sensor_and_gain_ratios_are_shown(motor_off: pd.DataFrame) -> None:
