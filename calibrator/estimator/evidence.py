@@ -213,6 +213,11 @@ class FleetMoments:
         """Variance of the measured currents, which no offset changes, shape (N, K). [A^2]"""
         return np.asarray(self.mean_square_a2 - self.mean_a**2)
 
+    @property
+    def noise_bound_a2(self) -> Array:
+        """Largest noise of the measured currents: what their fast changes show, shape (N, K). [A^2]"""
+        return self.blocks.total(self.noise_a2) / self.blocks.count[:, None]
+
 
 def covariances(mean: Array) -> Array:
     """Compute covariances from mean products (N, p, p) of columns, the last of them 1; zero for a constant column."""
@@ -363,8 +368,7 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
     z = np.array([*range(M + 1, M + K), M + K])
     gram, right = fleet.moments[:, z[:, None], z], fleet.moments[:, z, M]
     samples, currents = fleet.moments[:, -1, -1], fleet.mean[:, M:, M:]
-    bound_a2 = fleet.blocks.total(fleet.noise_a2) / fleet.blocks.count[:, None]
-    bound_a2 = np.minimum(bound_a2, MOST_NOISE * fleet.variance_a2)
+    bound_a2 = np.minimum(fleet.noise_bound_a2, MOST_NOISE * fleet.variance_a2)
     noise_a2, others = np.zeros_like(bound_a2), range(K - 1)
     for _ in range(NOISE_ROUNDS):
         clean = gram.copy()

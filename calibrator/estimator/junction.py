@@ -34,7 +34,7 @@ from calibrator.estimator.decision import (
     harm_probability,
     recovery_probability,
 )
-from calibrator.estimator.evidence import junction_regression, stack_summaries
+from calibrator.estimator.evidence import MOST_NOISE, TINY, FleetMoments, junction_regression, stack_summaries
 from calibrator.estimator.readings import CONTRADICTION, TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.estimator.settings import SUSPECTED
 from calibrator.summaries.moments import DriveSummary
@@ -91,7 +91,8 @@ class JunctionLaw(NamedTuple):
 def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: float) -> JunctionLaw:
     """Regress the junction law of a vehicle, ``where`` in messages; FleetError if a sign or unit is wrong."""
     order = np.argsort(-summary.variance_a2, kind="stable").tolist()
-    fit = junction_regression(stack_summaries([summary], order))
+    moments = stack_summaries([summary], order)
+    fit = junction_regression(moments)
     K, others, mean_a = len(order), order[1:], summary.mean_a
     covariance = fit.influence.T @ fit.influence + fit.prior_covariance[0]
     if summary.variance_a2.max() < (STILL * scale_a) ** 2:  # ratios stay open, and the mean sum is the constant
@@ -102,6 +103,8 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
         ratio, constant_a = -fit.estimate[0, :-1], float(fit.estimate[0, -1])
         sign = np.append(-np.ones(K - 1), 1.0)
         covariance *= np.outer(sign, sign)
+        turns = np.vstack([np.eye(K - 1), mean_a[others]])[:, _is_only_noise(moments)[1:]]
+        covariance += turns @ turns.T  # its ratio is open
         sure = np.sqrt(np.diagonal(covariance)[:-1]) < SURE_SD
         for k, value in zip(np.array(others)[sure].tolist(), ratio[sure].tolist(), strict=True):
             if not 1.0 / MOST_RATIO < value < MOST_RATIO:
@@ -117,6 +120,15 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
     covariance = covariance * np.outer(unit, unit) + jacobian @ jacobian.T
     covariance[-1, -1] += LAW_OFFSET_SD**2
     return JunctionLaw(order, np.append(ratio, constant_a / scale_a), covariance, (constant_a, constant_sd_a))
+
+
+def _is_only_noise(moments: FleetMoments) -> Mask:
+    """Return which of the K currents only noise moves: it changes from sample to sample, and not with the others."""
+    precision = np.linalg.pinv(moments.covariance[0, moments.inputs : -1, moments.inputs : -1])
+    diagonal = np.diagonal(precision)
+    shared = precision[0] ** 2 / np.maximum(precision[0, 0] * diagonal, TINY)  # square of the partial correlation
+    fast = moments.noise_bound_a2[0] >= MOST_NOISE * moments.variance_a2[0]
+    return np.asarray(fast & (shared < 1.0 - MOST_NOISE))
 
 
 def _possible(ratio: Array) -> Array:
