@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from ecu_node import __version__
+from ecu_node.errors import printable
 from ecu_node.program import CommandParser, load_python_can, run_program, write_output, write_result
 from ecu_node.update.command import add_update_commands
 
@@ -277,7 +278,7 @@ def _faults(options: argparse.Namespace) -> None:
 def _clear(options: argparse.Namespace) -> None:
     from ecu_node.bus.faults import clear_faults  # noqa: PLC0415
 
-    clear_faults(options.state)
+    write_output(printable(clear_faults(options.state)))
 
 
 def _check(options: argparse.Namespace) -> int:

@@ -1,5 +1,6 @@
 """The DBC as the layout uses it: every signal that the layout names is looked up, and its unit is checked."""
 
+import logging
 import re
 from collections.abc import Mapping
 from contextlib import suppress
@@ -22,6 +23,8 @@ __all__ = [
     "node_database",
     "read_database",
 ]
+
+logging.getLogger("cantools").addHandler(logging.NullHandler())  # it prints of identifiers that stand there twice
 
 _MAX_DBC_BYTES = 16_000_000
 """Largest DBC that is read: real ones have some megabytes, and reading takes a hundred times that in memory."""
@@ -79,7 +82,15 @@ class VehicleDatabase:
                 f"{layout.path}: message {bare!r}{where} is in the DBCs of the buses "
                 f"{' and '.join(buses)}; write '{buses[0]}:{bare}'"
             )
-        return found[0]
+        bus, message = found[0]
+        key = message.frame_id, message.is_extended_frame
+        same = [item.name for item in self.databases[bus].messages if (item.frame_id, item.is_extended_frame) == key]
+        if len(same) > 1:
+            raise DatabaseError(
+                f"{paths[bus]}: messages {' and '.join(same)} have one identifier, 0x{message.frame_id:X}; take out "
+                f"those that are not on this bus"
+            )
+        return bus, message
 
     def signal(self, name: str) -> tuple[Message, Signal]:
         """Return message and signal of ``Message.Signal``; raise :class:`DatabaseError` if the DBC lacks one of them.

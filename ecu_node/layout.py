@@ -180,7 +180,7 @@ class StatusMessage(_Table, frozen=True, kw_only=True):
     """The message in which the node reports itself, and its signals."""
 
     message: Name
-    period_s: _Positive = 0.1
+    period_s: Annotated[float, msgspec.Meta(ge=0.01, le=1e6)] = 0.1
     state: Name
     reason: Name
     parameter_set: Name | None = None

@@ -281,7 +281,7 @@ _COLUMNS = {
     "branch": "",
     "measured": "[A]",
     "corrected": "[A]",
-    "correction": "[A]",
+    "change": "[A]",
     "quality": "",
     "rate": "[1/s]",
     "answers": "[1/s]",

@@ -348,8 +348,8 @@ def check_fit(parameters: VehicleParameters, database: "VehicleDatabase", vehicl
     texts = []
     if verdict in {"cannot tell", "not enough data"} and applied:
         texts.append(
-            f"verdict {verdict!r}, yet branch {', '.join(map(shown_name, applied))} has 'apply': true; nothing was "
-            f"found to apply, calibrate with more drives"
+            f"verdict {verdict!r}, yet 'apply' is true for {', '.join(map(shown_name, applied))}; nothing was found to "
+            f"apply, calibrate with more drives"
         )
     if not abs(expected_a) <= offset_a:
         beyond = f"beyond the layout's limit of offsets, {offset_a:g} A"

@@ -54,7 +54,9 @@ def _send(bus: can.BusABC, message: can.Message) -> None:
             bus.send(message)
         except can.CanError as error:
             if time.monotonic() > give_up_s:
-                raise BusError(f"{bus.channel_info}: the bus takes no frame: {error}") from None
+                is_fd_to_classic = message.is_fd and bus.protocol is can.CanProtocol.CAN_20
+                advice = "; a CAN FD frame needs --fd" if is_fd_to_classic else ""
+                raise BusError(f"{bus.channel_info}: the bus takes no frame: {error}{advice}") from None
             time.sleep(_SEND_PAUSE_S)
         else:
             return

@@ -7,6 +7,7 @@ refused.
 
 import configparser
 import errno
+import re
 import socket
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -37,6 +38,8 @@ _LISTEN_ONLY: dict[str, dict[str, Any]] = {
 """Settings, by interface, with which the adapter sends nothing at all, not even acknowledgements."""
 _RECEIVE_BUFFER_BYTES = 1 << 20
 """Buffer for frames that come while the node is busy; the kernel gives as much of it as it allows. [byte]"""
+_NOT_OPENED = (can.CanError, OSError, ValueError, TypeError, KeyError, NotImplementedError, ImportError, NameError)
+"""Errors of python-can's interfaces; NameError: its kvaser calls functions of a driver that is missing."""
 _FD_MTU = 72
 """MTU of a SocketCAN interface that carries CAN FD. [byte]"""
 
@@ -79,12 +82,13 @@ def connect(
     config |= {"can_filters": filters, "receive_own_messages": False}
     try:
         bus = can.Bus(**config, ignore_config=True)
-    except (can.CanError, OSError, ValueError, TypeError, KeyError, NotImplementedError) as error:
-        raise BusError(f"{interface} {channel}: cannot open the bus: {error_text(error)}") from None
-    except (ImportError, NameError) as error:  # python-can's kvaser calls functions of a driver that is missing
-        raise BusError(
-            f"{interface} {channel}: cannot open the bus: {error}; install the driver of the adapter"
-        ) from None
+    except _NOT_OPENED as error:
+        why = error_text(error)
+        if isinstance(error, ImportError | NameError) or re.search("library|driver|module", why):
+            why += "; install the driver of the adapter"
+        elif isinstance(error, ValueError | TypeError):
+            why += "; see --channel, CAN_CONFIG, can.conf"
+        raise BusError(f"{interface} {channel}: cannot open the bus: {why}") from None
     if bus.channel_info == can.BusABC.channel_info:
         bus.channel_info = f"{interface} {channel}"  # for interfaces that do not name themselves
     opened = socketcan_socket(bus)

@@ -16,6 +16,7 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Reason
 from ecu_node.documents import read_user_file, write_atomically
 from ecu_node.errors import UserError
+from ecu_node.update.state import state_path, time_text
 
 _NAME = "faults.json"
 _MOST_FAULTS, _LARGEST_BYTES = 64, 1_000_000
@@ -32,8 +33,8 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Name of the reason in the status message."""
     branches: list[str]
     """Branches that explain it best."""
-    parameter_set: int
-    """Number of the parameter set in force when it last occurred, modulo 256."""
+    parameter_set: int | None
+    """Number of the parameter set in force when it last occurred, modulo 256; None: not known."""
     first: str
     last: str
     """When it occurred first and last; ISO 8601, UTC."""
@@ -68,9 +69,24 @@ def read_faults(folder: Path) -> list[Fault]:
         raise UserError(f"{path}: cannot read the fault memory: {why}; 'ecu-node clear' begins a new one") from None
 
 
-def clear_faults(folder: Path) -> None:
-    """Forget all entries; a running node then corrects again within a second. UserError: there is no such folder."""
-    _file(folder).unlink(missing_ok=True)
+def clear_faults(folder: Path) -> str:
+    """Forget all entries, and say how many; a running node then corrects again within a second.
+
+    Raises
+    ------
+    UserError
+        If there is no such folder, or it is none of a node.
+    """
+    path = _file(folder)
+    if not (path.exists() or state_path(folder).exists()):
+        raise UserError(f"{folder}: neither a state nor faults there; name the folder of 'ecu-node run --state'")
+    try:
+        count = len(read_faults(folder))
+        found = f"{count} fault{'s' * (count > 1)} cleared" if count else "no faults"
+    except UserError:
+        found = "a fault memory that could not be read is cleared"
+    path.unlink(missing_ok=True)
+    return f"{folder}: {found}"
 
 
 def faults_text(faults: list[Fault]) -> str:
@@ -95,7 +111,8 @@ class FaultMemory:
     Parameters
     ----------
     corrector : Corrector
-        Core, with its parameters already in force; an active fault of the same parameter set is latched again.
+        Core; an active fault is latched again once the parameter set that it occurred with is in force. If the memory
+        cannot be read, the gravest reason is latched, as nobody knows what was.
     folder : Path
         State folder.
     say : callable
@@ -112,12 +129,21 @@ class FaultMemory:
         try:
             self._faults = read_faults(folder)
         except UserError as error:
-            say(str(error))
-            self._faults = []
-        for fault in self._faults:
-            if fault.active and fault.parameter_set == corrector.parameter_set and not corrector.latched:
-                corrector.latch(Reason[fault.reason], fault.branches)
+            say(f"{error}; until then measured values are passed through")
+            reason, now = Reason.SUM_IMPLAUSIBLE.name, time_text(datetime.now(UTC))
+            self._faults = [Fault(reason=reason, branches=[], parameter_set=None, first=now, last=now, count=1)]
         self._before = corrector.latched, corrector.latched_branches
+        self._latch_again()
+
+    def _latch_again(self) -> None:
+        """Latch what was active when the node last ended, unless something else keeps it from correcting."""
+        corrector = self._corrector
+        for fault in self._faults:
+            is_of_set = fault.parameter_set in {None, corrector.parameter_set}
+            if fault.active and is_of_set and not (corrector.reason or corrector.latched):
+                corrector.latch(Reason[fault.reason], fault.branches)
+                self._before = corrector.latched, corrector.latched_branches
+                fault.parameter_set = corrector.parameter_set
 
     def look(self, now_s: float) -> None:
         """Record a change of what is latched since the last call, and see whether the memory was cleared."""
@@ -132,14 +158,14 @@ class FaultMemory:
                 if corrector.latched:
                     corrector.release()
         found = corrector.latched, corrector.latched_branches
-        if found == self._before:
-            return
-        self._before = found
-        for fault in self._faults:
-            fault.active = False
-        if corrector.latched:
-            self._add(Reason(corrector.latched).name, list(corrector.latched_branches))
-        self._keep(now_s)
+        if found != self._before:
+            self._before = found
+            for fault in self._faults:
+                fault.active = False
+            if corrector.latched:
+                self._add(Reason(corrector.latched).name, list(corrector.latched_branches))
+            self._keep(now_s)
+        self._latch_again()
 
     def _is_cleared(self) -> bool:
         """Whether the file of the fault memory is gone."""
@@ -156,7 +182,7 @@ class FaultMemory:
 
     def _add(self, reason: str, branches: list[str]) -> None:
         """Put a fault that occurs now first in the list: its old entry, counted once more, or a new one."""
-        corrector, now = self._corrector, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        corrector, now = self._corrector, time_text(datetime.now(UTC))
         found = [item for item in self._faults if (item.reason, item.branches) == (reason, branches)]
         fault = found[0] if found else Fault(reason=reason, branches=branches, parameter_set=0, first=now, last=now)
         fault.parameter_set, fault.last, fault.active = corrector.parameter_set, now, True

@@ -32,6 +32,7 @@ from ecu_node.bus.wiring import (
     Mode,
     branch_plan,
     choose_parameters,
+    narrowed,
     needs_fd,
     open_bus,
     received,
@@ -295,7 +296,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
     database = node_database(layout)
     in_force = choose_parameters(params, database, vehicle)
     wire(database, in_force, start_s=0.0, mode=mode)
-    warnings = list(unpublished(database, in_force, mode).values())
+    warnings = [*unpublished(database, in_force, mode).values(), *narrowed(database, mode)]
     if names := needs_fd(database, mode):
         warnings.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
     parameters = in_force.parameters

@@ -35,15 +35,19 @@ class Log:
     """Log on standard error; a line that repeats is written a few times, and later with how often it came in between.
 
     A reader that does not read must not hold up the bus: lines that standard error does not take at once are lost, and
-    the next one that it takes says how many.
+    the next one that it takes says how many. Threads may write at the same time.
     """
 
     def __init__(self) -> None:
-        self._lost = 0
+        self._lock, self._lost = threading.Lock(), 0
         self._said: dict[str, tuple[float, int]] = {}
 
     def say(self, text: str) -> None:
         """Write a line, unless it repeats too often."""
+        with self._lock:
+            self._say(text)
+
+    def _say(self, text: str) -> None:
         now_s = time.monotonic()
         since_s, times = self._said.pop(text, (now_s, 0))
         held_back = 0
@@ -60,8 +64,10 @@ class Log:
             return
         if self._lost:
             again, self._lost = f"{again} ({self._lost} lines before were lost: nobody read them)", 0
-        with suppress(OSError):  # a log that is gone, as when the journal is started anew, must not end the node
-            print(f"ecu-node: {printable(text)[:_LONGEST_LINE]}{again}", file=sys.stderr, flush=True)
+        # A log that is closed or gone, as when the journal is started anew, must not end the node.
+        with suppress(AttributeError, OSError):
+            sys.stderr.write(f"ecu-node: {printable(text)[:_LONGEST_LINE]}{again}\n")
+            sys.stderr.flush()
 
 
 def _takes_a_line() -> bool:

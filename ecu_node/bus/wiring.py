@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Unpack
@@ -50,7 +51,7 @@ PARAMETER_SETS = 256
 """The status publishes the number of the parameter set modulo this."""
 _NOBODY = "Vector__XXX"
 """How a DBC says that a message has no sender."""
-_CLASSIC_BYTES = 8
+_CLASSIC_BYTES, _FD_BYTES = 8, 64
 
 
 class Mode(Enum):
@@ -146,6 +147,12 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
             f"{where}: {database.layout.dbc_path} has {found}; all corrected values and the status need to be sent by "
             f"one control unit of their own, which sends no branch and no input"
         )
+    for message in sent.values():
+        if message.length > _FD_BYTES:
+            raise DatabaseError(
+                f"{database.layout.dbc_path}: message {message.name}, which the node sends, has {message.length} "
+                f"bytes; CAN FD carries at most {_FD_BYTES}"
+            )
     taken: dict[FrameKey, int] = {}
     for name, purpose, largest, own in _written(database, mode):
         message, signal = database.signal(name)
@@ -265,6 +272,32 @@ def unpublished(database: VehicleDatabase, in_force: InForce, mode: Mode) -> dic
     return {name: f"branch {name} is not published: {why}" for name in hidden if in_force.fault(name).applied}
 
 
+def _full_scale(database: VehicleDatabase, signals: Signals) -> Fraction:
+    """Return the full scale of a branch [A, or W where it is a power]."""
+    largest, volts = as_written(database.layout.full_scale_a), signals.voltage
+    if volts is None:
+        return largest
+    return largest * max(abs(volts.worth(code)) for code in (volts.lowest, volts.highest))
+
+
+def narrowed(database: VehicleDatabase, mode: Mode) -> list[str]:
+    """Return a warning for each corrected signal that cannot hold its measured signal's values up to full scale."""
+    found = []
+    for branch in database.layout.branch:
+        signals = branch_signals(database, branch, mode)
+        (low, high), (least, most) = (
+            sorted(codes.worth(code) for code in (codes.lowest, codes.highest))
+            for codes in (signals.source, signals.target)
+        )
+        largest = _full_scale(database, signals)
+        if least > max(low, -largest) or most < min(high, largest):
+            found.append(
+                f"branch {branch.name}: {branch.corrected} holds {float(least):g} to {float(most):g}, but "
+                f"{branch.source} {float(low):g} to {float(high):g}; values beyond are sent as the nearest end"
+            )
+    return found
+
+
 def put_in_force(
     corrector: Corrector, database: VehicleDatabase, in_force: InForce, now_s: float, *, mode: Mode
 ) -> None:
@@ -349,10 +382,7 @@ def wire(
     for branch in layout.branch:
         signals = branch_signals(database, branch, mode)
         if mode is Mode.GATEWAY or branch.corrected is not None:
-            largest, volts = as_written(layout.full_scale_a), signals.voltage
-            if volts is not None:
-                largest *= max(abs(volts.worth(code)) for code in (volts.lowest, volts.highest))
-            require_reach(signals.target, largest, f"{layout.path}: branch {branch.name}")
+            require_reach(signals.target, _full_scale(database, signals), f"{layout.path}: branch {branch.name}")
         if branch.voltage is not None and signals.voltage is not None and branch.voltage not in auxiliaries:
             timeout_s = max(item.timeout_s for item in layout.branch if item.voltage == branch.voltage)
             auxiliaries[branch.voltage] = HeardSignal(signals.voltage, timeout_s)

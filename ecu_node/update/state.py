@@ -39,6 +39,7 @@ __all__ = [
 _LARGEST_STATE_BYTES = 8_000_000
 """Largest state that is read; metadata of a repository of 10^6 vehicles and three parameter files take about 100 kB."""
 _REPLACE = "remove the folder, make it anew with 'ecu-node provision', and update anew"
+_FOLDER = "name a folder made by 'ecu-node provision'"
 _CAREFUL = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """Flags for opening files safely when root writes into the node's folder: no link is followed, no pipe blocks."""
 _LONGEST_WAIT_S = 30.0
@@ -132,7 +133,7 @@ def read_state(folder: Path) -> VehicleState:
     except UnsuitableFileError as error:
         raise TrustError(Reason.MALFORMED_PARAMETERS, f"{path}: {error}; {_REPLACE}") from None
     except OSError as error:
-        raise TrustError(Reason.NO_PARAMETERS, f"{path}: cannot read the state: {error.strerror}") from None
+        raise TrustError(Reason.NO_PARAMETERS, f"{path}: cannot read the state: {error.strerror}; {_FOLDER}") from None
     digest, _, document = content.partition(b"\n")
     try:
         if digest != hashlib.sha256(document).hexdigest().encode():
@@ -202,7 +203,7 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
         handle = _open(folder / "lock", os.O_RDWR | os.O_CREAT)
     except OSError as error:
         is_missing = error.errno in (errno.ENOENT, errno.ENOTDIR)
-        advice = "; name a folder made by 'ecu-node provision'" if is_missing else ""
+        advice = f"; {_FOLDER}" if is_missing else ""
         raise UserError(f"{folder}: cannot be used as state: {error.strerror}{advice}") from None
     try:
         until_s = time.monotonic() + (_LONGEST_WAIT_S if wait else 0.0)

@@ -86,7 +86,7 @@ def test_missing_or_contradictory_bit_rate_is_refused(
             connect(interface, "1", **settings)
 
 
-@pytest.mark.parametrize("interface", ["kvaser", "neovi"])
+@pytest.mark.parametrize("interface", ["kvaser", "neovi", "pcan"])
 def test_adapter_without_its_driver_is_refused_with_advice_to_install_it(interface: str) -> None:
     """python-can calls functions of a driver that it did not find."""
     with pytest.raises(BusError, match=f"^{interface} 0: cannot open the bus: .*; install the driver of the adapter"):

@@ -87,10 +87,13 @@ def test_check_of_a_layout_without_corrected_signals_fails_except_for_a_gateway(
     assert report["branches"]["battery"]["target"] == "Pair.Battery"
 
 
-def test_check_shows_an_unapplied_fault_and_warns_that_fd_messages_need_option_fd(
+NARROW_AND_FD = SMALL_DBC.replace("PairOut: 8", "PairOut: 12").replace("1- (0.1,0) [-3000|3000]", "1- (0.1,0) [-50|50]")
+
+
+def test_check_shows_an_unapplied_fault_and_warns_of_fd_messages_and_narrow_signals(
     make_database: MakeDatabase, tmp_path: Path
 ) -> None:
-    database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 12"))
+    database = make_database(dbc=NARROW_AND_FD)
     parameters = parameters_for(database, battery=(0.25, 5.0))
     held = {"battery": replace(parameters.branches["battery"], apply=False)}
     write_parameters(replace(parameters, vehicle="v\x1b[2J", branches=held), tmp_path / "v1.json")
@@ -98,6 +101,8 @@ def test_check_shows_an_unapplied_fault_and_warns_that_fd_messages_need_option_f
     assert '+5.000 A  passed through, "apply" is false' in text
     assert "vehicle v\\x1b[2J, parameter set 300: fit" in text, "a stranger's name moves no cursor"
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in text
+    assert text.count("warning: branch") == 1
+    assert "warning: branch battery: PairOut.Battery holds -50 to 50, but Pair.Battery -3000 to 3000; values" in text
 
 
 @pytest.mark.parametrize(("load", "expected_a"), [("[unmeasured_load]\nmean_a = 6.1\nsd_a = 1.0\n", 6.1), ("", 0.0)])

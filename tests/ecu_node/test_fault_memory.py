@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from ecu_node.bus.faults import FaultMemory
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, State
 from tests.ecu_node.junctions import Junction, driving, three_branches
 from tests.ecu_node.processes import ecu_node, running
 from tests.ecu_node.vehicles import LAYOUT, AtOnce
@@ -44,9 +44,12 @@ class Vehicle:
     def latched(self) -> Reason:
         return self.corrector.latched
 
-    def clear(self) -> None:
-        assert ecu_node("clear", "--state", self.state).code == 0
+    def clear(self) -> str:
+        """Clear the memory; return what the command printed."""
+        done = ecu_node("clear", "--state", self.state)
+        assert done.code == 0
         self.later(2.0)
+        return done.out.removeprefix(f"{self.state}: ").rstrip()
 
     def faults(self) -> Any:
         return json.loads(ecu_node("faults", "--state", self.state, "--json").out)
@@ -81,6 +84,21 @@ def test_latched_fault_survives_a_restart_until_it_is_cleared(vehicle: Vehicle, 
     vehicle.clear()
     assert vehicle.latched() is Reason.NONE
     assert vehicle.faults() == []
+
+
+def test_latched_fault_survives_a_start_at_which_its_parameters_are_not_valid_yet(vehicle: Vehicle) -> None:
+    """As where the clock is set only later."""
+    vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
+    corrector = vehicle.corrector
+    number, corrector.reason, corrector.parameter_set = corrector.parameter_set, Reason.NOT_VALID_NOW, 0
+    corrector.latch(Reason.NONE)
+    vehicle.memory = FaultMemory(corrector, vehicle.state, vehicle.said.append, AtOnce())
+    vehicle.later(2.0)
+    assert vehicle.latched() is Reason.NONE
+    corrector.begin(reason=Reason.NONE, parameter_set=number)
+    vehicle.later(2.0)
+    assert vehicle.latched() is Reason.SUM_IMPLAUSIBLE
+    assert [(fault["active"], fault["count"]) for fault in vehicle.faults()] == [(True, 1)]
 
 
 def test_bus_sleep_releases_a_stale_branch_and_a_short_gap_does_not(vehicle: Vehicle) -> None:
@@ -123,9 +141,12 @@ def test_vanished_state_folder_does_not_clear_a_latched_fault(vehicle: Vehicle) 
 def test_cleared_faults_do_not_return(vehicle: Vehicle) -> None:
     vehicle.latch(Reason.BRANCH_STALE, "motor")
     vehicle.latch(Reason.NONE)
-    vehicle.clear()
+    vehicle.latch(Reason.BRANCH_STUCK, "motor")
+    assert vehicle.clear() == "2 faults cleared"
     vehicle.latch(Reason.BRANCH_STUCK, "battery")
     assert [fault["reason"] for fault in vehicle.faults()] == ["BRANCH_STUCK"]
+    assert vehicle.clear() == "1 fault cleared"
+    assert vehicle.clear() == "no faults"
 
 
 @pytest.mark.parametrize(
@@ -136,9 +157,10 @@ def test_cleared_faults_do_not_return(vehicle: Vehicle) -> None:
         ("", None, "cannot read the fault memory: it is a folder"),
     ],
 )
-def test_damaged_fault_memory_is_logged_at_start_and_makes_ecu_node_faults_fail(
+def test_node_passes_values_through_if_it_cannot_read_the_fault_memory_until_it_is_cleared(
     vehicle: Vehicle, old: str, new: str | None, why: str
 ) -> None:
+    """The damaged file stays as it is until then; bus sleep changes nothing."""
     vehicle.latch(Reason.BRANCH_STALE, "motor")
     content = vehicle.file.read_text()
     vehicle.file.unlink()
@@ -148,9 +170,18 @@ def test_damaged_fault_memory_is_logged_at_start_and_makes_ecu_node_faults_fail(
         vehicle.file.write_text(content.replace(old, new, 1))
     vehicle.start()
     assert why in vehicle.said[-1]
+    vehicle.later(60.0)
+    assert (vehicle.latched(), vehicle.corrector.state()[0]) == (Reason.SUM_IMPLAUSIBLE, State.PASSING_THROUGH)
     code, _, err = ecu_node("faults", "--state", vehicle.state)
     assert code == 1
     assert "'ecu-node clear' begins a new one" in err
+    if new is None:
+        vehicle.file.rmdir()
+        vehicle.later(2.0)
+    else:
+        assert vehicle.clear() == "a fault memory that could not be read is cleared"
+    assert vehicle.latched() is Reason.NONE
+    assert vehicle.faults() == []
 
 
 def test_node_without_vehicle_state_passes_values_through_and_logs_why(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from ecu_node.bus.wiring import key_of
 from ecu_node.cli import run_ecu_node
-from ecu_node.core.status import Counters, Reason, State
+from ecu_node.core.status import Counters, Quality, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.monitor import BusMonitor, View, view_lines
 from tests.ecu_node.vehicles import LAYOUT, MakeDatabase, protected
@@ -139,7 +139,8 @@ def test_frames_that_fail_their_check_are_counted_and_not_used(bus: Bus) -> None
 
 
 def test_monitor_shows_the_status_message_of_the_node(bus: Bus) -> None:
-    bus.pair("Battery", 1.2, 100.0, 95.0)
+    bus.pair("Battery", 1.2, 100.0)
+    bus.send("HV_BatteryCorrected", 1.201, BatteryCurrentCorrected=100.0, BatteryCurrentQuality=Quality.PASSED_THROUGH)
     said: dict[str, Any] = {"State": State.PASSING_THROUGH, "Reason": Reason.BRANCH_STALE, "ParameterSet": 44}
     bus.send("HV_CorrectionStatus", 1.0, **said, JunctionSumMeasured=-12.3, JunctionSumCorrected=0.4)
     node = bus.monitor.look(1.25)["node"]
@@ -147,6 +148,7 @@ def test_monitor_shows_the_status_message_of_the_node(bus: Bus) -> None:
     assert node["sums"] == {"measured_a": pytest.approx(-12.3), "corrected_a": pytest.approx(0.4)}
     assert (node["age_s"], node["is_silent"]) == (pytest.approx(0.25), False)
     lines = bus.lines(1.25)
+    assert next(len(line) for line in lines if line.endswith("faults")) <= 80
     assert lines[0] == f"can0: node: {State.PASSING_THROUGH.words}; parameter set 44; status 0.2 s ago"
     assert lines[1] == f"because {Reason.BRANCH_STALE.words}"
     assert "node's sum, corrected: what its parameters would make of it; it publishes what was measured" in lines

@@ -207,7 +207,7 @@ def test_parameters_that_apply_a_branch_without_a_decisive_verdict_are_unfit(
     withheld = {name: replace(branch, apply=False) for name, branch in parameters.branches.items()}
     check_fit(replace(parameters, branches=withheld), database, "v1")
     one = replace(parameters, branches={**withheld, "motor": SOUND})
-    with pytest.raises(UnfitError, match=f"verdict '{verdict}', yet branch motor has 'apply': true") as caught:
+    with pytest.raises(UnfitError, match=f"verdict '{verdict}', yet 'apply' is true for motor; ") as caught:
         check_fit(one, database, "v1")
     assert caught.value.reason is Reason.IMPLAUSIBLE_PARAMETERS
 

@@ -10,6 +10,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -39,6 +41,19 @@ def test_log_that_nobody_reads_does_not_block_the_node(monkeypatch: pytest.Monke
         assert not reading.closed
     assert "ecu-node: after all (" in last
     assert "lines before were lost: nobody read them)" in last
+
+
+def test_lines_of_several_threads_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Slow(StringIO):
+        def write(self, text: str) -> int:
+            time.sleep(0.001)
+            return super().write(text)
+
+    monkeypatch.setattr(sys, "stderr", written := Slow())
+    log = Log()
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(lambda number: log.say(f"line {number}"), range(40)))
+    assert sorted(written.getvalue().splitlines()) == sorted(f"ecu-node: line {number}" for number in range(40))
 
 
 @pytest.fixture

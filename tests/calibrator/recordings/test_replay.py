@@ -71,8 +71,11 @@ def test_bus_that_accepts_no_frame_ends_the_replay(monkeypatch: pytest.MonkeyPat
             raise can.CanOperationError("Transmit buffer full")
 
     monkeypatch.setattr("calibrator.recordings.live._SEND_LIMIT_S", 0.01)
-    with Full("full") as bus, pytest.raises(BusError, match="the bus takes no frame: Transmit buffer full"):
-        list(play_frames(FRAMES, bus, speed=0.0))
+    with Full("full") as bus:
+        with pytest.raises(BusError, match=r"the bus takes no frame: Transmit buffer full$"):
+            list(play_frames(FRAMES, bus, speed=0.0))
+        with pytest.raises(BusError, match=r"Transmit buffer full; a CAN FD frame needs --fd$"):
+            list(play_frames([can.Message(is_fd=True)], bus))
 
 
 def command(*arguments: object) -> int:
