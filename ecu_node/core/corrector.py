@@ -185,6 +185,7 @@ class Source:
         self._seal = protection.seal if protection is not None else None
         self._counters, self.targets = counters, tuple(targets)
         self.branches = [part for part, _ in readers if isinstance(part, LiveBranch)]
+        self._others = [part for part, _ in readers if not isinstance(part, LiveBranch)]
         self.timeout_s = max((branch.timeout_s for branch in self.branches), default=float("inf"))
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch in self.branches)])
         self._silent_from_s = float("inf")
@@ -277,6 +278,9 @@ class Source:
                 if check > _LAST_USABLE:
                     return check
         self._frames.append((now_s, payload))
+        if self.is_invalid:  # other messages are corrected with these, and their receivers cannot know
+            for part in self._others:
+                part.spoil(now_s)
         for branch in ways.missing:
             branch.spoil(now_s)
             counters.short += 1

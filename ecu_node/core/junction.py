@@ -49,6 +49,7 @@ class HeardSignal:
         self._read: tuple[float, bytearray] | None = None
         """The last frame that was read."""
         self._past: deque[tuple[float, int]] = deque(maxlen=REMEMBERED_FRAMES)
+        self._spoilt_s = float("-inf")
 
     def follow(self, signal: PlacedSignal, frames: Frames) -> None:
         """Read the signal from these frames, to which its message goes on adding."""
@@ -65,11 +66,19 @@ class HeardSignal:
                     self._past.append((time_s, code))
         return reversed(self._past)
 
+    def spoil(self, now_s: float) -> None:
+        """Note that a frame came that must not be used: there is no value until the next usable frame."""
+        self._spoilt_s = now_s
+
     def code_at(self, time_s: float) -> int | None:
-        """Return the code of the last frame up to a time [s]; None if there is none, it is too old, or no value."""
+        """Return the code of the last frame up to a time [s]; None if there is none, or it is too old or no value.
+
+        None, too, if a frame that must not be used came since.
+        """
         for seen_s, code in self.newest_first():
             if seen_s <= time_s:
-                return code if time_s - seen_s <= self.timeout_s and self.codes.is_value(code) else None
+                is_usable = seen_s > self._spoilt_s and time_s - seen_s <= self.timeout_s
+                return code if is_usable and self.codes.is_value(code) else None
         return None
 
 
@@ -146,7 +155,7 @@ class LiveBranch(HeardSignal):
         self.fault, self.delay_s = NO_FAULT, 0.0
         self.plan = self._passing = self._correcting = AS_IT_IS
         self.quality = Quality.PASSED_THROUGH
-        self._spoilt_s = self._time_s = self._awake_s = self._waited_s = float("-inf")
+        self._time_s = self._awake_s = self._waited_s = float("-inf")
         self._is_named = False
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
 
@@ -187,10 +196,6 @@ class LiveBranch(HeardSignal):
         self.plan = self._correcting if corrects else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.IMPLAUSIBLE if doubted else Quality.PASSED_THROUGH
 
-    def spoil(self, now_s: float) -> None:
-        """Note that a frame came that must not be used: there is no value until the next usable frame."""
-        self._spoilt_s = now_s
-
     @property
     def time_s(self) -> float:
         """When the last frame with its signal came [s]; -infinity if none did."""
@@ -198,9 +203,9 @@ class LiveBranch(HeardSignal):
         return self._time_s
 
     def latest(self) -> tuple[float, int] | None:
-        """Return time [s] and code of its last frame; None if the code is no value, or no frame came."""
+        """Return time [s] and code of its last frame; None if it is no value or must not be used, or none came."""
         found = next(self.newest_first(), None)
-        return found if found is not None and self.codes.is_value(found[1]) else None
+        return found if found is not None and found[0] > self._spoilt_s and self.codes.is_value(found[1]) else None
 
     @property
     def seen(self) -> bool:

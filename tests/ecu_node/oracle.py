@@ -77,6 +77,11 @@ class _Branch:
         if self._seen:
             self.outcome = _Outcome(None, Quality.INVALID)
 
+    def lose_voltage(self) -> None:
+        """Note that the voltage came in a message that must not be used."""
+        if self.corrects and self.is_power and self._offset_a and self.outcome.allowed is not None:
+            self.outcome = _Outcome(None, Quality.NOT_AVAILABLE)
+
     def take(self, code: int, volts: Fraction | None) -> None:
         """Take the code of an intact frame, and the voltage at its time; None if no voltage is known."""
         self._seen = True
@@ -152,9 +157,14 @@ class Oracle:
         own, receiver = [item for item in self._branches if item.message is message], self._receivers.get(message.name)
         check = receiver.check(bytearray(data)) if receiver is not None else Check.OK
         codes, is_new = _codes(message, data), check <= Check.LOST
+        is_invalid = receiver is not None and receiver.state is E2EState.INVALID
         if is_new and self._voltage is not None and self._voltage[0] is message:
             net = self._voltage[1]  # it comes before the branches of the same frame
-            if net.name in codes:
+            if is_invalid:
+                self._volts = None
+                for item in self._branches:
+                    item.lose_voltage()
+            elif net.name in codes:
                 is_value = Codes(net).is_value(codes[net.name])
                 self._volts = Codes(net).worth(codes[net.name]) if is_value else None
         for item in own if is_new else ():
@@ -169,9 +179,8 @@ class Oracle:
             return None if sent == expected else f"a frame that is {check.name} was not stopped or left alone"
         if not is_new:
             return f"a frame that is {check.name} was answered" if sent else None
-        if receiver is not None and receiver.state is E2EState.INVALID:
-            for item in own:
-                item.spoil()
+        for item in own if is_invalid else ():
+            item.spoil()
         wanted = {item.target[0].name for item in own if item.target is not None}
         answered = [self._messages[number].name for number, _ in sent]
         if sorted(answered) != sorted(wanted):
