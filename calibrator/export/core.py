@@ -363,10 +363,13 @@ def c_text(checked: Checked) -> str:
         branches.append((branch, read(branch.source, signals.source), voltage, ends))
     unused = _BRANCHES - len(values)
     names = [*database.layout.branch_names, *["not used"] * unused]
+    judged = {voltage[0] for _, _, voltage, _ in branches if voltage is not None}
     return rendered(
         "hv_calibration.c",
         provenance=checked.provenance,
-        messages=[_message(database, message, key in carriers) for key, message in messages.items()],
+        messages=[
+            _message(database, message, key in carriers, numbers[key] in judged) for key, message in messages.items()
+        ],
         branches=branches,
         calibration=zip(names, values + [BranchValues(0, 0, 0, 0, 0)] * unused, strict=True),
         digest=f"0x{_layout_digest(database):016X}",
@@ -374,17 +377,19 @@ def c_text(checked: Checked) -> str:
     )
 
 
-def _message(database: VehicleDatabase, message: Message, has_branches: bool) -> tuple[object, ...]:
+def _message(database: VehicleDatabase, message: Message, has_branches: bool, has_voltage: bool) -> tuple[object, ...]:
     """Return the name of a message and the values of the fields of its C struct ``hv_message_t``."""
     entry, key = database.layout.protection(message.name), key_of(message)
-    profile, offset, step, data_id = "HV_UNPROTECTED", 0, 0, [0]
+    profile, offset, step, data_id, windows = "HV_UNPROTECTED", 0, 0, [0], [(0, 0, 0)] * 3
     if isinstance(entry, ProfileP01):
         profile, offset, step = f"HV_P01_{entry.data_id_mode.upper()}", entry.offset, entry.max_delta_counter
         data_id = [*entry.data_id.get(message.name, message.frame_id & 0xFFFF).to_bytes(2, "little")]
     elif isinstance(entry, ProfileP02):
         profile, step, data_id = "HV_P02", entry.max_delta_counter, entry.data_id_list[message.name]
+    if isinstance(entry, ProfileP01 | ProfileP02) and has_voltage:
+        windows = [(item.window, item.min_ok, item.max_error) for item in (entry.init, entry.valid, entry.invalid)]
     data_ids = data_id + [0] * (_DATA_IDS - len(data_id))
-    return message.name, key.identifier | key.extended << 31, profile, offset, step, data_ids, has_branches
+    return message.name, key.identifier | key.extended << 31, profile, offset, step, data_ids, has_branches, windows
 
 
 def rendered(template: str, **values: object) -> str:

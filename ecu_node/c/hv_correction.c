@@ -4,6 +4,9 @@
 #define SHIFT 58U /* bits of gains and fractions below one code */
 #define ONE_CODE INT64_C(288230376151711744) /* 2^SHIFT */
 #define ANY 0xFFU /* expected counter: the first intact frame may have any */
+#define INIT 0U /* states of a message in AUTOSAR's E2E state machine */
+#define VALID 1U
+#define INVALID 2U
 #define LOW_HALF 0xFFFFFFFFU
 
 typedef enum { OK, LOST, REPEATED, JUMPED, CORRUPT } check_t;
@@ -178,6 +181,11 @@ static uint8_t crc_of(const hv_message_t *message, const uint8_t *payload, size_
     return is_p02 ? (crc8(crc, message->data_id[counter], polynomial) ^ 0xFFU) : crc;
 }
 
+static bool is_usable(check_t check)
+{
+    return (check == OK) || (check == LOST);
+}
+
 static check_t check_of(const hv_message_t *message, const uint8_t *payload, size_t length, uint8_t *expected)
 {
     const uint8_t modulus = (message->profile == HV_P02) ? 16U : 15U;
@@ -206,22 +214,58 @@ static check_t check_of(const hv_message_t *message, const uint8_t *payload, siz
     return check;
 }
 
+static uint64_t ones_in(uint64_t word, uint8_t bits) /* among its lowest bits */
+{
+    uint64_t ones = 0U;
+    uint64_t rest = word;
+    for (uint8_t k = 0U; k < bits; k++) {
+        ones += rest & 1U;
+        rest >>= 1U;
+    }
+    return ones;
+}
+
+/* Update the state of a message. A repeated frame, or one that jumped, is neither usable nor an error. */
+static void judge(const hv_message_t *message, hv_received_t *received, check_t check)
+{
+    const hv_window_t *const window = &message->window[received->state];
+    const bool is_before_first = (received->state == INIT) && (received->expected == ANY); /* only corrupt ones came */
+    if ((window->frames != 0U) && !is_before_first) {
+        received->usable = (received->usable << 1U) | (is_usable(check) ? 1U : 0U);
+        received->corrupt = (received->corrupt << 1U) | ((check == CORRUPT) ? 1U : 0U);
+        const bool has_errors = ones_in(received->corrupt, window->frames) > window->max_error;
+        if (!has_errors && (ones_in(received->usable, window->frames) >= window->min_ok)) {
+            received->state = VALID;
+        } else if (has_errors || (received->state == VALID)) {
+            received->state = INVALID;
+        } else {
+            /* as it was */
+        }
+    }
+}
+
 static hv_result_t forward(const hv_layout_t *layout, const hv_calibration_t *calibration, hv_state_t *state,
                            size_t number, uint8_t *payload, size_t length)
 {
     const hv_message_t *const message = &layout->messages[number];
-    const check_t check = check_of(message, payload, length, &state->expected[number]);
-    const bool is_usable = (check == OK) || (check == LOST);
+    hv_received_t *const received = &state->message[number];
+    const check_t check = check_of(message, payload, length, &received->expected);
     hv_result_t result = HV_SAME;
-    if (!is_usable) {
+    judge(message, received, check);
+    if (!is_usable(check)) {
         result = message->has_branches ? HV_HELD_BACK : HV_SAME;
     } else if (calibration->layout == layout->digest) {
         for (size_t k = 0U; k < layout->branch_count; k++) { /* voltages first: a frame may have both */
             const hv_branch_t *const branch = &layout->branches[k];
-            if ((branch->voltage != NULL) && (branch->voltage_message == number) &&
-                is_present(branch->voltage, payload, length)) {
-                state->voltage[k] = read_code(&branch->voltage->place, payload);
-                state->has_voltage[k] = true;
+            if ((branch->voltage != NULL) && (branch->voltage_message == number)) {
+                if (received->state == INVALID) {
+                    state->has_voltage[k] = false;
+                } else if (is_present(branch->voltage, payload, length)) {
+                    state->voltage[k] = read_code(&branch->voltage->place, payload);
+                    state->has_voltage[k] = true;
+                } else {
+                    /* multiplexed: the last one counts */
+                }
             }
         }
         for (size_t k = 0U; k < layout->branch_count; k++) {
@@ -257,10 +301,18 @@ hv_result_t hv_forward(const hv_layout_t *layout, const hv_calibration_t *calibr
     return result;
 }
 
+static void forget(hv_received_t *received)
+{
+    received->usable = 0U;
+    received->corrupt = 0U;
+    received->expected = ANY;
+}
+
 void hv_start(hv_state_t *state)
 {
     for (size_t k = 0U; k < HV_MESSAGES; k++) {
-        state->expected[k] = ANY;
+        forget(&state->message[k]);
+        state->message[k].state = INIT;
     }
     for (size_t k = 0U; k < HV_BRANCHES; k++) {
         state->has_voltage[k] = false;
@@ -271,7 +323,9 @@ void hv_restart(const hv_layout_t *layout, hv_state_t *state, uint32_t identifie
 {
     for (size_t k = 0U; k < layout->message_count; k++) {
         if (layout->messages[k].identifier == identifier) {
-            state->expected[k] = ANY;
+            hv_received_t *const received = &state->message[k];
+            forget(received);
+            received->state = (received->state == VALID) ? INVALID : received->state;
             for (size_t b = 0U; b < layout->branch_count; b++) {
                 if (layout->branches[b].voltage_message == k) {
                     state->has_voltage[b] = false;

@@ -73,13 +73,20 @@ typedef enum { /* AUTOSAR end-to-end protection of a message: profiles 1A, 1B, 1
     HV_P02
 } hv_profile_t;
 
+typedef struct { /* condition on the last frames of a message under which it is VALID, as in the layout */
+    uint8_t frames;    /* how many are looked at, 1 to 64; 0 in a message without a voltage, whose state is not kept */
+    uint8_t min_ok;    /* fewest of them that must be usable */
+    uint8_t max_error; /* most of them that may be corrupt */
+} hv_window_t;
+
 typedef struct {
     uint32_t identifier; /* bit 31 is set in 29-bit identifiers */
     hv_profile_t profile;
-    uint8_t offset;      /* first byte of the header */
-    uint8_t max_step;    /* largest step of the counter that is used */
+    uint8_t offset;        /* first byte of the header */
+    uint8_t max_step;      /* largest step of the counter that is used */
     bool has_branches;
-    uint8_t data_id[16]; /* profile 1: low byte, high byte; profile 2: the list */
+    uint8_t data_id[16];   /* profile 1: low byte, high byte; profile 2: the list */
+    hv_window_t window[3]; /* to become VALID at the start, to stay so, and to become so again when INVALID */
 } hv_message_t;
 
 typedef struct {
@@ -90,8 +97,15 @@ typedef struct {
     size_t branch_count;
 } hv_layout_t;
 
+typedef struct {
+    uint64_t usable;  /* one bit for each of the last 64 frames; bit 0 is the last one */
+    uint64_t corrupt;
+    uint8_t expected; /* counter of the next frame */
+    uint8_t state;    /* of AUTOSAR's E2E state machine */
+} hv_received_t;
+
 typedef struct { /* what is remembered from frame to frame; one for each layout, in RAM */
-    uint8_t expected[HV_MESSAGES];
+    hv_received_t message[HV_MESSAGES];
     bool has_voltage[HV_BRANCHES];
     int64_t voltage[HV_BRANCHES];
 } hv_state_t;
@@ -102,13 +116,15 @@ typedef enum { HV_SAME, HV_CHANGED, HV_HELD_BACK } hv_result_t;
 extern const hv_layout_t hv_layout;
 extern const hv_calibration_t hv_calibration;
 
-/* Forget all counters and voltages: at start, and after the bus has slept. */
+/* Forget all that was received: at start. */
 void hv_start(hv_state_t *state);
 
-/* Forget counter and voltage of one message: when it has been silent for longer than its time-out. */
+/* Forget counter and voltage of one message: when it has been silent for longer than its time-out, each one after the
+ * bus has slept. If the message was VALID it becomes INVALID, and its voltage is used again when it has recovered. */
 void hv_restart(const hv_layout_t *layout, hv_state_t *state, uint32_t identifier);
 
 /* Take a frame from one bus: check it, correct its currents in place, protect it anew with the counter it came with.
+ * The voltage of a message that is INVALID, in which too many frames fail their check, is not used.
  * HV_SAME and HV_CHANGED: send the payload on; HV_HELD_BACK: do not. Other identifiers are HV_SAME. */
 hv_result_t hv_forward(const hv_layout_t *layout, const hv_calibration_t *calibration, hv_state_t *state,
                        uint32_t identifier, uint8_t *payload, size_t length);

@@ -36,7 +36,7 @@ RECORD = Struct("<IBB64s")
 
 _HERE = Path(__file__).parent
 SILENCE = 255
-"""Length that stands for a silence of all messages so long that counters and voltages are forgotten."""
+"""Length that stands for a silence of all messages so long that each begins anew."""
 
 
 def vehicle(layout: Path = _HERE / "c_core_vehicle.toml") -> Checked:

@@ -24,7 +24,8 @@ int main(int count, char **words)
     while (fread(record, sizeof record, 1, stdin) == 1) {
         const uint32_t identifier = record[0] | (uint32_t)record[1] << 8 | (uint32_t)record[2] << 16 | (uint32_t)record[3] << 24;
         if (record[4] == 255)
-            hv_start(&state);
+            for (size_t k = 0; k < hv_layout.message_count; k++)
+                hv_restart(&hv_layout, &state, hv_layout.messages[k].identifier);
         else
             record[5] = (uint8_t)hv_forward(&hv_layout, &hv_calibration, &state, identifier, record + 6, record[4]);
         fwrite(record, sizeof record, 1, stdout);

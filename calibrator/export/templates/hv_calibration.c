@@ -18,8 +18,10 @@
 #include "hv_correction.h"
 
 static const hv_message_t messages[] = {
-{% for message, identifier, profile, offset, step, data_ids, has_branches in messages %}
-    {0x[[ "%X" | format(identifier) ]]U, [[ profile ]], [[ offset ]]U, [[ step ]]U, [[ has_branches | tojson ]], {[[ data_ids | map("string") | join("U, ") ]]U}}, /* [[ message | comment ]] */
+{% for message, identifier, profile, offset, step, data_ids, has_branches, windows in messages %}
+    {0x[[ "%X" | format(identifier) ]]U, [[ profile ]], [[ offset ]]U, [[ step ]]U, [[ has_branches | tojson ]], {[[ data_ids | map("string") | join("U, ") ]]U}, {{% for numbers in windows -%}
+{[[ numbers | map("string") | join("U, ") ]]U}[[ "" if loop.last else ", " ]]
+{%- endfor %}}}, /* [[ message | comment ]] */
 {% endfor %}
 };
 static const hv_branch_t branches[] = {

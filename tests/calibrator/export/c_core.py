@@ -15,6 +15,8 @@ from tests.ecu_node.random_vehicles import draw_vehicle
 
 SILENCE_S = 1e7
 """Longer than any time-out."""
+STEP_S = 1e-6
+"""From frame to frame; no message is silent for long, and no two frames come at the same instant."""
 
 
 def by_the_node(checked: Checked, given: Iterable[tuple[int, bytes | None]]) -> Iterator[bytes]:
@@ -23,6 +25,7 @@ def by_the_node(checked: Checked, given: Iterable[tuple[int, bytes | None]]) -> 
     sources = {key[0] | key[1] << 31: source for key, source in corrector.sources.items()}
     now_s = 0.0
     for identifier, payload in given:
+        now_s += STEP_S
         if payload is None:
             now_s += SILENCE_S
             yield RECORD.pack(identifier, SILENCE, 0, b"")
