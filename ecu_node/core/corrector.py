@@ -245,7 +245,7 @@ class Source:
         bytearray or None
             Payload to be sent on, protected with the counter that the frame came with; None if the frame carries a
             branch and is corrupt, repeated, or its counter jumped: then it is not passed on. That too many frames of
-            the message fail their check holds nothing up: the receivers judge that for themselves.
+            the message fail their check holds nothing up: its receivers judge that for themselves.
         """
         ways = self.ways.get(len(payload)) or self._find(len(payload))
         if self._take(payload, now_s, ways) > _LAST_USABLE:

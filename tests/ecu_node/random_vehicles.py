@@ -307,7 +307,7 @@ def _autosar(rng: Random, draft: _Draft) -> dict[str, Any]:
     if profile == "P02":
         entry["data_id_list"] = {draft.name: [*rng.randbytes(16)]}
     else:
-        entry["offset"] = rng.choice((0, 0, 0, rng.randrange(draft.size - (bits + 7) // 8)))
+        entry["offset"] = rng.choice((0, 0, 0, rng.randrange(min(draft.size - (bits + 7) // 8, 61))))
         if rng.random() < 0.5:
             entry["data_id"] = {draft.name: rng.getrandbits(32 if profile in {"P04", "P07"} else 16)}
     if profile in {"P01", "P11"}:

@@ -458,6 +458,9 @@ def test_a_signal_beyond_the_end_of_its_frame_is_invalid(make_database: MakeData
     assert published(database, corrector, short, 0.0)[0] == pytest.approx(1.6 / 1.1, abs=0.05)
     assert published(database, corrector, short, 0.0, "motor")[0] == pytest.approx(0.05 * 32768)
     assert corrector.counters.short == 2
+    answers(corrector, frame_of(database, "Pair", Battery=1.6, Motor=0.0), 0.1)
+    answers(corrector, Frame(PAIR, b"\0"), 0.2)
+    assert state_at(corrector, 0.2) == (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
 
 
 MOTOR_SNA = '512 Motor -32768 "SNA"'
@@ -536,6 +539,7 @@ def test_message_with_half_of_its_frames_corrupt_is_not_used_at_all(database: Ve
     assert set(at_20_ms(database, corrector, 0.0, 0.6)) == {Quality.CORRECTED}
     found = at_20_ms(database, corrector, 0.6, 1.4, spoil=2)
     assert corrector.state() == (State.PARTLY_CORRECTING, Reason.E2E_INVALID)
+    assert corrector.watch.sums is None
     assert set(found[5:]) == {Quality.INVALID}
     assert at_20_ms(database, corrector, 1.4, 2.0)[-1] == Quality.CORRECTED
     assert corrector.state() == CORRECTING

@@ -1,6 +1,7 @@
 """The gateway's core: branch frames rewritten in place, bit by bit, and nothing else."""
 
 import pytest
+from e2e.p01 import e2e_p01_protect
 
 from ecu_node.bus.wiring import Mode
 from ecu_node.core.corrector import Corrector
@@ -97,6 +98,27 @@ def test_message_without_branches_is_forwarded_even_if_corrupt(make_database: Ma
     spoilt = Frame(NET, b"\x00\x01\x40\x9c")
     assert passed_on(corrector, spoilt, 0.0) == spoilt.data
     assert (corrector.counters.corrupt, corrector.counters.not_passed_on) == (1, 0)
+
+
+def test_power_is_not_corrected_with_the_voltage_of_an_invalid_message(make_database: MakeDatabase) -> None:
+    entry = '\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\n'
+    dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "16|16@1+ (0.01")
+    database = make_database(SMALL_LAYOUT + entry, dbc)
+    corrector, heater = gateway_for(database, heater=(0.25, -2.0)), frame_of(database, "Heater", Power=4000)
+
+    def is_corrected(counter: int, now_s: float, *, spoilt: bool = False) -> bool:
+        net = bytearray(frame_of(database, "Net", Voltage=400.0).data)
+        net[1] = counter
+        e2e_p01_protect(net, NET.identifier, increment_counter=False)
+        net[2] ^= spoilt
+        passed_on(corrector, Frame(NET, bytes(net)), now_s)
+        return passed_on(corrector, heater, now_s) != heater.data
+
+    assert [is_corrected(k, 0.1 * k) for k in range(4)] == [True] * 4
+    found = [is_corrected(k, 0.1 * k, spoilt=bool(k % 2)) for k in range(4, 15)]
+    assert found == [True] * 8 + [False] * 3, "from the first frame after the fourth error of ten"
+    after_silence = [is_corrected(k, 9.0 + 0.1 * k) for k in range(4)]
+    assert after_silence == [False, False, True, True]
 
 
 def test_gateway_refuses_a_named_code_within_the_range_of_a_branch(make_database: MakeDatabase) -> None:
