@@ -1,5 +1,6 @@
 """Command line of the calibrator. Results go to stdout, progress and messages to stderr."""
 
+import os
 import sys
 from collections.abc import Callable
 from itertools import chain
@@ -11,6 +12,7 @@ from typer.core import TyperGroup
 from calibrator.artificial.command import simulate
 from calibrator.doctor.command import doctor
 from calibrator.estimator.command import calibrate, identify, params
+from calibrator.estimator.settings import time_of_run
 from calibrator.experiments.command import experiment, score
 from calibrator.export.command import export
 from calibrator.kirchhoff.command import kirchhoff
@@ -88,6 +90,9 @@ for name, (command, lines) in chain.from_iterable(commands.items() for commands 
 
 def run_calibrator() -> int:
     """Run the command line and return its exit code, see :data:`calibrator.terminal.command_line.EXIT_CODES`."""
+    if not os.environ.get("SOURCE_DATE_EPOCH"):
+        os.environ.pop("SOURCE_DATE_EPOCH", None)
+    time_of_run()  # numpy fails at its import if SOURCE_DATE_EPOCH is empty or no number
     return run_app(app, "calibrator", sys.argv[1:])
 
 

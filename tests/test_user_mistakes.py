@@ -40,6 +40,7 @@ MISTAKES = [
     ("calibrator calibrate LAYOUT --out x", 2, "Missing argument 'FLEET'; see 'calibrator calibrate --help'"),
     ("calibrator calibrate a b LAYOUT --out x", 2, "unexpected extra argument"),
     ("calibrator calibrate a LAYOUT --out x --method both", 2, "'both' is not one of 'posterior', 'published'"),
+    ("calibrator calibrate logs LAYOUT --out x --trusted v1,battery", 2, "names vehicles and branches (battery); name"),
     ("calibrator score folder --truth", 2, "--truth"),
     ("ecu-node fly", 2, "invalid choice: 'fly'"),
     ("ecu-node", 2, "; see 'ecu-node --help'"),

@@ -2,6 +2,7 @@
 
 import math
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -122,7 +123,7 @@ def calibrate(
         trusted=_named(trusted),
         readings=readings,
         load=None if load is None else _load(load),
-        charge_ah=dict(_charge(item) for item in charge or ()),
+        charge_ah=_charges(charge or ()),
         meter=meter,
         expected_faults=expected_faults,
         branches=tuple(branches.split(",")) if branches else None,
@@ -182,6 +183,13 @@ def _load(text: str) -> UnmeasuredLoad:
             param_hint="--load",
         )
     return UnmeasuredLoad(mean_a=mean_a, sd_a=sd_a)
+
+
+def _charges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    found = dict(map(_charge, texts))
+    if len(found) < len(texts):
+        raise typer.BadParameter(f"{', '.join(texts)}: a branch is named twice; name it once", param_hint="--charge")
+    return found
 
 
 def _charge(text: str) -> tuple[str, tuple[float, float]]:

@@ -109,7 +109,8 @@ class FleetTask:
         """Return the user's choices on which the parameters of a vehicle depend, beside its drives."""
         settings = self.identity.settings
         bench = [self.bench.get((vehicle, branch)) for branch in self.branches]
-        return settings.harm_limit, settings.load, settings.expected_faults, vehicle in settings.trusted, bench
+        fleet = settings.harm_limit, settings.load, settings.expected_faults, sorted(settings.hold_out)
+        return *fleet, vehicle in settings.trusted, bench
 
     def _found(self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int) -> Calibrated | str:
         if why := impossible(estimate, j, self.branches):

@@ -39,6 +39,7 @@ from calibrator.summaries.vehicle_summary import (
     zero_current_offsets,
 )
 from calibrator.terminal.progress import shown
+from calibrator.terminal.text import few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
@@ -59,6 +60,8 @@ JUMP = 0.02
 """Change of a current within its largest possible delay, over full scale, that counts as a jump. [1]"""
 MOST_SHOWN = 5
 """Largest number of vehicles whose gain ratios are shown one by one."""
+WORSE, WORSE_A = 1.5, 1.0
+"""A correction is told that raises the RMS of the junction sum by more than this factor [1] and this current. [A]"""
 MOST_READ_HERE = 5
 """Largest number of vehicles that are read in this process: other processes would take longer to start."""
 
@@ -192,6 +195,7 @@ def calibrate_junctions(
     charge_a = _charges(drives, settings, fleet)
     groups = [[j] for j in range(len(vehicles))] if settings.meter is None else [[*range(len(vehicles))]]
     calibrated, junctions, notices = dict[str, Calibrated](), dict[str, object](), list[str]()
+    worse = dict[str, str]()
     for group in groups:
         known = JunctionKnowledge(read[..., group, :], load, charge_a, settings.meter)
         try:
@@ -222,11 +226,20 @@ def calibrate_junctions(
                 decisive=deciding[i],
             )
             calibrated[name] = Calibrated(mine)
+            was_a, is_a = mine.junction_residual.about_expected()
+            if is_a > max(WORSE * was_a, was_a + WORSE_A) and any(each.apply for each in mine.branches.values()):
+                worse[name] = f"RMS {was_a:.2f} A -> {is_a:.2f} A"
             junctions[name] = {"gain_ratio": named_ratios(laws[i], branches), "constant_a": laws[i].constant_a}
             if len(vehicles) <= MOST_SHOWN:
                 gains_known = [branches[k] for k in np.flatnonzero(np.isfinite(read[:, 0, 0, j]).any(axis=0))]
                 texts = [*_shown_texts(mine, laws[i]), *_same_error(mine, gains_known)]
                 notices += [f"{name}: {text}" for text in texts]
+    if worse:
+        what = "the values and signs of what was declared (--charge, --load, --trusted, --readings)"
+        where = few_reasons(worse)
+        notices.append(
+            f"the correction makes the junction sum worse; check {what}, or for a load without a sensor{where}"
+        )
     details = {"junction": junctions, "declared_load_a": expected_a}
     return equipment, encode_chunk({**left_out, **calibrated}), details, notices
 

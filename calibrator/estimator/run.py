@@ -15,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
+import pyarrow.compute as pc
 from threadpoolctl import threadpool_limits
 
 from calibrator.compiled import is_compiled
@@ -23,14 +24,21 @@ from calibrator.drives.store import DRIVES_FOLDER
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
 from calibrator.estimator.readings import read_bench_table
-from calibrator.estimator.results import PARTS, CalibrationReport, complete_result, part_file, parts_of, read_run
-from calibrator.estimator.settings import CalibrationSettings, Method, RunIdentity, require_learning
-from calibrator.estimator.vehicle_parameters import time_of_run
+from calibrator.estimator.results import (
+    PARTS,
+    CalibrationReport,
+    complete_result,
+    part_file,
+    parts_of,
+    read_run,
+    result_rows,
+)
+from calibrator.estimator.settings import CalibrationSettings, Method, RunIdentity, require_learning, time_of_run
 from calibrator.files.folders import require_new_folder, whole_folder
 from calibrator.files.storage import Storage, open_storage
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.sources.fleet_source import LOGS_FOLDER, find_fleet, probe_equipment
-from calibrator.summaries.identity import FEWEST_BUCKETS, StoreIdentity, read_identity
+from calibrator.summaries.identity import FEWEST_BUCKETS, StoreIdentity, bucket_of, read_identity
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.summarise_fleet import add_drives
 from calibrator.summaries.summary_store import SummaryStore, open_store
@@ -176,8 +184,11 @@ def _at_once(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) 
         _require_named(settings, _problems(fleet), f"fleet {fleet.name}")
         require_learning([*fleet.vehicles], settings, fleet.left_out)
         return calibrate_fleet_published
+    branches = set(layout.branch_names)
     names_branches = bool(settings.trusted) and not settings.trusted & fleet.vehicles.keys()
-    names_branches = names_branches and settings.trusted <= set(layout.branch_names)
+    names_branches = names_branches and settings.trusted <= branches
+    if settings.trusted & fleet.vehicles.keys() and (mixed := settings.trusted & branches - fleet.vehicles.keys()):
+        raise ContradictionError(f"--trusted names vehicles and branches ({few(sorted(mixed))}); name one or the other")
     alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
     if not (alone or names_branches or len(fleet.vehicles) == 1):
         return None
@@ -312,3 +323,7 @@ def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdent
     ):
         if was != now:
             raise FleetError(f"{folder}: its {what} is {was}, that of this run {now}; calibrate without --since")
+    rows = result_rows(folder, ["vehicle", "branch"])
+    names = pc.unique(rows.filter(pc.field("branch").is_valid())["vehicle"]).to_pylist()
+    if missing := {bucket_of(name, run.buckets) for name in names} - parts_of(folder).keys():
+        raise FleetError(f"{part_file(folder, min(missing))}: missing part of a result; calibrate without --since")

@@ -1,7 +1,9 @@
 """The user's choices of how a fleet, or single junctions, are calibrated, and the identity of a run."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ __all__ = [
     "Method",
     "RunIdentity",
     "require_learning",
+    "time_of_run",
 ]
 
 FEWEST_VEHICLES = 5
@@ -171,6 +174,22 @@ def require_learning(names: Sequence[str], settings: CalibrationSettings, left_o
             f"{FEWEST_VEHICLES} or more, the drives of a single vehicle a sensor that is right (--trusted BRANCH)"
             f"{few_reasons(left_out)}"
         )
+
+
+def time_of_run() -> str:
+    """Return the time now in ISO 8601, or that of SOURCE_DATE_EPOCH if set, so that results are the same to the bit.
+
+    Raises
+    ------
+    FleetError
+        If SOURCE_DATE_EPOCH is no number of seconds.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    try:
+        now = datetime.fromtimestamp(int(epoch), UTC) if epoch else datetime.now(UTC)
+    except (ValueError, OverflowError, OSError):
+        raise FleetError(f"SOURCE_DATE_EPOCH is {epoch!r}; expected seconds since 1970, or leave it unset") from None
+    return now.isoformat(timespec="seconds")
 
 
 def _named_digest(table: Path | str) -> list[str]:

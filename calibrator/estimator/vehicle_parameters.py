@@ -1,16 +1,13 @@
 """Parameters of a vehicle as written for the node: faults, junction sum before and after, and which run found them."""
 
 import math
-import os
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import Any, cast
 
 import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.drives.delays import BranchDelays
-from calibrator.errors import FleetError
 from calibrator.estimator.decision import FleetEstimate
 from calibrator.estimator.settings import CONFIDENT, SUSPECTED, RunIdentity
 from calibrator.estimator.vehicle_report import LEAST_RIVAL, REASONS, explained_faults
@@ -32,7 +29,6 @@ __all__ = [
     "impossible",
     "junction_residual",
     "parameters_of",
-    "time_of_run",
 ]
 
 MOST_REPORTED, LEAST_REPORTED = 3, 0.02
@@ -47,21 +43,6 @@ STABILITY = 0.01
 """Least change of gains with temperature between drives that is assumed: the node must not take it for a fault. [1]"""
 TINY_A2 = 1e-12
 """Least squared throughput, so that it can be divided by. [A^2]"""
-
-
-def time_of_run() -> str:
-    """Return the time now in ISO 8601, or that of SOURCE_DATE_EPOCH if set, so that results are the same to the bit.
-
-    Raises
-    ------
-    FleetError
-        If SOURCE_DATE_EPOCH is no number of seconds.
-    """
-    epoch = os.environ.get("SOURCE_DATE_EPOCH")
-    if epoch is not None and not epoch.isdecimal():
-        raise FleetError(f"SOURCE_DATE_EPOCH is {epoch!r}; expected seconds since 1970, or leave it unset")
-    now = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
-    return now.isoformat(timespec="seconds")
 
 
 def by_branch(branches: Sequence[str], values: Array) -> dict[str, float]:

@@ -144,7 +144,8 @@ def require_estimate(method: str, estimate: Estimate, truth: Faults) -> Estimate
     ------
     FleetError
         If it is no :class:`Estimate`, its faults are no :class:`Faults`, an array has a wrong shape or type or values
-        that are not finite, a confidence is outside 0 to 1, or findings are given but not for exactly N vehicles.
+        that are not finite, a confidence is outside 0 to 1, the number that failed is none of 0 to N, or findings are
+        given but not for exactly N vehicles.
     """
     if not isinstance(estimate, Estimate):
         raise FleetError(f"method '{method}': estimate() returned {type(estimate).__name__}, expected an Estimate")
@@ -160,13 +161,17 @@ def require_estimate(method: str, estimate: Estimate, truth: Faults) -> Estimate
         shape = (N,) if name in {"hardware_drift", "hardware", "confidence"} else (N, K)
         kinds, elements = ("b", "bool") if name in {"hardware", "corrected"} else ("fiu", "finite numbers")
         if given.shape != shape or given.dtype.kind not in kinds or not np.isfinite(given).all():
+            axes = "(vehicles, branches)" if len(shape) > 1 else "(vehicles)"
+            where = ", 0 where no fault is found" if name in vars(estimate.faults) else ""
             raise FleetError(
                 f"method '{method}': {name} is {given.dtype} of shape {given.shape}, expected {elements} of shape "
-                f"{shape} (vehicles, branches), 0 where no fault is found"
+                f"{shape} {axes}{where}"
             )
     sure, found = optional["confidence"], len(estimate.findings)
     if sure is not None and (np.min(sure) < -ROUNDING or np.max(sure) > 1.0 + ROUNDING):
         raise FleetError(f"method '{method}': confidence is {np.min(sure):g} to {np.max(sure):g}, expected 0 to 1")
+    if estimate.failed not in range(N + 1):
+        raise FleetError(f"method '{method}': failed is {estimate.failed!r}, expected a number of vehicles, 0 to {N}")
     if found not in {0, N}:
         raise FleetError(f"method '{method}': findings of {found} vehicles, expected those of {N}, or none")
     return estimate

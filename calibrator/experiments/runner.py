@@ -8,6 +8,8 @@ import platform
 import shutil
 import subprocess
 from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,13 +17,13 @@ from typing import Any
 import pandas as pd
 
 from calibrator.errors import FleetError
-from calibrator.estimator.vehicle_parameters import time_of_run
+from calibrator.estimator.settings import time_of_run
 from calibrator.experiments.common_drive import CommonDrive, common_trial
 from calibrator.experiments.experiments import ALL, KEYS, Experiment, ExperimentResult
 from calibrator.experiments.figures import Values, figure_rows, judge
 from calibrator.experiments.methods import require_estimate
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, recorded_trial
-from calibrator.experiments.trial import ComparedMethod
+from calibrator.experiments.trial import ComparedMethod, Trial
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.progress import shown
 from ecu_node import __version__
@@ -79,8 +81,8 @@ def run_experiment(
     if isinstance(fleet, RecordedFleet):  # before anything is run
         fleet.with_branches(max(each.case.branches for each in settings if isinstance(each.case, RecordedCase)))
     repetitions = experiment.repetitions if repetitions is None else repetitions
-    if repetitions < 1:
-        raise FleetError(f"{experiment.name}: {repetitions} repetitions; expected at least 1")
+    if not isinstance(repetitions, int) or repetitions < 1:
+        raise FleetError(f"{experiment.name}: {repetitions!r} repetitions; expected a whole number, 1 or more")
     tasks = [(setting.case, seed + number) for setting in settings for number in range(repetitions)]
     judged = run_many(partial(_run_trial, fleet, methods), tasks, Workers(processes=workers))
     trials = list(shown(judged, experiment.name, len(tasks), "trials"))
@@ -101,9 +103,22 @@ def run_experiment(
 def _run_trial(
     fleet: CommonDrive | RecordedFleet, methods: Sequence[ComparedMethod], task: tuple[Any, int]
 ) -> list[Values]:
-    """Make the trial of a case and a seed; return what :func:`judge` says of each method."""
+    """Make the trial of a case and a seed; return what :func:`judge` says of each method.
+
+    Each method has its own copy of the trial, as it may write into arrays.
+    """
     trial = recorded_trial(fleet, *task) if isinstance(fleet, RecordedFleet) else common_trial(fleet, *task)
-    return [judge(require_estimate(method.name, method.estimate(trial), trial.truth), trial) for method in methods]
+
+    def copied() -> Trial:
+        return replace(
+            trial,
+            truth=deepcopy(trial.truth),
+            unseen=deepcopy(trial.unseen),
+            record=lambda: deepcopy(trial.recorded),
+            collect=lambda: deepcopy(trial.evidence),
+        )
+
+    return [judge(require_estimate(method.name, method.estimate(copied()), trial.truth), trial) for method in methods]
 
 
 def made_now() -> str:

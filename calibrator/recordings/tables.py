@@ -396,12 +396,14 @@ def _time(path: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> tuple[li
     named = [name for name in frame if _TIME_WORD.search(bare_name(name).lower())]
     for first, second in itertools.pairwise(named):  # a date and the time of day beside it
         if "dat" in first.lower() and not pd.api.types.is_numeric_dtype(frame[second]):
-            both = _dates(frame[first].astype("string") + " " + frame[second].astype("string"))
+            both, form = _dates(frame[first].astype("string") + " " + frame[second].astype("string"))
             if _increases(both):
-                return [first, second], both, f"time '{first}' and '{second}'"
+                return [first, second], both, f"time '{first}' and '{second}', a {form}"
     for name in dict.fromkeys([*named, *frame.columns]):
         time_s, unit = _seconds(frame[name], name, units.get(name, ""))
-        if (name in named or unit in {"date", "time of day"} or not _is_row_number(name)) and _increases(time_s):
+        if (name in named or unit.startswith(("date", "time of day")) or not _is_row_number(name)) and _increases(
+            time_s
+        ):
             return [name], time_s, f"time '{name}' in {unit}" if unit in _TIME_UNITS else f"time '{name}', a {unit}"
     if named:
         raise LogError(f"{path}: the time does not increase in column '{named[0]}'; sort the rows by it")
@@ -428,7 +430,7 @@ def _seconds(column: "pd.Series[float]", name: str, unit: str) -> tuple[Array, s
     if pd.api.types.is_timedelta64_dtype(column):
         return np.asarray(column.dt.total_seconds()), "duration"
     if pd.api.types.is_datetime64_any_dtype(column):
-        return _dates(column), "date"
+        return _dates(column)
     value, bad = _numbers(column)
     if bad.mean() > 0.5:
         text = column.astype("string").str.strip()
@@ -436,7 +438,7 @@ def _seconds(column: "pd.Series[float]", name: str, unit: str) -> tuple[Array, s
         if bool(of_day.mean() > 0.5):
             minutes = text.str.replace(",", ".").str.replace(r"^(\d+:\d\d)$", r"\1:00", regex=True)
             return np.asarray(pd.to_timedelta(minutes, errors="coerce").dt.total_seconds()), "time of day"
-        return _dates(text), "date"
+        return _dates(text)
     words = [unit.lower(), *reversed(re.split(r"[\W_]+", name.lower()))]
     known = next((word for word in words if word in _TIME_UNITS), None) or _likely_unit(value[np.isfinite(value)])
     return value * _TIME_UNITS[known], known
@@ -454,17 +456,24 @@ def _likely_unit(value: Array) -> str:
     return next((unit for least, unit in _LONG_STEPS if step >= least), "s")
 
 
-def _dates(column: "pd.Series[str]") -> Array:
-    """Convert dates to seconds since the earliest one; dates with points, as 31.12.2025, have the day first."""
+def _dates(column: "pd.Series[str]") -> tuple[Array, str]:
+    """Convert dates to seconds since the earliest one; return also their form.
+
+    The day is first in dates with points, as 31.12.2025, and where any first number is above 12; else the month is.
+    """
+    form = "date"
     if not pd.api.types.is_datetime64_any_dtype(column):
         text = column.astype("string").str.strip().str.replace(r"(:\d\d),(\d)", r"\1.\2", regex=True)
         if not bool(text.str.match(r"\d+[-./]\d").mean() > 0.5):
-            return np.full(len(column), np.nan)
-        day_first = bool(text.str.match(r"\d{1,2}\.\d{1,2}\.").mean() > 0.5)
+            return np.full(len(column), np.nan), form
+        first = pd.to_numeric(text.str.extract(r"^(\d{1,2})[-./]\d{1,2}[-./]")[0])
+        day_first = bool((first > 12).any() or text.str.match(r"\d{1,2}\.\d{1,2}\.").mean() > 0.5)
+        if first.notna().any():
+            form = f"date, {'day' if day_first else 'month'} first"
         column = pd.to_datetime(text, format="mixed", dayfirst=day_first, utc=True, errors="coerce")
     if column.dt.tz is not None:
         column = column.dt.tz_convert("UTC").dt.tz_localize(None)
-    return np.asarray((column - column.min()) / pd.Timedelta(seconds=1), np.float64)
+    return np.asarray((column - column.min()) / pd.Timedelta(seconds=1), np.float64), form
 
 
 # ---- text

@@ -15,7 +15,7 @@ from calibrator.files.storage import open_storage
 from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption, whole_option
 from calibrator.terminal.progress import shown
-from calibrator.terminal.text import dumps, few
+from calibrator.terminal.text import counted, dumps, few
 from ecu_node.errors import UserError, printable
 from ecu_node.program import write_output
 
@@ -179,8 +179,8 @@ def add(
     bins, lifted = found.add(reading, days=days, allow_large_step=allow_large_step, database=database)
     facts = {"added": len(files), "bins": bins, "no_longer_revoked": lifted}
     words = f"; revoked before, and no longer: the files of {few(lifted)}" if lifted else ""
-    text = f"{folder}: {len(files)} parameter files added, {bins} bins changed{words}; to be published"
-    _tell(facts, text, json=json)
+    changed = f"{counted(len(files), 'parameter file')} added, {counted(bins, 'bin')} changed"
+    _tell(facts, f"{folder}: {changed}{words}; to be published", json=json)
 
 
 @repository.command("publish", epilog=example("calibrator repository publish repo --key anna.key --key online.key"))
@@ -203,7 +203,7 @@ def publish(folder: FolderArgument, key: KeysOption, json: JsonOption = False) -
     if waiting:
         text = f"the timestamp is new; what is staged is not published: {missing_text(waiting)}"
     else:
-        text = f"published, {len(signed)} roles changed"
+        text = f"published, {counted(len(signed), 'role')} changed"
     _tell({"published": 0 if waiting else len(signed), "waiting": waiting}, f"{folder}: {text}", json=json)
 
 
@@ -215,7 +215,7 @@ def status(folder: FolderArgument, json: JsonOption = False) -> None:
     found = _open(folder)
     staged, until = list(found.sign([])), found.valid_until
     words = [f"valid until {until:%Y-%m-%d}" if until else "nothing is published yet"]
-    words += [f"{len(staged)} roles staged" + (f": {missing_text(found.waiting)}" if found.waiting else "")]
+    words += [f"{counted(len(staged), 'role')} staged" + (f": {missing_text(found.waiting)}" if found.waiting else "")]
     facts = {"valid_until": until, "staged": staged, "waiting": found.waiting}
     _tell(facts, f"{folder}: {'; '.join(words)}", json=json)
 
@@ -225,7 +225,7 @@ def status(folder: FolderArgument, json: JsonOption = False) -> None:
 def unstage(folder: FolderArgument, json: JsonOption = False) -> None:
     """Drop what is staged, as after a mistake; what is published stays."""
     dropped = _open(folder).unstage()
-    _tell({"dropped": dropped}, f"{folder}: {len(dropped)} staged roles dropped", json=json)
+    _tell({"dropped": dropped}, f"{folder}: {counted(len(dropped), 'staged role')} dropped", json=json)
 
 
 @repository.command("rotate", epilog=example("calibrator repository rotate repo timestamp --public keys/new.pub"))
@@ -264,6 +264,8 @@ def revoke(
         raise ContradictionError(
             f"--sha256 {sha256}: 64 digits 0-9 and a-f are expected, as 'ecu-node inspect --json' says"
         )
+    if twice := sorted({name for name in vehicles if vehicles.count(name) > 1}):
+        raise ContradictionError(f"{few(twice)} is named twice; name each vehicle once")
     _open(folder).revoke(vehicles, sha256)
     _tell({"revoked": vehicles}, f"{folder}: {len(vehicles)} revoked; to be published", json=json)
 

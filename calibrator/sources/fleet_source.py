@@ -3,7 +3,8 @@
 A log belongs to the vehicle that its folder is named after, and its drive is named after the file without suffixes:
 ``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders and ``.zip`` archives are searched
 at any depth; an archive counts as a folder of its name. Logs that lie beside the folders of vehicles, vehicles with
-two folders of the same name, and drives for which there are two files, are left out, and the report names them.
+two folders of the same name, folders without logs beside them, and drives for which there are two files, are left out,
+and the report names them.
 """
 
 from collections import Counter
@@ -48,6 +49,7 @@ __all__ = [
 
 _Vehicle = TypeVar("_Vehicle")
 LOGS_FOLDER = "logs"
+_EXPECTED = f"expected {', '.join(LOG_SUFFIXES)}, each also with .gz"
 PROBED_VEHICLES = 7
 """So many readable vehicles are looked at to find out which branches and inputs the fleet has. [1]"""
 
@@ -101,11 +103,7 @@ def find_fleet(place: str | Path) -> FleetSource:
     storage = open_storage(place)
     if storage.is_local and not Path(storage.url).exists():
         raise FleetError(f"{place}: no such file or folder; give a log, a drive store, or a folder with logs")
-    folder = storage
-    if not (storage.is_local and Path(storage.url).is_file()):
-        inside = storage.contents()[0]
-        folder = next((storage.folder(name) for name in (DRIVES_FOLDER, LOGS_FOLDER) if name in inside), storage)
-    fleet = find_logs([folder.url])
+    fleet = find_logs([place])
     if not fleet.vehicles:
         raise FleetError(f"{place}: no drive in it{few_reasons(fleet.left_out)}")
     return replace(fleet, place=str(place))
@@ -117,7 +115,7 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     Parameters
     ----------
     arguments : iterable of str or Path
-        Files, or folders to search; paths or URLs.
+        Files, or folders to search, of which ``drives`` or ``logs`` alone if it is in one; paths or URLs.
 
     Returns
     -------
@@ -153,18 +151,25 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
 
     for argument in arguments:
         try:
-            storage, beside, is_found = open_storage(argument), list[Entry](), False
+            storage, beside, is_found, inside = open_storage(argument), list[Entry](), False, set[str]()
+            folders = storage.contents()[0]
+            if whole := next((name for name in (DRIVES_FOLDER, LOGS_FOLDER) if name in folders), None):
+                storage = storage.folder(whole)
             for url, logs, folder in _logs_in(storage, str(argument), problems):
                 if folder is not None and url == storage.url:
                     beside = logs
                 else:
                     add(url, logs, folder)
+                    inside.add(url.removeprefix(f"{storage.url}/").partition("/")[0])
                     is_found = True
             if beside and not is_found:
                 add(storage.url, beside, storage)
             elif not is_found:
                 what = "no logs in it" if storage.is_local else "nothing is there, or no logs in it"
-                raise LogError(f"{argument}: {what}; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
+                raise LogError(f"{argument}: {what}; {_EXPECTED}")
+            for empty in (f"{storage.url}/{name}" for name in storage.contents()[0] if is_found and name not in inside):
+                if not any(text.startswith((f"{empty}:", f"{empty}/")) for text in problems):
+                    problems.append(f"{empty}: no logs in it; {_EXPECTED}")
             for entry in beside if is_found else ():
                 strays[f"{storage.url}/{entry.name}"] = (
                     f"{storage.url}/{entry.name}: lies beside folders with logs; move it into that of its vehicle, or "

@@ -170,6 +170,7 @@ def add_drives(
         If the store cannot be read or written.
     """
     report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
+    summarised = dict[str, tuple[str, ...]]()
     outcomes = try_many_shown(
         partial(_read_record, store=store.identity, database=database),
         _tasks(store, fleet, owners),
@@ -191,11 +192,17 @@ def add_drives(
             for record in records:
                 owners.add(record.vehicle, record.digests)
                 _report(record, report)
+                if not record.problem:
+                    summarised[record.vehicle] = record.drives
     for bucket, vehicles in store.by_bucket(set().union(*owners.shared.values())).items():
         known = store.read(bucket, whole=False)
         copies = [copy for vehicle in vehicles for copy in owners.without_copies(known[vehicle])]
         store.append(bucket, copies)
         report.left_out |= {copy.vehicle: copy.problem for copy in copies}
+        for copy in copies:
+            if summarised.get(copy.vehicle) == copy.drives:
+                del summarised[copy.vehicle]
+    report.vehicles, report.drives = len(summarised), sum(map(len, summarised.values()))
     return report
 
 
@@ -309,9 +316,6 @@ def _record(
 def _report(record: Record, report: SummariseReport) -> None:
     if record.problem:
         report.left_out[record.vehicle] = record.problem
-    else:
-        report.vehicles += 1
-        report.drives += len(record.drives)
     twins = [n for n, d in zip(record.drives, record.digests, strict=False) if record.digests.count(d) > 1]
     if twins:
         report.notices.append(

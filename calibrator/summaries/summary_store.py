@@ -267,7 +267,7 @@ class StoreReport:
             f"{self.size_bytes / 1e6:.1f} MB",
             f"layout {self.layout}; branches {', '.join(self.branches)}; inputs {few(self.inputs)}",
         ]
-        return "\n".join([*lines, *([reasons_text("faults:", self.faults)] if self.faults else [])])
+        return "\n".join([*lines, *([reasons_text("faults", self.faults)] if self.faults else [])])
 
 
 def look_at_store(place: str, *, whole: bool = False) -> StoreReport:

@@ -90,6 +90,9 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
         If the reader of standard output has left.
     """
     others, debug = split_debug(arguments)
+    if "" in others:
+        say_error(f"{program}: an empty name; give the path of a folder, '.' for this one; see '{program} --help'")
+        return WRONG_USE
     command = typer.main.get_command(app)
     for each in _all_commands(command):
         each.epilog = f"{each.epilog}\n\n{EXIT_CODES}" if each.epilog else EXIT_CODES

@@ -109,26 +109,17 @@ def _scheduler(value: str | None) -> str | None:
     return value
 
 
-def _named(value: str) -> str:
-    if not value.strip():
-        raise typer.BadParameter("an empty name; give the path of a folder, '.' for this one")
-    return value
-
-
 FleetArgument = Annotated[
-    str, typer.Argument(callback=_named, help="Drive store, or folder with a folder of logs per vehicle; path or URL.")
+    str, typer.Argument(help="Drive store, or folder with a folder of logs per vehicle; path or URL.")
 ]
 FleetOrSummariesArgument = Annotated[
     str,
     typer.Argument(
-        callback=_named,
         help="Log, table, or folder of them, of one vehicle; folder with a folder of logs per vehicle; drive store; or "
         "summaries (path or URL).",
     ),
 ]
-StoreOption = Annotated[
-    str, typer.Option("--out", callback=_named, help="Store of summaries, path or URL; drives are added to one.")
-]
+StoreOption = Annotated[str, typer.Option("--out", help="Store of summaries, path or URL; drives are added to one.")]
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 WorkersOption = Annotated[int, whole_option("--workers", 1, MAX_WORKERS, "Number of processes")]

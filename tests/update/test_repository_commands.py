@@ -203,9 +203,10 @@ def test_each_mistake_is_refused_in_one_line_and_changes_nothing(
     failed(repo, "no parameters of vehicle 'v9' here", "revoke", repo.path, "v1", "v9")
     failed(repo, "no parameters of vehicle", "revoke", repo.path, b"\xff")
     failed(repo, "vehicle 'v1' never had a file 00000000...", "revoke", repo.path, "v1", "--sha256", 64 * "0")
+    failed(repo, "v1 is named twice", "revoke", repo.path, "v1", "v1", code=2)
     failed(repo, "64 digits", "revoke", repo.path, "v1", "--sha256", "12", code=2)
     failed(repo, "no parameters of vehicle 'v9' are published here", "bundle", repo.path, "v9", "--out", tmp_path / "b")
-    failed(repo, "a name for a file is expected", "key", "", "--no-passphrase", "--out", tmp_path, code=2)
+    failed(repo, "a name for a file is expected", "key", "a/b", "--no-passphrase", "--out", tmp_path, code=2)
     assert files() == before
 
 
@@ -225,7 +226,7 @@ def test_status_gives_the_expiry_of_a_root_that_expires_before_the_timestamp_rol
     repo.forge("root", expire_soon, "r1", "r2")
     repo.publish("snapshot", "timestamp")
     day = f"{datetime.now(UTC) + timedelta(days=3):%Y-%m-%d}"
-    assert f"valid until {day}; 1 roles staged: root has 0 of 2 signatures" in repo.done("status", repo.path)
+    assert f"valid until {day}; 1 role staged: root has 0 of 2 signatures" in repo.done("status", repo.path)
 
 
 def test_damaged_or_expired_repository_is_refused_in_one_line(repo: Repo) -> None:

@@ -110,6 +110,20 @@ def test_charge_balance_determines_an_offset(missing: float, gain: float) -> Non
     assert row.offset_sd_a < 0.5
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_charge_of_the_wrong_sign_is_noticed_by_the_junction_sum(sign: int) -> None:
+    frame = recording(offset_a=(3.0, 0.0, 0.0)).add([10.0, -10.0, 0.0])
+    true_ah = float((frame["battery"] - 3.0).mean()) * SECONDS / 3600.0
+    calibrator = JunctionCalibrator(trusted=["motor"], charge_ah={"battery": (sign * true_ah, 0.01)}).fit(
+        frame, JUNCTION
+    )
+    noticed = [
+        text for text in calibrator.notices_ if "makes the junction sum worse; check the values and signs" in text
+    ]
+    assert len(noticed) == (sign < 0)
+    assert all("; vehicle: RMS 3.0" in text for text in noticed)
+
+
 def test_several_junctions_are_calibrated_independently() -> None:
     # more vehicles than are read together
     frames = {f"V{number}": recording(number, gain=(0.0, 0.05, 0.0), seconds=60.0) for number in range(6)}

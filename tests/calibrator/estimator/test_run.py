@@ -147,11 +147,13 @@ def test_small_fleet_is_calibrated_without_worker_processes(
     (("--load=-3:0.1",), 2, "expected what flows out of the junction"),
     (("--charge", "battery"), 2, "expected a branch with its charge"),
     (("--charge", "battery=3"), 2, "give its standard deviation"),
+    (("--charge", "battery=3:0.1", "--charge", "battery=4:0.1"), 2, "a branch is named twice"),
     (("--trusted", "battery"), 1, "a store of summaries, and --trusted with a branch needs the drives"),
     (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
     (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
     (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
     (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
+    (("--since", ""), 2, "an empty name; give the path of a folder"),
     (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
     (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
 ])  # fmt: skip
@@ -293,6 +295,7 @@ def test_option_since_recalibrates_only_vehicles_that_a_changed_option_concerns(
         ((), set()),
         (("--readings", readings), {"V009.json"}),
         (("--harm-limit", "0.02"), set(old)),
+        (("--hold-out", "V009"), set(old)),
     ]):  # fmt: skip
         out = tmp_path / f"out{number}"
         succeeded(*words(store.url, out, "--since", result, *options))
@@ -311,6 +314,14 @@ def test_option_since_leaves_out_vehicles_removed_from_the_store_and_names_them(
     succeeded(*words(str(tmp_path / "store"), tmp_path / "out", "--since", result))
     why = "it is not in this store; its earlier parameters are in the earlier result"
     assert left_out_of(tmp_path / "out") == dict.fromkeys(gone, why)
+
+
+def test_option_since_refuses_a_result_without_a_part(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    shutil.copytree(result, tmp_path / "earlier")
+    part = tmp_path / "earlier" / "buckets" / f"{fullest(store):05d}.parquet"
+    part.unlink()
+    done = calibrator(*words(store.url, tmp_path / "out", "--since", tmp_path / "earlier"))
+    assert f"{part}: missing part of a result; calibrate without --since" in done.stderr
 
 
 @pytest.mark.parametrize(("key", "value", "message"), [

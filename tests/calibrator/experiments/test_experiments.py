@@ -21,7 +21,7 @@ from calibrator.experiments.methods import PERFECT, POSTERIOR, MethodRow
 from calibrator.experiments.pages import headline, result_markdown, result_table, write_page
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
 from calibrator.experiments.runner import run_experiment
-from calibrator.experiments.trial import ComparedMethod, Estimate, Trial
+from calibrator.experiments.trial import CommonEvidence, ComparedMethod, Estimate, Trial
 from calibrator.faults import Faults
 from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.experiments.small_trials import small_fleet, smooth_drive
@@ -168,9 +168,10 @@ def test_experiment_on_wrong_drives_or_without_distinct_settings_and_methods_is_
         run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive())
 
 
-def test_experiment_without_repetitions_is_refused() -> None:
-    with pytest.raises(FleetError, match="snr: 0 repetitions; expected at least 1"):
-        run_experiment(EXPERIMENTS["snr"], smooth_drive(), repetitions=0)
+@pytest.mark.parametrize("repetitions", [0, 1.5])
+def test_experiment_without_whole_repetitions_is_refused(repetitions: Any) -> None:
+    with pytest.raises(FleetError, match=f"snr: {repetitions} repetitions; expected a whole number, 1 or more"):
+        run_experiment(EXPERIMENTS["snr"], smooth_drive(), repetitions=repetitions)
 
 
 def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
@@ -248,6 +249,23 @@ def test_table_shows_users_methods_and_the_confidence_of_the_default_or_first_th
     assert headline(both)["confidence"].iloc[0] == f"{default:.3f}"
 
 
+class Spoiling(Own):
+    """A method that overwrites what it is given."""
+
+    def estimate(self, trial: Trial) -> Estimate:
+        assert isinstance(trial.recorded, CommonEvidence)
+        for part in (trial.truth, trial.unseen, trial.evidence, trial.recorded.rows, trial.recorded):
+            for values in vars(part).values():
+                if isinstance(values, np.ndarray):
+                    values[...] = 0
+        return super().estimate(trial)
+
+
+def test_method_that_overwrites_its_trial_does_not_change_the_figures_of_others() -> None:
+    spoilt, clean = run(Spoiling(), PERFECT, POSTERIOR), run(Own(), PERFECT, POSTERIOR)
+    pd.testing.assert_frame_equal(spoilt.figures, clean.figures)
+
+
 @pytest.mark.parametrize(("change", "message"), [
     (lambda _: MANY, r"estimate\(\) returned ndarray, expected an Estimate"),
     (with_faults(drift=None), "drift is NoneType, expected an array of numpy"),
@@ -255,7 +273,9 @@ def test_table_shows_users_methods_and_the_confidence_of_the_default_or_first_th
     (lambda e: replace(e, confidence=[0.5] * N), "confidence is list, expected an array of numpy"),
     (with_faults(hardware_drift=np.zeros(3)), r"hardware_drift is .*\(3,\), expected .*\(20,\)"),
     (with_faults(drift=MANY * np.nan), "drift .* expected finite numbers .*, 0 where no fault is found"),
-    (lambda e: replace(e, hardware=np.zeros(N)), "hardware is float64 .* expected bool"),
+    (lambda e: replace(e, hardware=np.zeros(N)), r"hardware is float64 .* bool of shape \(20,\) \(vehicles\)$"),
+    (lambda e: replace(e, failed=None), "failed is None, expected a number of vehicles, 0 to 20"),
+    (lambda e: replace(e, failed=-1), "failed is -1, expected"),
     (lambda e: replace(e, drift_sd=MANY[:3], offset_sd_a=MANY), r"drift_sd is .* \(3, 2\), expected .*\(20, 2\)"),
     (lambda e: replace(e, confidence=np.linspace(0.0, 1.5, N)), "confidence is 0 to 1.5, expected 0 to 1"),
     (lambda e: replace(e, findings=[["load"]]), "findings of 1 vehicles, expected those of 20, or none"),

@@ -46,6 +46,18 @@ def test_missing_package_or_ctrl_c_at_start_ends_with_one_line(code: str, exit_c
     assert (run.returncode, run.stdout, run.stderr) == (exit_code, "", said)
 
 
+@pytest.mark.parametrize(("epoch", "said"), [
+    ("abc", "SOURCE_DATE_EPOCH is 'abc'; expected seconds since 1970, or leave it unset"),
+    ("99999999999999", "SOURCE_DATE_EPOCH is '99999999999999'; expected seconds since 1970, or leave it unset"),
+    ("", "none: no such folder, store of drives or store of summaries"),
+])  # fmt: skip
+def test_wrong_time_of_run_ends_with_one_line_and_an_empty_one_is_none(tmp_path: Path, epoch: str, said: str) -> None:
+    command = [sys.executable, "-m", "calibrator", "calibrate", "none", "--layout", str(LAYOUT), "--out", "x"]
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": epoch, "PYTHONPATH": str(ROOT)}
+    run = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (1, f"calibrator: {said}\n")
+
+
 @pytest.mark.parametrize("delay_s", [0.0, 2.0])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_or_sigterm_ends_reader_processes_too(

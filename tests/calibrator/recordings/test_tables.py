@@ -117,6 +117,19 @@ def test_tables_of_all_formats_give_currents_without_a_layout(tmp_path: Path, ki
     require_sum(before(tmp_path / name, "--branches", BRANCHES))
 
 
+@pytest.mark.parametrize(("start", "form", "order"), [
+    ("2026-03-12", "%d/%m/%Y", "day"),  # which the 13th, after midnight, decides
+    ("2026-03-12", "%m/%d/%Y", "month"),
+    ("2026-03-04", "%m-%d-%Y", "month"),
+])  # fmt: skip
+def test_order_of_day_and_month_is_that_of_all_rows(tmp_path: Path, start: str, form: str, order: str) -> None:
+    times = pd.date_range(f"{start} 23:59:55", periods=ROWS, freq="100ms").strftime(f"{form} %H:%M:%S.%f")
+    csv(frame(time=times))(tmp_path / "x.csv")
+    table = read_table(tmp_path / "x.csv")
+    assert f"time 'time', a date, {order} first" in table.found
+    require_sum(before(tmp_path / "x.csv", "--branches", BRANCHES))
+
+
 def test_rows_without_time_or_with_too_many_cells_are_left_out_and_counted(tmp_path: Path) -> None:
     rows = frame().to_csv(index=False).splitlines()
     rows[20] += ",7"

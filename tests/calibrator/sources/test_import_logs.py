@@ -20,7 +20,7 @@ def test_import_adds_only_logs_that_the_store_lacks(
     two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
 ) -> None:
     first = imported([two_vehicles / "logs" / "V001"], tmp_path, database)
-    both = imported([two_vehicles / "logs"], tmp_path, database)
+    both = imported([two_vehicles], tmp_path, database)  # beside the logs it has unseen drives
     assert (len(first.drives), first.already_there) == (1, ())
     assert ([drive.vehicle for drive in both.drives], both.already_there) == (["V002"], ("V001/drive",))
     assert f"1 drive written to {tmp_path}, 1 already there, 0 left out" in both.as_text()

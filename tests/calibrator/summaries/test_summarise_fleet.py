@@ -130,8 +130,10 @@ def test_recording_found_in_two_vehicles_counts_for_neither(fleet: SmallFleet) -
     fleet.add()
     fleet.copy("V1/a", "V2/b")
     for _ in range(2):  # the second run gives the same
-        reasons = {name: text.partition(";")[0] for name, text in fleet.add().left_out.items()}
+        again = fleet.add()
+        reasons = {name: text.partition(";")[0] for name, text in again.left_out.items()}
         assert reasons == {"V1": "same recording as V2", "V2": "same recording as V1"}
+        assert again.drives == 0
         usable = [(name, *each.drives) for name, records in fleet.records().items() for each in records if each.found]
         assert sorted(usable) == [("V2", "a"), ("V3", "a")]
 

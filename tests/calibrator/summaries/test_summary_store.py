@@ -187,7 +187,9 @@ def test_changed_byte_in_a_bucket_is_detected(own_store: SummaryStore) -> None:
     path.write_bytes(content)
     with pytest.raises(FleetError, match="damaged file of summaries: it is cut or changed, or no Parquet file"):
         own_store.read(bucket)
-    assert list(look_at_store(own_store.url, whole=True).faults) == [f"bucket {bucket:05d}"]
+    report = look_at_store(own_store.url, whole=True)
+    assert list(report.faults) == [f"bucket {bucket:05d}"]
+    assert f"\nfaults:\n  bucket {bucket:05d}: " in report.as_text()
 
 
 def test_file_copied_from_another_bucket_is_refused(own_store: SummaryStore) -> None:
