@@ -114,8 +114,14 @@ SD_OF_RANGE = 9.0
 """Range of the background over the standard deviation of its Gaussian half, where ``widest`` sets the range. [1]"""
 UNKNOWN_VARIANCE = 100.0
 """Variance of an unknown row: a standard deviation of ten times full scale, or of a factor of 20 000. [1]"""
-LEAST_GAIN = 0.3
-"""Least slope or gain ratio that is used: a lower one comes from a branch that hardly moved, not from a sensor. [1]"""
+LEAST_GAIN, LEAST_SURE_GAIN = 0.3, 0.085
+"""Least slope or gain ratio that is used, and that of those that are known well: a lower one that is known badly comes
+from a branch that hardly moved, not from a sensor. Gains of 0.08 and less are not fitted. [1]"""
+MOST_RELATIVE_SD = 0.25
+"""Standard deviation of a slope or gain ratio, over itself, up to which it is known well. [1]"""
+DEAD_SD = 0.5
+"""Standard deviation of the logarithm of a slope or ratio that is known to be below the least one: it counts as that
+one, and says that the gain is small, not how small. [1]"""
 FEWEST_BLOCKS = 4
 """Least number of blocks of a vehicle; from fewer no variance can be estimated."""
 FLEET_BLOCKS = 20.0
@@ -813,12 +819,15 @@ def collect_rows(
 
     # Logarithms of the ratios, constants as seen in true currents. An unknown ratio becomes 1; its constant pivots.
     ratios, constant = values[:, :R], values[:, R:]
-    known = ratios > LEAST_GAIN
-    safe = np.where(known, ratios, 1.0)
+    sure = sd[:, :R] < MOST_RELATIVE_SD * np.maximum(ratios, LEAST_SURE_GAIN)
+    dead = sure & (np.abs(ratios) < LEAST_SURE_GAIN)
+    known = (ratios > LEAST_GAIN) | (sure & (ratios > -LEAST_SURE_GAIN))
+    safe = np.where(known, np.maximum(ratios, LEAST_SURE_GAIN), 1.0)
     constant = constant + products(to_means, ratios - safe)
     per_unit = np.concatenate([1.0 / safe, 1.0 / safe[:, :K], 1.0 / safe[:, :1]], axis=1)
     covariance = covariance * per_unit[:, :, None] * per_unit[:, None, :]
     covariance += np.diag(np.repeat(LEAST_SD, [R, K + 1]) ** 2)
+    covariance[:, range(R), range(R)] += DEAD_SD**2 * dead
     vehicle, row = np.nonzero(~known)
     covariance[vehicle, row, :], covariance[vehicle, :, row] = 0.0, 0.0
     covariance[vehicle, row, row] = UNKNOWN_VARIANCE

@@ -141,3 +141,21 @@ def test_standardised_errors_of_evidence_rows_are_standard_normal(
     assert ((rms[:-1] > 0.35) & (rms[:-1] < 1.45)).all(), rms
     assert 0.15 < rms[-1] < 1.45, rms
     assert (np.abs(z.mean(axis=0)) < 0.45).all(), z.mean(axis=0)
+
+
+def test_slope_of_a_dead_sensor_is_known_to_be_small_and_one_of_a_branch_that_hardly_moves_is_unknown() -> None:
+    faults = simulated_drives.no_faults(3, K)
+    faults.drift[:2, 1] = -0.8, -0.98
+    summaries = list(simulated_drives.summaries_of(faults, simulated_drives.Conditions(samples=600)))
+    rng = np.random.default_rng(1)
+    u = 1e-4 * simulated_drives.coloured(rng, 600, 3, 0.5)
+    still = simulated_drives.samples_of(u, rng.normal(0.0, 0.3, (600, K)))
+    summaries[2] = summarise_samples([still], period_s=simulated_drives.PERIOD_S)
+    fleet = evidence.stack_summaries(summaries)
+    rows, _ = evidence.collect_rows(fleet, np.vstack([W, np.zeros(K)]), full_scale_a=FULL_SCALE_A)
+    row = rows.places.slope(1)
+    sd = np.sqrt(rows.covariance[:, row, row])
+    assert rows.values[:2, row] == pytest.approx(np.log([0.2, 0.085]), abs=0.02)
+    assert sd[0] < 0.02
+    assert 0.4 < sd[1] < 0.8
+    assert sd[2] > 0.3

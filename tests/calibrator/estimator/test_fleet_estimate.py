@@ -59,6 +59,23 @@ def test_faults_beyond_the_limits_are_estimated_but_not_corrected(
     np.testing.assert_array_equal(limited.drift, free.drift)
 
 
+def test_low_gain_of_the_largest_branch_is_recovered_and_its_dead_sensor_is_not_surely_sound() -> None:
+    low = np.array([-0.65, -0.75, -0.88, -0.95, -1.0])
+    faults = random_faults(3, vehicles=16, branches=3, full_scale_a=SCALE_A)
+    for each in (faults.hardware_drift, faults.hardware_offset_a, faults.drift, faults.offset_a):
+        each[: len(low)] = 0.0
+    faults.drift[: len(low), 0], faults.drift[: len(low), 1] = low, 0.15
+    summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=3)
+    reference = learn_fleet(summaries, full_scale_a=SCALE_A, branches=(*NAMES, "auxiliaries"))
+    assert reference.order[0] == 0
+    found = estimate_vehicles(summaries, reference)
+    np.testing.assert_allclose(found.drift[:3, 0], low[:3], atol=0.01)
+    np.testing.assert_allclose(found.drift[:3, 1], 0.15, atol=0.01)
+    assert (found.confidence[3:5] < 0.5).all()
+    assert (found.fault_probability[:5, 0] > 0.99).all()
+    assert not found.corrected[3:5].any()
+
+
 @pytest.mark.parametrize(("factor", "told"), [
     (-1.0, "1 A in branch battery goes with +1 A in branch motor"),
     (0.1, "1 A in branch motor goes with -10 A in branch battery"),
