@@ -14,14 +14,15 @@ Equations (M18) and (M19) are those of docs/method.md.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import starmap
+from itertools import permutations, starmap
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces
-from calibrator.estimator.posterior import Draws, FaultModel, explain, weigh
+from calibrator.estimator.posterior import OFFSET, Draws, FaultModel, explain, weigh
+from calibrator.estimator.prior import GRID, Prior
 from calibrator.score import TOLERANCE
 from ecu_node.parameters import Explanation, SensorFinding
 
@@ -41,6 +42,9 @@ __all__ = [
     "recovery_probability",
 ]
 
+Integers = NDArray[np.int64]
+
+TINY = np.finfo(float).tiny
 NEGLIGIBLE = 1e-8
 """Weight of a draw below which it is left out. [1]"""
 CANDIDATES, LEAST_CANDIDATE = 8, 0.01
@@ -105,11 +109,12 @@ def group_centres(models: Sequence[FaultModel]) -> Array:
     return max((model.prior.group_centre for model in models), key=len)
 
 
-def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]]) -> list[FleetPoints]:
+def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]], read: Mask | None = None) -> list[FleetPoints]:
     """Return the posterior of each of N vehicles as weighted points, over all fault models that explain their fleet.
 
     Each model comes with the draws of the N vehicles under it, M from each of Q explanations, and with their weights as
     :func:`.weigh` returns them: shape (N, Q, M, 1 + g), for no group and for each of the g groups of the model.
+    ``read`` of shape (N, K) says which offsets were read directly: these have no twins, see :func:`_twins`.
     """
     centres, parts = group_centres([model for model, _, _ in models]), []
     for i, (model, draws, weights) in enumerate(models):
@@ -137,12 +142,79 @@ def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]]) -> list[
             load=np.where(g == 0, x[:, at.load], 0.0),
             group=np.array([0, *same])[g],
         )
-        parts.append((j, *vars(part).values()))
+        twins = _twins(draws, model.prior, (j, q, m, g), part, read)
+        total = np.ones(len(weights))
+        for vehicles, twin in twins:
+            total += np.bincount(vehicles, twin.weight, minlength=len(total)) / model.probability
+        shift = 1 + int(part.explanation.max(initial=0))
+        for n, (vehicles, points) in enumerate([(j, part), *twins]):
+            share, number = points.weight / total[vehicles], points.explanation + n * shift
+            parts.append((vehicles, *vars(replace(points, weight=share, explanation=number)).values()))
     vehicle, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(vehicle, kind="stable")
     ends = np.cumsum(np.bincount(vehicle, minlength=len(models[0][2])))[:-1]
     found = starmap(FleetPoints, zip(*(np.split(column[order], ends) for column in columns), strict=True))
     return [replace(each, explanation=np.unique(each.explanation, return_inverse=True)[1]) for each in found]
+
+
+def _twins(
+    draws: Draws, prior: Prior, places: tuple[Integers, ...], points: FleetPoints, read: Mask | None
+) -> list[tuple[Integers, FleetPoints]]:
+    """Return points with a current moved between two branches by the hardware, for offsets of both their sensors.
+
+    Offsets x and y of the sensors p and r (as seen in true currents) have the same rows as an offset x + y of p beside
+    a hardware offset y in r and -y in p; if x + y may be zero, also as that hardware offset alone. The parameters of a
+    support have one fault for it only if either branch is the last, so for all other pairs these points are added,
+    (M17a) of docs/method.md. ``places`` are vehicle, explanation, draw and group of the points.
+    """
+    j, q, m, g = places
+    fits, feed, K = draws.fits, draws.feed, draws.values.shape[3] // 3
+    x, first = draws.values[j, q, m], ParameterPlaces(K).offset(0)
+    gain = np.exp(x[:, 1 : K + 1] + draws.shared[K : 2 * K])
+    log_supports, hardware, sensor = prior.log_supports, fits.hardware[j, q], fits.sensor[j, q]
+    twins: list[tuple[Integers, FleetPoints]] = []
+
+    def log_density(size: Array) -> Array:
+        nearest = np.searchsorted(np.sqrt(GRID[1:] * GRID[:-1]), np.abs(size))
+        return np.asarray(prior.log_density[OFFSET, nearest])
+
+    for p, r in permutations(range(K - 1), 2):
+        both = fits.support[j, q, first + p] & fits.support[j, q, first + r] & (hardware < K)
+        both &= ~((g > 0) & (feed in (p, r)))
+        if read is not None:
+            both &= ~(read[j, p] | read[j, r])
+        i = np.flatnonzero(both)
+        if not i.size:
+            continue
+        at_p, at_r, gains = x[i, first + p], x[i, first + r], gain[i]
+        before = log_supports[hardware[i], sensor[i]] + np.log(gains[:, p] * gains[:, r])
+        before += log_density(at_p * gains[:, p]) + log_density(at_r * gains[:, r])
+        # x + y has a normal distribution in the draws; where it is zero, y is what regression on it leaves
+        root, of_r = fits.root[:, :, [first + p, first + r]], fits.theta[:, :, first + r]
+        of_sum, fitted = root.sum(axis=2), of_r[j[i], q[i]]
+        variance = np.maximum(np.sum(of_sum**2, axis=2), TINY)
+        share = (np.sum(of_sum * root[:, :, 1], axis=2) / variance)[j[i], q[i]]
+        at_zero = -0.5 * (fits.theta[:, :, first + p] + of_r) ** 2 / variance - 0.5 * np.log(2.0 * np.pi * variance)
+        for alone in (False, True) if p < r else (False,):
+            total = np.zeros(len(i)) if alone else at_p + at_r
+            moved = at_r - share * (at_p + at_r) if alone else at_r
+            after = log_supports[hardware[i] + 1, sensor[i] - 1 - alone] + log_density(moved)
+            if alone:
+                after += np.log(2.0) + at_zero[j[i], q[i]]
+            else:
+                after += np.log(gains[:, p]) + log_density(total * gains[:, p])
+            weight = points.weight[i] * np.exp(np.minimum(after - before, 500.0))
+            faults, of_hardware = points.faults[i].copy(), points.hardware[i].copy()
+            faults[:, K + p] += (total - at_p) * gains[:, p]
+            faults[:, K + r] -= at_r * gains[:, r]
+            faults[np.abs(faults) < 1e-12] = 0.0
+            of_hardware[:, 1 + p] -= fitted
+            of_hardware[:, 1 + r] += fitted
+            columns = {name: values[i] for name, values in vars(points).items()}
+            twins.append(
+                (j[i], FleetPoints(**{**columns, "faults": faults, "hardware": of_hardware, "weight": weight}))
+            )
+    return twins
 
 
 def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
@@ -394,7 +466,12 @@ def estimate_rows(
         )
     smallest = np.array([models[0].prior.gain.smallest, models[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
-    fault, hardware, points, supports = np.zeros((N, K)), np.zeros((N, 1 + K)), posterior_points(explained), []
+    fault, hardware, points, supports = (
+        np.zeros((N, K)),
+        np.zeros((N, 1 + K)),
+        posterior_points(explained, rows.known[:, rows.places.offset_reads]),
+        [],
+    )
     hardware_probability = np.zeros(N)
     for j, found in enumerate(points):
         estimate[j], confidence[j] = best_estimate(found, smallest)

@@ -23,7 +23,7 @@ from calibrator.estimator.prior import Prior, Slab, first_prior
 from calibrator.faults import Faults
 from calibrator.score import harmed, recovered
 from tests.calibrator.estimator.simulated_drives import no_faults
-from tests.calibrator.estimator.simulated_rows import model_of_equals, plain_evidence, random_faults, rows_of
+from tests.calibrator.estimator.simulated_rows import Errors, model_of_equals, plain_evidence, random_faults, rows_of
 
 K = 2
 LEAST = np.array([0.05, 0.05])
@@ -270,3 +270,29 @@ def test_vehicle_of_which_no_row_is_known_has_a_confidence_of_0() -> None:
     found = estimate_rows(rows, [model_of_equals(K)], feed=0, mean=moments, mean_square=moments, usual=moments[:2])
     assert found.confidence[0] > 0.9
     assert found.confidence[1] == 0.0
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.12])
+def test_current_moved_by_the_hardware_counts_alike_between_any_two_branches(offset: float) -> None:
+    """The parameters have one fault for it only if one of the two branches is the last."""
+    pairs = [(0, 1), (1, 2), (0, 2)]
+    faults = no_faults(len(pairs), 3)
+    for j, (p, r) in enumerate(pairs):
+        faults.hardware_offset_a[j, [p, r]], faults.offset_a[j, p] = (0.08, -0.08), offset
+    rows = rows_of(faults, noise=0.0)
+    found = estimate_rows(rows, [model_of_equals(3)], feed=1, **moments(rows))
+    assert found.hardware_probability.min() > (0.3 if offset else 0.99)
+    np.testing.assert_allclose(found.hardware_probability, found.hardware_probability[1], atol=0.05)
+    np.testing.assert_allclose(found.confidence, found.confidence[1], atol=0.05)
+    for points in found.points:
+        assert points.weight.sum() == pytest.approx(1.0, abs=1e-4)
+        np.testing.assert_allclose(points.hardware[:, 1:].sum(axis=1), 0.0, atol=1e-12)
+
+
+def test_offsets_that_were_read_directly_are_not_moved_to_the_hardware() -> None:
+    faults = no_faults(1, 3)
+    faults.offset_a[0] = 0.1, 0.05, 0.0
+    rows = rows_of(faults, errors=Errors(offset_read=0.001), noise=0.0)
+    found = estimate_rows(rows, [model_of_equals(3)], feed=0, **moments(rows))
+    assert found.hardware_probability[0] < 0.01
+    np.testing.assert_allclose(found.offset_a, faults.offset_a, atol=0.001)
