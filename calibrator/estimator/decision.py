@@ -12,7 +12,7 @@ with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its
 Equations (M18) and (M19) are those of docs/method.md.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations, starmap
 
@@ -44,7 +44,7 @@ __all__ = [
 
 Integers = NDArray[np.int64]
 
-TINY = np.finfo(float).tiny
+TINY, ROUNDING, MOST_LOG = np.finfo(float).tiny, 1e-12, 500.0
 NEGLIGIBLE = 1e-8
 """Weight of a draw below which it is left out. [1]"""
 CANDIDATES, LEAST_CANDIDATE = 8, 0.01
@@ -109,15 +109,19 @@ def group_centres(models: Sequence[FaultModel]) -> Array:
     return max((model.prior.group_centre for model in models), key=len)
 
 
-def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]], read: Mask | None = None) -> list[FleetPoints]:
+def posterior_points(
+    models: Sequence[tuple[FaultModel, Draws, Sequence[tuple[Prior, Array]]]], read: Mask | None = None
+) -> list[FleetPoints]:
     """Return the posterior of each of N vehicles as weighted points, over all fault models that explain their fleet.
 
-    Each model comes with the draws of the N vehicles under it, M from each of Q explanations, and with their weights as
-    :func:`.weigh` returns them: shape (N, Q, M, 1 + g), for no group and for each of the g groups of the model.
-    ``read`` of shape (N, K) says which offsets were read directly: these have no twins, see :func:`_twins`.
+    Each model comes with the draws of the N vehicles under it, M from each of Q explanations, and with their weights by
+    each of its priors, as :func:`.weigh` returns them, times the share of that prior: shape (N, Q, M, 1 + g), for no
+    group and for each of the g groups of the model. ``read`` of shape (N, K) says which offsets were read directly:
+    these have no twins, see :func:`_twins`.
     """
     centres, parts = group_centres([model for model, _, _ in models]), []
-    for i, (model, draws, weights) in enumerate(models):
+    for i, (model, draws, by_prior) in enumerate(models):
+        weights = np.sum([each for _, each in by_prior], axis=0)
         K = draws.values.shape[3] // 3
         at, shared, feed, fitted = ParameterPlaces(K), draws.shared, draws.feed, draws.fits.theta
         j, q, m, g = np.nonzero(weights > NEGLIGIBLE)
@@ -136,85 +140,92 @@ def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]], read: Ma
         same = [1 + np.argmin(np.abs(centres - centre)) for centre in model.prior.group_centre]
         part = FleetPoints(
             faults=np.hstack([gain - 1.0, np.where(cancel, 0.0, total)]),
-            weight=weights[j, q, m, g] * model.probability,
-            explanation=(q * weights.shape[3] + g) * len(models) + i,
+            weight=weights[j, q, m, g],
+            explanation=q * weights.shape[3] + g,
             hardware=np.column_stack([np.expm1(fitted[j, q, at.eta]), hardware, -hardware.sum(axis=1)]),
             load=np.where(g == 0, x[:, at.load], 0.0),
             group=np.array([0, *same])[g],
         )
-        twins = _twins(draws, model.prior, (j, q, m, g), part, read)
-        total = np.ones(len(weights))
-        for vehicles, twin in twins:
-            total += np.bincount(vehicles, twin.weight, minlength=len(total)) / model.probability
-        shift = 1 + int(part.explanation.max(initial=0))
-        for n, (vehicles, points) in enumerate([(j, part), *twins]):
-            share, number = points.weight / total[vehicles], points.explanation + n * shift
+        weight = np.array([each[j, q, m, g] for _, each in by_prior])
+        kinds = [(j, weight, part)]
+        for own, log_ratio, twin in _twins(draws, [prior for prior, _ in by_prior], (j, q, g), omega, part, read=read):
+            kinds.append((j[own], weight[:, own] * np.exp(np.minimum(log_ratio, MOST_LOG)), twin))
+        total = np.zeros((len(by_prior), len(weights)))
+        for vehicles, by, _ in kinds:
+            total += [np.bincount(vehicles, each, minlength=len(weights)) for each in by]
+        factor = np.array([each.sum(axis=(1, 2, 3)) for _, each in by_prior]) / np.maximum(total, TINY)
+        for n, (vehicles, by, points) in enumerate(kinds):
+            share = model.probability * np.sum(by * factor[:, vehicles], axis=0)
+            number = (points.explanation + n * weights.shape[1] * weights.shape[3]) * len(models) + i
             parts.append((vehicles, *vars(replace(points, weight=share, explanation=number)).values()))
     vehicle, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(vehicle, kind="stable")
-    ends = np.cumsum(np.bincount(vehicle, minlength=len(models[0][2])))[:-1]
+    ends = np.cumsum(np.bincount(vehicle, minlength=len(models[0][1].values)))[:-1]
     found = starmap(FleetPoints, zip(*(np.split(column[order], ends) for column in columns), strict=True))
     return [replace(each, explanation=np.unique(each.explanation, return_inverse=True)[1]) for each in found]
 
 
 def _twins(
-    draws: Draws, prior: Prior, places: tuple[Integers, ...], points: FleetPoints, read: Mask | None
-) -> list[tuple[Integers, FleetPoints]]:
-    """Return points with a current moved between two branches by the hardware, for offsets of both their sensors.
+    draws: Draws,
+    priors: Sequence[Prior],
+    places: tuple[Integers, Integers, Integers],
+    omega: Array,
+    points: FleetPoints,
+    *,
+    read: Mask | None,
+) -> Iterator[tuple[Integers, Array, FleetPoints]]:
+    """Yield points with a current moved between two branches by the hardware, for offsets of both their sensors.
 
     Offsets x and y of the sensors p and r (as seen in true currents) have the same rows as an offset x + y of p beside
     a hardware offset y in r and -y in p; if x + y may be zero, also as that hardware offset alone. The parameters of a
     support have one fault for it only if either branch is the last, so for all other pairs these points are added,
-    (M17a) of docs/method.md. ``places`` are vehicle, explanation, draw and group of the points.
+    (M17a) of docs/method.md. ``places`` are vehicle, explanation and group of the n points, ``omega`` (n, K) their
+    offsets as seen in true currents. Each of the kinds, as many for any fleet, comes with the numbers of the points
+    that it is made of, and the logarithm of its weight over theirs by each of R priors, shape (R, number of points).
     """
-    j, q, m, g = places
-    fits, feed, K = draws.fits, draws.feed, draws.values.shape[3] // 3
-    x, first = draws.values[j, q, m], ParameterPlaces(K).offset(0)
-    gain = np.exp(x[:, 1 : K + 1] + draws.shared[K : 2 * K])
-    log_supports, hardware, sensor = prior.log_supports, fits.hardware[j, q], fits.sensor[j, q]
-    twins: list[tuple[Integers, FleetPoints]] = []
-
-    def log_density(size: Array) -> Array:
-        nearest = np.searchsorted(np.sqrt(GRID[1:] * GRID[:-1]), np.abs(size))
-        return np.asarray(prior.log_density[OFFSET, nearest])
-
+    j, q, g = places
+    fits, K, first = draws.fits, omega.shape[1], ParameterPlaces(omega.shape[1]).offset(0)
+    hardware, sensor = fits.hardware[j, q], fits.sensor[j, q]
     for p, r in permutations(range(K - 1), 2):
         both = fits.support[j, q, first + p] & fits.support[j, q, first + r] & (hardware < K)
-        both &= ~((g > 0) & (feed in (p, r)))
+        both &= (g == 0) | (draws.feed not in {p, r})
         if read is not None:
             both &= ~(read[j, p] | read[j, r])
         i = np.flatnonzero(both)
-        if not i.size:
-            continue
-        at_p, at_r, gains = x[i, first + p], x[i, first + r], gain[i]
-        before = log_supports[hardware[i], sensor[i]] + np.log(gains[:, p] * gains[:, r])
-        before += log_density(at_p * gains[:, p]) + log_density(at_r * gains[:, r])
-        # x + y has a normal distribution in the draws; where it is zero, y is what regression on it leaves
-        root, of_r = fits.root[:, :, [first + p, first + r]], fits.theta[:, :, first + r]
-        of_sum, fitted = root.sum(axis=2), of_r[j[i], q[i]]
-        variance = np.maximum(np.sum(of_sum**2, axis=2), TINY)
-        share = (np.sum(of_sum * root[:, :, 1], axis=2) / variance)[j[i], q[i]]
-        at_zero = -0.5 * (fits.theta[:, :, first + p] + of_r) ** 2 / variance - 0.5 * np.log(2.0 * np.pi * variance)
+        gain_p, gain_r, at_p, at_r = 1.0 + points.faults[i, p], 1.0 + points.faults[i, r], omega[i, p], omega[i, r]
+        # x + y has a normal distribution in the draws of an explanation; where it is zero, y is what regression leaves
+        one, back = np.unique(j[i] * fits.theta.shape[1] + q[i], return_inverse=True)
+        (of_p, of_r), (root_p, root_r) = (
+            [each.reshape(-1, *each.shape[2:])[one, first + k] for k in (p, r)] for each in (fits.theta, fits.root)
+        )
+        of_sum, root = of_p + of_r, root_p + root_r
+        variance = np.maximum(np.sum(root**2, axis=1), TINY)
+        share = np.sum(root * root_r, axis=1) / variance
+        at_zero = -0.5 * (of_sum**2 / variance + np.log(2.0 * np.pi * variance))
         for alone in (False, True) if p < r else (False,):
-            total = np.zeros(len(i)) if alone else at_p + at_r
-            moved = at_r - share * (at_p + at_r) if alone else at_r
-            after = log_supports[hardware[i] + 1, sensor[i] - 1 - alone] + log_density(moved)
+            left, moved, fitted = at_p + at_r, at_r, of_r[back]  # offset that is left in p
             if alone:
-                after += np.log(2.0) + at_zero[j[i], q[i]]
-            else:
-                after += np.log(gains[:, p]) + log_density(total * gains[:, p])
-            weight = points.weight[i] * np.exp(np.minimum(after - before, 500.0))
-            faults, of_hardware = points.faults[i].copy(), points.hardware[i].copy()
-            faults[:, K + p] += (total - at_p) * gains[:, p]
-            faults[:, K + r] -= at_r * gains[:, r]
-            faults[np.abs(faults) < 1e-12] = 0.0
-            of_hardware[:, 1 + p] -= fitted
-            of_hardware[:, 1 + r] += fitted
+                left, moved, fitted = np.zeros(len(i)), at_r - share[back] * left, fitted - (share * of_sum)[back]
+            log_ratio = np.empty((len(priors), len(i)))
+            for n, prior in enumerate(priors):
+                before = prior.log_supports[hardware[i], sensor[i]] + np.log(gain_p * gain_r)
+                before += _log_density(prior, at_p * gain_p) + _log_density(prior, at_r * gain_r)
+                after = prior.log_supports[hardware[i] + 1, sensor[i] - 1 - alone] + _log_density(prior, moved)
+                of_left = np.log(gain_p) + _log_density(prior, left * gain_p)
+                log_ratio[n] = after - before + (np.log(2.0) + at_zero[back] if alone else of_left)
             columns = {name: values[i] for name, values in vars(points).items()}
-            twins.append(
-                (j[i], FleetPoints(**{**columns, "faults": faults, "hardware": of_hardware, "weight": weight}))
-            )
-    return twins
+            columns["faults"][:, K + p] += (left - at_p) * gain_p
+            columns["faults"][:, K + r] -= at_r * gain_r
+            columns["faults"][np.abs(columns["faults"]) < ROUNDING] = 0.0
+            columns["hardware"][:, 1 + p] -= fitted
+            columns["hardware"][:, 1 + r] += fitted
+            yield i, log_ratio, FleetPoints(**columns)
+
+
+def _log_density(prior: Prior, offset: Array) -> Array:
+    """Return the logarithm of the prior's density of an offset that is there. [over full scale]"""
+    nearest = np.searchsorted(np.sqrt(GRID[1:] * GRID[:-1]), np.abs(offset))
+    return np.asarray(prior.log_density[OFFSET, nearest])
 
 
 def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
@@ -461,9 +472,7 @@ def estimate_rows(
     explained = []
     for model in models:
         draws = explain(rows, model, feed=feed)
-        explained.append(
-            (model, draws, np.sum([share * weigh(draws, prior)[0] for share, prior in model.priors], axis=0))
-        )
+        explained.append((model, draws, [(prior, share * weigh(draws, prior)[0]) for share, prior in model.priors]))
     smallest = np.array([models[0].prior.gain.smallest, models[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
     fault, hardware, points, supports = (

@@ -34,7 +34,7 @@ from calibrator.estimator.decision import (
     harm_probability,
     recovery_probability,
 )
-from calibrator.estimator.evidence import MOST_NOISE, TINY, FleetMoments, junction_regression, stack_summaries
+from calibrator.estimator.evidence import MOST_NOISE, RIDGE, TINY, FleetMoments, junction_regression, stack_summaries
 from calibrator.estimator.readings import CONTRADICTION, TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.estimator.settings import SUSPECTED
 from calibrator.summaries.moments import DriveSummary
@@ -47,7 +47,8 @@ __all__ = ["SEEN", "JunctionKnowledge", "JunctionLaw", "estimate_junction", "nam
 LAW_GAIN_SD, LAW_OFFSET_SD = 0.002, 0.0005
 """Standard deviation that delays, noise and curvature of sensors add to a gain ratio, and to c over full scale. [1]"""
 MOST_RATIO, SURE_SD = 3.0, 0.1
-"""Gain ratio that no two sensors have, and standard deviation below which a ratio is sure enough to be refused. [1]"""
+"""Gain ratio that no two sensors have, and standard deviation below which it is refused (times the ratio, if greater);
+else it counts with its deviation. [1]"""
 OPEN_GAIN_SD, OPEN_OFFSET_SD, OPEN_LOAD_SD = 0.3, 0.2, 0.04
 """Standard deviations before anything is known: of lambda, and over full scale of an offset and of a load. [1]"""
 FAULT_SHARE = 0.2
@@ -66,7 +67,7 @@ USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
 """Usual misfit, due to curvature of good sensors, and usual residual of the sum, due to noise and switched loads, over
 full scale; and spread between cars of the logarithm of the square of that residual. [1]"""
 STEPS = 6
-"""Gauss-Newton steps for the gains in ratios, charges and loads: ratios between 1/3 and 3 need no more. [1]"""
+"""Gauss-Newton steps for the gains in ratios, charges and loads; more change nothing. [1]"""
 STILL = 0.003
 """Standard deviation of all currents, over full scale, up to which the car stands still. [1]"""
 SOUND_GAIN_SD, SOUND_OFFSET_SD = 0.01, 0.0025
@@ -105,7 +106,7 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
         covariance *= np.outer(sign, sign)
         turns = np.vstack([np.eye(K - 1), mean_a[others]])[:, _is_only_noise(moments)[1:]]
         covariance += turns @ turns.T  # its ratio is open
-        sure = np.sqrt(np.diagonal(covariance)[:-1]) < SURE_SD
+        sure = np.sqrt(np.diagonal(covariance)[:-1]) < SURE_SD * np.maximum(1.0, np.abs(ratio))
         for k, value in zip(np.array(others)[sure].tolist(), ratio[sure].tolist(), strict=True):
             if not 1.0 / MOST_RATIO < value < MOST_RATIO:
                 raise FleetError(
@@ -124,7 +125,8 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
 
 def _is_only_noise(moments: FleetMoments) -> Mask:
     """Return which of the K currents only noise moves: it changes from sample to sample, and not with the others."""
-    precision = np.linalg.pinv(moments.covariance[0, moments.inputs : -1, moments.inputs : -1])
+    covariance = moments.covariance[0, moments.inputs : -1, moments.inputs : -1]
+    precision = np.linalg.inv(covariance + RIDGE * np.trace(covariance) * np.eye(len(covariance)))
     diagonal = np.diagonal(precision)
     shared = precision[0] ** 2 / np.maximum(precision[0, 0] * diagonal, TINY)  # square of the partial correlation
     fast = moments.noise_bound_a2[0] >= MOST_NOISE * moments.variance_a2[0]
@@ -211,10 +213,9 @@ class _System:
             for j, law in enumerate(self.laws):
                 first, *others = self.places[j][law.order].tolist()
                 ratios, constant = slice(j * K, (j + 1) * K - 1), (j + 1) * K - 1
-                gain, log_ratio = np.exp(found[first]), found[first] - found[others]
-                ratio = np.exp(log_ratio)
+                gain, ratio = np.exp(found[first]), _possible(np.exp(found[first] - found[others]))
                 design[ratios, first], design[ratios, others] = ratio, -np.diag(ratio)
-                self.y[ratios] = law.value[:-1] - ratio + ratio * log_ratio
+                self.y[ratios] = law.value[:-1] - ratio + ratio * np.log(ratio)
                 design[constant, [S + s for s in others]] = ratio
                 design[constant, [first, 2 * S + j]] = gain * load.mean_a / scale_a, gain  # (1 + d_1) l
                 self.y[constant] = law.value[-1] + design[constant, first] * found[first]

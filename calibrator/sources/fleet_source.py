@@ -7,6 +7,7 @@ two folders of the same name, folders without logs beside them, and drives for w
 and the report names them.
 """
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -155,6 +156,7 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
             folders = storage.contents()[0]
             if whole := next((name for name in (DRIVES_FOLDER, LOGS_FOLDER) if name in folders), None):
                 storage = storage.folder(whole)
+                folders = storage.contents()[0]
             for url, logs, folder in _logs_in(storage, str(argument), problems):
                 if folder is not None and url == storage.url:
                     beside = logs
@@ -167,9 +169,9 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
             elif not is_found:
                 what = "no logs in it" if storage.is_local else "nothing is there, or no logs in it"
                 raise LogError(f"{argument}: {what}; {_EXPECTED}")
-            for empty in (f"{storage.url}/{name}" for name in storage.contents()[0] if is_found and name not in inside):
-                if not any(text.startswith((f"{empty}:", f"{empty}/")) for text in problems):
-                    problems.append(f"{empty}: no logs in it; {_EXPECTED}")
+            inside |= {re.split("[:/]", text.removeprefix(f"{storage.url}/"), maxsplit=1)[0] for text in problems}
+            if is_found and (empty := [name for name in folders if name not in inside]):
+                problems.append(f"{storage.url}: no logs in {few(empty)}; {_EXPECTED}")
             for entry in beside if is_found else ():
                 strays[f"{storage.url}/{entry.name}"] = (
                     f"{storage.url}/{entry.name}: lies beside folders with logs; move it into that of its vehicle, or "

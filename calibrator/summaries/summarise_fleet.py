@@ -170,7 +170,7 @@ def add_drives(
         If the store cannot be read or written.
     """
     report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
-    summarised = dict[str, tuple[str, ...]]()
+    summarised = dict[str, tuple[int, int]]()  # number of drives, and hash of their names, as names take memory
     outcomes = try_many_shown(
         partial(_read_record, store=store.identity, database=database),
         _tasks(store, fleet, owners),
@@ -193,16 +193,16 @@ def add_drives(
                 owners.add(record.vehicle, record.digests)
                 _report(record, report)
                 if not record.problem:
-                    summarised[record.vehicle] = record.drives
+                    summarised[record.vehicle] = len(record.drives), hash(record.drives)
     for bucket, vehicles in store.by_bucket(set().union(*owners.shared.values())).items():
         known = store.read(bucket, whole=False)
         copies = [copy for vehicle in vehicles for copy in owners.without_copies(known[vehicle])]
         store.append(bucket, copies)
         report.left_out |= {copy.vehicle: copy.problem for copy in copies}
         for copy in copies:
-            if summarised.get(copy.vehicle) == copy.drives:
+            if summarised.get(copy.vehicle) == (len(copy.drives), hash(copy.drives)):
                 del summarised[copy.vehicle]
-    report.vehicles, report.drives = len(summarised), sum(map(len, summarised.values()))
+    report.vehicles, report.drives = len(summarised), sum(number for number, _ in summarised.values())
     return report
 
 

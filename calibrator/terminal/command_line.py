@@ -91,7 +91,7 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
     """
     others, debug = split_debug(arguments)
     if "" in others:
-        say_error(f"{program}: an empty name; give the path of a folder, '.' for this one; see '{program} --help'")
+        say_error(f"{program}: an empty argument; give a value, such as '.' for this folder; see '{program} --help'")
         return WRONG_USE
     command = typer.main.get_command(app)
     for each in _all_commands(command):

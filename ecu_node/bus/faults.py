@@ -46,7 +46,7 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Whether it still keeps the node from correcting."""
 
     def __post_init__(self) -> None:
-        if self.reason not in Reason.__members__:
+        if self.reason not in Reason.__members__ or not Reason[self.reason]:
             raise ValueError(f"unknown reason {self.reason!r}")
 
 
@@ -138,12 +138,14 @@ class FaultMemory:
     def _latch_again(self) -> None:
         """Latch what was active when the node last ended, unless something else keeps it from correcting."""
         corrector = self._corrector
+        if corrector.reason or corrector.latched:
+            return
         for fault in self._faults:
-            is_of_set = fault.parameter_set in {None, corrector.parameter_set}
-            if fault.active and is_of_set and not (corrector.reason or corrector.latched):
+            if fault.active and fault.parameter_set in {None, corrector.parameter_set}:
                 corrector.latch(Reason[fault.reason], fault.branches)
                 self._before = corrector.latched, corrector.latched_branches
                 fault.parameter_set = corrector.parameter_set
+                return
 
     def look(self, now_s: float) -> None:
         """Record a change of what is latched since the last call, and see whether the memory was cleared."""

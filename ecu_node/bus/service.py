@@ -65,7 +65,7 @@ class Log:
         if self._lost:
             again, self._lost = f"{again} ({self._lost} lines before were lost: nobody read them)", 0
         # A log that is closed or gone, as when the journal is started anew, must not end the node.
-        with suppress(AttributeError, OSError):
+        with suppress(AttributeError, OSError, ValueError):
             sys.stderr.write(f"ecu-node: {printable(text)[:_LONGEST_LINE]}{again}\n")
             sys.stderr.flush()
 

@@ -252,20 +252,20 @@ static hv_result_t forward(const hv_layout_t *layout, const hv_calibration_t *ca
     const check_t check = check_of(message, payload, length, &received->expected);
     hv_result_t result = HV_SAME;
     judge(message, received, check);
+    for (size_t k = 0U; k < layout->branch_count; k++) {
+        if ((received->state == INVALID) && (layout->branches[k].voltage_message == number)) {
+            state->has_voltage[k] = false;
+        }
+    }
     if (!is_usable(check)) {
         result = message->has_branches ? HV_HELD_BACK : HV_SAME;
     } else if (calibration->layout == layout->digest) {
         for (size_t k = 0U; k < layout->branch_count; k++) { /* voltages first: a frame may have both */
             const hv_branch_t *const branch = &layout->branches[k];
-            if ((branch->voltage != NULL) && (branch->voltage_message == number)) {
-                if (received->state == INVALID) {
-                    state->has_voltage[k] = false;
-                } else if (is_present(branch->voltage, payload, length)) {
-                    state->voltage[k] = read_code(&branch->voltage->place, payload);
-                    state->has_voltage[k] = true;
-                } else {
-                    /* multiplexed: the last one counts */
-                }
+            if ((branch->voltage != NULL) && (branch->voltage_message == number) && (received->state != INVALID) &&
+                is_present(branch->voltage, payload, length)) {
+                state->voltage[k] = read_code(&branch->voltage->place, payload);
+                state->has_voltage[k] = true;
             }
         }
         for (size_t k = 0U; k < layout->branch_count; k++) {

@@ -221,7 +221,7 @@ class Source:
         if self.is_invalid:
             for branch in self.branches:
                 branch.spoil(now_s)
-            ways = self._find(0)  # as for an empty payload: nothing is read from it
+            ways = self.ways.get(0) or self._find(0)  # as for an empty payload: nothing is read from it
         for target, rewrite in ways.answers:
             made = rewrite(payload, target.data, now_s)
             if target.protection is not None:
@@ -270,6 +270,9 @@ class Source:
                 self._receiver.restart()
             self._silent_from_s = now_s + self._silence_s  # also for frames that fail, or a frozen counter would pass
             check = self._receiver.check(payload)
+            if self._receiver.state is _INVALID:  # other messages are corrected with these; their receivers cannot know
+                for part in self._others:
+                    part.spoil(now_s)
             if check is not _OK:
                 counters.corrupt += check is Check.CORRUPT
                 counters.repeated += check is Check.REPEATED
@@ -278,9 +281,6 @@ class Source:
                 if check > _LAST_USABLE:
                     return check
         self._frames.append((now_s, payload))
-        if self.is_invalid:  # other messages are corrected with these, and their receivers cannot know
-            for part in self._others:
-                part.spoil(now_s)
         for branch in ways.missing:
             branch.spoil(now_s)
             counters.short += 1

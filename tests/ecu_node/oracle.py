@@ -158,13 +158,13 @@ class Oracle:
         check = receiver.check(bytearray(data)) if receiver is not None else Check.OK
         codes, is_new = _codes(message, data), check <= Check.LOST
         is_invalid = receiver is not None and receiver.state is E2EState.INVALID
-        if is_new and self._voltage is not None and self._voltage[0] is message:
+        if self._voltage is not None and self._voltage[0] is message:
             net = self._voltage[1]  # it comes before the branches of the same frame
             if is_invalid:
                 self._volts = None
                 for item in self._branches:
                     item.lose_voltage()
-            elif net.name in codes:
+            elif is_new and net.name in codes:
                 is_value = Codes(net).is_value(codes[net.name])
                 self._volts = Codes(net).worth(codes[net.name]) if is_value else None
         for item in own if is_new else ():

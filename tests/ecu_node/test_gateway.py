@@ -116,9 +116,11 @@ def test_power_is_not_corrected_with_the_voltage_of_an_invalid_message(make_data
 
     assert [is_corrected(k, 0.1 * k) for k in range(4)] == [True] * 4
     found = [is_corrected(k, 0.1 * k, spoilt=bool(k % 2)) for k in range(4, 15)]
-    assert found == [True] * 8 + [False] * 3, "from the first frame after the fourth error of ten"
+    assert found == [True] * 7 + [False] * 4, "from the fourth error of ten on"
     after_silence = [is_corrected(k, 9.0 + 0.1 * k) for k in range(4)]
     assert after_silence == [False, False, True, True]
+    frozen = [is_corrected(3, 9.4 + 0.01 * k) for k in range(12)]
+    assert frozen == [True] * 9 + [False] * 3
 
 
 def test_gateway_refuses_a_named_code_within_the_range_of_a_branch(make_database: MakeDatabase) -> None:

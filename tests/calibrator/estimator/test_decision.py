@@ -101,8 +101,8 @@ def test_harm_on_two_drives_is_at_most_the_sum_of_both_and_0_without_a_correctio
 
 def explained(
     truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0, probability: float = 1.0
-) -> tuple[FaultModel, Draws, Array]:
-    """One model with its draws of a fleet, and their weights."""
+) -> tuple[FaultModel, Draws, list[tuple[Prior, Array]]]:
+    """One model with its draws of a fleet, and their weights by its only prior."""
     shared = np.zeros(2 * K + 1) if shared is None else shared
     centre = np.zeros(5 * K)
     centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
@@ -111,14 +111,14 @@ def explained(
     draws = draw_explanations(fit_explanations(evidence, prior.log_supports + 1.0, log_load), evidence)
     spread = Spread(mean=centre, covariance=np.zeros((5 * K, 5 * K)), dispersion=np.ones(K), shared=shared)
     model = FaultModel(probability=probability, spread=spread, priors=((1.0, prior),))
-    return model, draws, weigh(draws, prior)[0]
+    return model, draws, [(prior, weigh(draws, prior)[0])]
 
 
 def test_posterior_mean_is_averaged_over_fault_models_by_their_probabilities() -> None:
     truth = random_faults(3, vehicles=2, branches=K)
     shared = np.array([0.0, 0.01, 0.0, 0.02, 0.0])
 
-    def models(first: float, second: float) -> list[tuple[FaultModel, Draws, Array]]:
+    def models(first: float, second: float) -> list[tuple[FaultModel, Draws, list[tuple[Prior, Array]]]]:
         prior = first_prior(K)
         return [explained(truth, prior, probability=first), explained(truth, prior, shared=shared, probability=second)]
 
@@ -145,9 +145,9 @@ def test_estimated_offset_includes_the_group_constant_only_if_it_is_an_offset_of
     truth = no_faults(1, K)
     truth.offset_a[0, 0], truth.drift[0, 0] = (0.18 if of_sensor else 0.15), 0.1
     prior, shared = group_prior(), np.append(np.zeros(4), of_sensor)
-    model, draws, weight = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
+    model, draws, [(_, weight)] = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
     weight[..., 0] = 0.0  # only draws in which the vehicle belongs to the group
-    found = posterior_points([(model, draws, weight / weight.sum())])[0]
+    found = posterior_points([(model, draws, [(prior, weight / weight.sum())])])[0]
     np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)
 
 
@@ -272,15 +272,23 @@ def test_vehicle_of_which_no_row_is_known_has_a_confidence_of_0() -> None:
     assert found.confidence[1] == 0.0
 
 
+NARROW, WIDE = (
+    replace(first_prior(3), offset=Slab(low=low, high=high, tail=1e-3)) for low, high in ((0.005, 0.2), (0.05, 0.6))
+)
+
+
 @pytest.mark.parametrize("offset", [0.0, 0.12])
-def test_current_moved_by_the_hardware_counts_alike_between_any_two_branches(offset: float) -> None:
+@pytest.mark.parametrize("priors", [((1.0, first_prior(3)),), ((0.5, NARROW), (0.5, WIDE))], ids=["one prior", "two"])
+def test_current_moved_by_the_hardware_counts_alike_between_any_two_branches(
+    priors: tuple[tuple[float, Prior], ...], offset: float
+) -> None:
     """The parameters have one fault for it only if one of the two branches is the last."""
     pairs = [(0, 1), (1, 2), (0, 2)]
     faults = no_faults(len(pairs), 3)
     for j, (p, r) in enumerate(pairs):
         faults.hardware_offset_a[j, [p, r]], faults.offset_a[j, p] = (0.08, -0.08), offset
     rows = rows_of(faults, noise=0.0)
-    found = estimate_rows(rows, [model_of_equals(3)], feed=1, **moments(rows))
+    found = estimate_rows(rows, [replace(model_of_equals(3), priors=priors)], feed=1, **moments(rows))
     assert found.hardware_probability.min() > (0.3 if offset else 0.99)
     np.testing.assert_allclose(found.hardware_probability, found.hardware_probability[1], atol=0.05)
     np.testing.assert_allclose(found.confidence, found.confidence[1], atol=0.05)

@@ -153,7 +153,7 @@ def test_small_fleet_is_calibrated_without_worker_processes(
     (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
     (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
     (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
-    (("--since", ""), 2, "an empty name; give the path of a folder"),
+    (("--since", ""), 2, "an empty argument; give a value"),
     (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
     (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
 ])  # fmt: skip
@@ -175,7 +175,7 @@ def test_empty_store_or_name_and_folder_with_drives_and_summaries_are_refused(
     for place, code, message in (
         (tmp_path / "both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them"),
         (tmp_path / "empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
-        ("", 2, "an empty name; give the path"),
+        ("", 2, "an empty argument; give a value"),
     ):
         done = calibrator(*words(str(place), tmp_path / "out"))
         assert (done.returncode, message in done.stderr.splitlines()[-1]) == (code, True), done.stderr

@@ -39,7 +39,7 @@ def make(*paths: Path) -> None:
     (["V1/größe.log", "V2/a.log", "V2/a.blf", "V3/a.log"], ["."], ["V3/a"],
      ["größe.log: the file's name, which names the drive, 'größe' cannot be used", "vehicle V2: drive a is in"]),
     (["V1/a.log", "V2/notes.md", "V3/b/c.log", ".git/x", "notes.md"], ["."], ["V1/a", "b/c"],
-     ["{}/V2: no logs in it; expected .log, .asc"]),
+     ["{}: no logs in V2; expected .log, .asc"]),
     (["V1/a.log", "empty/notes.md"], ["nothing", "empty", "V1"], ["V1/a"],
      ["nothing: no such file or folder", "empty: no logs in it; expected .log, .asc"]),
 ])  # fmt: skip
