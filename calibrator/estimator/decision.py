@@ -150,10 +150,8 @@ def posterior_points(
         kinds = [(j, weight, part)]
         for own, log_ratio, twin in _twins(draws, [prior for prior, _ in by_prior], (j, q, g), omega, part, read=read):
             kinds.append((j[own], weight[:, own] * np.exp(np.minimum(log_ratio, MOST_LOG)), twin))
-        total = np.zeros((len(by_prior), len(weights)))
-        for vehicles, by, _ in kinds:
-            total += [np.bincount(vehicles, each, minlength=len(weights)) for each in by]
-        factor = np.array([each.sum(axis=(1, 2, 3)) for _, each in by_prior]) / np.maximum(total, TINY)
+        sums = [[np.bincount(vehicles, each, minlength=len(weights)) for each in by] for vehicles, by, _ in kinds]
+        factor = np.array(sums[0]) / np.maximum(np.sum(sums, axis=0), TINY)
         for n, (vehicles, by, points) in enumerate(kinds):
             share = model.probability * np.sum(by * factor[:, vehicles], axis=0)
             number = (points.explanation + n * weights.shape[1] * weights.shape[3]) * len(models) + i
