@@ -117,7 +117,7 @@ def posterior_points(
     Each model comes with the draws of the N vehicles under it, M from each of Q explanations, and with their weights by
     each of its priors, as :func:`.weigh` returns them, times the share of that prior: shape (N, Q, M, 1 + g), for no
     group and for each of the g groups of the model. ``read`` of shape (N, K) says which offsets were read directly:
-    these have no twins, see :func:`_twins`.
+    these have no twins, see (M17a).
     """
     centres, parts = group_centres([model for model, _, _ in models]), []
     for i, (model, draws, by_prior) in enumerate(models):
