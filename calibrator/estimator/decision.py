@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces
-from calibrator.estimator.posterior import OFFSET, Draws, FaultModel, explain, weigh
+from calibrator.estimator.evidence import TINY, EvidenceRows, ParameterPlaces
+from calibrator.estimator.posterior import OFFSET, Draws, FaultModel, Integers, explain, weigh
 from calibrator.estimator.prior import GRID, Prior
 from calibrator.score import TOLERANCE
 from ecu_node.parameters import Explanation, SensorFinding
@@ -42,9 +42,10 @@ __all__ = [
     "recovery_probability",
 ]
 
-Integers = NDArray[np.int64]
-
-TINY, ROUNDING, MOST_LOG = np.finfo(float).tiny, 1e-12, 500.0
+ROUNDING = 1e-12
+"""Faults below this are rounding of differences. [1]"""
+MOST_LOG = 500.0
+"""Largest logarithm of a ratio of weights: its exponential is still a number. [1]"""
 NEGLIGIBLE = 1e-8
 """Weight of a draw below which it is left out. [1]"""
 CANDIDATES, LEAST_CANDIDATE = 8, 0.01
@@ -473,13 +474,8 @@ def estimate_rows(
         explained.append((model, draws, [(prior, share * weigh(draws, prior)[0]) for share, prior in model.priors]))
     smallest = np.array([models[0].prior.gain.smallest, models[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
-    fault, hardware, points, supports = (
-        np.zeros((N, K)),
-        np.zeros((N, 1 + K)),
-        posterior_points(explained, rows.known[:, rows.places.offset_reads]),
-        [],
-    )
-    hardware_probability = np.zeros(N)
+    fault, hardware, hardware_probability, supports = np.zeros((N, K)), np.zeros((N, 1 + K)), np.zeros(N), []
+    points = posterior_points(explained, rows.known[:, rows.places.offset_reads])
     for j, found in enumerate(points):
         estimate[j], confidence[j] = best_estimate(found, smallest)
         # Each point has true currents of its own, i = (i_m - o) / (1 + d) on the vehicle's drives, and on the usual one

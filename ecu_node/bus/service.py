@@ -50,15 +50,15 @@ class Log:
     def _say(self, text: str) -> None:
         now_s = time.monotonic()
         since_s, times = self._said.pop(text, (now_s, 0))
-        held_back = 0
+        unsaid = 0
         if now_s - since_s >= _WHILE_S:
-            since_s, times, held_back = now_s, 0, max(times - _SAME_LINE_TIMES, 0)
+            since_s, times, unsaid = now_s, 0, max(times - _SAME_LINE_TIMES, 0)
         if len(self._said) >= _REMEMBERED_LINES:
             self._said.clear()
         self._said[text] = since_s, times + 1
         if times >= _SAME_LINE_TIMES:
             return
-        again = f" (and {held_back} times before)" if held_back else ""
+        again = f" (and {unsaid} times before)" if unsaid else ""
         if not _takes_a_line():
             self._lost += 1
             return

@@ -133,7 +133,8 @@ def read_state(folder: Path) -> VehicleState:
     except UnsuitableFileError as error:
         raise TrustError(Reason.MALFORMED_PARAMETERS, f"{path}: {error}; {_REPLACE}") from None
     except OSError as error:
-        raise TrustError(Reason.NO_PARAMETERS, f"{path}: cannot read the state: {error.strerror}; {_FOLDER}") from None
+        advice = f"; {_FOLDER}" if error.errno == errno.ENOTDIR else ""
+        raise TrustError(Reason.NO_PARAMETERS, f"{path}: cannot read the state: {error.strerror}{advice}") from None
     digest, _, document = content.partition(b"\n")
     try:
         if digest != hashlib.sha256(document).hexdigest().encode():
