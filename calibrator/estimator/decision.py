@@ -12,17 +12,16 @@ with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its
 Equations (M18) and (M19) are those of docs/method.md.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, starmap
+from itertools import starmap
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.evidence import TINY, EvidenceRows, ParameterPlaces
-from calibrator.estimator.posterior import OFFSET, Draws, FaultModel, Integers, explain, weigh
-from calibrator.estimator.prior import GRID, Prior
+from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces
+from calibrator.estimator.posterior import Draws, FaultModel, explain, weigh
 from calibrator.score import TOLERANCE
 from ecu_node.parameters import Explanation, SensorFinding
 
@@ -42,10 +41,6 @@ __all__ = [
     "recovery_probability",
 ]
 
-ROUNDING = 1e-12
-"""Faults below this are rounding of differences. [1]"""
-MOST_LOG = 500.0
-"""Largest logarithm of a ratio of weights: its exponential is still a number. [1]"""
 NEGLIGIBLE = 1e-8
 """Weight of a draw below which it is left out. [1]"""
 CANDIDATES, LEAST_CANDIDATE = 8, 0.01
@@ -110,19 +105,14 @@ def group_centres(models: Sequence[FaultModel]) -> Array:
     return max((model.prior.group_centre for model in models), key=len)
 
 
-def posterior_points(
-    models: Sequence[tuple[FaultModel, Draws, Sequence[tuple[Prior, Array]]]], read: Mask | None = None
-) -> list[FleetPoints]:
+def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]]) -> list[FleetPoints]:
     """Return the posterior of each of N vehicles as weighted points, over all fault models that explain their fleet.
 
-    Each model comes with the draws of the N vehicles under it, M from each of Q explanations, and with their weights by
-    each of its priors, as :func:`.weigh` returns them, times the share of that prior: shape (N, Q, M, 1 + g), for no
-    group and for each of the g groups of the model. ``read`` of shape (N, K) says which offsets were read directly:
-    these have no twins, see (M17a).
+    Each model comes with the draws of the N vehicles under it, M from each of Q explanations, and with their weights as
+    :func:`.weigh` returns them: shape (N, Q, M, 1 + g), for no group and for each of the g groups of the model.
     """
     centres, parts = group_centres([model for model, _, _ in models]), []
-    for i, (model, draws, by_prior) in enumerate(models):
-        weights = np.sum([each for _, each in by_prior], axis=0)
+    for i, (model, draws, weights) in enumerate(models):
         K = draws.values.shape[3] // 3
         at, shared, feed, fitted = ParameterPlaces(K), draws.shared, draws.feed, draws.fits.theta
         j, q, m, g = np.nonzero(weights > NEGLIGIBLE)
@@ -141,90 +131,18 @@ def posterior_points(
         same = [1 + np.argmin(np.abs(centres - centre)) for centre in model.prior.group_centre]
         part = FleetPoints(
             faults=np.hstack([gain - 1.0, np.where(cancel, 0.0, total)]),
-            weight=weights[j, q, m, g],
-            explanation=q * weights.shape[3] + g,
+            weight=weights[j, q, m, g] * model.probability,
+            explanation=(q * weights.shape[3] + g) * len(models) + i,
             hardware=np.column_stack([np.expm1(fitted[j, q, at.eta]), hardware, -hardware.sum(axis=1)]),
             load=np.where(g == 0, x[:, at.load], 0.0),
             group=np.array([0, *same])[g],
         )
-        weight = np.array([each[j, q, m, g] for _, each in by_prior])
-        kinds = [(j, weight, part)]
-        for own, log_ratio, twin in _twins(draws, [prior for prior, _ in by_prior], (j, q, g), omega, part, read=read):
-            kinds.append((j[own], weight[:, own] * np.exp(np.minimum(log_ratio, MOST_LOG)), twin))
-        sums = [[np.bincount(vehicles, each, minlength=len(weights)) for each in by] for vehicles, by, _ in kinds]
-        factor = np.array(sums[0]) / np.maximum(np.sum(sums, axis=0), TINY)
-        for n, (vehicles, by, points) in enumerate(kinds):
-            share = model.probability * np.sum(by * factor[:, vehicles], axis=0)
-            number = (points.explanation + n * weights.shape[1] * weights.shape[3]) * len(models) + i
-            parts.append((vehicles, *vars(replace(points, weight=share, explanation=number)).values()))
+        parts.append((j, *vars(part).values()))
     vehicle, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(vehicle, kind="stable")
-    ends = np.cumsum(np.bincount(vehicle, minlength=len(models[0][1].values)))[:-1]
+    ends = np.cumsum(np.bincount(vehicle, minlength=len(models[0][2])))[:-1]
     found = starmap(FleetPoints, zip(*(np.split(column[order], ends) for column in columns), strict=True))
     return [replace(each, explanation=np.unique(each.explanation, return_inverse=True)[1]) for each in found]
-
-
-def _twins(
-    draws: Draws,
-    priors: Sequence[Prior],
-    places: tuple[Integers, Integers, Integers],
-    omega: Array,
-    points: FleetPoints,
-    *,
-    read: Mask | None,
-) -> Iterator[tuple[Integers, Array, FleetPoints]]:
-    """Yield points with a current moved between two branches by the hardware, for offsets of both their sensors.
-
-    Offsets x and y of the sensors p and r (as seen in true currents) have the same rows as an offset x + y of p beside
-    a hardware offset y in r and -y in p; if x + y may be zero, also as that hardware offset alone. The parameters of a
-    support have one fault for it only if either branch is the last, so for all other pairs these points are added,
-    (M17a) of docs/method.md. ``places`` are vehicle, explanation and group of the n points, ``omega`` (n, K) their
-    offsets as seen in true currents. Each of the kinds, as many for any fleet, comes with the numbers of the points
-    that it is made of, and the logarithm of its weight over theirs by each of R priors, shape (R, number of points).
-    """
-    j, q, g = places
-    fits, K, first = draws.fits, omega.shape[1], ParameterPlaces(omega.shape[1]).offset(0)
-    hardware, sensor = fits.hardware[j, q], fits.sensor[j, q]
-    for p, r in permutations(range(K - 1), 2):
-        both = fits.support[j, q, first + p] & fits.support[j, q, first + r] & (hardware < K)
-        both &= (g == 0) | (draws.feed not in {p, r})
-        if read is not None:
-            both &= ~(read[j, p] | read[j, r])
-        i = np.flatnonzero(both)
-        gain_p, gain_r, at_p, at_r = 1.0 + points.faults[i, p], 1.0 + points.faults[i, r], omega[i, p], omega[i, r]
-        # x + y has a normal distribution in the draws of an explanation; where it is zero, y is what regression leaves
-        one, back = np.unique(j[i] * fits.theta.shape[1] + q[i], return_inverse=True)
-        (of_p, of_r), (root_p, root_r) = (
-            [each.reshape(-1, *each.shape[2:])[one, first + k] for k in (p, r)] for each in (fits.theta, fits.root)
-        )
-        of_sum, root = of_p + of_r, root_p + root_r
-        variance = np.maximum(np.sum(root**2, axis=1), TINY)
-        share = np.sum(root * root_r, axis=1) / variance
-        at_zero = -0.5 * (of_sum**2 / variance + np.log(2.0 * np.pi * variance))
-        for alone in (False, True) if p < r else (False,):
-            left, moved, fitted = at_p + at_r, at_r, of_r[back]  # offset that is left in p
-            if alone:
-                left, moved, fitted = np.zeros(len(i)), at_r - share[back] * left, fitted - (share * of_sum)[back]
-            log_ratio = np.empty((len(priors), len(i)))
-            for n, prior in enumerate(priors):
-                before = prior.log_supports[hardware[i], sensor[i]] + np.log(gain_p * gain_r)
-                before += _log_density(prior, at_p * gain_p) + _log_density(prior, at_r * gain_r)
-                after = prior.log_supports[hardware[i] + 1, sensor[i] - 1 - alone] + _log_density(prior, moved)
-                of_left = np.log(gain_p) + _log_density(prior, left * gain_p)
-                log_ratio[n] = after - before + (np.log(2.0) + at_zero[back] if alone else of_left)
-            columns = {name: values[i] for name, values in vars(points).items()}
-            columns["faults"][:, K + p] += (left - at_p) * gain_p
-            columns["faults"][:, K + r] -= at_r * gain_r
-            columns["faults"][np.abs(columns["faults"]) < ROUNDING] = 0.0
-            columns["hardware"][:, 1 + p] -= fitted
-            columns["hardware"][:, 1 + r] += fitted
-            yield i, log_ratio, FleetPoints(**columns)
-
-
-def _log_density(prior: Prior, offset: Array) -> Array:
-    """Return the logarithm of the prior's density of an offset that is there. [over full scale]"""
-    nearest = np.searchsorted(np.sqrt(GRID[1:] * GRID[:-1]), np.abs(offset))
-    return np.asarray(prior.log_density[OFFSET, nearest])
 
 
 def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
@@ -471,11 +389,13 @@ def estimate_rows(
     explained = []
     for model in models:
         draws = explain(rows, model, feed=feed)
-        explained.append((model, draws, [(prior, share * weigh(draws, prior)[0]) for share, prior in model.priors]))
+        explained.append(
+            (model, draws, np.sum([share * weigh(draws, prior)[0] for share, prior in model.priors], axis=0))
+        )
     smallest = np.array([models[0].prior.gain.smallest, models[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
-    fault, hardware, hardware_probability, supports = np.zeros((N, K)), np.zeros((N, 1 + K)), np.zeros(N), []
-    points = posterior_points(explained, rows.known[:, rows.places.offset_reads])
+    fault, hardware, points, supports = np.zeros((N, K)), np.zeros((N, 1 + K)), posterior_points(explained), []
+    hardware_probability = np.zeros(N)
     for j, found in enumerate(points):
         estimate[j], confidence[j] = best_estimate(found, smallest)
         # Each point has true currents of its own, i = (i_m - o) / (1 + d) on the vehicle's drives, and on the usual one

@@ -31,8 +31,9 @@ address rows and parameters by the numbers above.
 
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import permutations
 from math import exp, expm1, log
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +41,8 @@ from scipy.stats import norm, qmc
 
 from calibrator.compiled import compiled, inner
 from calibrator.drive import Array, Mask
-from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces, RowPlaces
-from calibrator.estimator.prior import GRID, Prior
+from calibrator.estimator.evidence import TINY, EvidenceRows, ParameterPlaces, RowPlaces
+from calibrator.estimator.prior import GRID, TAIL_RANGE, Prior
 
 __all__ = [
     "DRAWS",
@@ -94,6 +95,8 @@ NO_SIZE = len(GRID)
 """Index that stands for the size of a parameter that is zero; other sizes have an index of ``GRID``."""
 NEGLIGIBLE = 1e-15
 """Weight of a draw below which no density of the sizes makes it matter. [1]"""
+BETWEEN = np.sqrt(GRID[1:] * GRID[:-1])
+"""Sizes between those of ``GRID``."""
 LOG_FIRST, LOG_STEP = float(np.log(GRID[0])), float(np.log(GRID[1] / GRID[0]))
 LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
 
@@ -519,6 +522,99 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
                 base[j, q, m] = weight
 
 
+def _with_moved_currents(draws: Draws, log_prior: Array, read: Mask) -> Draws:
+    """Add the explanations in which the hardware moves a current between two branches, none of them the last.
+
+    Offsets x and y of the sensors p and r (as seen in true currents) have the same rows as an offset x + y of p beside
+    a hardware offset y in r and -y in p; if x + y may be zero, also as that hardware offset alone. The parameters of a
+    support have one fault for it only if either branch is the last, so these explanations are made from those with
+    offsets of both sensors, (M17a) of docs/method.md. ``theta`` and ``values`` have both hardware offsets; ``support``
+    and ``place`` have one, as they are one fault. ``log_prior`` is that of :func:`fit_explanations`; ``read`` (N, K)
+    says which offsets were read directly: a reading tells the two apart.
+    """
+    fits, free = draws.fits, ~read
+    least = (fits.log_evidence + log_prior[fits.hardware, fits.sensor]).max(axis=1) - MARGIN
+    found = [
+        _moved_current(draws, log_prior, least, free[:, p] & free[:, r], p, r, alone=alone)
+        for p, r in permutations(range(read.shape[1] - 1), 2)
+        for alone in ((False, True) if p < r else (False,))
+    ]
+    if not found:
+        return draws
+    vehicle = np.concatenate([j for j, _ in found])
+    order, more = np.argsort(vehicle, kind="stable"), np.bincount(vehicle, minlength=len(read))
+    number = fits.number + more
+    place = np.repeat(fits.number - np.cumsum(more) + more, more) + np.arange(len(vehicle))  # behind those that are
+    extended: dict[str, Any] = {}
+    for name, values in _by_explanation(draws).items():
+        longer = np.zeros((len(values), max(number.max(), values.shape[1]), *values.shape[2:]), values.dtype)
+        longer[:, : values.shape[1]] = values
+        longer[vehicle[order], place] = np.concatenate([new[name] for _, new in found])[order]
+        extended[name] = longer
+    values, place, base = (extended.pop(name) for name in ("values", "place", "base"))
+    return draws._replace(fits=Fits(number=number, **extended), values=values, place=place, base=base)
+
+
+def _by_explanation(draws: Draws) -> dict[str, NDArray[Any]]:
+    """Return the arrays of draws and of their fits that have an entry for each explanation, shape (N, Q, ...)."""
+    of_fits = {name: values for name, values in draws.fits._asdict().items() if name != "number"}
+    return {**of_fits, "values": draws.values, "place": draws.place, "base": draws.base}
+
+
+def _moved_current(
+    draws: Draws, log_prior: Array, least: Array, free: Mask, p: int, r: int, *, alone: bool
+) -> tuple[Integers, dict[str, NDArray[Any]]]:
+    """Make the explanations in which a current is moved from branch p to r, ``alone`` or beside an offset of sensor p.
+
+    They are made for vehicles that are ``free`` (N,), if their rough log weight is above ``least`` (N,). Returned are
+    the numbers of the vehicles of n explanations (n,), and what :func:`_by_explanation` does, shape (n, ...).
+    """
+    fits, K = draws.fits, draws.values.shape[3] // 3
+    offset_p, offset_r, hardware_p, hardware_r = 2 * K + p, 2 * K + r, K + 1 + p, K + 1 + r
+    on = np.moveaxis(fits.support, 2, 0)
+    both = on[offset_p] & on[offset_r] & ~(on[hardware_p] & on[hardware_r]) & (fits.hardware < K)
+    j, q = np.nonzero(both & free[:, None])
+    log_evidence, share = fits.log_evidence[j, q], np.zeros(len(j))
+    if alone:  # x + y is normal in the draws; where it is zero, y is what regression on it leaves
+        root = fits.root[j, q, offset_p] + fits.root[j, q, offset_r]
+        variance = np.maximum(np.sum(root**2, axis=1), TINY)
+        share = np.sum(root * fits.root[j, q, offset_r], axis=1) / variance
+        of_sum = fits.theta[j, q, offset_p] + fits.theta[j, q, offset_r]
+        log_evidence = log_evidence - 0.5 * (of_sum**2 / variance + np.log(variance / WIDE_SD**2))
+    hardware, sensor = fits.hardware[j, q] + 1, fits.sensor[j, q] - 1 - alone
+    n = np.flatnonzero(log_evidence + log_prior[hardware, sensor] > least[j])
+    j, q, share, log_evidence = j[n], q[n], share[n, None], log_evidence[n]
+    new = {name: values[j, q] for name, values in _by_explanation(draws).items()}
+    new["base"] += (log_evidence - new["log_evidence"])[:, None]
+    new |= {"hardware": hardware[n], "sensor": sensor[n], "log_evidence": log_evidence}
+
+    def move(x: Array) -> tuple[Array, Array]:
+        """Move the current in parameters x (n, P, ...); return the offset that is left in p, and what is moved."""
+        left = x[:, offset_p] + x[:, offset_r]
+        moved = x[:, offset_r] - share * left
+        x[:, offset_p] = left = 0.0 * left if alone else left
+        x[:, offset_r] = 0.0
+        x[:, hardware_p] -= moved
+        x[:, hardware_r] += moved
+        return left, moved
+
+    gain_p, gain_r = (np.exp(new["values"][:, :, 1 + k] + draws.shared[K + k]) for k in (p, r))
+    for offset, gain in ((offset_p, gain_p), (offset_r, gain_r)):  # without one it is two faults equal by chance
+        new["base"][np.abs(new["values"][:, :, offset] * gain) < TAIL_RANGE[0]] = -np.inf
+    move(new["theta"][:, :, None])
+    move(new["root"])
+    left, moved = move(np.swapaxes(new["values"], 1, 2))
+    new["base"] -= np.log(gain_r)  # sizes of offsets are those of measured currents, of the hardware those of true ones
+    if alone:  # one sign less; and the wide Gaussian of the sum is taken out
+        new["base"] += log(2.0) - log(WIDE_SD) - LOG_ROOT_TAU - np.log(gain_p)
+    slot = np.arange(len(j)), np.where(new["support"][:, hardware_r], hardware_p, hardware_r)
+    support, place = new["support"], np.swapaxes(new["place"], 1, 2)
+    support[:, offset_p], support[:, offset_r], support[slot] = not alone, False, True
+    place[:, offset_p] = NO_SIZE if alone else np.searchsorted(BETWEEN, np.abs(left * gain_p))
+    place[:, offset_r], place[slot] = NO_SIZE, np.searchsorted(BETWEEN, np.abs(moved))
+    return j, new
+
+
 @inner
 def _terms(
     draws: Draws, prior: "_Tables", j: int, q: int, m: int, places: Integers, kinds: Integers
@@ -779,7 +875,7 @@ def explain(rows: EvidenceRows, model: FaultModel, *, feed: int) -> Draws:
     picked = (np.arange(len(rows)), best)
     free = np.maximum(rows.known.sum(axis=1) - fits.support[picked].sum(axis=1), 1.0)
     bad = fits.chi2[picked] > free + MISFIT_SD * np.sqrt(2.0 * free)
-    if not bad.any():
-        return draws
-    wider = (fits.chi2[picked] / free)[:, None, None]
-    return fitted(np.where(bad[:, None, None], wider, 1.0) * covariance)
+    if bad.any():
+        wider = (fits.chi2[picked] / free)[:, None, None]
+        draws = fitted(np.where(bad[:, None, None], wider, 1.0) * covariance)
+    return _with_moved_currents(draws, rough, rows.known[:, rows.places.offset_reads])

@@ -101,8 +101,8 @@ def test_harm_on_two_drives_is_at_most_the_sum_of_both_and_0_without_a_correctio
 
 def explained(
     truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0, probability: float = 1.0
-) -> tuple[FaultModel, Draws, list[tuple[Prior, Array]]]:
-    """One model with its draws of a fleet, and their weights by its only prior."""
+) -> tuple[FaultModel, Draws, Array]:
+    """One model with its draws of a fleet, and their weights."""
     shared = np.zeros(2 * K + 1) if shared is None else shared
     centre = np.zeros(5 * K)
     centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
@@ -111,14 +111,14 @@ def explained(
     draws = draw_explanations(fit_explanations(evidence, prior.log_supports + 1.0, log_load), evidence)
     spread = Spread(mean=centre, covariance=np.zeros((5 * K, 5 * K)), dispersion=np.ones(K), shared=shared)
     model = FaultModel(probability=probability, spread=spread, priors=((1.0, prior),))
-    return model, draws, [(prior, weigh(draws, prior)[0])]
+    return model, draws, weigh(draws, prior)[0]
 
 
 def test_posterior_mean_is_averaged_over_fault_models_by_their_probabilities() -> None:
     truth = random_faults(3, vehicles=2, branches=K)
     shared = np.array([0.0, 0.01, 0.0, 0.02, 0.0])
 
-    def models(first: float, second: float) -> list[tuple[FaultModel, Draws, list[tuple[Prior, Array]]]]:
+    def models(first: float, second: float) -> list[tuple[FaultModel, Draws, Array]]:
         prior = first_prior(K)
         return [explained(truth, prior, probability=first), explained(truth, prior, shared=shared, probability=second)]
 
@@ -145,9 +145,9 @@ def test_estimated_offset_includes_the_group_constant_only_if_it_is_an_offset_of
     truth = no_faults(1, K)
     truth.offset_a[0, 0], truth.drift[0, 0] = (0.18 if of_sensor else 0.15), 0.1
     prior, shared = group_prior(), np.append(np.zeros(4), of_sensor)
-    model, draws, [(_, weight)] = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
+    model, draws, weight = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
     weight[..., 0] = 0.0  # only draws in which the vehicle belongs to the group
-    found = posterior_points([(model, draws, [(prior, weight / weight.sum())])])[0]
+    found = posterior_points([(model, draws, weight / weight.sum())])[0]
     np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)
 
 
