@@ -34,7 +34,7 @@ def test_recorded_samples_obey_the_fault_model_within_noise_and_quantisation(fle
     assert vehicles.unmeasured_a.std() > 0.3
 
 
-def test_default_recovers_recorded_vehicles_that_defeat_the_published_method(fleet: RecordedFleet) -> None:
+def test_default_method_recovers_recorded_vehicles_that_defeat_the_published_method(fleet: RecordedFleet) -> None:
     trial = recorded_trial(fleet, RecordedCase(), 0)
     default, published = (judge(m.estimate(trial), trial) for m in (POSTERIOR, PERFECT))
     assert default["recovery_rate"].mean() >= 0.9
