@@ -128,7 +128,7 @@ class Candidate:
         return peak_of(self.good)
 
     def at(self, time_s: Array) -> Array:
-        """Return the recording at given instants, interpolated between good values; NaN if it has none."""
+        """Return the values (T,) at instants `time_s` (T,), interpolated between good ones; NaN if there is none."""
         if self.channel is None or not len(self.good):
             return np.full(len(time_s), np.nan)
         return np.interp(time_s, self.channel.time_s[self.channel.good], self.good)

@@ -138,7 +138,7 @@ def test_gain_error_beyond_its_uncertainty_is_found_from_an_alternating_current(
     assert junction.watch.verdict == verdict
 
 
-def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_named_after_it() -> None:
+def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_also_named() -> None:
     """The heater is first heard after a second."""
 
     def noisy(time_s: float) -> dict[str, float]:
@@ -175,7 +175,7 @@ def test_current_that_never_changes_is_stuck_unless_it_is_small(
 @pytest.mark.parametrize(
     ("jump_a", "period_s", "looks"), [(50.0, 1 / 32, 3), (50.0, 1 / 128, 5), (-21.0, 1 / 32, 3), (19.0, 1 / 32, None)]
 )
-def test_jump_lasts_for_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
+def test_jump_counts_if_it_lasts_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
     jump_a: float, period_s: float, looks: int | None
 ) -> None:
     junction = Watched(corrected_sd_a=1.0)

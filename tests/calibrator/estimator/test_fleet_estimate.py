@@ -262,7 +262,7 @@ def test_load_is_estimated_from_the_fleet_or_taken_as_declared() -> None:
     assert not estimate_vehicles(summaries, declared).corrected.any()
 
 
-def test_expected_share_and_known_distribution_of_the_faults_are_used() -> None:
+def test_expected_share_of_faulty_vehicles_and_known_prior_replace_learnt_ones() -> None:
     summaries, counts = drives("drift"), np.zeros((3, 5))
     expected = learned(summaries, expected_faults=0.4)
     assert expected.models[0].prior.counts[:, 1:].sum() == pytest.approx(0.4, abs=0.02)

@@ -133,7 +133,7 @@ def test_tables_compare_the_paper_with_methods_and_explain_columns(snr: Experime
         assert not any(absent in text for absent in ("confidence", "calibration error", "delays", "failed:"))
 
 
-def test_rows_called_all_together_pool_the_trials_of_all_settings(snr: ExperimentResult) -> None:
+def test_row_all_together_pools_the_trials_of_all_settings(snr: ExperimentResult) -> None:
     rows = snr.figures[snr.figures["method"] == POSTERIOR.name].set_index(["series", "figure"])
     rates = [snr.value("recovery_rate", x=x, method=POSTERIOR.name) for x in (10.0, 20.0)]
     assert rows.loc[(ALL, "recovery_rate"), "value"] == pytest.approx(np.mean(rates))
