@@ -83,7 +83,7 @@ class Faults:
 
 
 def true_currents(i_s: Array, faults: Faults) -> Array:
-    """Currents that flow in one vehicle, equation (11) of [1]_.
+    """Return the currents that flow in one vehicle, equation (11) of [1]_.
 
     Parameters
     ----------
@@ -101,12 +101,12 @@ def true_currents(i_s: Array, faults: Faults) -> Array:
 
 
 def measured_currents(i: Array, faults: Faults) -> Array:
-    """What the sensors of one vehicle show for its true currents, equation (13) of [1]_; shapes as in true_currents."""
+    """Return what the sensors of one vehicle show for its true currents i, equation (13) of [1]_; both (T, K). [A]"""
     return (1.0 + faults.drift) * i + faults.offset_a
 
 
 def slopes_and_intercepts(faults: Faults) -> tuple[Array, Array]:
-    """Slopes a and intercepts b of the measured over the ideal currents, equation (15) of [1]_.
+    """Return slopes a and intercepts b of the measured over the ideal currents, equation (15) of [1]_.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ TOLERANCE = 0.10
 def recovered(
     estimate: Faults, truth: Faults, *, full_scale_a: float, smallest_fault: float, tolerance: float = TOLERANCE
 ) -> Mask:
-    """Whether each vehicle's sensor faults were found.
+    """Check whether each vehicle's sensor faults were found.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def recovered(
 
 
 def f2_score(predicted: Mask, actual: Mask) -> float:
-    """f_beta score with beta = 2, footnote 7 of [1]_.
+    """Return the f_beta score with beta = 2, footnote 7 of [1]_.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class UnseenDrive:
         return cls(i, i2, d * i + o, d**2 * i2 + 2.0 * d * o * i + o**2, d * i2 + o * i)
 
     def rms_a(self, drift: Array, offset_a: Array) -> Array:
-        """Root mean square error of the currents corrected with drifts and offsets, all of shape (N, K). [A]
+        """Return the RMS error of the currents corrected with drifts and offsets, all of shape (N, K). [A]
 
         (i_m - o) / (1 + d) - i = (e - o - d i) / (1 + d); parameters of 0 give the error as measured.
         """
@@ -111,13 +111,13 @@ class UnseenDrive:
         return np.asarray(np.sqrt(np.maximum(square, 0.0)) / np.abs(1.0 + drift))
 
     def worsening_a(self, drift: Array, offset_a: Array) -> Array:
-        """By how much correcting with these values raises the RMS error, shape (N, K); negative where it helps. [A]"""
+        """Return by how much these corrections raise the RMS error, shape (N, K); negative where they help. [A]"""
         zero = np.zeros_like(drift)
         return self.rms_a(drift, offset_a) - self.rms_a(zero, zero)
 
 
 def harmed(estimate: Faults, truth: Faults, *, mean_a: Array, mean_square_a2: Array) -> Mask:
-    """Whether the correction makes any branch of a vehicle worse.
+    """Check for each vehicle whether the correction makes any branch worse.
 
     Parameters
     ----------

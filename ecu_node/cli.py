@@ -237,7 +237,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _bus_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Settings of the bus, as :func:`ecu_node.bus.adapters.bus_config` takes them."""
+    """Return the settings of the bus, as :func:`ecu_node.bus.adapters.bus_config` takes them."""
     names = [option.removeprefix("--").replace("-", "_") for option in _BUS.split()]
     return {name: getattr(options, name) for name in names}
 

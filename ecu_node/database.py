@@ -302,7 +302,7 @@ def _look_everything_up(vehicle: VehicleDatabase) -> None:
 
 
 def means_not_available(name: str) -> bool:
-    """Whether a name in a value table says that there is no value.
+    """Check whether a name in a value table says that there is no value.
 
     Such names are SNA, "Signal not available", "Invalid", "Error", "Not_Defined" or "Init", in any spelling, with or
     without "signal", "value" or "data". Names that only contain such words ("No error") are values.

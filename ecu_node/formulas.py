@@ -75,7 +75,7 @@ def parse_formula(text: str) -> ast.expr:
 
 @cache
 def formula_names(tree: ast.expr) -> tuple[str, ...]:
-    """Names of the inputs that a formula uses, sorted."""
+    """Return the names of the inputs that a formula uses, sorted."""
     called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
     return tuple(sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and id(node) not in called}))
 

@@ -414,7 +414,7 @@ class LayoutKeys(_Table, frozen=True, kw_only=True):
         return [(f"[[e2e]] entry number {number}", entry) for number, entry in enumerate(self.e2e, start=1)]
 
     def protection(self, message: str) -> EndToEnd | None:
-        """How the message of this name is protected; None if it is not."""
+        """Return how the message of this name is protected; None if it is not."""
         return next((entry for _, entry in self.protections if message in entry.messages), None)
 
     def base_inputs(self, names: Collection[str]) -> set[str]:
@@ -536,7 +536,7 @@ def _toml_place(document: dict[str, Any], steps: list[str]) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a text file, the same for LF and CRLF line ends."""
+    """Return the SHA-256 of a text file, the same for LF and CRLF line ends."""
     return text_digest(path.read_bytes())
 
 

@@ -296,7 +296,7 @@ def write_parameters(parameters: VehicleParameters, path: Path) -> None:
 
 
 def parameter_schema() -> dict[str, Any]:
-    """JSON Schema (2020-12) of the parameter file, made from the structures of this module."""
+    """Return the JSON Schema (2020-12) of the parameter file, made from the structures of this module."""
     schema = msgspec.json.schema(VehicleParameters)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Vehicle parameter file", **schema}
 

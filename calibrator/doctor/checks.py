@@ -174,7 +174,7 @@ CHECKS: Sequence[Callable[[Facts], Findings]] = (
 
 
 def readiness(facts: Facts, findings: Sequence[Finding]) -> dict[str, str]:
-    """Return for each command, in the order of use, why it is not ready; an empty text if it is."""
+    """Return for each command, in the order of use, why it is not ready; an empty text if it is ready."""
     errors, junction = [finding.subject for finding in findings if finding.severity == "error"], facts.junction
     wrong = f"of the errors above ({', '.join(dict.fromkeys(errors))})" if errors else ""
     single = () if junction.comparisons else facts.drives  # no drive has all branches, but one may have enough

@@ -49,7 +49,7 @@ def doctor(
 def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
     """Return the report as text: tables of branches and inputs, findings, which commands are ready; lines may be long.
 
-    `steps` has for each command why it is not ready, empty if it is, as :func:`.readiness` returns it.
+    `steps`, from :func:`.readiness`, maps each command to why it is not ready, or to an empty text if it is ready.
     """
     seconds, frames = sum(log.duration_s for log in facts.logs), sum(log.report.frames for log in facts.logs)
     reasons: dict[str, list[str]] = {}
@@ -90,7 +90,7 @@ def _next_commands(facts: "Facts", ready: Sequence[str]) -> list[str]:
 def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
     """Return the report as JSON: branches, inputs, sum, findings, and which commands are ready.
 
-    `steps` has for each command why it is not ready, empty if it is, as :func:`.readiness` returns it.
+    `steps`, from :func:`.readiness`, maps each command to why it is not ready, or to an empty text if it is ready.
     """
     sum_a, channels = facts.junction.sum_a, facts.channels
     rows = channels.drop(columns=["is_branch", "needed", "good"]).set_index("name", drop=False)

@@ -372,7 +372,8 @@ def estimate_rows(
     mean, mean_square : ndarray of shape (N, K)
         Mean and mean square of the measured currents, over full scale and its square.
     usual : ndarray of shape (2, K)
-        The same two of the fleet's usual drive: medians over its vehicles, which count as ideal currents.
+        Mean and mean square of each current on the fleet's usual drive, over full scale and its square: medians over
+        the vehicles, which count as ideal currents.
     order : sequence of int or None
         Branches in the order of the rows: branch k of the rows is branch ``order[k]`` of the vehicles; None: branch k.
     full_scale_a : float

@@ -310,8 +310,8 @@ def regress_vehicles(
     blocks : Blocks
         Which blocks belong to which vehicle.
     prior_gain : float
-        Mean of the Gaussian prior of all coefficients but the last, the constant, which has none; its standard
-        deviation is :data:`GAIN_SD`. [1]
+        Mean of the Gaussian prior of each coefficient but the last, the constant, which has none; the standard
+        deviation of the prior is :data:`GAIN_SD`.
 
     Returns
     -------
@@ -627,15 +627,15 @@ class RowPlaces:
         self.measured: NDArray[np.int64] = np.r_[self.slopes, self.ratios, self.intercepts, self.junction]
 
     def slope(self, branch: int) -> int:
-        """Row of the slope of a branch; branches and rows are counted from 0."""
+        """Return the row of the slope of a branch; branches and rows are counted from 0."""
         return int(self.slopes.start) + branch
 
     def ratio(self, branch: int) -> int:
-        """Row of the gain ratio of a branch, 1 to K - 1; branch 0 has none."""
+        """Return the row of the gain ratio of a branch, 1 to K - 1; branch 0 has none."""
         return int(self.ratios.start) + branch - 1
 
     def intercept(self, branch: int) -> int:
-        """Row of the intercept of a branch; branches and rows are counted from 0."""
+        """Return the row of the intercept of a branch; branches and rows are counted from 0."""
         return int(self.intercepts.start) + branch
 
 
@@ -662,7 +662,7 @@ class ParameterPlaces:
         self.gains, self.hardware_offsets, self.offsets = slice(1, K + 1), slice(K + 1, 2 * K), slice(2 * K, 3 * K)
 
     def offset(self, branch: int) -> int:
-        """Place of omega of the sensor of a branch; branches and places are counted from 0."""
+        """Return the place of omega of the sensor of a branch; branches and places are counted from 0."""
         return int(self.offsets.start) + branch
 
 
@@ -733,7 +733,7 @@ class EvidenceRows:
         return EvidenceRows(**{name: values[index] for name, values in vars(self).items()})
 
     def intercept_covariance(self) -> Array:
-        """Covariance of the intercepts at the mean current, where errors of slopes have no effect, shape (N, K, K)."""
+        """Return the covariance (N, K, K) of the intercepts at the mean current, where slope errors have no effect."""
         b = self.places.intercepts
         return _shifted(self.covariance, -_pivot(self.means, self.values), first=b.start)[:, b, b]
 

@@ -125,7 +125,7 @@ class FleetReference:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether no vehicle but a trusted one may be corrected, as a small fleet is compared with itself."""
+        """Whether the fleet is too small to be its own reference, so that only trusted vehicles may be corrected."""
         return not self.carried and self.vehicles < FEWEST_VEHICLES
 
     @property

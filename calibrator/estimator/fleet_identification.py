@@ -193,13 +193,13 @@ class IdentificationReport:
     notices: tuple[str, ...]
 
     def as_json(self) -> str:
-        """The report as JSON."""
+        """Return the report as JSON."""
         bank = {"identity": self.bank.identity, "file": self.bank, "described": self.bank.described()}
         branches, snr_db = self._by_branch().to_dict("index"), self.snr_db.to_dict("index")
         return dumps({**vars(self), "bank": bank, "branches": branches, "snr_db": snr_db})
 
     def as_text(self) -> str:
-        """The report as readable text."""
+        """Return the report as readable text."""
         rows = [
             [branch, *(f"{value:.1f}" if np.isfinite(value) else "-" for value in (median_db, worst_db)), vehicle]
             for branch, median_db, worst_db, vehicle in self._by_branch().itertuples()

@@ -465,11 +465,11 @@ class CalibrationReport:
     """Median over vehicles of the RMS of the junction sum, with the parameters that the node applies. [A]"""
 
     def as_json(self) -> str:
-        """The report as JSON."""
+        """Return the report as JSON."""
         return dumps(vars(self))
 
     def as_text(self) -> str:
-        """The report as readable text."""
+        """Return the report as readable text."""
         run, details = self.run, self.run.details
         load_a = details.get("declared_load_a", 0.0)
         by_branch = {

@@ -72,7 +72,7 @@ class CommonDrive:
 
     @property
     def unity_start(self) -> int:
-        """Number of the first sample of the unity drive, T_1 of section IV-C."""
+        """Index of the first sample of the unity drive, T_1 of section IV-C."""
         return int(TRAIN_SHARE * len(self.i_s))
 
     @property

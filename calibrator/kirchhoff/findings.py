@@ -25,26 +25,26 @@ ENOUGH_S = 60.0
 NEAR_ZERO = 0.05
 """Share of full scale below which a current is near zero. [1]"""
 LEAST_DELAY_S, LONG_DELAY_S = 0.02, 0.1
-"""Delays from the first on are a hint: shorter ones, two frames of a fast message, change no result. From the second on
-they are a warning: 300 ms bend the gains of the junction law by 3 %, and this is a third of that. [s]"""
+"""Delays from LEAST_DELAY_S on are a hint: shorter ones, two frames of a fast message, change no result. From
+LONG_DELAY_S on they are a warning: 300 ms bend the gains of the junction law by 3 %; this is a third of that. [s]"""
 LEAST_GAIN, LARGEST_GAIN, LEAST_SHARE = 0.02, 0.25, 0.5
 """Least gain error that is reported; largest one that sensors drift by; and least ratio of what gain errors explain of
 the sum's variation to what remains unexplained, below which none is reported. [1]"""
 LEAST_MEAN_A, LEAST_MEAN, LARGE_MEAN = 0.5, 0.001, 0.05
-"""A mean of the sum is reported if it is beyond the first and beyond the second times full scale. Beyond the third
+"""A mean of the sum is reported if it is beyond LEAST_MEAN_A and beyond LEAST_MEAN times full scale. Beyond LARGE_MEAN
 times full scale it is a warning, as loads without a sensor usually draw less. [A], [1]"""
 LEAST_SUM_A, NO_SUM = 0.5, 0.3
-"""A sum that varies by less than the first is right. Branches do not belong together if the mean square of their sum is
-more than the second times the sum of their mean squares. [A], [1]"""
+"""A sum that varies by less than LEAST_SUM_A is right. Branches do not belong together if the mean square of their sum
+is more than NO_SUM times the sum of their mean squares. [A], [1]"""
 SAME, CLEAR = 1.2, 2.0
-"""The sign of a branch is unknown if with the other sign the sum varies less than the first times as much. Two branches
-are surely exchanged if the sum varies more than the second times as much as with each in the other's place. [1]"""
+"""The sign of a branch is unknown if with the other sign the sum varies less than SAME times as much. Two branches are
+surely exchanged if the sum varies more than CLEAR times as much as with each in the other's place. [1]"""
 STUCK_S, STUCK_RANGE = 10.0, (0.1, 0.9)
 """A current other than zero is stuck if it holds its exact value for so long; how much the others' sum varies meanwhile
 is taken between these quantiles. [s], [1]"""
 STUCK_MOVE, STUCK_VALUE, STUCK_ROUNDING = 0.02, 0.002, 1e-9
-"""Shares of full scale: a current is stuck only if it exceeds the second while the others' sum varies by more than the
-first; interpolation makes equal values differ by up to the third. [1]"""
+"""Shares of full scale: a current is stuck only if it exceeds STUCK_VALUE while the others' sum varies by more than
+STUCK_MOVE; interpolation makes equal values differ by up to STUCK_ROUNDING. [1]"""
 
 UNITS = {factor_a: unit for unit, factor_a in AMPERE.items()}
 """Units of currents by the factor that turns their values into A."""

@@ -24,14 +24,16 @@ from ecu_node.layout import Layout
 __all__ = ["RecordedJunction", "look_at_junction"]
 
 CHANGE_PRICE, UNIT_PRICE = 0.7, 0.3
-"""Prices are added to log (V / N), see :mod:`calibrator.kirchhoff.signs`. Price of each changed branch: the change must
-halve V / N. The second is added for a wrong unit: where sign or unit explain the same, the sign is wrong. [1]"""
+"""Prices are added to log (V / N), see :mod:`calibrator.kirchhoff.signs`. CHANGE_PRICE is that of each changed branch:
+the change must halve V / N. UNIT_PRICE comes on top if its unit is changed: where sign or unit explain the same, the
+sign is wrong. [1]"""
 PLAUSIBLE_PRICE = 2.0
 """Price of each branch whose current would be beyond full scale, and of currents that would all be near zero. [1]"""
 ORIENTATION_PRICE = 1.5
 """Price of signs by which energy flows into a battery while its voltage falls: more than that of one change. [1]"""
 LARGEST_SHARE, LEAST_SHARE = 1.2, 0.002
-"""Shares of full scale: a current above the first is beyond it; if all are below the second, they are near zero. [1]"""
+"""Shares of full scale: a current above LARGEST_SHARE is beyond it; if all are below LEAST_SHARE, they are near
+zero. [1]"""
 PEAK_QUANTILE = 0.999
 """Quantile of the magnitudes that is taken as peak, so that a few wild samples do not count. [1]"""
 SMALL_SHARE = 0.05

@@ -183,7 +183,7 @@ def try_many_shown(
     size: int,
     size_of: Callable[[_Item], int],
 ) -> "Generator[tuple[_Item, _Result | Failed], None, None]":
-    """Run :func:`try_many` with a progress bar; `size` is that of all items, `size_of` returns that of one. [byte]"""
+    """Run :func:`try_many` with a progress bar; `size` counts the bytes of all items, `size_of` those of one."""
     done, total = 0, size // MEGABYTE + 1
     with (
         progress_bar(label, total, "MB") as progress,

@@ -29,17 +29,17 @@ its value never changes; NEVER: it cannot be a branch."""
 UNITS, LEAST_OF_LOADS = {"current": "A", "power": "W"}, {"current": 3.0, "power": 500.0}
 """Units by quantity, and least range of heaters, converters and chargers in a database; valves have less. [A, W]"""
 CELL_V, LOW_V, HIGH_V = 6.0, 40.0, 60.0
-"""Bounds of a voltage in the message of a current: below the first it is of a cell, below the second of a network of 12
-or 24 V, and from the third on of a junction. [V]"""
+"""Bounds of a voltage in the message of a current: below CELL_V it is of a cell, below LOW_V of a network of 12 or
+24 V, and from HIGH_V on of a junction. [V]"""
 STEADY_SHARE = 0.1
 """A current that varies by less than this share of its peak is steady; how the sum varies then says little. [1]"""
 ROUGH, ROUGH_POINTS = 0.5, -50.0
-"""A candidate jumps about as no current does if its steps exceed the first times those of white noise of the same
-spread (root mean squares); it then gets the second as points. [1]"""
+"""A candidate jumps about as no current does if its steps exceed ROUGH times those of white noise of the same spread
+(root mean squares); it then gets ROUGH_POINTS. [1]"""
 CLEAR = 2.0
 """A sign, or one more branch, is clear if the sum varies this many times more without it. [1]"""
 OWN_GAIN, FEWEST_BINS = 1.3, 20
-"""A current closes the sum if all gains are within this factor of 1; fewer instants than the second cannot tell. [1]"""
+"""A current closes the sum if all gains are within the factor OWN_GAIN of 1; FEWEST_BINS instants are needed. [1]"""
 MOST_TOGETHER, MOST_TRIED = 2, 12
 """Most currents without a place that are tried together, and that are tried at all, the best first. [1]"""
 MEANS = 50

@@ -128,7 +128,7 @@ class Candidate:
         return peak_of(self.good)
 
     def at(self, time_s: Array) -> Array:
-        """Return the recording at given instants, interpolated between good values; NaN if it has none."""
+        """Return the values (T,) at instants `time_s` (T,), interpolated between good ones; NaN if there is none."""
         if self.channel is None or not len(self.good):
             return np.full(len(time_s), np.nan)
         return np.interp(time_s, self.channel.time_s[self.channel.good], self.good)
@@ -239,7 +239,7 @@ def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
 
 
 def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
-    """Return the candidate with its recorded values; if many exceed its range, that is wrong and they are good."""
+    """Return the candidate with its recorded values; if many exceed its range, the range is wrong and they are good."""
     outside = channel.good & ~inside
     wrong = (
         outside.sum() > WRONG_RANGE * channel.good.sum() and len(np.unique(channel.value[outside])) >= FEWEST_OUTSIDE
@@ -249,7 +249,7 @@ def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
 
 
 def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
-    """Return, with values, those signals that are columns of a table, headed ``Message.Signal`` or ``Signal``.
+    """Return those signals that are columns of a table (``Message.Signal`` or ``Signal``), with their values.
 
     Raises
     ------

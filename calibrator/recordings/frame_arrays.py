@@ -175,7 +175,7 @@ class FrameColumns(NamedTuple):
 
 
 def frames_of(messages: Sequence[can.Message]) -> Frames:
-    """Convert messages of python-can; those with an impossible length, identifier or time stamp count as damaged."""
+    """Convert messages of python-can to frames; an impossible length, identifier or time stamp counts as damage."""
     columns = FrameColumns.of(len(messages), fd=any(len(message.data) > CLASSIC_BYTES for message in messages))
     channels: dict[str, int] = {}
     for row, message in enumerate(messages):

@@ -165,8 +165,8 @@ def is_bus_log(path: Path) -> bool:
 def kind_of_text(head: str, *, headed: bool = True) -> Literal["candump", "frames", "table", ""]:
     """Tell what the beginning of a text is: lines of candump, a CSV of frames, a table, or (empty) none of these.
 
-    A text that is neither of the first two is a table if `headed` (its suffix promises a table with a header); if not,
-    it is one only if most lines below the first have several numbers.
+    A text of neither candump nor frames is a table if `headed` (its suffix promises a table with a header); if not, it
+    is one only if most lines below the first have several numbers.
     """
     lines = head.splitlines()
     if is_candump(head):

@@ -49,7 +49,7 @@ _IS_TABLE = "a table of values, not a log of frames, which is needed here"
 
 
 def is_log(path: Path) -> bool:
-    """Check by its suffix whether a file is a log or a table; a ``.txt`` if its content is one, or unreadable."""
+    """Check whether a file is a log or a table: by its suffix, a ``.txt`` by its content; an unreadable one counts."""
     suffix = suffix_of(path)
     if suffix == ".txt":
         try:

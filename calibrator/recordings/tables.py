@@ -69,7 +69,7 @@ _TIME_UNITS = {
 _SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """Least numbers that are times since 1970 in this unit; in the next larger unit they would be absurd dates."""
 _LONG_STEPS = ((5000.0, "us"), (5.0, "ms"))
-"""Times that are whole numbers without a unit are in the first of these units whose step their median step reaches.
+"""Units of times that are whole numbers without a unit: the first whose bound their median step reaches, else seconds.
 
 The bounds rest on tables with up to 200 rows a second, or one every few seconds. Steps below 100 count as milliseconds
 only if the table is then not shorter than :data:`_SHORTEST_S`.

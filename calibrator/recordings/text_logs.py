@@ -64,8 +64,8 @@ __all__ = ["parse_candump", "read_asc", "read_candump", "read_csv", "read_trc"]
 _DECIMAL = re.compile(r"^base\s+dec", re.MULTILINE | re.IGNORECASE)
 _RELATIVE = re.compile(r"^base\s+\w+\s+timestamps\s+relative", re.MULTILINE | re.IGNORECASE)
 _MOST_DISORDER = 0.1
-"""Times count from the line before if more than this share of them is no larger than that of the line before: nearly
-none are if times are absolute, about half if they count from the line before. [1]"""
+"""If more than this share of the times is no larger than the time before, they count from the line before: then about
+half are, and of absolute times nearly none. [1]"""
 _SINCE_1970_S = 1e8
 """Times above this are dates: no recording lasts so long since its start. [s]"""
 _NO_TEXT = frozenset(range(32)) - frozenset(b"\t\n\v\f\r\x1a")

@@ -46,9 +46,9 @@ class FleetTable:
     columns : mapping of str to ndarray of shape (N, K)
         Columns of ``results.parquet``, in its order of the vehicles that have parameters: numbers (NaN where the method
         gives none), flags, texts (empty where there is none). What belongs to the vehicle as a whole is the same in all
-        K places. Added are: whether a sensor is ``faulty``, that is whether a fault was found in it that is corrected,
-        held back, or has no probability; its error at full scale, ``error_a`` [A]; and whether its gain
-        (``open_gain``) or its offset (``open_offset``) is not known, as its standard deviation is too large.
+        K places. Added are for each sensor: ``faulty``, a fault was found and is corrected or held back (if the method
+        gives no probabilities: any fault); ``error_a``, its error at full scale [A]; ``open_gain`` and
+        ``open_offset``, its gain or offset is not known, as the standard deviation is too large.
     left_out : mapping of str to str
         Vehicles without parameters, or files whose vehicle is unclear, with the reason.
     """

@@ -42,12 +42,12 @@ class ImportReport:
     left_out: dict[str, str]
 
     def as_json(self) -> str:
-        """The report as JSON, with the notices of every drive."""
+        """Return the report as JSON, with the notices of every drive."""
         drives = [{**vars(drive), "notices": list(map(str, drive.notices))} for drive in self.drives]
         return dumps({**vars(self), "drives": drives})
 
     def as_text(self) -> str:
-        """The report as readable text; a notice that several drives share appears once."""
+        """Return the report as readable text; a notice that several drives share appears once."""
         rows = [(d.vehicle, d.name, f"{d.duration_s:.1f}", ", ".join(d.branches)) for d in self.drives]
         notices = [f"  {line}" for line in merged_notices({(d.vehicle, d.name): d.notices for d in self.drives})]
         parts = [

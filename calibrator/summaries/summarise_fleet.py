@@ -76,11 +76,11 @@ class SummariseReport:
     notices: list[str] = field(default_factory=list)
 
     def as_json(self) -> str:
-        """The report as JSON."""
+        """Return the report as JSON."""
         return dumps(vars(self))
 
     def as_text(self) -> str:
-        """The report as readable text."""
+        """Return the report as readable text."""
         parts = [
             "\n".join(f"notice: {notice}" for notice in self.notices),
             left_out_text(self.left_out),
@@ -237,7 +237,7 @@ class _Owners:
                 self.shared.setdefault(key, {other}).add(vehicle)
 
     def without_copies(self, records: Iterable[Record]) -> Iterator[Record]:
-        """Yield those records of which another vehicle has a recording, with a problem in place of the summary."""
+        """Yield the records that share a recording with another vehicle, with a problem in place of the summary."""
         for record in records:
             sharing = set[str]().union(*(self.shared.get(_key(digest), ()) for digest in record.digests))
             if others := ", ".join(sorted(sharing - {record.vehicle})):

@@ -199,7 +199,7 @@ def second_differences(currents_a: Array, used: Mask) -> Array:
 
 
 def find_spikes(currents_a: Array, used: Mask) -> NDArray[np.int8]:
-    """Label spikes: samples at which one branch alone breaks the junction law and stands out from the samples beside.
+    """Label spikes: samples at which one branch alone breaks the junction law and stands out from its neighbours.
 
     Parameters
     ----------

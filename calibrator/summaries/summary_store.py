@@ -79,7 +79,7 @@ class SummaryStore:
         Raises
         ------
         FleetError
-            If there is a Parquet file that is not one of this store, by its name; it would never be read.
+            If a Parquet file has a name that no file of this store can have, so that it would never be read.
         """
         names, count = [name for name in self._files.names() if name.endswith(".parquet")], self.identity.buckets
         for name in names:
@@ -256,11 +256,11 @@ class StoreReport:
     faults: dict[str, str] = field(default_factory=dict)
 
     def as_json(self) -> str:
-        """The report as JSON."""
+        """Return the report as JSON."""
         return dumps(vars(self))
 
     def as_text(self) -> str:
-        """The report as readable text."""
+        """Return the report as readable text."""
         lines = [
             f"{self.store}: {counted(self.vehicles, 'vehicle')}, {self.unusable} of them without usable drives; "
             f"{counted(self.drives, 'drive')}, {self.hours:.1f} h; {counted(self.files, 'file')}, "

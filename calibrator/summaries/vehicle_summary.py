@@ -153,7 +153,7 @@ def summarise_drives(
 def aligned_drives(
     drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, *, known_s: float = 0.0
 ) -> tuple[BranchDelays, list[Samples]]:
-    """Estimate the delays of a vehicle's branches, take them out and align each drive to the period of the layout.
+    """Return the delays of a vehicle's branches, and its drives without them, aligned to the period of the layout.
 
     Arguments and errors are those of :func:`summarise_drives`.
     """

@@ -112,7 +112,7 @@ def error_text(error: Exception) -> str:
 
 
 def is_interface(bus: can.BusABC, name: str) -> bool:
-    """Whether a bus belongs to python-can's interface of this name."""
+    """Check whether a bus belongs to python-can's interface of this name."""
     return any(f"{kind.__module__}.".startswith(f"can.interfaces.{name}.") for kind in type(bus).__mro__)
 
 
@@ -123,7 +123,7 @@ def socketcan_socket(bus: can.BusABC) -> socket.socket | None:
 
 
 def carries_fd(interface: str, channel: str) -> bool:
-    """Whether a SocketCAN interface is set up for CAN FD; False if that is not known."""
+    """Check whether a SocketCAN interface is set up for CAN FD; False if that is not known."""
     try:
         return interface == "socketcan" and int(Path(f"/sys/class/net/{channel}/mtu").read_text()) >= _FD_MTU
     except (OSError, ValueError):

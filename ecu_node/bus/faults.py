@@ -170,7 +170,7 @@ class FaultMemory:
         self._latch_again()
 
     def _is_cleared(self) -> bool:
-        """Whether the file of the fault memory is gone."""
+        """Check whether the file of the fault memory is gone."""
         try:
             return all(path.name != _NAME for path in self._folder.iterdir())
         except OSError:  # a folder that is gone, or on a broken disk, says nothing

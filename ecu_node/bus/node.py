@@ -103,7 +103,7 @@ class OwnFrames:
         self._sent[key].append(data)
 
     def is_foreign(self, key: _Key, data: bytes | bytearray) -> bool:
-        """Whether another node must have sent this frame; one that was sent from here may be received once."""
+        """Check whether another node must have sent this frame; one that was sent from here may be received once."""
         try:
             self._sent[key].remove(data)
         except ValueError:

@@ -71,7 +71,7 @@ class Log:
 
 
 def _takes_a_line() -> bool:
-    """Whether standard error takes a line without waiting; a pipe that says so has room for PIPE_BUF bytes."""
+    """Check whether standard error takes a line without waiting; a pipe that says so has room for PIPE_BUF bytes."""
     try:
         number = sys.stderr.fileno()
     except (AttributeError, OSError, ValueError):  # closed, or no file at all

@@ -67,7 +67,7 @@ def key_of(message: Message) -> FrameKey:
 
 
 def is_fd(message: Message) -> bool:
-    """Whether only CAN FD can carry a message, or the DBC says that it does."""
+    """Check whether a message needs CAN FD: by its length, or because the DBC says so."""
     return bool(message.is_fd) or message.length > _CLASSIC_BYTES
 
 

@@ -411,7 +411,7 @@ class Corrector:
         return self._silent and self._was_awake
 
     def state(self) -> tuple[State, Reason]:
-        """What the node does, and why."""
+        """Return what the node does, and why."""
         if reason := self.reason or self.latched:
             return State.PASSING_THROUGH, reason
         if self.is_asleep:

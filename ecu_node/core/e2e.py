@@ -84,11 +84,11 @@ class Protection:
     windows: tuple[E2EWindow, E2EWindow, E2EWindow]
 
     def is_sound(self, payload: bytearray) -> bool:
-        """Whether the CRC of a payload is right; the counter is not looked at."""
+        """Check whether the CRC of a payload is right; the counter is not looked at."""
         return self.check(payload, self.identity)
 
     def is_intact(self, payload: bytearray) -> bool:
-        """Whether a payload is long enough, its CRC right, and its counter possible."""
+        """Check whether a payload is long enough, its CRC right, and its counter possible."""
         return len(payload) >= self.least_bytes and self.is_sound(payload) and self.counter_of(payload) < self.modulus
 
     def counter_of(self, payload: bytes | bytearray) -> int:

@@ -225,11 +225,11 @@ class LiveBranch(HeardSignal):
         return self._waited_s + max(self.timeout_s, self._start_s) if self._is_named else float("inf")
 
     def is_stale(self, now_s: float) -> bool:
-        """Whether its next frame is overdue."""
+        """Check whether the next frame of the branch is overdue."""
         return now_s > self.deadline_s
 
     def is_old(self, now_s: float) -> bool:
-        """Whether its last frame is older than the timeout; also true for a branch that never sent."""
+        """Check whether the last frame is older than the timeout; also true for a branch that never sent."""
         return now_s - self.time_s > self.timeout_s
 
     def expect(self, now_s: float) -> None:
@@ -237,7 +237,7 @@ class LiveBranch(HeardSignal):
         self._awake_s = self._waited_s = now_s
 
     def lacks_input(self, now_s: float) -> bool:
-        """Whether the branch is not corrected now: it is passed through, or its value or its voltage is missing."""
+        """Check whether the branch is not corrected now: passed through, or without its value or its voltage."""
         no_value = self.seen and self.latest() is None
         return self.quality is not Quality.CORRECTED or no_value or self._voltage_code(now_s) is None
 
@@ -522,11 +522,11 @@ class JunctionWatch:
         self._whole = state, valid
 
     def is_whole(self, now_s: float) -> bool:
-        """Whether all currents of the junction are measured now; sums of other times are published, but not judged."""
+        """Check whether all currents of the junction are measured now; other sums are published, but not judged."""
         return self._whole is None or self._whole[0].code_at(now_s) in self._whole[1]
 
     def is_blind(self, now_s: float) -> bool:
-        """Whether the state that says when sums can be judged is not known now."""
+        """Check whether the state that tells when sums can be judged is unknown now."""
         return self._whole is not None and self._whole[0].code_at(now_s) is None
 
     def restart(self, expected: JunctionResidual | None = None) -> None:
@@ -586,7 +586,7 @@ class JunctionWatch:
         self._recent.add(moment)
 
     def _sum_sd_a(self) -> float:
-        """Standard deviation that the corrected sum of right sensors has at the currents of this instant. [A]"""
+        """Return the standard deviation of the corrected sum of right sensors at the currents of this instant. [A]"""
         throughput_a = 0.5 * sum(abs(corrected) for _, corrected in self.currents_a.values())
         return math.hypot(self._sd_a, self._sd_per_a * throughput_a)
 

@@ -46,7 +46,7 @@ def usual_unit(text: str) -> str:
 
 
 def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float:
-    """Factor that turns the values of a signal into the base unit, such as 1000 for kW into W.
+    """Return the factor that turns the values of a signal into the base unit, such as 1000 for kW into W.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ class PlacedSignal:
         return max(self.place.end, *(item.place.end for item in self.above), 0)
 
     def code(self, payload: bytes | bytearray) -> int | None:
-        """Raw code of the signal in a payload; None if it is not there."""
+        """Return the raw code of the signal in a payload; None if it is not there."""
         if all(item.place.extract(payload) in item.codes for item in self.above):
             return self.place.extract(payload)
         return None
@@ -329,15 +329,15 @@ class Codes:
     named: Mapping[int, str]
 
     def is_value(self, code: int) -> bool:
-        """Whether a code stands for a number, rather than for a name or outside the DBC's range."""
+        """Check whether a code stands for a number, rather than for a name or outside the DBC's range."""
         return self.lowest <= code <= self.highest and code not in self.named
 
     def worth(self, code: int) -> Fraction:
-        """Value of a code, whether it has a name or not."""
+        """Return the value of a code, whether it has a name or not."""
         return self.scale * code + self.offset
 
     def nearest(self, value: Fraction) -> int:
-        """Code nearest to a value, halves up, inside the width and the DBC's range."""
+        """Return the code nearest to a value, halves up, inside the width and the DBC's range."""
         code = math.floor((value - self.offset) / self.scale + Fraction(1, 2))
         return min(max(code, self.lowest), self.highest)
 
@@ -347,7 +347,7 @@ _ENDLESS = 1e300
 
 
 def as_written(number: float) -> Fraction:
-    """Exact value of the shortest decimal that reads as this float: 1/50 for 0.02, as it stands in a DBC or JSON."""
+    """Return the exact value of the shortest decimal that reads as this float: 1/50 for 0.02 of a DBC or JSON."""
     return Fraction(repr(number))
 
 

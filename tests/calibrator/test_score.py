@@ -52,7 +52,7 @@ def test_error_from_moments_equals_the_error_of_corrected_currents() -> None:
         np.testing.assert_allclose(unseen.rms_a(drift, offset_a)[0], expected)
 
 
-def test_one_worsened_branch_is_harm_but_no_correction_or_the_true_one_is_not() -> None:
+def test_one_worsened_branch_counts_as_harm_and_no_or_perfect_correction_does_not() -> None:
     rng = np.random.default_rng(2)
     truth = sensor_faults(*rng.uniform(-0.2, 0.2, (2, 50, 2)))
     moments = {"mean_a": MEAN_A, "mean_square_a2": MEAN_SQUARE_A2}

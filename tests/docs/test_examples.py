@@ -20,7 +20,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Any:
     plt.close("all")
 
 
-def test_trusted_battery_corrects_the_motor_of_one_car(run: Any) -> None:
+def test_one_car_example_corrects_the_motor_by_the_trusted_battery(run: Any) -> None:
     names = run("one_car.py")
     rows = names["calibrator"].parameters_.set_index("branch")
     assert rows.gain_error["motor"] == pytest.approx(0.06, abs=3.0 * rows.gain_error_sd["motor"])

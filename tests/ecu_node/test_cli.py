@@ -106,7 +106,7 @@ def test_check_shows_an_unapplied_fault_and_warns_of_fd_messages_and_narrow_sign
 
 
 @pytest.mark.parametrize(("load", "expected_a"), [("[unmeasured_load]\nmean_a = 6.1\nsd_a = 1.0\n", 6.1), ("", 0.0)])
-def test_template_takes_the_expected_sum_from_the_unmeasured_load_of_the_layout(
+def test_parameter_template_takes_the_expected_sum_from_the_unmeasured_load_of_the_layout(
     make_database: MakeDatabase, load: str, expected_a: float
 ) -> None:
     database = make_database(f"{SMALL_LAYOUT}{load}")

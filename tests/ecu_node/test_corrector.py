@@ -185,7 +185,7 @@ def test_value_from_before_bus_sleep_or_reload_is_never_published(make_database:
     assert published(database, corrector, pair, 3600.4, "motor")[0] == no_value
 
 
-def test_only_the_last_frames_are_remembered(database: VehicleDatabase) -> None:
+def test_branch_keeps_only_its_newest_frames(database: VehicleDatabase) -> None:
     class Payload(bytearray):
         """A bytearray to which there can be weak references."""
 
@@ -217,7 +217,9 @@ def test_branches_going_silent_one_after_another_are_not_a_fault(database: Vehic
     assert corrector.state() == ASLEEP
 
 
-def test_stray_frame_of_an_unfitted_branch_affects_only_the_current_drive(database: VehicleDatabase) -> None:
+def test_stray_frame_of_an_unfitted_branch_stops_the_correction_only_until_the_bus_has_slept(
+    database: VehicleDatabase,
+) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     drive(database, corrector, 0.0, 1.0)
     data = protected(database, "HV_Dcdc", 0, DcdcCurrent=1.0)
@@ -229,7 +231,7 @@ def test_stray_frame_of_an_unfitted_branch_affects_only_the_current_drive(databa
     assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
-def test_parameters_that_worsen_the_sum_are_not_used_until_others_are_put_in_force(database: VehicleDatabase) -> None:
+def test_correction_that_worsens_the_sum_stops_until_other_parameters_are_in_force(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.2, 0.0), motor=(0.0, 0.0))
     balanced(database, corrector, 0.0, 9.0)
     assert corrector.state() == (State.CORRECTING, Reason.NONE)
@@ -257,7 +259,7 @@ def test_junction_sum_is_judged_only_in_the_valid_states_of_the_watch(
     assert corrector.watch.sums is not None
 
 
-def test_missing_signal_of_watch_input_key_is_reported(make_database: MakeDatabase) -> None:
+def test_missing_input_of_the_junction_watch_is_reported_in_the_state(make_database: MakeDatabase) -> None:
     own = whole_vehicle(make_database, '\n[watch]\ninput = "speed"\nvalid = [0]\n')
     corrector, motion = corrector_for(own, battery=(0.01, 0.0), motor=(0.0, 0.0)), FrameKey(0x200, extended=False)
     missing = (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
@@ -374,7 +376,7 @@ def test_junction_sum_is_not_interpolated_across_a_frame_without_value(database:
     assert sums_at(corrector, 0.07) == pytest.approx((-20.0, -20.0))
 
 
-def test_value_is_used_though_stamped_earlier_than_the_frame_without_value_before_it(database: VehicleDatabase) -> None:
+def test_value_after_a_frame_without_value_is_used_even_if_its_time_is_earlier(database: VehicleDatabase) -> None:
     """As after a clock step: the first frame has the time of its reading, the next one that of its arrival."""
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
     answers(corrector, battery(database, 0, -655.36), 0.02)

@@ -104,7 +104,7 @@ def test_protection_writes_only_the_bits_of_its_header_mask(kind: str, protectio
     assert {Receiver(protection).check(bytearray(size)) for size in range(len(header))} == {Check.CORRUPT}
 
 
-def test_corrupt_frame_leaves_the_expected_counter_and_before_the_first_good_frame_the_state_init(
+def test_corrupt_frame_changes_neither_the_expected_counter_nor_the_e2e_state(
     protection: Protection,
 ) -> None:
     (first, second), receiver = stream(protection, 2), Receiver(protection)

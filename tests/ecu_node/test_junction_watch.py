@@ -65,7 +65,7 @@ class Watched:
                 return
 
 
-def test_ordinary_codes_have_no_names_and_are_not_clipped() -> None:
+def test_range_of_ordinary_codes_excludes_named_and_clipped_codes() -> None:
     branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
     branch.codes = codes(Fraction(1), -32767, 32767)
     assert branch.ordinary_codes() == (-32766, 32766)
@@ -75,7 +75,7 @@ def test_ordinary_codes_have_no_names_and_are_not_clipped() -> None:
     assert branch.ordinary_codes() == (1, 0)
 
 
-def test_movement_of_a_power_is_the_current_that_a_right_sensor_would_show() -> None:
+def test_movement_of_a_power_branch_is_that_of_its_corrected_current() -> None:
     """In steps of 1/8 s; the sensor is one step late, and shows 25 % too much; one code is 100 W."""
     shown = enumerate([100, 0, 70, 10, 60, 65, 1000])
     voltage = HeardSignal(codes(Fraction(1)), 9.0)
@@ -97,7 +97,7 @@ def test_movement_of_a_power_is_the_current_that_a_right_sensor_would_show() -> 
 
 
 @pytest.mark.parametrize("load_a", [0.0, 30.0])
-def test_sums_count_from_the_load_that_parameters_expect(load_a: float) -> None:
+def test_watch_judges_sums_relative_to_the_load_that_parameters_expect(load_a: float) -> None:
     """Right sensors, one of which is corrected by 3 A: no deviation that could not be, but worse than as measured."""
     junction = Watched(faults={"motor": SensorFault(offset_a=-3.0)}, expected_a=load_a, corrected_sd_a=1.0)
     junction.run(9.0, lambda _: {"battery": 50.0 + load_a, "motor": -50.0})
@@ -105,7 +105,7 @@ def test_sums_count_from_the_load_that_parameters_expect(load_a: float) -> None:
 
 
 @pytest.mark.parametrize(("offset_a", "verdict"), [(2.4, None), (2.6, (Reason.CORRECTION_WORSE, ()))])
-def test_margin_grows_by_what_the_calibrator_itself_saw_the_correction_make_worse(
+def test_margin_includes_the_worsening_of_the_sum_stated_in_the_parameter_file(
     offset_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
     """A margin of 0.5 A, and 2 A more in the parameter file."""
@@ -115,14 +115,14 @@ def test_margin_grows_by_what_the_calibrator_itself_saw_the_correction_make_wors
     assert junction.watch.verdict == verdict
 
 
-def test_right_sums_are_never_worse_than_measured_ones() -> None:
+def test_sums_of_right_sensors_give_no_verdict() -> None:
     junction = Watched(margin_a=0.5)
     junction.run(9.0, lambda _: {"battery": 50.0, "motor": -50.0})
     assert junction.watch.verdict is None
 
 
 @pytest.mark.parametrize(("sd_per_a", "verdict"), [(0.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (0.1, None)])
-def test_gain_error_shows_where_the_current_changes_its_sign(
+def test_gain_error_beyond_its_uncertainty_is_found_from_an_alternating_current(
     sd_per_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
     def swinging(time_s: float) -> dict[str, float]:
@@ -138,7 +138,7 @@ def test_gain_error_shows_where_the_current_changes_its_sign(
     assert junction.watch.verdict == verdict
 
 
-def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_named_after_it() -> None:
+def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_also_named() -> None:
     """The heater is first heard after a second."""
 
     def noisy(time_s: float) -> dict[str, float]:
@@ -175,7 +175,7 @@ def test_current_that_never_changes_is_stuck_unless_it_is_small(
 @pytest.mark.parametrize(
     ("jump_a", "period_s", "looks"), [(50.0, 1 / 32, 3), (50.0, 1 / 128, 5), (-21.0, 1 / 32, 3), (19.0, 1 / 32, None)]
 )
-def test_jump_lasts_for_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
+def test_jump_counts_if_it_lasts_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
     jump_a: float, period_s: float, looks: int | None
 ) -> None:
     junction = Watched(corrected_sd_a=1.0)

@@ -234,7 +234,7 @@ def test_pause_of_the_process_makes_no_branch_stale(database: VehicleDatabase, c
     assert corrector.counters.clock_steps == 0
 
 
-def test_bus_counts_as_heard_only_until_the_timeout_if_the_process_pauses_after_it(
+def test_pause_of_the_process_after_a_receive_timeout_is_not_time_of_listening(
     channel: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent, now_s = VirtualBus(channel), time.monotonic()

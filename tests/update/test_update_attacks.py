@@ -65,7 +65,7 @@ def test_bundle_older_than_the_accepted_metadata_is_refused(repo: Repo, state: P
     repo.refused(state, "older than what was accepted before", repo.folder / "bundles" / "v1.json.xz")
 
 
-def test_rollback_of_a_single_bin_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
+def test_rollback_of_the_metadata_of_a_single_bin_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
     """The attacker has the keys of snapshot and timestamp."""
     repo.take(state, other)
 

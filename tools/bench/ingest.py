@@ -154,7 +154,7 @@ def _best(measured: Callable[[], Result], repetitions: int) -> tuple[Result, flo
 
 
 def _processor_s() -> float:
-    """Processor time of this process, of those that it waited for, and of those that still run. [s]"""
+    """Return the processor time of this process, of those that it waited for, and of those that still run. [s]"""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     living = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
     return sum(each.ru_utime + each.ru_stime for each in used) + sum(float(each.user + each.system) for each in living)

@@ -115,7 +115,7 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def main(*, vehicles: int = 10_000, sampled: bool = False) -> None:
-    """Measure; if sampled, one bin of the fleet alone, which gives size of a bundle and time to verify.
+    """Measure a repository; if sampled, with one bin of the fleet alone, enough for bundle size and time to verify.
 
     10^6 vehicles need about 15 GB in the folder for temporary files (TMPDIR).
     """

@@ -53,7 +53,7 @@ def test_rejoined_trip_has_jumps_only_at_standstills() -> None:
     np.testing.assert_allclose(joined.matrix_a().sum(axis=1), 0.0, atol=1e-12)
 
 
-def test_recorded_drive_becomes_a_trip_over_the_span_of_all_channels() -> None:
+def test_recorded_drive_becomes_a_trip_over_the_span_common_to_all_channels() -> None:
     def channel(start: float, good: np.ndarray) -> Channel:
         time_s = start + np.arange(100) * 0.1
         return Channel(time_s=time_s, value=np.where(good, 2.0 * time_s, 1e9), good=good)

@@ -355,7 +355,7 @@ def exchange(layout: Path, one: str, other: str) -> None:
     layout.write_text(mark.replace("signal = @", f"signal = {second[1]}"))
 
 
-def test_branches_of_opposite_signs_that_read_each_others_signal_give_an_error(
+def test_branches_of_opposite_signs_with_exchanged_signals_give_an_error(
     log: Path, layout: Path, tmp_path: Path
 ) -> None:
     exchange(layout, "battery", "motor")

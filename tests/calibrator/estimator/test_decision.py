@@ -221,7 +221,7 @@ def test_corrections_harm_no_vehicle_despite_a_batch_fault_or_a_load(shared: str
     assert shared == "gain" or np.abs(found.offset_a[:, 1] - faults.offset_a[:, 1]).max() < 0.01
 
 
-def test_harm_counts_the_true_currents_that_each_explanation_has_by_itself() -> None:
+def test_harm_probability_uses_the_true_currents_that_each_explanation_implies() -> None:
     """On the vehicle's own drives the measured currents are known, and on the usual one the ideal ones."""
     faults = random_faults(5, vehicles=12, branches=3, magnitude=(0.1, 0.3))
     rows = rows_of(faults, seed=5)
@@ -279,10 +279,10 @@ NARROW, WIDE = (
 
 @pytest.mark.parametrize("offset", [0.0, 0.12])
 @pytest.mark.parametrize("priors", [((1.0, first_prior(3)),), ((0.5, NARROW), (0.5, WIDE))], ids=["one prior", "two"])
-def test_current_moved_by_the_hardware_counts_alike_between_any_two_branches(
+def test_hardware_offset_between_two_branches_is_equally_probable_for_every_pair(
     priors: tuple[tuple[float, Prior], ...], offset: float
 ) -> None:
-    """The parameters have one fault for it only if one of the two branches is the last."""
+    """The parameters express it as a single fault only if one of the two branches is the last."""
     pairs = [(0, 1), (1, 2), (0, 2)]
     faults = no_faults(len(pairs), 3)
     for j, (p, r) in enumerate(pairs):
@@ -297,7 +297,7 @@ def test_current_moved_by_the_hardware_counts_alike_between_any_two_branches(
         np.testing.assert_allclose(points.hardware[:, 1:].sum(axis=1), 0.0, atol=1e-12)
 
 
-def test_offsets_that_were_read_directly_are_not_moved_to_the_hardware() -> None:
+def test_sensor_offsets_known_from_readings_are_not_taken_for_hardware_offsets() -> None:
     faults = no_faults(1, 3)
     faults.offset_a[0] = 0.1, 0.05, 0.0
     rows = rows_of(faults, errors=Errors(offset_read=0.001), noise=0.0)

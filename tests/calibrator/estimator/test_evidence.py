@@ -85,7 +85,7 @@ def currents_of(seed: int, size_a: tuple[float, ...], noise_a: tuple[float, ...]
     return (1.0 + d) * i + o + rng.normal(size=i.shape) * np.array(noise_a), truth
 
 
-def test_gain_ratios_are_in_doubt_if_a_signal_is_a_mean_over_a_second_but_not_by_gain_errors() -> None:
+def test_averaged_signal_puts_gain_ratios_in_doubt_and_gain_errors_do_not() -> None:
     measured = [currents_of(seed, (60.0, 8.0), (0.2, 0.2, 0.2), 9000)[0] for seed in range(8)]
     assert not evidence.ratios_in_doubt(fleet_of(*measured)).any()
     window = np.ones(10) / 10.0

@@ -59,7 +59,7 @@ def test_faults_beyond_the_limits_are_estimated_but_not_corrected(
     np.testing.assert_array_equal(limited.drift, free.drift)
 
 
-def test_low_gain_of_the_largest_branch_is_recovered_and_its_dead_sensor_is_not_surely_sound() -> None:
+def test_low_gain_of_the_largest_branch_is_recovered_and_its_dead_sensor_is_found_but_not_corrected() -> None:
     low = np.array([-0.65, -0.75, -0.88, -0.95, -1.0])
     faults = random_faults(3, vehicles=16, branches=3, full_scale_a=SCALE_A)
     for each in (faults.hardware_drift, faults.hardware_offset_a, faults.drift, faults.offset_a):
@@ -78,7 +78,7 @@ def test_low_gain_of_the_largest_branch_is_recovered_and_its_dead_sensor_is_not_
 
 @pytest.mark.long
 @pytest.mark.parametrize("offset_a", [0.0, 10.0])
-def test_current_moved_by_the_hardware_corrects_no_sensor_wrongly_whichever_two_branches(offset_a: float) -> None:
+def test_hardware_offset_between_any_two_branches_causes_no_wrong_correction(offset_a: float) -> None:
     """Six fleets with one such vehicle for each pair; beside an offset of one of the two sensors none is surely wrong.
 
     With one fault for pairs with the last branch alone, 5 of the 6 vehicles of the first pair were wrong beside the
@@ -282,7 +282,7 @@ def test_load_is_estimated_from_the_fleet_or_taken_as_declared() -> None:
     assert not estimate_vehicles(summaries, declared).corrected.any()
 
 
-def test_expected_share_and_known_distribution_of_the_faults_are_used() -> None:
+def test_expected_share_of_faulty_vehicles_and_known_prior_replace_learnt_ones() -> None:
     summaries, counts = drives("drift"), np.zeros((3, 5))
     expected = learned(summaries, expected_faults=0.4)
     assert expected.models[0].prior.counts[:, 1:].sum() == pytest.approx(0.4, abs=0.02)

@@ -49,7 +49,7 @@ MOTOR_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift":
 
 
 @pytest.mark.long
-def test_corrections_of_random_junctions_raise_no_error_by_more_than_the_accuracy_of_zero() -> None:
+def test_corrections_of_random_junctions_raise_no_error_by_more_than_0_05_percent_of_full_scale() -> None:
     """600 cars with a gain error of the motor, offsets and loads that may be there, and a trusted battery sensor."""
     rng, growth_a = np.random.default_rng(5), []
     for case in range(600):

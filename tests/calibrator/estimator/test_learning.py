@@ -149,7 +149,7 @@ def test_constant_shared_by_all_vehicles_is_more_probably_a_load_but_may_be_an_o
 
 
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_negative_junction_constant_is_an_offset_shared_by_a_branch(K: int) -> None:
+def test_negative_junction_constant_is_taken_for_an_offset_of_all_sensors_of_a_branch(K: int) -> None:
     """Currents that sum to less than zero: no load gives current."""
     faults = random_faults(12, vehicles=24, branches=K)
     faults.offset_a[:, 0] -= 0.03
@@ -159,7 +159,7 @@ def test_negative_junction_constant_is_an_offset_shared_by_a_branch(K: int) -> N
 
 
 @pytest.mark.parametrize(("offset", "load"), [(0.02, 0.0), (0.15, None)])
-def test_branch_of_a_shared_offset_stays_undecided_if_it_cannot_be_a_load(offset: float, load: float | None) -> None:
+def test_shared_offset_that_cannot_be_a_load_is_not_attributed_to_one_branch(offset: float, load: float | None) -> None:
     """The load is declared, or the offset is larger than any load that a fleet shares."""
     faults = no_faults(12, 3)
     faults.offset_a[:, 1] += offset
@@ -170,7 +170,7 @@ def test_branch_of_a_shared_offset_stays_undecided_if_it_cannot_be_a_load(offset
     assert by_branch.max() < 0.9
 
 
-def test_offset_of_most_vehicles_is_not_a_group_beside_a_declared_load() -> None:
+def test_offset_of_most_vehicles_is_not_learnt_as_a_group_if_the_load_is_declared() -> None:
     """What eight of twelve sensors share is their offset: the four others show the load that is declared."""
     faults = no_faults(12, 3)
     faults.offset_a[:8, 1] += 0.02
@@ -226,8 +226,7 @@ def test_single_fault_does_not_determine_the_prior_of_fault_sizes() -> None:
     assert np.interp(0.03, GRID, density) > 0.3 * np.interp(0.25, GRID, density)
 
 
-def test_single_vehicle_does_not_reinforce_its_own_number_of_faults() -> None:
-    """It is judged by the initial guess, not by a prior that it has shaped itself."""
+def test_single_vehicle_is_judged_by_the_initial_prior_and_not_by_one_learnt_from_itself() -> None:
     errors = Errors(slope=0.1, ratio=0.03, intercept=0.05, junction=0.03)
     rows = rows_of(random_faults(3, vehicles=1, branches=2), seed=3, errors=errors)
     draws, guess = explain(rows, law_of(2), feed=0), first_prior(2)

@@ -219,7 +219,7 @@ def test_posterior_weights_equal_integration_on_a_grid() -> None:
 
 @pytest.mark.parametrize("kind", [posterior.GAIN, posterior.OFFSET])
 @pytest.mark.parametrize("every", [1, 4])
-def test_evidence_for_other_densities_of_fault_sizes_equals_that_of_weighing_anew(kind: int, every: int) -> None:
+def test_evidence_for_another_slab_equals_that_of_weighing_all_draws_again(kind: int, every: int) -> None:
     prior = paper_prior(2, 0, 1, 2)
     draws = drawn(rows_of(random_faults(9, vehicles=20, branches=2, sparsity=70.0), seed=9), prior)
     slabs = [Slab(low=low, high=high, tail=0.02) for low, high in ((0.02, 0.3), (0.05, 0.25), (0.1, 0.5))]

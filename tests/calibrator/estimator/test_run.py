@@ -166,9 +166,7 @@ def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_empty_store_or_name_and_folder_with_drives_and_summaries_are_refused(
-    store: SummaryStore, tmp_path: Path
-) -> None:
+def test_store_that_is_empty_ambiguous_or_not_named_is_refused(store: SummaryStore, tmp_path: Path) -> None:
     shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
     shutil.copytree(store.url, tmp_path / "both")
     (tmp_path / "both" / "drives").mkdir()
@@ -316,7 +314,7 @@ def test_option_since_leaves_out_vehicles_removed_from_the_store_and_names_them(
     assert left_out_of(tmp_path / "out") == dict.fromkeys(gone, why)
 
 
-def test_option_since_refuses_a_result_without_a_part(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+def test_option_since_refuses_an_incomplete_result(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     shutil.copytree(result, tmp_path / "earlier")
     part = tmp_path / "earlier" / "buckets" / f"{fullest(store):05d}.parquet"
     part.unlink()

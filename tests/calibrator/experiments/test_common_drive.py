@@ -46,7 +46,7 @@ def test_common_drive_with_more_branches_than_the_builtin_vehicle_has_is_refused
 
 
 @pytest.mark.long
-def test_better_classifiers_raise_f2_and_sparsity_and_snr_raise_the_recovery_rate() -> None:
+def test_f2_rises_with_better_classifiers_and_recovery_with_sparsity_and_snr() -> None:
     f2 = rates(CASE, PERFECT, TREE, THRESHOLD, figure="f2")
     assert f2[0] == 1.0
     assert f2 == sorted(f2, reverse=True)

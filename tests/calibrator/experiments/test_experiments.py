@@ -133,7 +133,7 @@ def test_tables_compare_the_paper_with_methods_and_explain_columns(snr: Experime
         assert not any(absent in text for absent in ("confidence", "calibration error", "delays", "failed:"))
 
 
-def test_rows_called_all_together_pool_the_trials_of_all_settings(snr: ExperimentResult) -> None:
+def test_row_all_together_pools_the_trials_of_all_settings(snr: ExperimentResult) -> None:
     rows = snr.figures[snr.figures["method"] == POSTERIOR.name].set_index(["series", "figure"])
     rates = [snr.value("recovery_rate", x=x, method=POSTERIOR.name) for x in (10.0, 20.0)]
     assert rows.loc[(ALL, "recovery_rate"), "value"] == pytest.approx(np.mean(rates))
@@ -161,9 +161,7 @@ NO_TABLE = "^snr: methods .*; expected methods with names of their own, and sett
     ({"methods": ()}, NO_TABLE),
     ({"methods": (PERFECT, POSTERIOR, PERFECT)}, "^snr: methods published/perfect, posterior, published/perfect;"),
 ])  # fmt: skip
-def test_experiment_on_wrong_drives_or_without_distinct_settings_and_methods_is_refused(
-    change: dict[str, Any], message: str
-) -> None:
+def test_experiment_with_unfit_drives_settings_or_methods_is_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(FleetError, match=message):
         run_experiment(replace(EXPERIMENTS["snr"], **change), smooth_drive())
 
@@ -181,14 +179,14 @@ def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
     assert (EXPERIMENTS["asymmetry"].repetitions, small.repetitions) == (3, 2)
 
 
-def test_experiment_is_restricted_to_settings_with_a_text_in_their_name_which_must_exist() -> None:
+def test_option_only_selects_settings_by_a_part_of_their_name_and_refuses_an_unknown_one() -> None:
     kept = EXPERIMENTS["attacks"].only("cubic").small().settings
     assert [(each.series, each.x) for each in kept] == [("cubic 5-20 %", 2.0), ("cubic 5-20 %", 3.0)]
     ran = CliRunner().invoke(app, ["experiment", "asymmetry", "--only", "0.3"])
     assert "asymmetry: no setting has '0.3' in its name; there are 0, 0.2, 0.4, 0.5" in str(ran.exception)
 
 
-def test_recorded_case_with_a_number_of_vehicles_but_no_minutes_is_refused() -> None:
+def test_number_of_vehicles_without_a_drive_length_is_refused_for_recorded_trips() -> None:
     with pytest.raises(FleetError, match="40 vehicles, and each trip is one: give minutes as well"):
         RecordedCase(vehicles=40)
 
@@ -233,7 +231,7 @@ def run(*methods: ComparedMethod) -> ExperimentResult:
     return run_experiment(EXPERIMENTS["classifier"].small(), smooth_drive(), methods=methods, repetitions=1)
 
 
-def test_table_shows_users_methods_and_the_confidence_of_the_default_or_first_that_has_one() -> None:
+def test_table_shows_own_methods_and_one_confidence_preferably_of_the_default_method() -> None:
     sure = Own(change=lambda estimate: replace(estimate, confidence=np.full(N, 0.8)))
     result = run(PERFECT, Own("silent"), sure)
     table = headline(result)

@@ -34,7 +34,7 @@ def test_recorded_samples_obey_the_fault_model_within_noise_and_quantisation(fle
     assert vehicles.unmeasured_a.std() > 0.3
 
 
-def test_default_recovers_recorded_vehicles_that_defeat_the_published_method(fleet: RecordedFleet) -> None:
+def test_default_method_recovers_recorded_vehicles_that_defeat_the_published_method(fleet: RecordedFleet) -> None:
     trial = recorded_trial(fleet, RecordedCase(), 0)
     default, published = (judge(m.estimate(trial), trial) for m in (POSTERIOR, PERFECT))
     assert default["recovery_rate"].mean() >= 0.9
@@ -104,7 +104,7 @@ def many() -> RecordedFleet:
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_world_of_an_attack_changes_only_the_currents_of_affected_vehicles(many: RecordedFleet, world: str) -> None:
+def test_attack_changes_only_the_currents_of_affected_vehicles(many: RecordedFleet, world: str) -> None:
     trips, case = many.with_branches(2), RecordedCase(sparsity=100.0, world=world)
     plain, attacked = (record_vehicles(many, one, trips, 2) for one in (SOUND, case))
     pairs = zip(plain.samples, attacked.samples, strict=True)
@@ -114,7 +114,7 @@ def test_world_of_an_attack_changes_only_the_currents_of_affected_vehicles(many:
     assert any(changed) == bool(WORLDS[world].share)
 
 
-def test_truth_and_unseen_drive_follow_the_world_of_an_attack(many: RecordedFleet) -> None:
+def test_truth_and_unseen_drive_include_the_attack(many: RecordedFleet) -> None:
     sound, inverted, load, quadratic = (
         recorded_trial(many, RecordedCase(sparsity=100.0, world=world), 2)
         for world in ("", "inverted in 10%", "load 5 A in 30%", "quadratic 5-20 %")

@@ -52,7 +52,7 @@ def test_c_core_matches_the_node_for_random_frames(seed: int, tmp_path: Path) ->
 
 
 @needs("gcc")
-def test_c_core_matches_the_node_at_many_starts(tmp_path: Path) -> None:
+def test_c_core_matches_the_node_in_many_runs_from_its_start(tmp_path: Path) -> None:
     checked = vehicle()
     program = build(checked, tmp_path)
     assert sum(check_frames(checked, program, Random(seed), 500) for seed in range(100)) > 15_000

@@ -51,7 +51,9 @@ def test_missing_package_or_ctrl_c_at_start_ends_with_one_line(code: str, exit_c
     ("99999999999999", "SOURCE_DATE_EPOCH is '99999999999999'; expected seconds since 1970, or leave it unset"),
     ("", "none: no such folder, store of drives or store of summaries"),
 ])  # fmt: skip
-def test_wrong_time_of_run_ends_with_one_line_and_an_empty_one_is_none(tmp_path: Path, epoch: str, said: str) -> None:
+def test_wrong_source_date_epoch_ends_with_one_line_and_an_empty_one_is_ignored(
+    tmp_path: Path, epoch: str, said: str
+) -> None:
     command = [sys.executable, "-m", "calibrator", "calibrate", "none", "--layout", str(LAYOUT), "--out", "x"]
     environment = {**os.environ, "SOURCE_DATE_EPOCH": epoch, "PYTHONPATH": str(ROOT)}
     run = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)

@@ -128,7 +128,7 @@ def test_reason_is_given_why_a_current_is_not_taken_as_that_of_the_pack(kind: st
     assert last.startswith(f"calibrator: {path}: no pack current found")
 
 
-def test_charger_is_a_branch_without_a_log_only_if_there_is_no_motor(tmp_path: Path) -> None:
+def test_charger_is_proposed_without_a_log_only_if_the_dbc_has_no_motor(tmp_path: Path) -> None:
     charger = (
         'BO_ 5 Chg: 8 OBC\n SG_ CHG_Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS\n'
         ' SG_ CHG_Volts : 16|16@1+ (0.1,0) [0|1] "Volts" BMS\n'

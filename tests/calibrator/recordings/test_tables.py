@@ -122,7 +122,7 @@ def test_tables_of_all_formats_give_currents_without_a_layout(tmp_path: Path, ki
     ("2026-03-12", "%m/%d/%Y", "month"),
     ("2026-03-04", "%m-%d-%Y", "month"),
 ])  # fmt: skip
-def test_order_of_day_and_month_is_that_of_all_rows(tmp_path: Path, start: str, form: str, order: str) -> None:
+def test_order_of_day_and_month_is_found_from_all_rows(tmp_path: Path, start: str, form: str, order: str) -> None:
     times = pd.date_range(f"{start} 23:59:55", periods=ROWS, freq="100ms").strftime(f"{form} %H:%M:%S.%f")
     csv(frame(time=times))(tmp_path / "x.csv")
     table = read_table(tmp_path / "x.csv")

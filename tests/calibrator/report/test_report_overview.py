@@ -137,7 +137,7 @@ def margin(tmp_path: Path, database: VehicleDatabase) -> Margin:
     return of
 
 
-def test_margin_is_the_sensor_error_or_if_corrected_its_uncertainty(margin: Margin) -> None:
+def test_protection_margin_is_the_sensor_error_or_after_correction_its_uncertainty(margin: Margin) -> None:
     found, _ = margin(sensor(0.1, -4.0, apply=True), sensor(0.02, 1.0, apply=True))
     assert found["common_before_a"] == pytest.approx(44.0 + DOUBT_A)
     assert found["common_after_a"] == pytest.approx(DOUBT_A)
@@ -166,7 +166,7 @@ def test_sensor_of_undetermined_error_is_left_out_of_the_protection_margin_and_c
     assert "How wrong the battery sensor can be is not known, so no margin follows." in text
 
 
-def test_margin_gain_is_given_in_kilowatts_if_the_voltage_is_known(margin: Margin) -> None:
+def test_saved_margin_is_given_in_kilowatts_if_the_voltage_is_known(margin: Margin) -> None:
     _, text = margin(sensor(0.1, 4.0, apply=True), sensor(), voltage_v=350.0)
     assert "44.0 A = 15.4 kW given back with one margin for all" in text
     _, text = margin(sensor(0.1, 4.0, apply=True), sensor())
