@@ -268,17 +268,15 @@ def _batch(share: float, offset_a: float) -> World:
     return World(share=share, size=size, causes=("batch",), battery=True, truth=lambda d, o, s: (d, o + s))
 
 
-def _gain_batch(share: float, drift: float) -> World:
-    """Make the world of a batch of battery sensors with a gain error in common, in addition to their own."""
-    return World(share=share, size=(drift, drift), battery=True, truth=_one_more_gain)
-
-
 STEP, BENT, SPIKE = (0.15, 0.15), (0.05, 0.2), (1.0, 1.0)
 WORLDS = {
     "faults 30-60 %": World(share=0.0, magnitude=(0.3, 0.6)),
     "small errors in 30%": World(size=(0.3, 1.0), truth=lambda d, o, s: (d + 0.0015 * s, o + 0.5 * s)),
     **{f"battery {a:+g} A in {share:.0%}": _batch(share, a) for share in (1.0, 0.6) for a in (5.0, 12.0, 20.0, -12.0)},
-    **{f"battery gain +10 % in {share:.0%}": _gain_batch(share, 0.1) for share in (1.0, 0.6)},
+    **{
+        f"battery gain +10 % in {share:.0%}": World(share=share, size=(0.1, 0.1), battery=True, truth=_one_more_gain)
+        for share in (1.0, 0.6)
+    },
     "load 5 A in 30%": _load(0.3, (5.0, 5.0), lambda i, s: np.full(len(i), s.size)),
     "load 10 A in 15%": _load(0.15, (10.0, 10.0), lambda i, s: np.full(len(i), s.size)),
     "load 0-10 % of |motor| in 30%": _load(0.3, (0.0, 0.1), lambda i, s: s.size * np.abs(i[:, 1]), "sign"),

@@ -29,6 +29,7 @@ from ecu_node.summary import RANGE_SLACK
 __all__ = [
     "Decoded",
     "SignalRange",
+    "bit_range",
     "decode_signal",
     "message_is_sound",
     "p01_is_sound",
@@ -195,7 +196,7 @@ def signal_range(signal: Signal, factor: float = 1.0) -> SignalRange:
     """
     low = -math.inf if signal.minimum is None else float(signal.minimum)
     high = math.inf if signal.maximum is None else float(signal.maximum)
-    if not signal.minimum and not signal.maximum:
+    if signal.minimum == signal.maximum == 0:
         low, high = -math.inf, math.inf
     ends = sorted((factor * low, factor * high))
     return SignalRange(low=ends[0], high=ends[1], slack=abs(factor * float(signal.scale)) * RANGE_SLACK)

@@ -100,7 +100,7 @@ def read_frames(path: Path) -> Frames:
     Returns
     -------
     Frames
-        The frames in the order of the file.
+        The frames in the order of the file, those of MF4 by time.
 
     Raises
     ------

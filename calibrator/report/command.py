@@ -24,7 +24,7 @@ def report(
     ] = None,
     vehicle: Annotated[str | None, typer.Option(help="The page of this vehicle alone.")] = None,
     battery: Annotated[
-        str | None, typer.Option(help="Branch of the battery, for its protection margin; default: battery.")
+        str | None, typer.Option(help="Branch of the battery, for its protection margin; default: by its name.")
     ] = None,
     limit: Annotated[
         float | None,

@@ -335,7 +335,7 @@ class Repository:
                 delegators.append(live)
             before = len(metadata.signatures)
             for signer in signers:
-                if any(signer.public_key.keyid in _keyids(delegator, role) for delegator in delegators):
+                if any(signer.public_key.keyid in each.get_delegated_role(role).keyids for each in delegators):
                     metadata.sign(signer, append=True)
             if len(metadata.signatures) > before:
                 _write(path, _encoded(metadata))
@@ -476,10 +476,6 @@ def _facts(file: TargetFile) -> TargetFacts:
 def _set_target(targets: Targets, path: str, length: int, digest: str, facts: TargetFacts) -> None:
     custom = msgspec.to_builtins(facts)
     targets.targets[path] = TargetFile(length, {"sha256": digest}, path, {"custom": custom})
-
-
-def _keyids(delegator: Root | Targets, role: str) -> Sequence[str]:
-    return delegator.get_delegated_role(role).keyids
 
 
 def _signed_by(root: Root, role: str, signed: Signed, signers: Sequence[Signer]) -> bytes:

@@ -39,7 +39,7 @@ def summarise(
     time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
 ) -> None:
-    """Reduce drives to what the calibration needs of them: second moments, a few kilobytes per vehicle."""
+    """Reduce drives to what the calibration needs of them: second moments, some ten kilobytes per vehicle."""
     with importing():
         from calibrator.processes.run_many import Workers
         from calibrator.summaries.filter_bank import read_bank

@@ -23,7 +23,7 @@ from calibrator.compiled import compiled
 from calibrator.drive import Array, Complex, Mask
 from calibrator.errors import DriveError
 
-__all__ = ["FilterBank", "low_passes", "plain_bank", "read_bank"]
+__all__ = ["FilterBank", "low_passes", "read_bank"]
 
 LONGEST_HOLD_S = 1.0
 """Longest time that an input may keep its last valid value; currents seldom change much within it. [s]"""
@@ -127,11 +127,6 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         """Return the poles in words: time constant of each low-pass, frequency and time constant of each resonance."""
         words = [_described(pole, self.period_s) for pole in self.complex_poles]
         return ", ".join(words) or "the plain inputs"
-
-
-def plain_bank(input_names: tuple[str, ...], *, period_s: float) -> FilterBank:
-    """Return a bank without poles, whose columns are the inputs as they are."""
-    return FilterBank(input_names=input_names, period_s=period_s)
 
 
 def low_passes(time_constants_s: Array, *, period_s: float) -> Poles:

@@ -8,7 +8,7 @@ import msgspec
 from calibrator.drive import Equipment
 from calibrator.errors import DriveError, FleetError
 from calibrator.files.storage import Storage
-from calibrator.summaries.filter_bank import FilterBank, plain_bank
+from calibrator.summaries.filter_bank import FilterBank
 from ecu_node.database import VehicleDatabase
 
 __all__ = [
@@ -99,7 +99,7 @@ def store_identity(
         layout_sha256=layout.digest,
         dbc_sha256=database.digest,
         equipment=equipment,
-        bank=bank or plain_bank(equipment.fleet_inputs, period_s=layout.period_s),
+        bank=bank or FilterBank(input_names=equipment.fleet_inputs, period_s=layout.period_s),
         buckets=min(max(wanted, FEWEST_BUCKETS), MOST_BUCKETS),
         fleet=fleet,
     )

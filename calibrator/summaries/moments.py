@@ -58,8 +58,8 @@ class DriveSummary:
         Sums over the samples of a block of the products of (inputs, measured currents [A], 1). Inputs here are the M
         columns of the filter bank: the inputs of the drive and their filtered forms.
     noise_a2 : ndarray of shape (B, K)
-        Variance of the white noise of each measured current in a block, never less than that of rounding to its steps;
-        an upper bound where the current itself changes fast. [A^2]
+        Variance of the white noise of each measured current in a block; an upper bound where the current itself changes
+        fast. In summaries of vehicles it is at least that of rounding to the current's steps. [A^2]
     branches : int
         Number of branches K.
     period_s : float

@@ -9,7 +9,7 @@ from scipy.ndimage import median_filter
 from calibrator.compiled import compiled
 from calibrator.drive import Array, Mask, Samples
 from calibrator.errors import DriveError
-from calibrator.summaries.filter_bank import FilterBank, plain_bank
+from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, DriveSummary, FitSums
 from ecu_node.summary import (
     BATCH_SAMPLES,
@@ -70,7 +70,7 @@ def summarise_samples(
     DriveError
         If no block has enough valid samples, or the bank was made for other inputs or another period.
     """
-    bank = plain_bank(drives[0].input_names, period_s=period_s) if bank is None else bank
+    bank = FilterBank(input_names=drives[0].input_names, period_s=period_s) if bank is None else bank
     K, W = drives[0].currents_a.shape[1], bank.width
     length = max(round(block_s / period_s), 1)
     batch = length * max(BATCH_SAMPLES // length, 1)

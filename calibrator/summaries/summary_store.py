@@ -262,7 +262,7 @@ class StoreReport:
     def as_text(self) -> str:
         """Return the report as readable text."""
         lines = [
-            f"{self.store}: {counted(self.vehicles, 'vehicle')}, {self.unusable} of them without usable drives; "
+            f"{self.store}: {counted(self.vehicles, 'vehicle')}, {self.unusable} of them cannot be calibrated; "
             f"{counted(self.drives, 'drive')}, {self.hours:.1f} h; {counted(self.files, 'file')}, "
             f"{self.size_bytes / 1e6:.1f} MB",
             f"layout {self.layout}; branches {', '.join(self.branches)}; inputs {few(self.inputs)}",

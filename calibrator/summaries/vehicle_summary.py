@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calibrator.drive import Array, Channel, Drive, Equipment, Samples
+from calibrator.drive import Array, Channel, Drive, Equipment, Mask, Samples
 from calibrator.drives.align import align, at_pace, step_seen
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
@@ -293,7 +293,7 @@ def _shown(drive: Drive, branch: str, layout: Layout) -> Iterator[Channel]:
             yield Channel(time_s=current.time_s[inside], value=current.value[inside], good=current.good[inside])
 
 
-def _is_open(state: Channel, contactor: Contactor) -> Array:
+def _is_open(state: Channel, contactor: Contactor) -> Mask:
     is_open = np.isclose(state.value[:, None], np.array(contactor.open)[None, :], rtol=1e-9, atol=1e-9).any(axis=1)
     return np.asarray(state.good & is_open)
 

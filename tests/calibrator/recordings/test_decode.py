@@ -141,6 +141,7 @@ def test_names_in_the_dbc_that_mean_not_available_are_recognised(name: str, expe
 @pytest.mark.parametrize(("limits", "good"), [
     ((-1.0, 1.0), [True, True, False]), ((0.0, 0.0), [True, True, True]), ((None, None), [True, True, True]),
     ((0.5, None), [False, True, True]), ((None, 0.5), [True, False, False]), ((0.0, 1.0), [True, True, False]),
+    ((None, 0.0), [True, False, False]),
 ])  # fmt: skip
 def test_value_outside_the_range_of_the_dbc_is_not_good(limits: tuple[float, float], good: list[bool]) -> None:
     message, signal = one_signal(8, scale=0.1, limits=limits)

@@ -36,7 +36,7 @@ def test_columns_are_the_inputs_and_each_input_filtered_by_each_pole() -> None:
 
 def test_bank_without_poles_returns_the_inputs_unchanged() -> None:
     u = inputs_of(2)
-    bank = filter_bank.plain_bank(NAMES, period_s=PERIOD_S)
+    bank = filter_bank.FilterBank(input_names=NAMES, period_s=PERIOD_S)
     columns, used = bank.run(u, np.ones(SAMPLES, bool))
     assert used.all()
     np.testing.assert_array_equal(columns, u)
