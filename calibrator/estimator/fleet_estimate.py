@@ -425,6 +425,7 @@ def estimate_vehicles(
         summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=reference.branches
     )
     drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
+    load = np.array([each.weight @ (each.load != 0.0) > SUSPECTED for each in found.points])  # or an offset
     held_back, corrected, verdicts = decided(
         found.faulty,
         unfit=np.array([_unfit(each, reference.branches) for each in unfit]),
@@ -432,7 +433,7 @@ def estimate_vehicles(
         still=~found.identifiable,
         harmful=~(found.harm_probability < harm_limit),
         beyond=(np.abs(found.drift) > drift_limit) | (np.abs(found.offset_a) > offset_limit_a),
-        sound=~found.faulty.any(axis=1) & (found.confidence >= CONFIDENT) & ~np.array(list(map(bool, unfit))),
+        sound=~found.faulty.any(axis=1) & (found.confidence >= CONFIDENT) & ~np.array(list(map(bool, unfit))) & ~load,
     )
     linear = [
         1.0 - max((each.probability for each in mine if each.cause not in LINEAR_CAUSES), default=0.0) for mine in unfit

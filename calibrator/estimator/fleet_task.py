@@ -24,6 +24,8 @@ from calibrator.estimator.readings import (
     TRUSTED_OFFSET_SD,
     BenchTable,
     bench_readings,
+    flow_notices,
+    flows_in_fleet,
     merge_readings,
     window_readings,
 )
@@ -63,6 +65,8 @@ class FleetTask:
         Bench readings that are used, by vehicle and branch.
     believed : frozenset of str
         Trusted vehicles whose currents do not contradict the trust in them.
+    windows : bool
+        Whether zero-current windows are used; not if a current flows in those of most vehicles.
     fleet_size : int
         Number of usable vehicles in the whole fleet, not only in the sample.
     """
@@ -71,6 +75,7 @@ class FleetTask:
     identity: RunIdentity
     bench: BenchTable
     believed: frozenset[str]
+    windows: bool
     fleet_size: int
 
     @property
@@ -84,7 +89,7 @@ class FleetTask:
         return estimate_vehicles(
             [vehicle.summary for vehicle in vehicles],
             self.reference,
-            readings=merge_readings(vehicles, self.bench, self.branches)[0],
+            readings=merge_readings(vehicles, self.bench, self.branches, windows=self.windows)[0],
             trusted=np.array([vehicle.vehicle in self.believed for vehicle in vehicles]),
             harm_limit=self.identity.settings.harm_limit,
             limits=(layout.limits.drift, layout.offset_limit_a),
@@ -162,9 +167,10 @@ def learn_task(
     learning = np.array([vehicle.vehicle not in settings.hold_out for vehicle in vehicles])
     learners = list(compress(vehicles, learning))
     trusted = np.array([vehicle.vehicle in settings.trusted for vehicle in learners])
+    windows = not flows_in_fleet(vehicles)
 
     def learn(used: BenchTable) -> tuple[FleetTask, list[str]]:
-        readings, notices = merge_readings(vehicles, used, branches)
+        readings, notices = merge_readings(vehicles, used, branches, windows=windows)
         reference = learn_fleet(
             [vehicle.summary for vehicle in learners],
             full_scale_a=layout.full_scale_a,
@@ -179,6 +185,7 @@ def learn_task(
             identity=identity,
             bench=used,
             believed=settings.trusted - {learners[j].vehicle for j in reference.distrusted},
+            windows=windows,
             fleet_size=fleet_size,
         )
         return task, notices
@@ -188,6 +195,7 @@ def learn_task(
         wrong = _contradicted(task, vehicles, bench)
         task, notices = learn({sensor: values for sensor, values in bench.items() if sensor not in wrong})
         notices += wrong.values()
+    notices += flow_notices(vehicles, windows=windows)
     return task, [*task.reference.notices, *_distrust(learners, trusted, task.reference), *notices]
 
 

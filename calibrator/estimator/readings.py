@@ -8,9 +8,10 @@ offset_sd_a`` or both pairs; a pair of empty cells was not read. measured = (1 +
 
 import csv
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import combinations, compress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +32,9 @@ __all__ = [
     "BenchReading",
     "BenchTable",
     "bench_readings",
+    "current_flows",
+    "flow_notices",
+    "flows_in_fleet",
     "merge_readings",
     "read_bench_table",
     "untrusted_vehicles",
@@ -46,6 +50,12 @@ FEWEST_TRUSTED = 3
 """Least number of trusted vehicles that can carry the reference."""
 CONTRADICTION = 4.0
 """Difference of two readings of one sensor, in standard deviations, above which they contradict each other. [1]"""
+CANCEL_SD, FLOW_SD = 3.0, 10.0
+"""Standard deviations up to which the sum of two readings counts as zero, and above which the readings are far from it:
+offsets of two sensors then cancel by chance only, and a current that flows always does. [1]"""
+LEAST_FLOWS, FLOWS_SHARE, SMALL_FLOW_SD = 3, 0.6, 4.0
+"""Vehicles, and share of those with windows, in which the same two sensors cancel, and median size in standard
+deviations, from which on a current flows in the whole fleet: small offsets of two sensors cancel in fewer. [1]"""
 LEAST_GAIN, LEAST_OFFSET = 0.003, 0.001
 """Standard deviations that causes other than sensors add to a gain ratio, and to the junction constant over full scale.
 [1]"""
@@ -83,9 +93,46 @@ BenchTable = Mapping[tuple[str, str], BenchReading]
 
 
 def window_readings(vehicles: Sequence[VehicleSummary]) -> Array:
-    """Return offsets that sensors showed in zero-current windows, in the form of :func:`bench_readings`; drifts NaN."""
+    """Return offsets that sensors showed in zero-current windows, in the form of :func:`bench_readings`; drifts NaN.
+
+    They are NaN for vehicles in which :func:`current_flows`.
+    """
     shown = np.array([(each.zero_current.offset_a, each.zero_current.sd_a) for each in vehicles])
+    shown[current_flows(vehicles)] = np.nan
     return np.stack([np.full_like(shown, np.nan), shown]).transpose(2, 0, 1, 3)
+
+
+def current_flows(vehicles: Sequence[VehicleSummary]) -> Mask:
+    """Return for each of N vehicles whether a current flows from one sensor to another in its zero-current windows."""
+    return np.asarray(np.any([(rest < CANCEL_SD) & (shown > FLOW_SD) for rest, shown in _pairs(vehicles)], axis=0))
+
+
+def flows_in_fleet(vehicles: Sequence[VehicleSummary]) -> bool:
+    """Return whether a current flows between the same two sensors in the windows of most vehicles, however small."""
+    for rest, shown in _pairs(vehicles):
+        known = np.isfinite(rest)
+        fewest = max(LEAST_FLOWS, FLOWS_SHARE * np.count_nonzero(known))
+        if np.count_nonzero(rest < CANCEL_SD) >= fewest and np.median(shown[known]) > SMALL_FLOW_SD:
+            return True
+    return False
+
+
+def _pairs(vehicles: Sequence[VehicleSummary]) -> Iterator[tuple[Array, Array]]:
+    """Yield for each two sensors |sum| and the smaller of both window readings, in standard deviations, (N,) each."""
+    offset_a = np.array([each.zero_current.offset_a for each in vehicles])
+    sd_a = np.array([each.zero_current.sd_a for each in vehicles])
+    for p, r in combinations(range(offset_a.shape[1]), 2):
+        one, other, sd = offset_a[:, p], offset_a[:, r], np.hypot(sd_a[:, p], sd_a[:, r])
+        yield np.abs(one + other) / sd, np.minimum(np.abs(one), np.abs(other)) / sd
+
+
+def flow_notices(vehicles: Sequence[VehicleSummary], *, windows: bool = True) -> list[str]:
+    """Say in which vehicles :func:`current_flows`, and if no ``windows`` of the fleet are used for it."""
+    found = few([each.vehicle for each in compress(vehicles, current_flows(vehicles))])
+    why = "two sensors show the same current with opposite signs while the contactors count as open, so one flows"
+    if not windows:
+        return [f"most vehicles: {why}; no vehicle's zero-current windows are used; check [contactor] in the layout"]
+    return [f"{found}: {why}; what they show then is not used; check [contactor] in the layout"] if found else []
 
 
 def bench_readings(bench: BenchTable, vehicles: Sequence[str], branches: Sequence[str]) -> Array:
@@ -257,7 +304,7 @@ def _reading(row: Mapping[str, str], place: str, full_scale_a: float) -> BenchRe
 
 
 def merge_readings(
-    vehicles: Sequence[VehicleSummary], bench: BenchTable, branches: Sequence[str]
+    vehicles: Sequence[VehicleSummary], bench: BenchTable, branches: Sequence[str], *, windows: bool = True
 ) -> tuple[Array, list[str]]:
     """Return weighted means of what sensors showed on a bench and in zero-current windows.
 
@@ -269,6 +316,8 @@ def merge_readings(
         Bench readings.
     branches : sequence of str
         Names of the K branches.
+    windows : bool
+        Whether zero-current windows are used.
 
     Returns
     -------
@@ -279,6 +328,8 @@ def merge_readings(
     """
     names = [vehicle.vehicle for vehicle in vehicles]
     read, shown = bench_readings(bench, names, branches), window_readings(vehicles)
+    if not windows:
+        shown[:] = np.nan
     merged = np.array(weighted_mean((shown[0], shown[1]), (read[0], read[1])))
     (offset_a, sd_a), (read_a, read_sd_a) = shown[:, 1], read[:, 1]
     apart = np.abs(offset_a - read_a) > CONTRADICTION * np.hypot(sd_a, read_sd_a)

@@ -14,9 +14,13 @@ from calibrator.estimator.readings import (
     BenchReading,
     BenchTable,
     bench_readings,
+    current_flows,
+    flow_notices,
+    flows_in_fleet,
     merge_readings,
     read_bench_table,
     untrusted_vehicles,
+    window_readings,
 )
 from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.layout import UnmeasuredLoad
@@ -107,6 +111,35 @@ def test_bench_and_window_readings_are_averaged_or_both_dropped_if_contradictory
     assert (readings[0, 0, 1, 0], readings[0, 0, 2, 1]) == pytest.approx((0.03, 0.02))
     assert notices[0].startswith("vehicle V2: its battery sensor was read as -5.0 A on the bench, and showed +5.0 A")
     assert notices[1] == "bench readings of vehicles that are left out are not used: gone"
+
+
+def with_windows(*shown_a: tuple[float, float]) -> list[VehicleSummary]:
+    windows = (ZeroCurrent(offset_a=np.array(pair), sd_a=np.array([0.03, 0.03])) for pair in shown_a)
+    summaries = [SimpleNamespace(vehicle=f"V{j + 1}", zero_current=each) for j, each in enumerate(windows)]
+    return cast("list[VehicleSummary]", summaries)
+
+
+def test_window_in_which_a_current_flows_between_two_sensors_is_not_used() -> None:
+    vehicles = with_windows((0.84, -0.85), (0.84, 0.85), (0.2, -0.2), (5.0, -4.5), (NAN, NAN))
+    assert current_flows(vehicles).tolist() == [True, False, False, False, False]
+    assert np.isnan(window_readings(vehicles)[0, 1]).all(axis=1).tolist() == [True, False, False, False, True]
+    assert flow_notices(vehicles)[0].startswith("V1: two sensors show the same current with opposite signs while the")
+    assert flow_notices(vehicles[1:]) == []
+
+
+@pytest.mark.parametrize(("shown_a", "flows"), [
+    ([(0.25, -0.2), (0.2, -0.22), (0.22, -0.2), (9.0, -0.2)], True),
+    ([(0.25, -0.2), (0.2, -0.22), (9.0, -0.2), (0.2, 0.2)], False),
+    ([(0.1, -0.1)] * 4, False),
+    ([(0.5, -0.5)] * 2, False),
+])  # fmt: skip
+def test_windows_of_a_fleet_are_not_used_if_the_same_small_current_flows_in_most(
+    shown_a: list[tuple[float, float]], flows: bool
+) -> None:
+    vehicles = with_windows(*shown_a)
+    assert flows_in_fleet(vehicles) == flows
+    assert np.isnan(merge_readings(vehicles, {}, BRANCHES, windows=False)[0]).all()
+    assert flow_notices(vehicles, windows=False)[0].startswith("most vehicles: two sensors show the same current")
 
 
 @pytest.mark.parametrize("others_a", [0.0, 5.0, -12.0])
