@@ -261,7 +261,7 @@ class LiveBranch(HeardSignal):
             first += 1
         while last in self.codes.named:
             last -= 1
-        if plan.needs_voltage or plan.gain <= 0 or any(first <= code <= last for code in self.codes.named):
+        if plan.needs_voltage or plan.gain <= 0 or any(code in range(first, last) for code in self.codes.named):
             return 1, 0
         least, beyond = plan.lowest << plan.shift, (plan.highest + 1) << plan.shift
         bias = plan.bias + (1 << (plan.shift - 1))

@@ -43,13 +43,30 @@ def live(
 
 
 class Watched:
-    """A junction of which each branch sends 32 frames a second, and its watch; all currents are into the junction."""
+    """A junction of which each branch sends 32 frames a second, and its watch; all currents are into the junction.
 
-    def __init__(self, *, margin_a: float = 1.0, faults: dict[str, SensorFault] | None = None, **expected: float):
+    The battery is seen later by ``late_s``.
+    """
+
+    def __init__(
+        self,
+        *,
+        margin_a: float = 1.0,
+        faults: dict[str, SensorFault] | None = None,
+        late_s: float = 0.0,
+        **expected: float,
+    ):
         names, none = ("battery", "motor", "heater"), SensorFault()
         self.frames: dict[str, Frames] = {name: deque() for name in names}
         branches = [
-            live(name, self.frames[name], fault=(faults or {}).get(name, none), unit=Fraction(1, 100)) for name in names
+            live(
+                name,
+                self.frames[name],
+                fault=(faults or {}).get(name, none),
+                unit=Fraction(1, 100),
+                delay_s=late_s if name == "battery" else 0.0,
+            )
+            for name in names
         ]
         self.watch = JunctionWatch(branches, window_s=8.0, margin_a=margin_a, full_scale_a=400.0)
         self.watch.restart(JunctionResidual(**{"measured_a": 0.0, "corrected_a": 0.0} | expected))
@@ -82,10 +99,15 @@ def test_ordinary_codes_have_no_names_and_are_not_clipped() -> None:
     branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
     branch.codes = codes(Fraction(1), -32767, 32767)
     assert branch.ordinary_codes() == (-32766, 32766)
-    branch.plan = IntegerPlan(gain=2, bias=20, shift=1, lowest=-100, highest=100)
-    assert branch.ordinary_codes() == (-110, 90)
-    branch.plan = IntegerPlan(gain=-2, bias=0, shift=1, lowest=-100, highest=100)
-    assert branch.ordinary_codes() == (1, 0)
+    none = 1, 0
+    for gain, bias, shift, codes_of in (
+        (3, 30, 2, (-144, 123)),
+        (1, 0, 1, (-201, 200)),
+        (0, 0, 1, none),
+        (-2, 0, 1, none),
+    ):
+        branch.plan = IntegerPlan(gain=gain, bias=bias, shift=shift, lowest=-100, highest=100)
+        assert branch.ordinary_codes() == codes_of
 
 
 def test_movement_of_a_power_is_the_current_that_a_right_sensor_would_show() -> None:
@@ -107,6 +129,18 @@ def test_movement_of_a_power_is_the_current_that_a_right_sensor_would_show() -> 
     assert power.movement(1.375, 0.25, 5) == Movement(70 * per_code_a, 70 * per_code_a, 5 * per_code_a)
     volts.append(frame(0.5, 0))
     assert power.movement(1.375, 0.25, 3) == Movement(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("battery_a", "period_s", "at_s"),
+    [(60.0, 1 / 32, 3.0), (60.0, 0.25, 3.25), (53.0, 1 / 32, 8.21875)],
+    ids=["implausible after half a window", "implausible after ten looks", "worse after nine tenths of a window"],
+)
+def test_sums_are_judged_from_part_of_a_window_and_ten_looks_on(battery_a: float, period_s: float, at_s: float) -> None:
+    """The first frames come after a second; the motor is corrected by 3 A."""
+    junction = Watched(faults={"motor": SensorFault(offset_a=-3.0)}, corrected_sd_a=1.0, corrected_sd_per_a=0.0)
+    junction.run(9.0, lambda now_s: {"battery": battery_a, "motor": -53.0} if now_s >= 1.0 else {}, period_s=period_s)
+    assert (junction.watch.verdict is not None, junction.now_s) == (True, at_s)
 
 
 @pytest.mark.parametrize("load_a", [0.0, 30.0])
@@ -176,14 +210,17 @@ def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_named_afte
 def test_current_that_never_changes_is_stuck_unless_it_is_small(
     still_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
-    """The sum varies by what no gain error explains; the motor is first heard after half a second."""
+    """The sum varies by what no gain error explains; the motor is first heard after half a second.
+
+    When the heater changes at last, its new code is known one instant before its new current.
+    """
 
     def varying(time_s: float) -> dict[str, float]:
         motor_a = 100.0 * math.sin(3.0 * time_s) if time_s > 0.5 else 0.0
-        shown = {"battery": -motor_a + 15.0 * math.sin(11.0 * time_s), "heater": still_a}
+        shown = {"battery": -motor_a + 15.0 * math.sin(11.0 * time_s), "heater": still_a + (time_s >= 8.0)}
         return shown | {"motor": motor_a} if time_s > 0.5 else shown
 
-    junction = Watched(corrected_sd_a=15.0)
+    junction = Watched(late_s=PERIOD_S, corrected_sd_a=15.0)
     junction.run(9.0, varying)
     assert junction.watch.verdict == verdict
 
