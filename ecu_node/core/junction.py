@@ -357,7 +357,7 @@ class LiveBranch(HeardSignal):
             if not self.codes.is_value(code):
                 return None
             if seen_s <= time_s:
-                if later is None or later[0] <= seen_s:
+                if later is None:
                     return code
                 return code + (time_s - seen_s) / (later[0] - seen_s) * (later[1] - code)
             later = sample

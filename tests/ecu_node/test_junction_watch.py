@@ -88,7 +88,7 @@ def test_value_is_used_up_to_its_timeout_and_not_if_an_unusable_frame_came_at_it
     for now_s, code, published in ((1.5, 7, (7, Quality.PASSED_THROUGH)), (1.51, None, (None, Quality.NOT_AVAILABLE))):
         assert (branch.code_at(now_s), branch.published(now_s)) == (code, published)
         assert branch.is_old(now_s) is branch.is_stale(now_s) is (code is None)
-    assert branch.code_at(0.99) is None
+    assert (branch.code_at(0.99), branch.currents_at(0.5), branch.currents_at(0.49)) == (None, (7.0, 7.0), None)
     branch.spoil(0.99)
     assert (branch.code_at(1.0), branch.latest()) == (7, (1.0, 7))
     branch.spoil(1.0)
@@ -127,7 +127,9 @@ def test_movement_of_a_power_is_the_current_that_a_right_sensor_would_show() -> 
     per_code_a = 100.0 / 200.0 / 1.25
     assert power.movement(1.375, 0.25, 3) == Movement(60 * per_code_a, 60 * per_code_a, 0.0)
     assert power.movement(1.375, 0.25, 5) == Movement(70 * per_code_a, 70 * per_code_a, 5 * per_code_a)
-    volts.append(frame(0.5, 0))
+    volts.append(frame(0.375, 10))
+    assert power.movement(1.375, 0.25, 3).distance_a == 60 * 100.0 / 10.0 / 1.25
+    volts.append(frame(0.5, 9))
     assert power.movement(1.375, 0.25, 3) == Movement(0.0, 0.0, 0.0)
 
 
