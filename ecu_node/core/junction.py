@@ -18,7 +18,7 @@ from typing import NamedTuple
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault
 from ecu_node.core.signals import BitPlace, Codes, PlacedSignal
 from ecu_node.core.status import Counters, Quality, Reason
-from ecu_node.parameters import JunctionResidual
+from ecu_node.parameters import NOTHING_EXPECTED, JunctionResidual
 
 REMEMBERED_FRAMES = 1024
 """Number of frames of a message that are remembered: they reach back further than branches lag each other."""
@@ -529,7 +529,7 @@ class JunctionWatch:
         """Whether the state that says when sums can be judged is not known now."""
         return self._whole is not None and self._whole[0].code_at(now_s) is None
 
-    def restart(self, expected: JunctionResidual | None = None) -> None:
+    def restart(self, expected: JunctionResidual = NOTHING_EXPECTED) -> None:
         """Forget what was seen, and judge from now on by what the parameter file expects of the sum of right sensors.
 
         If the calibrator itself saw the correction make the sum worse (as where one of two offsets that cancel is
@@ -537,7 +537,6 @@ class JunctionWatch:
         deviations, shares of full scale (or what the calibrator saw, if more) and of the throughput take their place:
         then only gross faults show.
         """
-        expected = expected or JunctionResidual(measured_a=0.0, corrected_a=0.0)
         measured_a, corrected_a = expected.about_expected()
         margins = min(max((corrected_a - measured_a) / self._margin_a, 0.0), _MOST_MARGINS)
         self._expected_a, self._allowed_a = expected.expected_a, self._margin_a * (1.0 + margins)
