@@ -154,7 +154,7 @@ def test_sums_count_from_the_load_that_parameters_expect(load_a: float) -> None:
     assert junction.watch.verdict == (Reason.CORRECTION_WORSE, ())
 
 
-@pytest.mark.parametrize(("offset_a", "verdict"), [(2.4, None), (2.6, (Reason.CORRECTION_WORSE, ()))])
+@pytest.mark.parametrize(("offset_a", "verdict"), [(2.5, None), (2.6, (Reason.CORRECTION_WORSE, ()))])
 def test_margin_grows_by_what_the_calibrator_itself_saw_the_correction_make_worse(
     offset_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
@@ -242,7 +242,7 @@ def test_current_that_never_changes_is_stuck_unless_it_is_small(
 
 
 @pytest.mark.parametrize(
-    ("jump_a", "period_s", "looks"), [(50.0, 1 / 32, 3), (50.0, 1 / 128, 5), (-21.0, 1 / 32, 3), (19.0, 1 / 32, None)]
+    ("jump_a", "period_s", "looks"), [(50.0, 1 / 32, 3), (50.0, 1 / 128, 5), (-21.0, 1 / 32, 3), (-20.0, 1 / 32, None)]
 )
 def test_jump_lasts_for_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
     jump_a: float, period_s: float, looks: int | None
@@ -265,4 +265,22 @@ def test_branch_that_does_not_follow_another_ones_rise_is_stuck_if_it_carries_ha
 ) -> None:
     junction = Watched(corrected_sd_a=1.0)
     junction.run(2.0, lambda now_s: {"battery": still_a + 96.0 * max(now_s - 1.0, 0.0), "heater": -still_a})
+    assert junction.watch.verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("rises", "verdict"),
+    [(3, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (4, (Reason.BRANCH_STUCK, ("heater",)))],
+)
+def test_still_branch_is_stuck_if_another_one_moves_as_the_sum_does_but_not_in_one_step(
+    rises: int, verdict: tuple[Reason, tuple[str, ...]]
+) -> None:
+    """The battery rises by 1 A, which makes the sum wrong, and then by 4 A each time: half of 8 A, a third of 12 A."""
+
+    def rising(now_s: float) -> dict[str, float]:
+        level = min(max(math.floor(10.0 * now_s) - 9, 0), rises)
+        return {"battery": 20.0 + max(4.0 * level - 3.0, 0.0), "heater": -20.0}
+
+    junction = Watched(corrected_sd_a=1.0, corrected_sd_per_a=0.0)
+    junction.run(4.0, rising)
     assert junction.watch.verdict == verdict
