@@ -102,13 +102,16 @@ def test_ordinary_codes_have_no_names_and_are_not_clipped() -> None:
     assert branch.ordinary_codes() == (-32766, 32766)
     none = 1, 0
     for gain, bias, shift, codes_of in (
-        (3, 30, 2, (-144, 123)),
+        (3, 31, 2, (-144, 123)),
         (1, 0, 1, (-201, 200)),
         (0, 0, 1, none),
         (-2, 0, 1, none),
     ):
         branch.plan = IntegerPlan(gain=gain, bias=bias, shift=shift, lowest=-100, highest=100)
         assert branch.ordinary_codes() == codes_of
+    for amid in (-5, 5):
+        branch.codes, branch.plan = codes(Fraction(1), amid), AS_IT_IS
+        assert branch.ordinary_codes() == none
 
 
 def test_movement_of_a_power_is_the_current_that_a_right_sensor_would_show() -> None:
