@@ -278,7 +278,7 @@ def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:
             f"{where}: a standard deviation or the confidence is not finite; leave it out where it is not known; "
             f"nothing was written"
         )
-    return msgspec.json.format(content, indent=2) + b"\n"
+    return msgspec.json.format(content) + b"\n"
 
 
 def write_parameters(parameters: VehicleParameters, path: Path) -> None:
