@@ -142,7 +142,7 @@ def test_parameters_of_another_vehicle_layout_or_dbc_are_unfit(
 
 
 def test_rms_about_the_expected_sum_follows_from_rms_and_mean() -> None:
-    measured_a, corrected_a, expected_a = [3.0, 5.0, -1.0, 7.0], [1.5, 2.0, 2.5, 1.0], 3.0
+    measured_a, corrected_a, expected_a = [3.0, 5.0, -1.0, 7.0], [2.5, 2.0, 3.5, 3.0], 3.0
 
     def rms(values: list[float]) -> float:
         return math.hypot(*values) / math.sqrt(len(values))
