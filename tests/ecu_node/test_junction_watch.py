@@ -96,6 +96,11 @@ def test_value_is_used_up_to_its_timeout_and_not_if_an_unusable_frame_came_at_it
     assert (branch.code_at(1.0), branch.latest(), branch.published(1.0)) == (None, None, (None, Quality.INVALID))
 
 
+def test_branch_that_no_parameters_name_and_that_never_sent_is_neither_fitted_nor_stale() -> None:
+    branch = LiveBranch(name="motor", codes=codes(Fraction(1)), sign=1, timeout_s=0.5)
+    assert (branch.is_fitted, branch.is_stale(100.0), branch.is_old(100.0)) == (False, False, True)
+
+
 def test_ordinary_codes_have_no_names_and_are_not_clipped() -> None:
     branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
     branch.codes = codes(Fraction(1), -32767, 32767)
