@@ -131,6 +131,10 @@ class JunctionResidual(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return about(self.measured_a, self.measured_mean_a), about(self.corrected_a, self.corrected_mean_a)
 
 
+NOTHING_EXPECTED = JunctionResidual(measured_a=0.0, corrected_a=0.0)
+"""Without parameters."""
+
+
 class FileReference(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A file that the parameters belong to."""
 
@@ -274,7 +278,7 @@ def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:
             f"{where}: a standard deviation or the confidence is not finite; leave it out where it is not known; "
             f"nothing was written"
         )
-    return msgspec.json.format(content, indent=2) + b"\n"
+    return msgspec.json.format(content) + b"\n"
 
 
 def write_parameters(parameters: VehicleParameters, path: Path) -> None:

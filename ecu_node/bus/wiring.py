@@ -43,7 +43,7 @@ from ecu_node.core.status import Counters, Quality, Reason, State, UnfitError
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError, DatabaseError, LayoutError
 from ecu_node.layout import Branch, SignalName, split_signal
-from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
+from ecu_node.parameters import NOTHING_EXPECTED, VehicleParameters, check_fit, read_parameters
 
 __all__ = ["InForce", "Mode", "branch_plan", "choose_parameters", "open_bus", "put_in_force", "wire"]
 
@@ -334,7 +334,7 @@ def put_in_force(
     for take in takes:
         take()
     number = parameters.number % PARAMETER_SETS if parameters is not None else 0
-    expected = parameters.junction_residual if parameters is not None else None
+    expected = parameters.junction_residual if parameters is not None else NOTHING_EXPECTED
     corrector.begin(reason=in_force.reason, parameter_set=number, expected=expected)
 
 

@@ -19,7 +19,7 @@ from ecu_node.core.e2e import Check, E2EState, Protection, Receiver
 from ecu_node.core.junction import REMEMBERED_FRAMES, Frames, HeardSignal, JunctionWatch, LiveBranch, Written
 from ecu_node.core.signals import BitPlace, Codes, FrameKey, PlacedSignal, as_written
 from ecu_node.core.status import Counters, Reason, State
-from ecu_node.parameters import JunctionResidual
+from ecu_node.parameters import NOTHING_EXPECTED, JunctionResidual
 
 __all__ = ["OF_ONE_DRIVE", "Corrector", "StatusFields"]
 
@@ -372,7 +372,7 @@ class Corrector:
         if status_fields is not None:
             self.own_keys.add(status_fields.message.key)
 
-    def begin(self, *, reason: Reason, parameter_set: int, expected: JunctionResidual | None = None) -> None:
+    def begin(self, *, reason: Reason, parameter_set: int, expected: JunctionResidual = NOTHING_EXPECTED) -> None:
         """Work from now on with the parameters that the branches took over last, and release what is latched.
 
         Parameters

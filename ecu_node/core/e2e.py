@@ -132,7 +132,7 @@ class Receiver:
     def __init__(self, protection: Protection) -> None:
         self.state = E2EState.INIT
         self._protection = protection
-        self._expected = -1  # the first intact frame may have any counter
+        self._expected: int | None = None  # the first intact frame may have any counter
         self._past: deque[Check] = deque(maxlen=max(window.window for window in protection.windows))
         place = protection.counter
         self._is_short = place.end - place.first == 1
@@ -167,7 +167,7 @@ class Receiver:
 
     def restart(self) -> None:
         """Begin anew after a silence: any counter may come next, and a VALID message becomes INVALID."""
-        self._expected, self._is_steady = -1, False
+        self._expected = None
         self._past.clear()
         if self.state is E2EState.VALID:
             self.state = E2EState.INVALID
@@ -178,7 +178,7 @@ class Receiver:
             return Check.CORRUPT
         counter, before = self._protection.counter_of(payload), self._expected
         self._expected = (counter + 1) % self._modulus
-        step = 1 if before < 0 else (counter - before + 1) % self._modulus
+        step = 1 if before is None else (counter - before + 1) % self._modulus
         if step <= 1:
             return _OK if step else Check.REPEATED
         return Check.LOST if step <= self._protection.max_step else Check.JUMPED

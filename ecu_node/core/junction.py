@@ -10,15 +10,15 @@ reached. Currents are positive into the junction [A]; times are those of one ste
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise, takewhile
-from operator import mul
+from operator import add, mul, sub
 from typing import NamedTuple
 
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault
 from ecu_node.core.signals import BitPlace, Codes, PlacedSignal
 from ecu_node.core.status import Counters, Quality, Reason
-from ecu_node.parameters import JunctionResidual
+from ecu_node.parameters import NOTHING_EXPECTED, JunctionResidual
 
 REMEMBERED_FRAMES = 1024
 """Number of frames of a message that are remembered: they reach back further than branches lag each other."""
@@ -261,7 +261,7 @@ class LiveBranch(HeardSignal):
             first += 1
         while last in self.codes.named:
             last -= 1
-        if plan.needs_voltage or plan.gain <= 0 or any(first <= code <= last for code in self.codes.named):
+        if plan.needs_voltage or plan.gain <= 0 or any(code in range(first, last) for code in self.codes.named):
             return 1, 0
         least, beyond = plan.lowest << plan.shift, (plan.highest + 1) << plan.shift
         bias = plan.bias + (1 << (plan.shift - 1))
@@ -357,7 +357,7 @@ class LiveBranch(HeardSignal):
             if not self.codes.is_value(code):
                 return None
             if seen_s <= time_s:
-                if later is None or later[0] <= seen_s:
+                if later is None:
                     return code
                 return code + (time_s - seen_s) / (later[0] - seen_s) * (later[1] - code)
             later = sample
@@ -446,7 +446,8 @@ class _Moment(NamedTuple):
     corrected_a: float
     deviations: float
     """The corrected sum in standard deviations, signed."""
-    currents_a: Currents
+    currents_a: Mapping[str, float]
+    """Corrected current of each branch."""
     codes: Mapping[str, int]
     """Last code of each branch."""
     terms: tuple[float, float, float, float, float]
@@ -462,10 +463,9 @@ class _Window:
 
     def add(self, moment: _Moment) -> None:
         self.moments.append(moment)
-        self._sums = [total + term for total, term in zip(self._sums, moment.terms, strict=True)]
+        self._sums = [*map(add, self._sums, moment.terms)]
         while moment.time_s - self.moments[0].time_s > self._length_s:
-            old = self.moments.popleft().terms
-            self._sums = [total - term for total, term in zip(self._sums, old, strict=True)]
+            self._sums = [*map(sub, self._sums, self.moments.popleft().terms)]
 
     def means(self, share: float) -> list[float] | None:
         """Return the mean of each of the moments' ``terms`` over the window.
@@ -529,7 +529,7 @@ class JunctionWatch:
         """Check whether the state that tells when sums can be judged is unknown now."""
         return self._whole is not None and self._whole[0].code_at(now_s) is None
 
-    def restart(self, expected: JunctionResidual | None = None) -> None:
+    def restart(self, expected: JunctionResidual = NOTHING_EXPECTED) -> None:
         """Forget what was seen, and judge from now on by what the parameter file expects of the sum of right sensors.
 
         If the calibrator itself saw the correction make the sum worse (as where one of two offsets that cancel is
@@ -537,7 +537,6 @@ class JunctionWatch:
         deviations, shares of full scale (or what the calibrator saw, if more) and of the throughput take their place:
         then only gross faults show.
         """
-        expected = expected or JunctionResidual(measured_a=0.0, corrected_a=0.0)
         measured_a, corrected_a = expected.about_expected()
         margins = min(max((corrected_a - measured_a) / self._margin_a, 0.0), _MOST_MARGINS)
         self._expected_a, self._allowed_a = expected.expected_a, self._margin_a * (1.0 + margins)
@@ -564,7 +563,8 @@ class JunctionWatch:
         if found is None:
             return
         self.instant_s, self.currents_a = found
-        self.sums = JunctionSums(*map(sum, zip(*self.currents_a.values(), strict=True)))
+        pairs = self.currents_a.values()
+        self.sums = JunctionSums(sum(measured for measured, _ in pairs), sum(corrected for _, corrected in pairs))
         if not self.is_whole(now_s):
             self.forget()
         elif self.instant_s > self._judged_s and len(self.currents_a) > 1:  # the sum of a single branch says nothing
@@ -577,11 +577,11 @@ class JunctionWatch:
         measured_a, corrected_a = sums.measured_a - self._expected_a, sums.corrected_a - self._expected_a
         deviations = corrected_a / self._sum_sd_a()
         deviations = min(max(deviations, -_LARGEST_DEVIATION), _LARGEST_DEVIATION)
-        largest = max((corrected for _, corrected in self.currents_a.values()), key=abs)
-        latest = {name: self._branches[name].latest() for name in self.currents_a}
-        codes = {name: seen[1] for name, seen in latest.items() if seen is not None}
+        currents_a = {name: corrected for name, (_, corrected) in self.currents_a.items()}
+        largest = max(currents_a.values(), key=abs)
+        codes = {name: next(self._branches[name].newest_first())[1] for name in self.currents_a}
         terms = measured_a, measured_a**2, corrected_a**2, deviations, math.copysign(deviations, deviations * largest)
-        moment = _Moment(self.instant_s, corrected_a, deviations, self.currents_a, codes, terms)
+        moment = _Moment(self.instant_s, corrected_a, deviations, currents_a, codes, terms)
         self._window.add(moment)
         self._recent.add(moment)
 
@@ -617,41 +617,43 @@ class JunctionWatch:
             self._jump = None
             return None
         if self._jump is None:
-            still = [name for name, movement in moved.items() if movement.distance_a == 0.0]
+            half_a = 0.5 * abs(residual_a)
+            still = [name for name in moved if moved[name].distance_a == 0.0 and abs(self.currents_a[name][1]) > half_a]
             is_step = moved[most].step_a >= 0.5 * moved[most].distance_a
-            frozen = () if is_step else self._frozen(still, residual_a)
+            frozen = () if is_step else self._frozen(still)
             self._jump = instant_s, 0, (Reason.BRANCH_STUCK, frozen) if frozen else (Reason.SUM_IMPLAUSIBLE, (most,))
         since_s, looks, verdict = self._jump
         self._jump = since_s, looks + 1, verdict
         return verdict if looks + 1 >= _JUMP_LOOKS and instant_s - since_s >= _JUMP_S else None
 
-    def _frozen(self, still: Sequence[str], residual_a: float = 0.0) -> tuple[str, ...]:
-        """Return which of these unchanging branches carry more than at rest, and more than half of the residual."""
-        least_a = max(_REST_SHARE * self._full_scale_a, 0.5 * abs(residual_a))
-        return tuple(name for name in still if abs(self.currents_a[name][1]) > least_a)
+    def _frozen(self, still: Sequence[str]) -> tuple[str, ...]:
+        """Return which of these unchanging branches carry more than at rest."""
+        rest_a = _REST_SHARE * self._full_scale_a
+        return tuple(name for name in still if abs(self.currents_a[name][1]) > rest_a)
 
     def _stuck(self) -> tuple[str, ...]:
         """Return branches whose code never changed in the window; none if another's gain explains the sum."""
         moments = self._window.moments
-        still = [name for name, code in moments[-1].codes.items() if all(m.codes.get(name) == code for m in moments)]
+        still = [name for name in self.currents_a if len({moment.codes.get(name) for moment in moments}) == 1]
         measured_a = [moment.terms[0] for moment in moments]
-        for name in self.currents_a.keys() - still:
-            slope, explains = _line([moment.currents_a.get(name, (0.0, 0.0))[0] for moment in moments], measured_a)
-            if explains and abs(slope) < _LARGEST_SLOPE:
-                return ()
+        lines = [_line(row, measured_a) for name, row in self._rows(moments).items() if name not in still]
+        if any(explains and abs(slope) < _LARGEST_SLOPE for slope, explains in lines):
+            return ()
         return self._frozen(still)
+
+    def _rows(self, moments: Iterable[_Moment]) -> dict[str, list[float]]:
+        """Return the corrected current of each branch in these moments; 0 while it had not been heard. [A]"""
+        return {name: [moment.currents_a.get(name, 0.0) for moment in moments] for name in self.currents_a}
 
     def _explaining(self) -> _Verdict:
         """Return the verdict on wrong sums: which branches are stuck, else whose gain error explains the sums best.
 
         The sums count since they went wrong. If an offset explains them, all branches are named: it may be any one's.
         """
-        moments = list(self._recent.moments)
-        good = (number for number, moment in enumerate(moments) if abs(moment.deviations) < 1.0)
-        since = moments[max(good, default=-1) + 1 :]
-        moments = since if len(since) >= _LEAST_LOOKS else moments
+        since = [*takewhile(lambda moment: abs(moment.deviations) >= 1.0, reversed(self._recent.moments))]
+        moments = since if len(since) >= _LEAST_LOOKS else self._recent.moments
         residual = [moment.corrected_a for moment in moments]
-        rows = {name: [moment.currents_a.get(name, (0.0, 0.0))[1] for moment in moments] for name in self.currents_a}
+        rows = self._rows(moments)
         still = [name for name, row in rows.items() if min(row) == max(row)]
         if frozen := self._frozen(still):  # a branch that moved in one step is left out: its own sensor may have jumped
             lines = [_line(row, residual) for name, row in rows.items() if name not in still and not _is_step(row)]
@@ -678,7 +680,7 @@ def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
 def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
     """Return the covariance of two columns; it is enough that one of them has its mean taken out."""
     mean_y = math.fsum(y) / len(y)
-    return math.fsum(a * (b - mean_y) for a, b in zip(x, y, strict=True)) / len(x)
+    return math.fsum(map(mul, x, (b - mean_y for b in y))) / len(x)
 
 
 def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, bool]:

@@ -426,11 +426,22 @@ def test_scale_given_both_in_the_unit_and_as_factor_is_applied_once(
     assert corrector.branches[2].currents_at(0.0) == pytest.approx((-10.0, -10.0))
 
 
+POWER_OUT = (
+    SMALL_LAYOUT.replace('"Net.Voltage"', '"Net.Voltage", corrected = "PairOut.Heater"'),
+    SMALL_DBC.replace(" SG_ Quality", ' SG_ Heater : 40|16@1+ (1,0) [0|60000] "W" Node\n SG_ Quality')
+    + 'VAL_ 512 Heater 65535 "SNA";\n',
+)
+
+
+def test_power_is_corrected_without_a_voltage_if_its_sensor_has_no_offset(make_database: MakeDatabase) -> None:
+    database = make_database(*POWER_OUT)
+    corrector = corrector_for(database, heater=(0.25, 0.0))
+    assert published(database, corrector, frame_of(database, "Heater", Power=4000), 0.0, "heater")[0] == 3200.0
+
+
 def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_database: MakeDatabase) -> None:
     """Until it is stale, it is repeated in each answer to the other branches of its message."""
-    layout = SMALL_LAYOUT.replace('"Net.Voltage"', '"Net.Voltage", corrected = "PairOut.Heater"')
-    signal = ' SG_ Heater : 40|16@1+ (1,0) [0|60000] "W" Node\n SG_ Quality'
-    database = make_database(layout, SMALL_DBC.replace(" SG_ Quality", signal) + 'VAL_ 512 Heater 65535 "SNA";\n')
+    database = make_database(*POWER_OUT)
     corrector = corrector_for(database, heater=(0.25, -2.0))
     pair = frame_of(database, "Pair", Battery=0.0, Motor=0.0)
     heater = frame_of(database, "Heater", Power=4000)
@@ -448,7 +459,10 @@ def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_datab
     volts(500.0, 0.3)
     assert heater_w(pair, 0.4) == (4000.0 - 2.0 * 400.0) / 1.25
     assert heater_w(heater, 0.5) == (4000.0 - 2.0 * 500.0) / 1.25
-    assert heater_w(pair, 1.1) == 65535, "stale"
+    assert state_at(corrector, 0.5) == (State.CORRECTING, Reason.NONE)
+    assert heater_w(heater, 0.9) == 65535, "the voltage is stale"
+    assert state_at(corrector, 0.9) == (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
+    assert heater_w(pair, 1.5) == 65535, "stale"
     assert corrector.counters.saturated == 0
 
 

@@ -217,8 +217,17 @@ def test_every_byte_of_a_multi_byte_counter_is_compared(protection: Protection, 
             *(range(0, 20, 2), (2,), "IIIVXVVVVV"),
         ),
         ("valid = { window = 5, min_ok = 1, max_error = 2 }", [0] * 6, (), "VVVVVX"),
+        (
+            "valid = { window = 6, min_ok = 3, max_error = 0 }\ninvalid = { window = 6, min_ok = 6, max_error = 0 }",
+            *(range(9), (), "VXXXXVVVV"),
+        ),
     ],
-    ids=["corrupt frames are errors", "lost frames are not errors", "repeated frames are not intact"],
+    ids=[
+        "corrupt frames are errors",
+        "lost frames are not errors",
+        "repeated frames are not intact",
+        "few frames are too few for the next state",
+    ],
 )
 def test_e2e_state_follows_the_windows_of_recent_frames(
     kind: str, protect: Callable[..., Protection], windows: str, sent: Sequence[int], spoilt: Sequence[int], states: str

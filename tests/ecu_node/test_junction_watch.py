@@ -11,7 +11,7 @@ import pytest
 from ecu_node.core.correction import AS_IT_IS, IntegerPlan, SensorFault
 from ecu_node.core.junction import Frames, HeardSignal, JunctionWatch, LiveBranch, Movement
 from ecu_node.core.signals import BitPlace, Codes, PlacedSignal
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Quality, Reason
 from ecu_node.parameters import JunctionResidual
 
 PLACE = BitPlace(first=0, end=2, order="little", shift=0, length=16, signed=True)
@@ -43,13 +43,30 @@ def live(
 
 
 class Watched:
-    """A junction of which each branch sends 32 frames a second, and its watch; all currents are into the junction."""
+    """A junction of which each branch sends 32 frames a second, and its watch; all currents are into the junction.
 
-    def __init__(self, *, margin_a: float = 1.0, faults: dict[str, SensorFault] | None = None, **expected: float):
+    The battery is seen later by ``late_s``. The watch looks twice at each instant.
+    """
+
+    def __init__(
+        self,
+        *,
+        margin_a: float = 1.0,
+        faults: dict[str, SensorFault] | None = None,
+        late_s: float = 0.0,
+        **expected: float,
+    ):
         names, none = ("battery", "motor", "heater"), SensorFault()
         self.frames: dict[str, Frames] = {name: deque() for name in names}
         branches = [
-            live(name, self.frames[name], fault=(faults or {}).get(name, none), unit=Fraction(1, 100)) for name in names
+            live(
+                name,
+                self.frames[name],
+                fault=(faults or {}).get(name, none),
+                unit=Fraction(1, 100),
+                delay_s=late_s if name == "battery" else 0.0,
+            )
+            for name in names
         ]
         self.watch = JunctionWatch(branches, window_s=8.0, margin_a=margin_a, full_scale_a=400.0)
         self.watch.restart(JunctionResidual(**{"measured_a": 0.0, "corrected_a": 0.0} | expected))
@@ -61,18 +78,45 @@ class Watched:
             for name, value in shown_a(now_s).items():
                 self.frames[name].append(frame(now_s, round(100.0 * value)))
             self.watch.look(now_s)
+            self.watch.look(now_s)
             if self.watch.verdict is not None:
                 return
+
+
+def test_value_is_used_up_to_its_timeout_and_not_if_an_unusable_frame_came_at_its_time_or_later() -> None:
+    """A value is a code, and the code is published as it is."""
+    branch = live("motor", deque([frame(1.0, 7)]), fault=SensorFault(), unit=Fraction(1))
+    for now_s, code, published in ((1.5, 7, (7, Quality.PASSED_THROUGH)), (1.51, None, (None, Quality.NOT_AVAILABLE))):
+        assert (branch.code_at(now_s), branch.published(now_s)) == (code, published)
+        assert branch.is_old(now_s) is branch.is_stale(now_s) is (code is None)
+    assert (branch.code_at(0.99), branch.currents_at(0.5), branch.currents_at(0.49)) == (None, (7.0, 7.0), None)
+    branch.spoil(0.99)
+    assert (branch.code_at(1.0), branch.latest()) == (7, (1.0, 7))
+    branch.spoil(1.0)
+    assert (branch.code_at(1.0), branch.latest(), branch.published(1.0)) == (None, None, (None, Quality.INVALID))
+
+
+def test_branch_that_no_parameters_name_and_that_never_sent_is_neither_fitted_nor_stale() -> None:
+    branch = LiveBranch(name="motor", codes=codes(Fraction(1)), sign=1, timeout_s=0.5)
+    assert (branch.is_fitted, branch.is_stale(100.0), branch.is_old(100.0)) == (False, False, True)
 
 
 def test_range_of_ordinary_codes_excludes_named_and_clipped_codes() -> None:
     branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
     branch.codes = codes(Fraction(1), -32767, 32767)
     assert branch.ordinary_codes() == (-32766, 32766)
-    branch.plan = IntegerPlan(gain=2, bias=20, shift=1, lowest=-100, highest=100)
-    assert branch.ordinary_codes() == (-110, 90)
-    branch.plan = IntegerPlan(gain=-2, bias=0, shift=1, lowest=-100, highest=100)
-    assert branch.ordinary_codes() == (1, 0)
+    none = 1, 0
+    for gain, bias, shift, codes_of in (
+        (3, 31, 2, (-144, 123)),
+        (1, 0, 1, (-201, 200)),
+        (0, 0, 1, none),
+        (-2, 0, 1, none),
+    ):
+        branch.plan = IntegerPlan(gain=gain, bias=bias, shift=shift, lowest=-100, highest=100)
+        assert branch.ordinary_codes() == codes_of
+    for amid in (-5, 5):
+        branch.codes, branch.plan = codes(Fraction(1), amid), AS_IT_IS
+        assert branch.ordinary_codes() == none
 
 
 def test_movement_of_a_power_branch_is_that_of_its_corrected_current() -> None:
@@ -92,8 +136,22 @@ def test_movement_of_a_power_branch_is_that_of_its_corrected_current() -> None:
     per_code_a = 100.0 / 200.0 / 1.25
     assert power.movement(1.375, 0.25, 3) == Movement(60 * per_code_a, 60 * per_code_a, 0.0)
     assert power.movement(1.375, 0.25, 5) == Movement(70 * per_code_a, 70 * per_code_a, 5 * per_code_a)
-    volts.append(frame(0.5, 0))
+    volts.append(frame(0.375, 10))
+    assert power.movement(1.375, 0.25, 3).distance_a == 60 * 100.0 / 10.0 / 1.25
+    volts.append(frame(0.5, 9))
     assert power.movement(1.375, 0.25, 3) == Movement(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("battery_a", "period_s", "at_s"),
+    [(110.0, 1 / 32, 1.0625), (60.0, 1 / 32, 3.0), (60.0, 0.25, 3.25), (54.0, 1 / 32, 8.21875)],
+    ids=["like a jump", "implausible after half a window", "after ten looks", "worse after nine tenths of a window"],
+)
+def test_sums_are_judged_from_part_of_a_window_and_ten_looks_on(battery_a: float, period_s: float, at_s: float) -> None:
+    """The first frames come after a second; the motor is corrected by 3 A."""
+    junction = Watched(faults={"motor": SensorFault(offset_a=-3.0)}, corrected_sd_a=1.0, corrected_sd_per_a=0.0)
+    junction.run(9.0, lambda now_s: {"battery": battery_a, "motor": -53.0} if now_s >= 1.0 else {}, period_s=period_s)
+    assert (junction.watch.verdict is not None, junction.now_s) == (True, at_s)
 
 
 @pytest.mark.parametrize("load_a", [0.0, 30.0])
@@ -104,7 +162,7 @@ def test_watch_judges_sums_relative_to_the_load_that_parameters_expect(load_a: f
     assert junction.watch.verdict == (Reason.CORRECTION_WORSE, ())
 
 
-@pytest.mark.parametrize(("offset_a", "verdict"), [(2.4, None), (2.6, (Reason.CORRECTION_WORSE, ()))])
+@pytest.mark.parametrize(("offset_a", "verdict"), [(2.5, None), (2.6, (Reason.CORRECTION_WORSE, ()))])
 def test_margin_includes_the_worsening_of_the_sum_stated_in_the_parameter_file(
     offset_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
@@ -115,23 +173,39 @@ def test_margin_includes_the_worsening_of_the_sum_stated_in_the_parameter_file(
     assert junction.watch.verdict == verdict
 
 
+def test_sum_of_a_single_branch_is_published_but_not_judged() -> None:
+    junction = Watched(corrected_sd_a=1.0)
+    junction.run(3.0, lambda _: {"battery": 60.0})
+    assert (junction.watch.sums, junction.watch.verdict) == ((60.0, 60.0), None)
+
+
+def test_new_parameters_begin_without_sums_and_currents() -> None:
+    junction = Watched()
+    junction.run(1.0, lambda _: {"battery": 50.0, "motor": -50.0})
+    junction.watch.restart()
+    assert (junction.watch.sums, junction.watch.currents_a, junction.watch.instant_s) == (None, {}, -math.inf)
+
+
 def test_sums_of_right_sensors_give_no_verdict() -> None:
     junction = Watched(margin_a=0.5)
     junction.run(9.0, lambda _: {"battery": 50.0, "motor": -50.0})
     assert junction.watch.verdict is None
 
 
-@pytest.mark.parametrize(("sd_per_a", "verdict"), [(0.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (0.1, None)])
+@pytest.mark.parametrize(
+    ("sd_per_a", "heater_a", "verdict"),
+    [
+        (0.0, 10.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
+        (0.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery", "motor"))),
+        (0.1, 10.0, None),
+    ],
+)
 def test_gain_error_beyond_its_uncertainty_is_found_from_an_alternating_current(
-    sd_per_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
+    sd_per_a: float, heater_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
     def swinging(time_s: float) -> dict[str, float]:
-        motor_a = 100.0 * math.sin(3.0 * time_s)
-        return {
-            "battery": -1.1 * motor_a - 11.0 * math.sin(5.0 * time_s),
-            "motor": motor_a,
-            "heater": 10.0 * math.sin(5.0 * time_s),
-        }
+        currents_a = {"motor": 100.0 * math.sin(3.0 * time_s), "heater": heater_a * math.sin(5.0 * time_s)}
+        return currents_a | {"battery": -1.1 * sum(currents_a.values())}
 
     junction = Watched(corrected_sd_a=1.0, corrected_sd_per_a=sd_per_a)
     junction.run(7.0, swinging)
@@ -156,24 +230,27 @@ def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_also_named
     assert junction.watch.verdict == (Reason.SUM_IMPLAUSIBLE, ("motor", "battery"))
 
 
-@pytest.mark.parametrize(("still_a", "verdict"), [(1.5, None), (3.0, (Reason.BRANCH_STUCK, ("heater",)))])
+@pytest.mark.parametrize(("still_a", "verdict"), [(2.0, None), (3.0, (Reason.BRANCH_STUCK, ("heater",)))])
 def test_current_that_never_changes_is_stuck_unless_it_is_small(
     still_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
-    """The sum varies by what no gain error explains; the motor is first heard after half a second."""
+    """The sum varies by what no gain error explains; the motor is first heard after half a second.
+
+    When the heater changes at last, its new code is known one instant before its new current.
+    """
 
     def varying(time_s: float) -> dict[str, float]:
         motor_a = 100.0 * math.sin(3.0 * time_s) if time_s > 0.5 else 0.0
-        shown = {"battery": -motor_a + 15.0 * math.sin(11.0 * time_s), "heater": still_a}
+        shown = {"battery": -motor_a + 15.0 * math.sin(11.0 * time_s), "heater": still_a + (time_s >= 8.0)}
         return shown | {"motor": motor_a} if time_s > 0.5 else shown
 
-    junction = Watched(corrected_sd_a=15.0)
+    junction = Watched(late_s=PERIOD_S, corrected_sd_a=15.0)
     junction.run(9.0, varying)
     assert junction.watch.verdict == verdict
 
 
 @pytest.mark.parametrize(
-    ("jump_a", "period_s", "looks"), [(50.0, 1 / 32, 3), (50.0, 1 / 128, 5), (-21.0, 1 / 32, 3), (19.0, 1 / 32, None)]
+    ("jump_a", "period_s", "looks"), [(50.0, 1 / 32, 3), (50.0, 1 / 128, 5), (-21.0, 1 / 32, 3), (-20.0, 1 / 32, None)]
 )
 def test_jump_counts_if_it_lasts_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
     jump_a: float, period_s: float, looks: int | None
@@ -196,4 +273,22 @@ def test_branch_that_does_not_follow_another_ones_rise_is_stuck_if_it_carries_ha
 ) -> None:
     junction = Watched(corrected_sd_a=1.0)
     junction.run(2.0, lambda now_s: {"battery": still_a + 96.0 * max(now_s - 1.0, 0.0), "heater": -still_a})
+    assert junction.watch.verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("rises", "verdict"),
+    [(3, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (4, (Reason.BRANCH_STUCK, ("heater",)))],
+)
+def test_still_branch_is_stuck_if_another_one_moves_as_the_sum_does_but_not_in_one_step(
+    rises: int, verdict: tuple[Reason, tuple[str, ...]]
+) -> None:
+    """The battery rises by 1 A, which makes the sum wrong, and then by 4 A each time: half of 8 A, a third of 12 A."""
+
+    def rising(now_s: float) -> dict[str, float]:
+        level = min(max(math.floor(10.0 * now_s) - 9, 0), rises)
+        return {"battery": 20.0 + max(4.0 * level - 3.0, 0.0), "heater": -20.0}
+
+    junction = Watched(corrected_sd_a=1.0, corrected_sd_per_a=0.0)
+    junction.run(4.0, rising)
     assert junction.watch.verdict == verdict
