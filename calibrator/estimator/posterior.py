@@ -282,12 +282,15 @@ def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
         hardware = theta[K + 1 + k] if k < K - 1 else oh_last
         batch = shared[k] * (unit - 1.0)  # change of the offset that the centre includes
         e[c + k] = seen - centre[c + k] - hardware - theta[2 * K + k] - batch
-        e[c + K + 1 + k] = y[c + K + 1 + k] * unit - centre[c + K + 1 + k] - theta[2 * K + k]
+        e[c + K + 1 + k] = y[c + K + 1 + k] - centre[c + K + 1 + k] - shared[k] - theta[2 * K + k] / unit
         junction -= theta[2 * K + k] + batch
         if k:
             x = e[K + k - 1]
             junction -= means[1, k] * (unit * expm1(min(x, MOST_TURN)) - exp(-y[k]) * x)
-    load = theta[3 * K] * (exp(-theta[1 + feed] - shared[K + feed]) if shared[2 * K] else 1.0)
+    load = theta[3 * K]
+    if shared[2 * K]:  # it is an offset of the feeding sensor
+        e[c + K + 1 + feed] -= load
+        load *= exp(-theta[1 + feed] - shared[K + feed])
     e[c + K] = junction - centre[c + K] - load
     e[c + feed] -= load
 

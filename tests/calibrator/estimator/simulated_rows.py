@@ -160,7 +160,7 @@ def plain_residual(rows: EvidenceRows, theta: Array) -> Array:
     junction = (c - turned) / gain[:, :1] + (ratio_error @ (measured[1:] / np.exp(log_a[1:])))[:, None]
     junction -= omega.sum(axis=1, keepdims=True) + load
     return np.column_stack(
-        [slope_error, ratio_error, gain_read - log_gain, intercept, junction, offset_read / gain - omega]
+        [slope_error, ratio_error, gain_read - log_gain, intercept, junction, offset_read - omega * gain]
     )
 
 
