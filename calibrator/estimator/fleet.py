@@ -288,13 +288,13 @@ class _Calibrator:
             given["readings"] = path_of(readings, "readings", "a DataFrame or the path of a CSV table")
             require(given["readings"].is_file(), "readings", readings, "a file that exists")
         if alone:
-            meter, charge_ah, load = given["meter"], given["charge_ah"] or {}, given["load"]
+            meter, charge_ah = given["meter"], given["charge_ah"] or {}
             require(meter is None or isinstance(meter, str), "meter", meter, "the name of a branch")
             require(isinstance(charge_ah, Mapping), "charge_ah", charge_ah, "charges by branch")
             given["charge_ah"] = {str(name): _with_sd(pair, "charge_ah") for name, pair in charge_ah.items()}
-            if load is not None:
-                mean_a, sd_a = _with_sd(load, "load", least=0.0)
-                given["load"] = UnmeasuredLoad(mean_a=mean_a, sd_a=sd_a)
+        if given["load"] is not None:
+            mean_a, sd_a = _with_sd(given["load"], "load", least=0.0)
+            given["load"] = UnmeasuredLoad(mean_a=mean_a, sd_a=sd_a)
         used = CalibrationSettings.__dataclass_fields__.keys() & given.keys()
         return CalibrationSettings(alone=alone, **{name: given[name] for name in used})
 
@@ -384,6 +384,8 @@ class FleetCalibrator(_Calibrator):
         Vehicles with bench-checked sensors; three or more of them are what the others are compared with.
     readings : path or DataFrame or None
         Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
+    load : tuple of (float, float), or None
+        Load that no branch measures and its standard deviation; None: as the layout says, else not known. [A]
     hold_out : collection of str
         Vehicles that are calibrated, but from which nothing is learnt for others.
     expected_faults : float or None
@@ -417,6 +419,7 @@ class FleetCalibrator(_Calibrator):
     harm_limit: float = 0.001
     trusted: Collection[str] = ()
     readings: str | Path | pd.DataFrame | None = None
+    load: tuple[float, float] | None = None
     hold_out: Collection[str] = ()
     expected_faults: float | None = None
     workers: int = 2

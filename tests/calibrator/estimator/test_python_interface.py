@@ -159,10 +159,12 @@ def test_python_interface_writes_the_same_result_as_the_command(
     store: SummaryStore = small_store(tmp_path / "store", database, random_faults(20))
     bench = pd.DataFrame([("V001", "motor", 0.0, 0.001)], columns=["vehicle", "branch", "drift", "drift_sd"])
     bench.to_csv(tmp_path / "readings.csv", index=False)
-    options = ("--workers", 1, "--hold-out", "V003,V004", "--harm-limit", 0.01, "--readings", tmp_path / "readings.csv")
-    said = succeeded("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "command", *options)
+    options = ("--workers", 1, "--hold-out", "V003,V004", "--harm-limit", 0.01, "--load", "0:0.5")
+    known = ("--readings", tmp_path / "readings.csv")
+    said = succeeded("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "command", *options, *known)
     capsys.readouterr()
     settings: dict[str, Any] = {"workers": 1, "hold_out": ["V003", "V004"], "harm_limit": 0.01, "readings": bench}
+    settings["load"] = 0.0, 0.5
     found = FleetCalibrator(**settings).fit(Fleet.from_folder(store.url, LAYOUT))
     here, there = contents(found.write(tmp_path / "python")), contents(tmp_path / "command")
     here["run.json"] = here["run.json"].replace(b'"data frame"', b'"readings.csv"')  # where the readings came from
