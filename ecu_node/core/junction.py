@@ -446,8 +446,7 @@ class _Moment(NamedTuple):
     corrected_a: float
     deviations: float
     """The corrected sum in standard deviations, signed."""
-    currents_a: Mapping[str, float]
-    """Corrected current of each branch."""
+    currents_a: Currents
     codes: Mapping[str, int]
     """Last code of each branch."""
     terms: tuple[float, float, float, float, float]
@@ -577,11 +576,10 @@ class JunctionWatch:
         measured_a, corrected_a = sums.measured_a - self._expected_a, sums.corrected_a - self._expected_a
         deviations = corrected_a / self._sum_sd_a()
         deviations = min(max(deviations, -_LARGEST_DEVIATION), _LARGEST_DEVIATION)
-        currents_a = {name: corrected for name, (_, corrected) in self.currents_a.items()}
-        largest = max(currents_a.values(), key=abs)
+        largest = max((corrected for _, corrected in self.currents_a.values()), key=abs)
         codes = {name: next(self._branches[name].newest_first())[1] for name in self.currents_a}
         terms = measured_a, measured_a**2, corrected_a**2, deviations, math.copysign(deviations, deviations * largest)
-        moment = _Moment(self.instant_s, corrected_a, deviations, currents_a, codes, terms)
+        moment = _Moment(self.instant_s, corrected_a, deviations, self.currents_a, codes, terms)
         self._window.add(moment)
         self._recent.add(moment)
 
@@ -636,14 +634,16 @@ class JunctionWatch:
         moments = self._window.moments
         still = [name for name in self.currents_a if len({moment.codes.get(name) for moment in moments}) == 1]
         measured_a = [moment.terms[0] for moment in moments]
-        lines = [_line(row, measured_a) for name, row in self._rows(moments).items() if name not in still]
+        rows = self._rows(moments, corrected=False)
+        lines = [_line(row, measured_a) for name, row in rows.items() if name not in still]
         if any(explains and abs(slope) < _LARGEST_SLOPE for slope, explains in lines):
             return ()
         return self._frozen(still)
 
-    def _rows(self, moments: Iterable[_Moment]) -> dict[str, list[float]]:
-        """Return the corrected current of each branch in these moments; 0 while it had not been heard. [A]"""
-        return {name: [moment.currents_a.get(name, 0.0) for moment in moments] for name in self.currents_a}
+    def _rows(self, moments: Iterable[_Moment], *, corrected: bool = True) -> dict[str, list[float]]:
+        """Return the current of each branch, corrected or measured, in these moments; 0 while it was not heard. [A]"""
+        none = 0.0, 0.0
+        return {name: [each.currents_a.get(name, none)[corrected] for each in moments] for name in self.currents_a}
 
     def _explaining(self) -> _Verdict:
         """Return the verdict on wrong sums: which branches are stuck, else whose gain error explains the sums best.

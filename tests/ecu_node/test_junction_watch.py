@@ -230,6 +230,22 @@ def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_also_named
     assert junction.watch.verdict == (Reason.SUM_IMPLAUSIBLE, ("motor", "battery"))
 
 
+@pytest.mark.parametrize(("drift", "battery_is_stuck", "verdict"), [
+    (-0.25, True, (Reason.BRANCH_STUCK, ("battery",))), (0.9, False, None),
+])  # fmt: skip
+def test_stuck_branch_is_found_beside_a_large_gain_error_and_a_steady_one_is_not_taken_for_it(
+    drift: float, battery_is_stuck: bool, verdict: tuple[Reason, tuple[str, ...]] | None
+) -> None:
+    def shown_a(now_s: float) -> dict[str, float]:
+        motor_a = -50.0 + 20.0 * math.sin(2.0 * math.pi * now_s / 3.0)
+        battery_a = 50.0 if battery_is_stuck else -motor_a - 20.0
+        return {"battery": battery_a, "motor": motor_a * (1.0 + drift), "heater": 0.0 if battery_is_stuck else 20.0}
+
+    junction = Watched(margin_a=5.0, faults={"motor": SensorFault(drift=drift)})
+    junction.run(9.5, shown_a)
+    assert junction.watch.verdict == verdict
+
+
 @pytest.mark.parametrize(("still_a", "verdict"), [(2.0, None), (3.0, (Reason.BRANCH_STUCK, ("heater",)))])
 def test_current_that_never_changes_is_stuck_unless_it_is_small(
     still_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
