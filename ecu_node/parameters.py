@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ecu_node.database import VehicleDatabase
 
 __all__ = [
+    "NOTHING_EXPECTED",
     "BranchParameters",
     "Explanation",
     "FileReference",
@@ -132,7 +133,7 @@ class JunctionResidual(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 NOTHING_EXPECTED = JunctionResidual(measured_a=0.0, corrected_a=0.0)
-"""Without parameters."""
+"""Expected sums where no parameters are in force."""
 
 
 class FileReference(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -425,7 +425,9 @@ def estimate_vehicles(
         summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=reference.branches
     )
     drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
-    load = np.array([each.weight @ (each.load != 0.0) > SUSPECTED for each in found.points])  # or an offset
+    has_own_load = np.array([each.weight @ (each.load != 0.0) > SUSPECTED for each in found.points])
+    is_read = rows.known[:, rows.places.offset_reads][:, reference.feed]  # then the load is no offset
+    has_finding = np.array(list(map(bool, unfit)))
     held_back, corrected, verdicts = decided(
         found.faulty,
         unfit=np.array([_unfit(each, reference.branches) for each in unfit]),
@@ -433,8 +435,9 @@ def estimate_vehicles(
         still=~found.identifiable,
         harmful=~(found.harm_probability < harm_limit),
         beyond=(np.abs(found.drift) > drift_limit) | (np.abs(found.offset_a) > offset_limit_a),
-        sound=~found.faulty.any(axis=1) & (found.confidence >= CONFIDENT) & ~np.array(list(map(bool, unfit))) & ~load,
+        sound=~found.faulty.any(axis=1) & (found.confidence >= CONFIDENT) & ~has_finding & ~(has_own_load & ~is_read),
     )
+    shared = _shared_findings(found, reference, is_read)
     linear = [
         1.0 - max((each.probability for each in mine if each.cause not in LINEAR_CAUSES), default=0.0) for mine in unfit
     ]
@@ -445,7 +448,7 @@ def estimate_vehicles(
         held_back=held_back,
         verdicts=verdicts,
         explanations=[[_explanation(*each, reference) for each in mine] for mine in found.supports],
-        findings=[(*each, *others) for each, others in zip(unfit, _shared_findings(found, reference), strict=True)],
+        findings=[(*each, *others) for each, others in zip(unfit, shared, strict=True)],
         evidence=reported_evidence(rows, found, reference.models[0].spread),
     )
 
@@ -489,14 +492,17 @@ def reported_evidence(rows: EvidenceRows, found: SensorEstimate, spread: Spread)
     return np.stack([value, sd, made], axis=1)
 
 
-def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
-    """Return for each vehicle findings of loads without a sensor, batches and variants: reported, not corrected."""
+def _shared_findings(found: RowsEstimate, reference: FleetReference, is_read: Mask) -> list[list[SensorFinding]]:
+    """Return for each vehicle findings of loads without a sensor, batches and variants: reported, not corrected.
+
+    `is_read` (N,) says of which vehicles the offset of the feeding sensor was read directly.
+    """
     feed, findings, scale_a = reference.ordered[reference.feed], list[list[SensorFinding]](), reference.full_scale_a
     sensor = sum(model.probability for model in reference.models if model.spread.shared[-1])
     cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
     what = {"load": "a load without a sensor", "batch": "an offset of a batch of sensors"}
     groups = group_centres(reference.models)
-    for points, supports in zip(found.points, found.supports, strict=True):
+    for points, supports, read in zip(found.points, found.supports, is_read, strict=True):
         others = f"A in branch {feed} as in other vehicles: {what[cause]}, or {what[rival]}"
         of_group = np.bincount(points.group, points.weight, minlength=1 + len(groups))[1:]
         said: list[tuple[str | None, str, float, str]] = [
@@ -504,7 +510,7 @@ def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[lis
         ]
         alone = points.weight @ (points.load != 0.0)
         load_a = points.weight @ points.load / max(alone, 1e-300) * scale_a
-        load = f"a load without a sensor of {load_a:.1f} A, or an offset of the {feed} sensor"
+        load = f"a load without a sensor of {load_a:.1f} A" + ("" if read else f", or an offset of the {feed} sensor")
         said.append((feed, "load", alone, load))
         if reference.variants:
             eta = [(p, float(np.log1p(values[0]))) for p, values in supports]

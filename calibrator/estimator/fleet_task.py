@@ -115,7 +115,7 @@ class FleetTask:
         settings = self.identity.settings
         bench = [self.bench.get((vehicle, branch)) for branch in self.branches]
         fleet = settings.harm_limit, settings.load, settings.expected_faults, sorted(settings.hold_out)
-        return *fleet, vehicle in settings.trusted, bench
+        return *fleet, vehicle in settings.trusted, bench, self.windows
 
     def _found(self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int) -> Calibrated | str:
         if why := impossible(estimate, j, self.branches):
@@ -167,7 +167,7 @@ def learn_task(
     learning = np.array([vehicle.vehicle not in settings.hold_out for vehicle in vehicles])
     learners = list(compress(vehicles, learning))
     trusted = np.array([vehicle.vehicle in settings.trusted for vehicle in learners])
-    windows = not flows_in_fleet(vehicles)
+    windows = not flows_in_fleet(learners)
 
     def learn(used: BenchTable) -> tuple[FleetTask, list[str]]:
         readings, notices = merge_readings(vehicles, used, branches, windows=windows)
@@ -196,10 +196,12 @@ def learn_task(
         task, notices = learn({sensor: values for sensor, values in bench.items() if sensor not in wrong})
         notices += wrong.values()
     notices += flow_notices(vehicles, windows=windows)
-    return task, [*task.reference.notices, *_distrust(learners, trusted, task.reference), *notices]
+    return task, [*task.reference.notices, *_distrust(learners, trusted, task.reference, windows=windows), *notices]
 
 
-def _distrust(vehicles: Sequence[VehicleSummary], trusted: Mask, reference: FleetReference) -> list[str]:
+def _distrust(
+    vehicles: Sequence[VehicleSummary], trusted: Mask, reference: FleetReference, *, windows: bool = True
+) -> list[str]:
     """Say which trusted vehicles contradict the trust in them, and whether too few are left to carry the reference."""
     notices, names = [], [vehicle.vehicle for vehicle in vehicles]
     carriers = int(np.count_nonzero(trusted)) - len(reference.distrusted)
@@ -210,8 +212,10 @@ def _distrust(vehicles: Sequence[VehicleSummary], trusted: Mask, reference: Flee
         )
     notices += [f"vehicle {names[j]} is not trusted: {why}; check it again" for j, why in reference.distrusted.items()]
     (_, offset_a), (_, sd_a) = window_readings(vehicles)
-    shown = trusted[:, None] & (
-        np.abs(offset_a) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * reference.full_scale_a)
+    shown = (
+        windows
+        & trusted[:, None]
+        & (np.abs(offset_a) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * reference.full_scale_a))
     )
     return notices + [
         f"trusted vehicle {names[j]}: its {reference.branches[k]} sensor showed {offset_a[j, k]:+.1f} A with open "

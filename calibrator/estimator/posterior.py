@@ -73,6 +73,8 @@ MARGIN = 12.0
 """Distance of a support's log weight below the best one's from which on the support is not fitted any further."""
 MOST_FITTED = 96
 """Largest number of supports of a vehicle that are kept, the most probable ones."""
+MOST_MOVED = 48
+"""Largest number of explanations of a vehicle that are added for currents that the hardware moves."""
 MOST_PARAMETERS = 6
 """Largest number of parameters of a support; if 20 % of all parameters are faulty, few vehicles have more."""
 MOST_TURN = 3.0
@@ -146,7 +148,7 @@ class Fits(NamedTuple):
     number : ndarray of int of shape (N,)
         Number of explanations of each vehicle; entries beyond it in the other arrays are meaningless.
     support : ndarray of bool of shape (N, Q, P)
-        Which parameters are not zero.
+        Which parameters are not zero; of a current that is moved between two branches one, in ``theta`` both.
     hardware, sensor : ndarray of int of shape (N, Q)
         Numbers of hardware and sensor faults.
     theta : ndarray of shape (N, Q, P)
@@ -525,32 +527,44 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
                 base[j, q, m] = weight
 
 
-def _with_moved_currents(draws: Draws, log_prior: Array, read: Mask) -> Draws:
-    """Add the explanations in which the hardware moves a current between two branches, none of them the last.
+def _with_moved_currents(draws: Draws, log_prior: Array, log_load: float, read: Mask) -> Draws:
+    """Add the explanations in which the hardware moves a current between two branches, neither of them the last.
 
     Offsets x and y of the sensors p and r (as seen in true currents) have the same rows as an offset x + y of p beside
     a hardware offset y in r and -y in p; if x + y may be zero, also as that hardware offset alone. The parameters of a
     support have one fault for it only if either branch is the last, so these explanations are made from those with
     offsets of both sensors, (M17a) of docs/method.md. ``theta`` and ``values`` have both hardware offsets; ``support``
-    and ``place`` have one, as they are one fault. ``log_prior`` is that of :func:`fit_explanations`; ``read`` (N, K)
-    says which offsets were read directly: a reading tells the two apart.
+    and ``place`` have one, as they are one fault. ``log_prior`` and ``log_load`` are those of :func:`fit_explanations`;
+    ``read`` (N, K) says which offsets were read directly: a reading tells the two apart.
     """
-    fits, free = draws.fits, ~read
-    least = (fits.log_evidence + log_prior[fits.hardware, fits.sensor]).max(axis=1) - MARGIN
-    found = [
-        _moved_current(draws, log_prior, least, free[:, p] & free[:, r], p, r, alone=alone)
-        for p, r in permutations(range(read.shape[1] - 1), 2)
-        for alone in ((False, True) if p < r else (False,))
-    ]
-    if not found:
+    fits, K, N = draws.fits, read.shape[1], len(read)
+    pairs = permutations(range(K - 1), 2)
+    kinds = [(p, r, alone) for p, r in pairs for alone in ((False, True) if p < r else (False,))]
+    if not kinds:
         return draws
+    of_load = log_load * fits.support[:, :, 3 * K]
+    on = np.moveaxis(fits.support, 2, 0)
+    score = np.full((len(kinds), *fits.hardware.shape), -np.inf)
+    for each, (p, r, alone) in zip(score, kinds, strict=True):
+        both = on[2 * K + p] & on[2 * K + r] & ~(on[K + 1 + p] & on[K + 1 + r]) & (fits.hardware < K)
+        j, q = np.nonzero(both & ~(read[:, [p]] | read[:, [r]]))
+        rough = log_prior[fits.hardware[j, q] + 1, fits.sensor[j, q] - 1 - alone] + of_load[j, q]
+        each[j, q] = fits.log_evidence[j, q] + rough + (_zero_sum(fits, j, q, p, r)[0] if alone else 0.0)
+    least = (fits.log_evidence + log_prior[fits.hardware, fits.sensor] + of_load).max(axis=1) - MARGIN
+    ranked = -np.sort(-np.moveaxis(score, 1, 0).reshape(N, -1), axis=1)
+    if ranked.shape[1] > MOST_MOVED:
+        least = np.maximum(least, ranked[:, MOST_MOVED])
+    found = []
+    for each, (p, r, alone) in zip(score, kinds, strict=True):
+        j, q = np.nonzero(each > least[:, None])
+        found.append((j, _moved_current(draws, j, q, p, r, alone=alone)))
     vehicle = np.concatenate([j for j, _ in found])
-    order, more = np.argsort(vehicle, kind="stable"), np.bincount(vehicle, minlength=len(read))
+    order, more = np.argsort(vehicle, kind="stable"), np.bincount(vehicle, minlength=N)
     number = fits.number + more
     place = np.repeat(fits.number - np.cumsum(more) + more, more) + np.arange(len(vehicle))  # behind those that are
     extended: dict[str, Any] = {}
     for name, values in _by_explanation(draws).items():
-        longer = np.zeros((len(values), max(number.max(), values.shape[1]), *values.shape[2:]), values.dtype)
+        longer = np.zeros((N, max(number.max(), values.shape[1]), *values.shape[2:]), values.dtype)
         longer[:, : values.shape[1]] = values
         longer[vehicle[order], place] = np.concatenate([new[name] for _, new in found])[order]
         extended[name] = longer
@@ -564,50 +578,49 @@ def _by_explanation(draws: Draws) -> dict[str, NDArray[Any]]:
     return {**of_fits, "values": draws.values, "place": draws.place, "base": draws.base}
 
 
-def _moved_current(
-    draws: Draws, log_prior: Array, least: Array, free: Mask, p: int, r: int, *, alone: bool
-) -> tuple[Integers, dict[str, NDArray[Any]]]:
-    """Make the explanations in which a current is moved from branch p to r, ``alone`` or beside an offset of sensor p.
+def _zero_sum(fits: Fits, j: Integers, q: Integers, p: int, r: int) -> tuple[Array, Array]:
+    """Return what log evidence n explanations (j, q) gain if the offsets of p and r sum to zero, and the regression.
 
-    They are made for vehicles that are ``free`` (N,), if their rough log weight is above ``least`` (N,). Returned are
-    the numbers of the vehicles of n explanations (n,), and what :func:`_by_explanation` does, shape (n, ...).
+    Shapes (n,) and (n, P): in the draws of an explanation the sum is normal, and if it is zero each parameter is what
+    regression on it leaves.
     """
-    fits, K = draws.fits, draws.values.shape[3] // 3
+    K, theta, root = fits.theta.shape[2] // 3, fits.theta[j, q], fits.root[j, q]
+    of_sum, root_sum = theta[:, 2 * K + p] + theta[:, 2 * K + r], root[:, 2 * K + p] + root[:, 2 * K + r]
+    variance = np.maximum(np.sum(root_sum**2, axis=1), TINY)
+    gained = -0.5 * (of_sum**2 / variance + np.log(variance / WIDE_SD**2))
+    return gained, np.einsum("npi,ni->np", root, root_sum) / variance[:, None]
+
+
+def _moved_current(draws: Draws, j: Integers, q: Integers, p: int, r: int, *, alone: bool) -> dict[str, NDArray[Any]]:
+    """Make explanations in which a current is moved from branch p to r, ``alone`` or beside an offset of sensor p.
+
+    They are made from the n explanations (j, q); returned is what :func:`_by_explanation` does, shape (n, ...).
+    """
+    K, new = draws.values.shape[3] // 3, {name: values[j, q] for name, values in _by_explanation(draws).items()}
     offset_p, offset_r, hardware_p, hardware_r = 2 * K + p, 2 * K + r, K + 1 + p, K + 1 + r
-    on = np.moveaxis(fits.support, 2, 0)
-    both = on[offset_p] & on[offset_r] & ~(on[hardware_p] & on[hardware_r]) & (fits.hardware < K)
-    j, q = np.nonzero(both & free[:, None])
-    log_evidence, share = fits.log_evidence[j, q], np.zeros(len(j))
-    if alone:  # x + y is normal in the draws; where it is zero, y is what regression on it leaves
-        root = fits.root[j, q, offset_p] + fits.root[j, q, offset_r]
-        variance = np.maximum(np.sum(root**2, axis=1), TINY)
-        share = np.sum(root * fits.root[j, q, offset_r], axis=1) / variance
-        of_sum = fits.theta[j, q, offset_p] + fits.theta[j, q, offset_r]
-        log_evidence = log_evidence - 0.5 * (of_sum**2 / variance + np.log(variance / WIDE_SD**2))
-    hardware, sensor = fits.hardware[j, q] + 1, fits.sensor[j, q] - 1 - alone
-    n = np.flatnonzero(log_evidence + log_prior[hardware, sensor] > least[j])
-    j, q, share, log_evidence = j[n], q[n], share[n, None], log_evidence[n]
-    new = {name: values[j, q] for name, values in _by_explanation(draws).items()}
-    new["base"] += (log_evidence - new["log_evidence"])[:, None]
-    new |= {"hardware": hardware[n], "sensor": sensor[n], "log_evidence": log_evidence}
+    gained, share = _zero_sum(draws.fits, j, q, p, r) if alone else (np.zeros(len(j)), np.zeros((len(j), 3 * K + 1)))
+    gain_p, gain_r = (np.exp(new["values"][:, :, 1 + k] + draws.shared[K + k]) for k in (p, r))
+    for offset, gain in ((offset_p, gain_p), (offset_r, gain_r)):  # without one it is two faults equal by chance
+        new["base"][np.abs(new["values"][:, :, offset] * gain) < TAIL_RANGE[0]] = -np.inf
 
     def move(x: Array) -> tuple[Array, Array]:
         """Move the current in parameters x (n, P, ...); return the offset that is left in p, and what is moved."""
-        left = x[:, offset_p] + x[:, offset_r]
-        moved = x[:, offset_r] - share * left
-        x[:, offset_p] = left = 0.0 * left if alone else left
-        x[:, offset_r] = 0.0
+        x -= share[:, :, None] * (x[:, offset_p] + x[:, offset_r])[:, None]
+        left, moved = (0.0 if alone else 1.0) * (x[:, offset_p] + x[:, offset_r]), x[:, offset_r].copy()
+        x[:, offset_p], x[:, offset_r] = left, 0.0
         x[:, hardware_p] -= moved
         x[:, hardware_r] += moved
         return left, moved
 
-    gain_p, gain_r = (np.exp(new["values"][:, :, 1 + k] + draws.shared[K + k]) for k in (p, r))
-    for offset, gain in ((offset_p, gain_p), (offset_r, gain_r)):  # without one it is two faults equal by chance
-        new["base"][np.abs(new["values"][:, :, offset] * gain) < TAIL_RANGE[0]] = -np.inf
     move(new["theta"][:, :, None])
     move(new["root"])
     left, moved = move(np.swapaxes(new["values"], 1, 2))
-    new["base"] -= np.log(gain_r)  # sizes of offsets are those of measured currents, of the hardware those of true ones
+    new["hardware"] += 1
+    new["sensor"] -= 1 + alone
+    new["log_evidence"] += gained
+    new["base"] += gained[:, None] - np.log(
+        gain_r
+    )  # sizes of offsets are in measured currents, of hardware in true ones
     if alone:  # one sign less; and the wide Gaussian of the sum is taken out
         new["base"] += log(2.0) - log(WIDE_SD) - LOG_ROOT_TAU - np.log(gain_p)
     slot = np.arange(len(j)), np.where(new["support"][:, hardware_r], hardware_p, hardware_r)
@@ -615,7 +628,7 @@ def _moved_current(
     support[:, offset_p], support[:, offset_r], support[slot] = not alone, False, True
     place[:, offset_p] = NO_SIZE if alone else np.searchsorted(BETWEEN, np.abs(left * gain_p))
     place[:, offset_r], place[slot] = NO_SIZE, np.searchsorted(BETWEEN, np.abs(moved))
-    return j, new
+    return new
 
 
 @inner
@@ -881,4 +894,4 @@ def explain(rows: EvidenceRows, model: FaultModel, *, feed: int) -> Draws:
     if bad.any():
         wider = (fits.chi2[picked] / free)[:, None, None]
         draws = fitted(np.where(bad[:, None, None], wider, 1.0) * covariance)
-    return _with_moved_currents(draws, rough, rows.known[:, rows.places.offset_reads])
+    return _with_moved_currents(draws, rough, log_load, rows.known[:, rows.places.offset_reads])

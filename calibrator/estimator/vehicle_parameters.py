@@ -278,6 +278,10 @@ def deciding_evidence(
             f"bench-checked vehicles would decide: the fleet's reference is in doubt for branch {', '.join(doubtful)}; "
             f"name at least three with --trusted"
         ), None
+    loads = [each for each in estimate.findings[j] if each.cause == "load"]
+    if loads and not (held_back != "").any():
+        what = f"a zero-current window (contactors open) or a bench check of the {loads[0].branch} sensor would decide"
+        return f"{what}: {loads[0].text}", None
     text, rival = _rival(estimate.explanations[j], branches, held_back != "", full_scale_a)
     if text:
         return text, rival

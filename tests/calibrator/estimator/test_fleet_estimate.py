@@ -16,6 +16,7 @@ from calibrator.errors import FleetError
 from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
 from calibrator.estimator.fleet_task import _distrust
 from calibrator.estimator.prior import known_prior
+from calibrator.estimator.vehicle_parameters import deciding_evidence
 from calibrator.faults import Faults
 from calibrator.score import harmed
 from calibrator.summaries.moments import DriveSummary
@@ -74,6 +75,22 @@ def test_low_gain_of_the_largest_branch_is_recovered_and_its_dead_sensor_is_foun
     assert (found.confidence[3:5] < 0.5).all()
     assert (found.fault_probability[:5, 0] > 0.99).all()
     assert not found.corrected[3:5].any()
+
+
+@pytest.mark.parametrize("is_read", [False, True])
+def test_load_of_one_vehicle_that_may_be_an_offset_leaves_it_open_unless_that_was_read(is_read: bool) -> None:
+    faults, readings = no_faults(16, K), np.full((2, 2, 16, K), NAN)
+    faults.offset_a[1, 1] = 10.0  # of the feeding branch; where it was read as none, it is a load
+    readings[:, 1, 1, 1] = (0.0, 0.1) if is_read else NAN
+    summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=3)
+    found = estimate_vehicles(summaries, learned(summaries, readings=readings), readings=readings)
+    (finding,) = found.findings[1]
+    assert finding.cause == "load"
+    assert finding.text.endswith("or an offset of the motor sensor") is not is_read
+    assert found.verdicts[1:3] == ["no sensor fault" if is_read else "cannot tell", "no sensor fault"]
+    if not is_read:
+        text = deciding_evidence(found, 1, NAMES, layout="hv.toml")[0]
+        assert text.startswith("a zero-current window (contactors open) or a bench check of the motor sensor would")
 
 
 @pytest.mark.long

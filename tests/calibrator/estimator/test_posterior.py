@@ -250,6 +250,30 @@ def test_probability_of_a_load_equals_integration_on_a_grid_and_negative_loads_h
     assert [of_supports(draws, weight, j)[6,][0] > 0.5 for j in range(3)] == [True, False, False]
 
 
+def test_other_parameters_fit_best_beside_a_current_that_the_hardware_moves() -> None:
+    faults = no_faults(1, 4)
+    faults.hardware_offset_a[0, :2], faults.offset_a[0, 2] = (0.08, -0.08), 0.15
+    rows = rows_of(faults, seed=2, errors=Errors(intercept=0.004, junction=0.0003))
+    model = model_of_equals(4)
+    draws = posterior.explain(rows, model, feed=0)
+    best = int(posterior.weigh(draws, model.prior)[0].sum(axis=(2, 3))[0].argmax())
+    assert (draws.fits.hardware[0, best], draws.fits.sensor[0, best]) == (1, 1)
+    theta = draws.fits.theta[:, [best]]
+    np.testing.assert_allclose(theta[0, 0, 4 + 1 : 2 * 4], [0.08, -0.08, 0.0], atol=0.01)
+    assert theta[0, 0, 2 * 4 + 2] == pytest.approx(0.15, abs=5e-4)
+    junction = posterior.row_residuals(plain_evidence(rows), theta)[0, 0, rows.places.junction]
+    assert abs(junction) < 0.0003
+
+
+def test_moved_currents_are_as_many_as_are_kept_and_none_where_no_two_sensors_have_offsets() -> None:
+    faults = no_faults(2, 5)
+    faults.offset_a[0] = 0.11, -0.05, 0.08, 0.19, 0.0
+    model = model_of_equals(5)
+    number = posterior.explain(rows_of(faults, seed=1), model, feed=0).fits.number
+    assert posterior.MOST_MOVED < number[0] <= posterior.MOST_FITTED + posterior.MOST_MOVED
+    assert number[1] < posterior.MOST_FITTED
+
+
 # Prior of the faults
 
 
