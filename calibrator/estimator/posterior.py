@@ -618,9 +618,8 @@ def _moved_current(draws: Draws, j: Integers, q: Integers, p: int, r: int, *, al
     new["hardware"] += 1
     new["sensor"] -= 1 + alone
     new["log_evidence"] += gained
-    new["base"] += gained[:, None] - np.log(
-        gain_r
-    )  # sizes of offsets are in measured currents, of hardware in true ones
+    # sizes of offsets are in measured currents, those of the hardware in true ones
+    new["base"] += gained[:, None] - np.log(gain_r)
     if alone:  # one sign less; and the wide Gaussian of the sum is taken out
         new["base"] += log(2.0) - log(WIDE_SD) - LOG_ROOT_TAU - np.log(gain_p)
     slot = np.arange(len(j)), np.where(new["support"][:, hardware_r], hardware_p, hardware_r)
