@@ -52,8 +52,8 @@ CONTRADICTION = 4.0
 """Difference of two readings of one sensor, in standard deviations, above which they contradict each other. [1]"""
 CANCEL_SD, FLOW_SD = 3.0, 10.0
 """Standard deviations up to which the sum of two readings counts as zero, and above which the readings are far from it:
-a current that flows always cancels, and offsets of two sensors do by chance: in 1 % of the vehicles that have four of
-them, at 0.03 A, and in 9 % at 0.3 A. [1]"""
+a current that flows always cancels; offsets of two sensors do by chance, the more rarely the better they are known.
+[1]"""
 LEAST_FLOWS, FLOWS_SHARE, SMALL_FLOW_SD = 3, 0.6, 4.0
 """Vehicles, and share of those with windows, in which the same two sensors cancel, and median size in standard
 deviations, from which on a current flows in the whole fleet: small offsets of two sensors cancel in fewer. [1]"""

@@ -278,13 +278,13 @@ def deciding_evidence(
             f"bench-checked vehicles would decide: the fleet's reference is in doubt for branch {', '.join(doubtful)}; "
             f"name at least three with --trusted"
         ), None
+    text, rival = _rival(estimate.explanations[j], branches, held_back != "", full_scale_a)
+    if text:
+        return text, rival
     loads = [each for each in estimate.findings[j] if each.cause == "load"]
     if loads and not (held_back != "").any():
         what = f"a zero-current window (contactors open) or a bench check of the {loads[0].branch} sensor would decide"
         return f"{what}: {loads[0].text}", None
-    text, rival = _rival(estimate.explanations[j], branches, held_back != "", full_scale_a)
-    if text:
-        return text, rival
     # One explanation is left, and not known well enough: which sensor is known least, relative to the faults found?
     sd = np.array([estimate.drift_sd[j], estimate.offset_sd_a[j] / full_scale_a])
     size = np.linalg.norm([drift, offset_a / full_scale_a], axis=1, keepdims=True)

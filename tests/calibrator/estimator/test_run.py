@@ -24,7 +24,7 @@ from calibrator.processes import run_many
 from calibrator.processes.run_many import Workers
 from calibrator.summaries.record import Record
 from calibrator.summaries.summary_store import SummaryStore
-from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator, succeeded
 from tests.calibrator.conftest import LAYOUT
@@ -82,6 +82,19 @@ def test_learning_sample_is_limited_to_the_largest_number_of_blocks(
     assert [item.vehicle for item in read_sample(store, settings)] == [item.vehicle for item in whole[:10]]
     trusted = CalibrationSettings(trusted=frozenset([whole[-1].vehicle]))
     assert read_sample(store, trusted)[-1].vehicle == whole[-1].vehicle
+
+
+def test_fleet_in_whose_windows_a_current_flows_is_calibrated_as_without_windows(
+    store: SummaryStore, task: FleetTask
+) -> None:
+    seen = ZeroCurrent(offset_a=np.array([0.84, -0.84]), sd_a=np.full(2, 0.1))
+    plain = read_sample(store, CalibrationSettings())
+    flowing = [replace(each, zero_current=seen) for each in plain]
+    found, notices = learn_task(flowing, {}, branches=BRANCHES, identity=task.identity, fleet_size=VEHICLES)
+    assert next(each for each in notices if "so one flows" in each).startswith("most vehicles: two sensors show")
+    one, other = task.estimate(plain[:3]), found.estimate(flowing[:3])
+    np.testing.assert_array_equal(one.offset_a, other.offset_a)
+    assert task.choices(plain[0].vehicle) != found.choices(plain[0].vehicle), "--since looks at them again"
 
 
 def texts(chunk: bytes) -> dict[str, bytes]:
