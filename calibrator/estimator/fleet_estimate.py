@@ -91,6 +91,11 @@ class FleetReference:
         Number of vehicles learnt from.
     carried : bool
         Whether enough trusted vehicles carry the reference, so that the fleet may be small.
+    sums_a : (float, float)
+        Sum of the currents of trusted vehicles that carry the reference, their median, and the sum on which most of the
+        others agree; NaN if there are too few, or they do not agree. [A]
+    zero_trusted : bool
+        Whether trusted vehicles, if there are any, say where zero is, see :func:`_says_zero`.
     agreeing : tuple of float
         For each branch in ``branches``, share of the vehicles whose slopes agree. [1]
     variants : tuple of float
@@ -113,6 +118,8 @@ class FleetReference:
     load: UnmeasuredLoad | None
     vehicles: int
     carried: bool
+    sums_a: tuple[float, float]
+    zero_trusted: bool
     agreeing: tuple[float, ...]
     variants: tuple[float, ...]
     distrusted: Mapping[int, str]
@@ -173,7 +180,20 @@ class FleetReference:
             )
         best = self.models[0]
         constant = best.spread.mean[RowPlaces(K).junction]
-        if self.load is None and abs(constant) > LEAST_SHARED:
+        trusted_a, others_a = self.sums_a
+        apart = (
+            f"the currents of the trusted vehicles sum to {trusted_a:+.1f} A, those of most others to {others_a:+.1f} A"
+        )
+        if not self.zero_trusted:
+            notices.append(
+                f"{apart}: the zero of the trusted ones is not believed, but their gains; read offsets again"
+            )
+        elif abs(trusted_a - others_a) > LEAST_SHARED * scale_a:
+            notices.append(
+                f"{apart}: the others share an offset, and are corrected for it, or the zero of the trusted ones is "
+                f"wrong; read an offset of one of the others"
+            )
+        elif self.load is None and abs(constant) > LEAST_SHARED:
             notices.append(
                 f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: " + _causes(self.models, ordered)
             )
@@ -263,7 +283,10 @@ def learn_fleet(
     carriers = trusted[used]
     broken = untrusted_vehicles(measured, carriers, ordered, full_scale_a=full_scale_a, load=load)
     carriers[list(broken)] = False
-    rows = with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load)
+    carried = int(carriers.sum()) >= FEWEST_TRUSTED
+    sums_a = _sums_a(measured, carriers, full_scale_a) if carried else (np.nan, np.nan)
+    zero = _says_zero(*sums_a, full_scale_a, load)
+    rows = with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load, zero=zero)
 
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
@@ -272,7 +295,7 @@ def learn_fleet(
     models = learn_fault_models(
         rows,
         feed=feed,
-        fixed=_carried_centre(rows, carriers, doubtful),
+        fixed=_carried_centre(rows, carriers, doubtful, zero=zero),
         load=None if load is None else load.mean_a / full_scale_a,
         known=known,
         expected_faults=expected_faults,
@@ -293,7 +316,9 @@ def learn_fleet(
         full_scale_a=full_scale_a,
         load=load,
         vehicles=len(fleet),
-        carried=int(carriers.sum()) >= FEWEST_TRUSTED,
+        carried=carried,
+        sums_a=sums_a,
+        zero_trusted=zero,
         agreeing=tuple(_agreeing(rows, int(p)) for p in place),
         variants=_variants(everyone.hardware_drift),
         distrusted={used[j]: why for j, why in broken.items()}
@@ -327,14 +352,38 @@ def _balanced(fleet: FleetMoments, branches: Sequence[str]) -> Mask:
     return np.asarray(~wrong.any(axis=1))
 
 
-def _carried_centre(rows: EvidenceRows, carriers: Mask, doubtful: Mask) -> Array:
-    """Return the median over trusted vehicles of each row that enough of them show, shape (5K,); NaN in the others."""
+def _sums_a(rows: EvidenceRows, carriers: Mask, full_scale_a: float) -> tuple[float, float]:
+    """Return what the currents of trusted vehicles sum to, and those of most others, see :class:`FleetReference`."""
+    junction = rows.places.junction
+    others = rows.take(~carriers).shown(junction)
+    found = densest_clusters(*others, widest=1.0) if len(others[0]) >= FEWEST_TRUSTED else []
+    shared = found[0].centre if found and found[0].share > 0.5 else np.nan
+    return float(np.median(rows.values[carriers, junction])) * full_scale_a, shared * full_scale_a
+
+
+def _says_zero(trusted_a: float, others_a: float, full_scale_a: float, load: UnmeasuredLoad | None) -> bool:
+    """Return whether trusted vehicles say where zero is: not if only the currents of the others sum to the load.
+
+    The others would have to share an offset that happens to cancel a load of all vehicles. It is likelier that the
+    trusted vehicles share a wrong zero, or a load such as a recorder.
+    """
+    expected_a, least_a = 0.0 if load is None else load.mean_a, LEAST_SHARED * full_scale_a
+    return not (abs(others_a - expected_a) < least_a < abs(trusted_a - others_a))
+
+
+def _carried_centre(rows: EvidenceRows, carriers: Mask, doubtful: Mask, *, zero: bool) -> Array:
+    """Return the median over trusted vehicles of each row that enough of them show, shape (5K,); NaN in the others.
+
+    If the ``zero`` of these vehicles is not trusted, only rows of ratios have one.
+    """
     fixed = np.full(rows.values.shape[1], np.nan)
     if np.count_nonzero(carriers) >= FEWEST_TRUSTED:
         for row in np.flatnonzero(centre_rows(rows.branches, doubtful)):
             shown = carriers & rows.known[:, row]
             if np.count_nonzero(shown) >= FEWEST_TRUSTED:
                 fixed[row] = np.median(rows.values[shown, row])
+    if not zero:
+        fixed[rows.places.constant] = np.nan
     return fixed
 
 
@@ -410,7 +459,15 @@ def estimate_vehicles(
     measured, _ = collect_rows(
         fleet, reference.read_out[:, order], full_scale_a=scale_a, usual_correlation=reference.usual_correlation
     )
-    rows = with_knowledge(measured, readings, trusted, order=order, full_scale_a=scale_a, load=reference.load)
+    rows = with_knowledge(
+        measured,
+        readings,
+        trusted,
+        order=order,
+        full_scale_a=scale_a,
+        load=reference.load,
+        zero=reference.zero_trusted,
+    )
     found = estimate_rows(
         rows,
         reference.models,

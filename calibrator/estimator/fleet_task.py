@@ -20,11 +20,11 @@ from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, e
 from calibrator.estimator.readings import (
     CONTRADICTION,
     FEWEST_TRUSTED,
+    FLOWS,
     TRUSTED_DRIFT_SD,
     TRUSTED_OFFSET_SD,
     BenchTable,
     bench_readings,
-    flow_notices,
     flows_in_fleet,
     merge_readings,
     window_readings,
@@ -195,7 +195,10 @@ def learn_task(
         wrong = _contradicted(task, vehicles, bench)
         task, notices = learn({sensor: values for sensor, values in bench.items() if sensor not in wrong})
         notices += wrong.values()
-    notices += flow_notices(vehicles, windows=windows)
+    if not windows:
+        notices.append(
+            f"most vehicles: {FLOWS}; no vehicle's zero-current windows are used; check [contactor] in the layout"
+        )
     return task, [*task.reference.notices, *_distrust(learners, trusted, task.reference, windows=windows), *notices]
 
 

@@ -20,7 +20,6 @@ from calibrator.estimator.readings import (
     TRUSTED_DRIFT_SD,
     TRUSTED_OFFSET_SD,
     bench_readings,
-    flow_notices,
     read_bench_table,
     window_readings,
 )
@@ -195,7 +194,7 @@ def calibrate_junctions(
     read = _known_readings(vehicles, branches, settings, layout, left_out=left_out)
     charge_a = _charges(drives, settings, fleet)
     groups = [[j] for j in range(len(vehicles))] if settings.meter is None else [[*range(len(vehicles))]]
-    calibrated, junctions, notices = dict[str, Calibrated](), dict[str, object](), flow_notices(vehicles)
+    calibrated, junctions, notices = dict[str, Calibrated](), dict[str, object](), list[str]()
     worse = dict[str, str]()
     for group in groups:
         known = JunctionKnowledge(read[..., group, :], load, charge_a, settings.meter)

@@ -11,7 +11,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import combinations, compress
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,16 +24,18 @@ from calibrator.summaries.vehicle_summary import VehicleSummary, weighted_mean
 from calibrator.terminal.text import few
 from ecu_node.documents import read_user_file
 from ecu_node.layout import UnmeasuredLoad
+from ecu_node.parameters import SensorFinding
 
 __all__ = [
     "FEWEST_TRUSTED",
+    "FLOWS",
     "TRUSTED_DRIFT_SD",
     "TRUSTED_OFFSET_SD",
     "BenchReading",
     "BenchTable",
     "bench_readings",
     "current_flows",
-    "flow_notices",
+    "flow_findings",
     "flows_in_fleet",
     "merge_readings",
     "read_bench_table",
@@ -57,6 +59,8 @@ a current that flows always cancels; offsets of two sensors do by chance, the mo
 LEAST_FLOWS, FLOWS_SHARE, SMALL_FLOW_SD = 3, 0.6, 4.0
 """Vehicles, and share of those with windows, in which the same two sensors cancel, and median size in standard
 deviations, from which on a current flows in the whole fleet: small offsets of two sensors cancel in fewer. [1]"""
+FLOWS = "two sensors show the same current with opposite signs while the contactors count as open, so one flows"
+"""What :func:`current_flows` finds, in words."""
 LEAST_GAIN, LEAST_OFFSET = 0.003, 0.001
 """Standard deviations that causes other than sensors add to a gain ratio, and to the junction constant over full scale.
 [1]"""
@@ -127,13 +131,11 @@ def _pairs(vehicles: Sequence[VehicleSummary]) -> Iterator[tuple[Array, Array]]:
         yield np.abs(one + other) / sd, np.minimum(np.abs(one), np.abs(other)) / sd
 
 
-def flow_notices(vehicles: Sequence[VehicleSummary], *, windows: bool = True) -> list[str]:
-    """Say in which vehicles :func:`current_flows` finds one, and if no ``windows`` of the fleet are used for it."""
-    found = few([each.vehicle for each in compress(vehicles, current_flows(vehicles))])
-    why = "two sensors show the same current with opposite signs while the contactors count as open, so one flows"
-    if not windows:
-        return [f"most vehicles: {why}; no vehicle's zero-current windows are used; check [contactor] in the layout"]
-    return [f"{found}: {why}; no window of these vehicles is used; check [contactor] in the layout"] if found else []
+def flow_findings(vehicle: VehicleSummary) -> list[SensorFinding]:
+    """Return a finding if :func:`current_flows` in the zero-current windows of a vehicle, else none."""
+    text = f"{FLOWS}; its zero-current windows are not used; check [contactor] in the layout"
+    found = bool(current_flows([vehicle])[0])
+    return [SensorFinding(branch=None, cause="window", probability=1.0, text=text)] * found
 
 
 def bench_readings(bench: BenchTable, vehicles: Sequence[str], branches: Sequence[str]) -> Array:
@@ -157,6 +159,7 @@ def with_knowledge(
     order: Sequence[int],
     full_scale_a: float,
     load: UnmeasuredLoad | None,
+    zero: bool = True,
 ) -> EvidenceRows:
     """Return the evidence with what is known from other sources than the drives: readings, trust and load.
 
@@ -174,6 +177,8 @@ def with_knowledge(
         Full scale of the junction. [A]
     load : UnmeasuredLoad or None
         Load that no branch measures, if it is known.
+    zero : bool
+        Whether the offsets of trusted vehicles are known to be zero, too, and not only their gain errors.
 
     Returns
     -------
@@ -184,6 +189,8 @@ def with_knowledge(
     given = np.full((2, 2, N, K), np.nan) if readings is None else readings
     accuracy = np.array([[0.0, 0.0], [TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD * full_scale_a]])
     right = np.where(trusted[:, None], accuracy[:, :, None, None], np.nan) * np.ones(K)
+    if not zero:
+        right[:, 1] = np.nan
     known = np.array(weighted_mean((given[0], given[1]), (right[0], right[1])))[..., list(order)]
     (drift, offset_a), (drift_sd, offset_sd_a) = known
     value = np.array([np.log1p(drift), offset_a / full_scale_a])

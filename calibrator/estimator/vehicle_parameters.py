@@ -9,6 +9,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.drives.delays import BranchDelays
 from calibrator.estimator.decision import FleetEstimate
+from calibrator.estimator.readings import flow_findings
 from calibrator.estimator.settings import CONFIDENT, SUSPECTED, RunIdentity
 from calibrator.estimator.vehicle_report import LEAST_RIVAL, REASONS, explained_faults
 from calibrator.summaries.vehicle_summary import VehicleSummary
@@ -199,7 +200,7 @@ def parameters_of(
         ),
         explanations=reported,
         deciding_evidence=deciding,
-        findings=list(estimate.findings[j]),
+        findings=[*estimate.findings[j], *flow_findings(vehicle)],
         junction_residual=junction_residual(
             vehicle.summary.moments[:, inputs:, inputs:],
             gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],

@@ -249,6 +249,9 @@ def drives(fault: str, load_a: float = 0.0) -> Summaries:
         fleet.drift[0, 1] = 0.06
     elif fault == "hardware":
         fleet.hardware_drift[2] = 0.1
+    elif fault == "zero":
+        fleet.offset_a[:3, 0] = 1.5
+        fleet.drift[5, 1] = 0.1
     elif fault == "batch":
         fleet.offset_a[3:, 0] = 12.0
     return summaries_of(fleet, Conditions(samples=1200, model_error_a=0.5, unmeasured_a=load_a), seed=1)
@@ -269,6 +272,25 @@ def test_trusted_vehicles_set_the_reference_of_a_fleet_with_a_shared_offset() ->
     assert reference.distrusted == {}
     assert not found.offset_a[:3].any()
     assert np.median(found.offset_a[3:, 0]) == pytest.approx(12.0, abs=1.0)
+    assert "trusted vehicles sum to -0.0 A, those of most others to +12.0 A" in reference.notices[0]
+
+
+@pytest.mark.parametrize("load_a", [0.0, 3.0])
+def test_wrong_zero_of_all_trusted_vehicles_turns_no_other_vehicle(load_a: float) -> None:
+    """Where the load is declared, the sum of the others is as right as where it is zero and there is none."""
+    trusted, load = first(3), UnmeasuredLoad(mean_a=load_a, sd_a=0.1) if load_a else None
+    reference = learned(drives("zero", load_a), trusted=trusted, load=load)
+    found = estimate_vehicles(drives("zero", load_a), reference, trusted=trusted)
+    assert "the zero of the trusted ones is not believed" in reference.notices[0]
+    assert np.abs(found.offset_a[3:]).max() < 0.3
+    assert found.drift[5, 1] == pytest.approx(0.1, abs=0.01)
+    assert found.corrected[:, 1].tolist() == [j == 5 for j in range(16)]
+
+
+@pytest.mark.parametrize("load_a", [0.0, 3.0])
+def test_trusted_vehicles_whose_currents_sum_to_what_others_do_give_no_notice_of_trust(load_a: float) -> None:
+    reference, _ = trusting(drives("none", load_a), first(3))
+    assert not [text for text in reference.notices if "trusted" in text]
 
 
 @pytest.mark.parametrize(("trusted", "doubt"), [(None, True), (first(2, 4), True), (first(3, 4), False)])

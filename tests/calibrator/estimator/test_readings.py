@@ -15,7 +15,7 @@ from calibrator.estimator.readings import (
     BenchTable,
     bench_readings,
     current_flows,
-    flow_notices,
+    flow_findings,
     flows_in_fleet,
     merge_readings,
     read_bench_table,
@@ -123,8 +123,8 @@ def test_window_in_which_a_current_flows_between_two_sensors_is_not_used() -> No
     vehicles = with_windows((0.84, -0.85), (0.84, 0.85), (0.2, -0.2), (5.0, -4.5), (NAN, NAN))
     assert current_flows(vehicles).tolist() == [True, False, False, False, False]
     assert np.isnan(window_readings(vehicles)[0, 1]).all(axis=1).tolist() == [True, False, False, False, True]
-    assert flow_notices(vehicles)[0].startswith("V1: two sensors show the same current with opposite signs while the")
-    assert flow_notices(vehicles[1:]) == []
+    assert [[each.cause for each in flow_findings(vehicle)] for vehicle in vehicles] == [["window"], [], [], [], []]
+    assert flow_findings(vehicles[0])[0].text.startswith("two sensors show the same current with opposite signs while")
 
 
 @pytest.mark.parametrize(("shown_a", "flows"), [
@@ -139,7 +139,6 @@ def test_windows_of_a_fleet_are_not_used_if_the_same_small_current_flows_in_most
     vehicles = with_windows(*shown_a)
     assert flows_in_fleet(vehicles) == flows
     assert np.isnan(merge_readings(vehicles, {}, BRANCHES, windows=False)[0]).all()
-    assert flow_notices(vehicles, windows=False)[0].startswith("most vehicles: two sensors show the same current")
 
 
 @pytest.mark.parametrize("others_a", [0.0, 5.0, -12.0])

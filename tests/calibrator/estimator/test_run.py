@@ -16,7 +16,7 @@ import pytest
 from calibrator.errors import FleetError
 from calibrator.estimator import run
 from calibrator.estimator.fleet_task import FleetTask, calibrate_bucket, learn_task
-from calibrator.estimator.results import left_out_of, read_results, read_run
+from calibrator.estimator.results import Calibrated, left_out_of, read_results, read_run
 from calibrator.estimator.run import read_sample
 from calibrator.estimator.settings import CalibrationSettings, RunIdentity
 from calibrator.files.storage import open_storage
@@ -95,6 +95,15 @@ def test_fleet_in_whose_windows_a_current_flows_is_calibrated_as_without_windows
     one, other = task.estimate(plain[:3]), found.estimate(flowing[:3])
     np.testing.assert_array_equal(one.offset_a, other.offset_a)
     assert task.choices(plain[0].vehicle) != found.choices(plain[0].vehicle), "--since looks at them again"
+
+
+@pytest.mark.parametrize("shown_a", [0.84, 0.1])
+def test_vehicle_is_told_if_its_windows_are_not_used(store: SummaryStore, task: FleetTask, shown_a: float) -> None:
+    seen = ZeroCurrent(offset_a=np.array([shown_a, -shown_a]), sd_a=np.full(2, 0.05))
+    vehicle = replace(read_sample(store, CalibrationSettings())[0], zero_current=seen)
+    found = task.calibrate([vehicle])[vehicle.vehicle]
+    assert isinstance(found, Calibrated)
+    assert [each.cause for each in found.parameters.findings] == ["window"] * (shown_a > 0.5)
 
 
 def texts(chunk: bytes) -> dict[str, bytes]:
