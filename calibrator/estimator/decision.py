@@ -53,6 +53,9 @@ RESOLUTION = 3e-4
 """Drift [1] and offset in fractions of full scale below which they are zero: no sensor's resolution is finer."""
 MOST_GAIN_SD = 0.1
 """Standard deviation from which on a gain counts as unknown: smaller than the faults that matter. [1]"""
+LEAST_HARDWARE = 0.025
+"""Hardware drift up to which vehicles differ without a fault: three times the 0.8 % by which a branch of one sound car
+differs between its trips (docs/limits.md). [1]"""
 LEAST_EXPLANATION = 1e-5
 """Least probability of an explanation that is reported. [1]"""
 CENTRAL = 0.6827
@@ -251,8 +254,8 @@ class SensorEstimate:
         Sensor faults and their standard deviations; in a fleet these are the distances from the estimate within which
         68 % of the posterior lies. [1], [A]
     hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
-        Drift and probability of a hardware fault (NaN for single junctions); probability that the estimate is
-        recovered. [1]
+        Drift and probability of a hardware fault (NaN for single junctions), to which a smaller drift than
+        :data:`LEAST_HARDWARE` does not count; probability that the estimate is recovered. [1]
     hardware_offset_a : ndarray of shape (N, K)
         Offsets of a hardware fault. [A]
     fault_probability, harm_probability : ndarray of shape (N, K)
@@ -412,7 +415,8 @@ def estimate_rows(
         fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
         supports.append(_supports(found))
         hardware[j] = _nearest(supports[j], estimate[j])[: 1 + K]
-        hardware_probability[j] = min(sum(share for share, values in supports[j] if values[: 1 + K].any()), 1.0)
+        of_hardware = [each for each, (d, *values) in supports[j] if abs(d) > LEAST_HARDWARE or any(values[:K])]
+        hardware_probability[j] = min(sum(of_hardware), 1.0)
     confidence[~rows.known.any(axis=1)] = 0.0  # nothing is known of these: a prior is no evidence
     return RowsEstimate(
         drift=estimate[:, place],

@@ -197,6 +197,19 @@ def test_gain_error_shared_by_all_sensors_of_a_branch_gives_a_notice_and_is_not_
     assert not estimate_vehicles(summaries, learnt).corrected.any()
 
 
+@pytest.mark.parametrize(("drift", "suspected"), [(0.02, False), (-0.02, False), (0.06, True)])
+def test_vehicle_that_differs_by_no_more_than_sound_ones_do_has_no_hardware_fault(
+    drift: float, suspected: bool
+) -> None:
+    fleet = no_faults(12, K)
+    fleet.hardware_drift[3] = drift
+    summaries = summaries_of(fleet, Conditions(samples=900, model_error_a=0.3), seed=7)
+    found = estimate_vehicles(summaries, learned(summaries))
+    assert (found.hardware_probability > 0.5).tolist() == [suspected and j == 3 for j in range(12)]
+    assert found.hardware_drift[3] == pytest.approx(drift, abs=0.005)
+    assert not found.corrected.any()
+
+
 @pytest.mark.parametrize("larger", [0.0, 0.1])
 def test_two_variants_of_the_vehicle_give_a_notice_and_a_finding_per_vehicle(larger: float) -> None:
     fleet = no_faults(12, K)
