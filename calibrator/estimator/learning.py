@@ -79,6 +79,9 @@ the fleet model last for a whole drive. [1]"""
 COMMON_SPREADS = (0.0, 0.005, 0.03)
 """Spreads, beyond the guess, that all branches of a vehicle have in common, to start from: on recorded trips it is 0.5
 to 0.8 %. If learning starts with a narrow spread, vehicles at its edge keep a small hardware fault each. [1]"""
+OWN_SPREAD = 0.03
+"""Spread of each slope by itself to start from, too, where the junction law tells a gain ratio less precisely: how two
+branches in parallel share a current may differ between vehicles by as much, and looks like two gain errors. [1]"""
 MOST_LOAD_SPREAD = 0.005
 """Largest spread over vehicles of loads without a sensor, before anything is known, over full scale: some A. [1]"""
 LEAST_SPREAD = (1e-5, 1e-6)
@@ -190,9 +193,10 @@ def learn_fault_models(
         declared=load is not None,
     )
     starter = replace(learner, rows=some_rows(MOST_STARTED))
-    starts = [
-        starter.initial_model(centre, spread) for centre, spread in product(learner.initial_centres(), COMMON_SPREADS)
-    ]
+    spreads = [(common, 0.0) for common in COMMON_SPREADS]
+    if any(np.median(rows.shown(rows.places.ratio(k))[1]) > OWN_SPREAD for k in range(1, rows.branches)):
+        spreads.append((0.0, OWN_SPREAD))
+    starts = [starter.initial_model(centre, *spread) for centre, spread in product(learner.initial_centres(), spreads)]
     climbed = [starter.climb(start, START_ROUNDS) for start in starts]
     references = [learner.climb(model, ROUNDS, begun=True) for model in learner.rivals(climbed, STARTED_LOG_ODDS)]
     models = learner.variants(learner.rivals(references, KEPT_LOG_ODDS))
@@ -317,11 +321,12 @@ class _Learner:
                     found.append(start)
         return found
 
-    def initial_model(self, centre: Array, common_spread: float = 0.0) -> FaultModel:
-        """Make a first model from a centre, and from the spread that all branches of a vehicle have in common. [1]"""
+    def initial_model(self, centre: Array, common_spread: float = 0.0, own_spread: float = 0.0) -> FaultModel:
+        """Make a first model from a centre, and two spreads of slopes: common to a vehicle's branches, and of each. [1]"""
         rows, K = self.rows, self.rows.branches
         junction, eta = self.at.junction, self.design[:, self.parameters.eta]
         covariance = self.guess + self.least + common_spread**2 * np.outer(eta, eta)
+        covariance[range(K), range(K)] += own_spread**2  # the rows of slopes come first
         clusters = densest_clusters(
             rows.values[:, junction], np.sqrt(rows.covariance[:, junction, junction]), farthest=LARGEST_SHARED
         )
