@@ -58,6 +58,9 @@ LINEAR_CAUSES = (*LEFT_OUT_CAUSES, "noise", "switching")
 """Causes of findings with which a sensor still has a gain and an offset."""
 VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
 """Least share of the fleet, half width of the hardware drift, and least number of vehicles of a variant. [1]"""
+WORSE_SUM, WORSE_SUM_A = 1.5, 0.0025
+"""An estimate is wrong with which the sum of the currents scatters more by this factor [1] and by this share of full
+scale."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -481,6 +484,9 @@ def estimate_vehicles(
     unfit = find_misfits(
         summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=reference.branches
     )
+    covariance_a2 = fleet.covariance[:, fleet.inputs : -1, fleet.inputs : -1]
+    growing = _growing_sums(covariance_a2, 1.0 + found.drift[:, order], scale_a)
+    unfit = [(*mine, *other) for mine, other in zip(unfit, growing, strict=True)]
     drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
     has_own_load = np.array([each.weight @ (each.load != 0.0) > SUSPECTED for each in found.points])
     is_read = rows.known[:, rows.places.offset_reads][:, reference.feed]  # then the load is no offset
@@ -508,6 +514,25 @@ def estimate_vehicles(
         findings=[(*each, *others) for each, others in zip(unfit, shared, strict=True)],
         evidence=reported_evidence(rows, found, reference.models[0].spread),
     )
+
+
+def _growing_sums(covariance_a2: Array, gain: Array, full_scale_a: float) -> list[tuple[SensorFinding, ...]]:
+    """Find the vehicles whose currents would sum to more if these gains were right, which therefore are not.
+
+    Gains of parallel branches, which the junction law does not tell apart, come from the fleet model alone.
+    """
+    before_a, after_a = (
+        np.sqrt(np.maximum(np.einsum("nkl,nk,nl->n", covariance_a2, weight, weight), 0.0)).tolist()
+        for weight in (np.ones_like(gain), 1.0 / gain)
+    )
+    found = list[tuple[SensorFinding, ...]]()
+    for before, after in zip(before_a, after_a, strict=True):
+        grows = after > max(WORSE_SUM * before, before + WORSE_SUM_A * full_scale_a)
+        text = (
+            f"corrected, its currents would sum to {after:.1f} A RMS about their mean, now {before:.1f} A: a variant?"
+        )
+        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=text),) * grows)
+    return found
 
 
 def reported_evidence(rows: EvidenceRows, found: SensorEstimate, spread: Spread) -> Array:

@@ -322,7 +322,7 @@ class _Learner:
         return found
 
     def initial_model(self, centre: Array, common_spread: float = 0.0, own_spread: float = 0.0) -> FaultModel:
-        """Make a first model from a centre, and two spreads of slopes: common to a vehicle's branches, and of each. [1]"""
+        """Make a first model from a centre, and spreads [1] of slopes: common to a vehicle's branches, and of each."""
         rows, K = self.rows, self.rows.branches
         junction, eta = self.at.junction, self.design[:, self.parameters.eta]
         covariance = self.guess + self.least + common_spread**2 * np.outer(eta, eta)
@@ -452,15 +452,16 @@ class _Learner:
                 broken[k] = alike and abs(centre[k]) > max(LEAST_SHARED_GAIN[1], SURELY_SHARED * sd[k])
         if not broken.any():
             return []
-        # lambda_1 - lambda_k is off: by the sensors of the first branch if that fits all ratios, else by those of k
-        of_first: Array = np.zeros(2 * K + 1)
-        of_others: Array = np.zeros(2 * K + 1)
-        of_first[K] = np.average(centre[broken], weights=sd[broken] ** -2.0)
-        of_others[K : 2 * K] = -np.where(broken, centre, 0.0)
-        apart = np.abs(centre - of_first[K])[1:]
-        if (apart > LEAST_SHARED_GAIN[1] + SURELY_SHARED * sd[1:]).any():
-            return [of_others]
-        return [of_first] if np.count_nonzero(broken) > 1 else [of_first, of_others]
+        # The centres are lambda_1 - lambda_k. One lambda can be chosen: those that leave the fewest branches wrong are.
+        tolerance = LEAST_SHARED_GAIN[1] + SURELY_SHARED * sd
+        found: dict[tuple[bool, ...], Array] = {}
+        for first in (0.0, *centre[broken]):
+            alike = broken & (np.abs(centre - first) <= tolerance)
+            of_first = np.average(centre[alike], weights=sd[alike] ** -2.0) if first and alike.any() else first
+            gains = np.append(of_first, np.where(np.abs(centre - of_first) > tolerance, of_first - centre, 0.0)[1:])
+            found.setdefault(tuple(gains != 0.0), np.concatenate([np.zeros(K), gains, [0.0]]))
+        fewest = min(sum(wrong) for wrong in found)
+        return [shared for wrong, shared in found.items() if sum(wrong) == fewest]
 
     def with_modes(self, model: FaultModel) -> FaultModel:
         """Return the model with all priors that explain the fleet nearly as well as the best one.
