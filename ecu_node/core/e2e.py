@@ -4,7 +4,6 @@ So a frame that came in corrupt can never go out with a valid CRC. Supported are
 P05, P06, P07 and P11, computed by autosar-e2e, and a counter with a CRC-8 (fastcrc), as many control units have it.
 """
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -133,10 +132,11 @@ class Receiver:
         self.state = E2EState.INIT
         self._protection = protection
         self._expected: int | None = None  # the first intact frame may have any counter
-        self._past: deque[Check] = deque(maxlen=max(window.window for window in protection.windows))
+        self._past: list[Check] = []
+        self._remembered = max(window.window for window in protection.windows)
         place = protection.counter
         self._is_short = place.end - place.first == 1
-        self._is_steady = False  # VALID, all that is remembered was in order, and the counter is within a byte
+        self._is_steady = False  # all that is remembered was in order, and the counter is within a byte
         self._check, self._identity, self._least_bytes = protection.check, protection.identity, protection.least_bytes
         self._byte, self._shift, self._ones = place.first, place.shift, place.highest
         self._modulus = protection.modulus
@@ -158,8 +158,7 @@ class Receiver:
         if self._is_steady and len(payload) >= self._least_bytes:
             counter = payload[self._byte] >> self._shift & self._ones
             if counter == self._expected and self._check(payload, self._identity):
-                counter += 1
-                self._expected = counter if counter < self._modulus else 0
+                self._expected = (counter + 1) % self._modulus
                 return _OK
         check = self._checked(payload)
         self._judge(check)
@@ -187,16 +186,15 @@ class Receiver:
         """Update the state of the message after the check of one more frame."""
         if check is Check.CORRUPT and not self._past and self.state is E2EState.INIT:
             return  # nothing was received yet
-        self._past.append(check)
+        self._past = [*self._past, check][-self._remembered :]
         allowed = self._protection.windows[self.state]
-        last = [*self._past][-allowed.window :]
+        last = self._past[-allowed.window :]
         errors = last.count(Check.CORRUPT)
         if errors <= allowed.max_error and sum(item <= Check.LOST for item in last) >= allowed.min_ok:
             self.state = E2EState.VALID
         elif self.state is E2EState.VALID or errors > allowed.max_error:
             self.state = E2EState.INVALID
-        is_valid = self.state is E2EState.VALID and len(self._past) == self._past.maxlen
-        self._is_steady = self._is_short and is_valid and max(self._past) <= Check.LOST
+        self._is_steady = self._is_short and self._past == [_OK] * self._remembered
 
 
 class _Profile(NamedTuple):
