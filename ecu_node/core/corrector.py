@@ -149,6 +149,17 @@ class _Ways(NamedTuple):
     """For an overlay: messages that answer such a payload, each with the function that fills it."""
 
 
+class _WaysByLength(dict[int, _Ways]):
+    """What is done with payloads, by their length; found when the first one of a length comes."""
+
+    def __init__(self, find: Callable[[int], _Ways]) -> None:
+        self._find = find
+
+    def __missing__(self, length: int) -> _Ways:
+        found = self[length] = self._find(length)
+        return found
+
+
 class Source:
     """One incoming message, what is read from it and which messages answer it.
 
@@ -190,8 +201,8 @@ class Source:
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch in self.branches)])
         self._silent_from_s = float("inf")
         self._frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
-        self.ways: dict[int, _Ways] = {}
-        """What is done with payloads, by their length; must be cleared when the correction of a branch changes."""
+        self.ways = _WaysByLength(self._find)
+        """What is done with payloads; must be cleared when the correction of a branch changes."""
         for part, signal in readers:
             part.follow(signal, self._frames)
 
@@ -215,13 +226,13 @@ class Source:
         sequence of OwnMessage
             Messages to be sent; none if the frame is corrupt, repeated, or its counter jumped.
         """
-        ways = self.ways.get(len(payload)) or self._find(len(payload))
+        ways = self.ways[len(payload)]
         if self._take(payload, now_s, ways) > _LAST_USABLE:
             return ()
         if self.is_invalid:
             for branch in self.branches:
                 branch.spoil(now_s)
-            ways = self.ways.get(0) or self._find(0)  # as for an empty payload: nothing is read from it
+            ways = self.ways[0]  # as for an empty payload: nothing is read from it
         for target, rewrite in ways.answers:
             made = rewrite(payload, target.data, now_s)
             if target.protection is not None:
@@ -247,7 +258,7 @@ class Source:
             branch and is corrupt, repeated, or its counter jumped: then it is not passed on. That too many frames of
             the message fail their check holds nothing up: its receivers judge that for themselves.
         """
-        ways = self.ways.get(len(payload)) or self._find(len(payload))
+        ways = self.ways[len(payload)]
         if self._take(payload, now_s, ways) > _LAST_USABLE:
             if not self.branches:
                 return payload
@@ -287,19 +298,18 @@ class Source:
         return check
 
     def _find(self, length: int) -> _Ways:
-        """Prepare what is done with payloads of this length [byte], and remember it."""
+        """Prepare what is done with payloads of this length. [byte]"""
         inside = {item: Written(item.signal.place) for item in self.branches if item.signal.end <= length}
 
         def way(branches: Mapping[LiveBranch, Written], made_length: int) -> _Rewrite:
             plain = _signal_by_signal(branches, inside, self._counters)
             return _in_one_word(branches, inside, length, made_length, plain)
 
-        found = self.ways[length] = _Ways(
+        return _Ways(
             missing=[branch for branch in self.branches if branch not in inside],
             in_place=way(inside, length),
             answers=[(target, way(target.branches, len(target.data))) for target in self.targets],
         )
-        return found
 
 
 OF_ONE_DRIVE = frozenset((Reason.BRANCH_STALE, Reason.BRANCH_STUCK))
