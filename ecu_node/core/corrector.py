@@ -11,6 +11,7 @@ itself (gateway). What does not change from frame to frame is looked up once per
 correction of a branch changes.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
@@ -197,9 +198,9 @@ class Source:
         self._counters, self.targets = counters, tuple(targets)
         self.branches = [part for part, _ in readers if isinstance(part, LiveBranch)]
         self._others = [part for part, _ in readers if not isinstance(part, LiveBranch)]
-        self.timeout_s = max((branch.timeout_s for branch in self.branches), default=float("inf"))
+        self.timeout_s = max((branch.timeout_s for branch in self.branches), default=math.inf)
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch in self.branches)])
-        self._silent_from_s = float("inf")
+        self._silent_from_s = math.inf
         self._frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
         self.ways = _WaysByLength(self._find)
         """What is done with payloads; must be cleared when the correction of a branch changes."""
@@ -375,8 +376,8 @@ class Corrector:
         """Identifiers of the messages that carry branches, which a gateway rewrites."""
         self.own_keys = {target.key for source in self.sources.values() for target in source.targets}
         """Identifiers of the messages that it makes itself: answers and status."""
-        self._looked_s = self._foreign_until_s = float("-inf")
-        self._silent, self._silent_since_s, self._was_awake = True, float("inf"), False
+        self._looked_s = self._foreign_until_s = -math.inf
+        self._silent, self._silent_since_s, self._was_awake = True, math.inf, False
         self._foreign, self._alive = counters.foreign, 0
         self._status_fields = status_fields
         if status_fields is not None:
@@ -465,8 +466,8 @@ class Corrector:
         """
         silent = all(branch.is_old(now_s) for branch in self.branches)
         if not silent:
-            self._silent_since_s = float("inf")
-        elif self._silent_since_s == float("inf"):
+            self._silent_since_s = math.inf
+        elif self._silent_since_s == math.inf:
             self.watch.forget()
             self._silent_since_s = now_s
         if self.latched in OF_ONE_DRIVE and now_s - self._silent_since_s >= self._sleep_s:

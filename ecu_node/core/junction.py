@@ -49,7 +49,7 @@ class HeardSignal:
         self._read: tuple[float, bytearray] | None = None
         """The last frame that was read."""
         self._past: deque[tuple[float, int]] = deque(maxlen=REMEMBERED_FRAMES)
-        self._spoilt_s = float("-inf")
+        self._spoilt_s = -math.inf
 
     def follow(self, signal: PlacedSignal, frames: Frames) -> None:
         """Read the signal from these frames, to which its message goes on adding."""
@@ -155,7 +155,7 @@ class LiveBranch(HeardSignal):
         self.fault, self.delay_s = NO_FAULT, 0.0
         self.plan = self._passing = self._correcting = AS_IT_IS
         self.quality = Quality.PASSED_THROUGH
-        self._time_s = self._awake_s = self._waited_s = float("-inf")
+        self._time_s = self._awake_s = self._waited_s = -math.inf
         self._is_named = False
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
 
@@ -222,7 +222,7 @@ class LiveBranch(HeardSignal):
         """Instant by which the next frame of the branch is due; infinity if the vehicle has no such branch. [s]"""
         if self.seen:
             return self.time_s + self.timeout_s
-        return self._waited_s + max(self.timeout_s, self._start_s) if self._is_named else float("inf")
+        return self._waited_s + max(self.timeout_s, self._start_s) if self._is_named else math.inf
 
     def is_stale(self, now_s: float) -> bool:
         """Check whether the next frame of the branch is overdue."""
@@ -544,7 +544,7 @@ class JunctionWatch:
         self._sd_a, self._sd_per_a = max(sd_a, self._margin_a), _UNKNOWN_SD_PER_A if sd_per_a is None else sd_per_a
         self.sums: JunctionSums | None = None
         self.currents_a: Currents = {}
-        self.instant_s = self._judged_s = float("-inf")
+        self.instant_s = self._judged_s = -math.inf
         self.forget()
 
     def forget(self) -> None:
