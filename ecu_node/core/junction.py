@@ -44,7 +44,8 @@ class HeardSignal:
 
     def __init__(self, codes: Codes, timeout_s: float) -> None:
         self.codes, self.timeout_s = codes, timeout_s
-        self.signal = PlacedSignal(place=codes.place)
+        self.signal: PlacedSignal
+        """The signal in its message; only where :meth:`follow` said which."""
         self._frames: Frames = deque()
         self._read: tuple[float, bytearray] | None = None
         """The last frame that was read."""
