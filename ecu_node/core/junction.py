@@ -347,7 +347,9 @@ class LiveBranch(HeardSignal):
         if self.voltage is None:
             return 1.0
         code = self.voltage.code_at(time_s)
-        volts = 0.0 if code is None else float(self.voltage.codes.worth(code))
+        if code is None:
+            return None
+        volts = float(self.voltage.codes.worth(code))
         return volts if volts >= _LEAST_VOLTAGE_V else None
 
     def _code_between(self, time_s: float) -> float | None:
