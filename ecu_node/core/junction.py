@@ -639,7 +639,7 @@ class JunctionWatch:
         measured_a = [moment.terms[0] for moment in moments]
         rows = self._rows(moments, corrected=False)
         lines = [_line(row, measured_a) for name, row in rows.items() if name not in still]
-        if any(explains and abs(slope) < _LARGEST_SLOPE for slope, explains in lines):
+        if any(explains and not is_steep for is_steep, explains in lines):
             return ()
         return self._frozen(still)
 
@@ -660,10 +660,10 @@ class JunctionWatch:
         still = [name for name, row in rows.items() if min(row) == max(row)]
         if frozen := self._frozen(still):  # a branch that moved in one step is left out: its own sensor may have jumped
             lines = [_line(row, residual) for name, row in rows.items() if name not in still and not _is_step(row)]
-            if any(explains and abs(slope) >= _LARGEST_SLOPE for slope, explains in lines):
+            if any(explains and is_steep for is_steep, explains in lines):
                 return Reason.BRANCH_STUCK, frozen
         left = {name: _left_of_gain(row, residual) for name, row in rows.items()}
-        of_offset, best = len(residual) * _covariance(residual, residual), min(left.values())
+        of_offset, best = _common_change(residual, residual), min(left.values())
         enough = _NEARLY_AS_GOOD * best + _ROUNDING * math.fsum(map(mul, residual, residual))
         near = [name for name in left if left[name] <= enough or of_offset <= enough]
         return Reason.SUM_IMPLAUSIBLE, tuple(sorted(near, key=left.__getitem__))
@@ -677,17 +677,16 @@ def _is_step(current: Sequence[float]) -> bool:
 def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
     """Return the sum of squares of the residual that the best gain error of a branch leaves. [A^2]"""
     own, both = math.fsum(map(mul, current, current)), math.fsum(map(mul, current, residual))
-    return math.fsum(map(mul, residual, residual)) - (both * both / own if own else 0.0)
+    return math.fsum(map(mul, residual, residual)) - both * both / (own or math.inf)
 
 
-def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
-    """Return the covariance of two columns; it is enough that one of them has its mean taken out."""
+def _common_change(x: Sequence[float], y: Sequence[float]) -> float:
+    """Return the sum of products of two columns about their means; it is enough that one has its mean taken out."""
     mean_y = math.fsum(y) / len(y)
-    return math.fsum(map(mul, x, (b - mean_y for b in y))) / len(x)
+    return math.fsum(map(mul, x, (b - mean_y for b in y)))
 
 
-def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, bool]:
-    """Return the slope of the line through points, and whether it explains them: y hardly scatters around it."""
-    xx, xy, yy = _covariance(x, x), _covariance(x, y), _covariance(y, y)
-    slope = xy / xx if xx else 0.0
-    return slope, slope * xy >= _EXPLAINS * yy
+def _line(x: Sequence[float], y: Sequence[float]) -> tuple[bool, bool]:
+    """Return whether the line through points has a large slope, and explains them: y hardly scatters around it."""
+    xx, xy, yy = _common_change(x, x), _common_change(x, y), _common_change(y, y)
+    return abs(xy) >= _LARGEST_SLOPE * xx, xy * xy >= _EXPLAINS * xx * yy
