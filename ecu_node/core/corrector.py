@@ -82,8 +82,7 @@ def _in_one_word(
             return otherwise
         bias = plan.bias + (1 << (plan.shift - 1)) + place.lowest * plan.gain - (written.place.lowest << plan.shift)
         at, to_at = place.shift_in(length), written.place.shift_in(made_length)
-        ones = (1 << place.length) - 1
-        cells.append((at, ones, first - place.lowest, last - place.lowest, plan.gain, bias, plan.shift, to_at))
+        cells.append((at, place.ones, first - place.lowest, last - place.lowest, plan.gain, bias, plan.shift, to_at))
         place.put(signs, place.lowest)
         written.place.put(ready, written.place.lowest)
         written.place.put(taken, written.place.highest)  # all but a sign bit, which is set anew
