@@ -101,6 +101,12 @@ def test_branch_that_no_parameters_name_and_that_never_sent_is_neither_fitted_no
     assert (branch.is_fitted, branch.is_stale(100.0), branch.is_old(100.0)) == (False, False, True)
 
 
+def test_branch_that_parameters_name_is_stale_if_it_has_not_sent_by_its_timeout() -> None:
+    branch = LiveBranch(name="motor", codes=codes(Fraction(1)), sign=1, timeout_s=0.5)
+    branch.take(SensorFault(), correcting=AS_IT_IS, passing=AS_IT_IS, delay_s=0.0, expected_since_s=2.0)
+    assert (branch.is_fitted, branch.is_stale(2.5), branch.is_stale(2.51)) == (True, False, True)
+
+
 def test_range_of_ordinary_codes_excludes_named_and_clipped_codes() -> None:
     branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
     branch.codes = codes(Fraction(1), -32767, 32767)
