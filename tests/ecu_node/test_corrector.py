@@ -606,6 +606,16 @@ def test_first_two_frames_after_a_silence_are_not_used(database: VehicleDatabase
     assert at_20_ms(database, corrector, 3.0, 3.1) == [Quality.INVALID] * 2 + [Quality.CORRECTED] * 3
 
 
+@pytest.mark.parametrize(("silence_s", "repeated"), [(1.0, 1), (1.01, 0)])
+def test_any_counter_is_accepted_after_a_silence_of_more_than_a_second(
+    database: VehicleDatabase, silence_s: float, repeated: int
+) -> None:
+    corrector = corrector_for(database, battery=(0.02, 3.0))
+    for now_s in (0.0, silence_s):
+        answers(corrector, battery(database, 3), now_s)
+    assert corrector.counters.repeated == repeated
+
+
 def test_gateway_forwards_the_intact_frames_of_an_invalid_message(database: VehicleDatabase) -> None:
     source = corrector_for(database, Mode.GATEWAY, battery=(0.02, 3.0)).sources[BATTERY]
     for number in range(20):
