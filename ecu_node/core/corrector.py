@@ -329,7 +329,7 @@ class StatusFields(NamedTuple):
 
 
 class Corrector:
-    """The pure core of the node; built by :func:`ecu_node.bus.wiring.wire`.
+    """The pure core of the node; built by :func:`ecu_node.bus.wiring.wire`, and ready after the first :meth:`begin`.
 
     Parameters
     ----------
@@ -362,13 +362,13 @@ class Corrector:
     ) -> None:
         self.branches, self.shadow, self.watch, self._sleep_s = branches, shadow, watch, sleep_s
         self.counters = counters
-        self.reason = Reason.NO_PARAMETERS
+        self.reason: Reason
         """Why the parameters cannot be applied and measured values are passed through; NONE if they can."""
-        self.latched = Reason.NONE
+        self.latched: Reason
         """Why the node has fallen back to passing through; NONE if it has not. Lasts until parameters are put in force,
         until :meth:`release`, or, if a branch was silent or stuck, until the bus has slept."""
-        self.latched_branches: tuple[str, ...] = ()
-        self.parameter_set = 0
+        self.latched_branches: tuple[str, ...]
+        self.parameter_set: int
         self.sources: dict[tuple[int, bool], Source] = dict(sources.items())
         """Which source takes which frames, by identifier and whether it has 29 bits."""
         self.branch_keys = {key for key, source in self.sources.items() if source.branches}
