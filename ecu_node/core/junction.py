@@ -153,7 +153,9 @@ class LiveBranch(HeardSignal):
     ) -> None:
         super().__init__(codes, timeout_s)
         self.name, self.voltage, self._start_s = name, voltage, start_s
-        self.fault, self.delay_s = NO_FAULT, 0.0
+        self.fault = NO_FAULT
+        self.delay_s: float
+        """How much later its values are seen than they were at the junction, as :meth:`take` said. [s]"""
         self.plan = self._passing = self._correcting = AS_IT_IS
         self.quality = Quality.PASSED_THROUGH
         self._time_s = self._awake_s = self._waited_s = -math.inf
