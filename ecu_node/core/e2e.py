@@ -276,7 +276,7 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
     return protection
 
 
-def _data_id(given: dict[str, int], message: Message, highest: int = 0xFFFF) -> int:
+def _data_id(given: dict[str, int], message: Message, highest: int) -> int:
     """Return the data identifier that is given for a message, else the message's own identifier, cut to `highest`."""
     return given.get(message.name, message.frame_id & highest)
 
@@ -317,7 +317,8 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
         if name not in signals:
             raise LayoutError(f"{where} has no signal {name!r}; it has {', '.join(signals)}")
     counter_place, crc_place = bit_place(signals[entry.counter]), bit_place(signals[entry.crc])
-    modulus, data_id = entry.counter_modulus or counter_place.highest + 1, _data_id(entry.data_id, message)
+    modulus, largest_id = entry.counter_modulus or counter_place.highest + 1, (1 << 8 * entry.data_id_bytes) - 1
+    data_id = _data_id(entry.data_id, message, largest_id)
     for is_wrong, text in (
         (crc_place.length != 8 or crc_place.shift, f"signal {entry.crc} must be one whole byte to be a CRC-8"),
         (
@@ -333,7 +334,7 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
             f"signal {entry.counter} cannot count from 0 to {modulus - 1}",
         ),
         (
-            message.name in entry.data_id and data_id >= 1 << 8 * entry.data_id_bytes,
+            data_id > largest_id,
             f"data_id {data_id} does not fit into data_id_bytes = {entry.data_id_bytes}",
         ),
     ):
@@ -368,5 +369,5 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
         "counter": counter_place,
         "check": lambda payload, identity: payload[byte] == crc(payload, identity),
         "protect": protect,
-        "identity": data_id.to_bytes(2, "little")[: entry.data_id_bytes],
+        "identity": data_id.to_bytes(entry.data_id_bytes, "little"),
     }
