@@ -252,9 +252,10 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
         If the signal of its counter or CRC is a floating-point number or wider than 64 bits.
     """
     layout = database.layout
-    place, entry = next((pair for pair in layout.protections if message.name in pair[1].messages), ("", None))
-    if entry is None:
+    found = next((pair for pair in layout.protections if message.name in pair[1].messages), None)
+    if found is None:
         return None
+    place, entry = found
     where = f"{layout.path}: {place}: message {message.name}"
     if message.length > _LONGEST_CLASSIC and message.length not in _FD_LENGTHS:
         raise LayoutError(
