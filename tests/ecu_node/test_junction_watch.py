@@ -199,21 +199,25 @@ def test_sums_of_right_sensors_give_no_verdict() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sd_per_a", "heater_a", "verdict"),
+    ("sd_per_a", "heater_a", "offset_a", "verdict"),
     [
-        (0.0, 10.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
-        (0.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery", "motor"))),
-        (0.1, 10.0, None),
+        (0.0, 10.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
+        (0.0, 10.0, 100.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
+        (0.0, 0.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery", "motor"))),
+        (0.1, 10.0, 0.0, None),
     ],
 )
 def test_gain_error_beyond_its_uncertainty_is_found_from_an_alternating_current(
-    sd_per_a: float, heater_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
+    sd_per_a: float, heater_a: float, offset_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
+    """The battery's offset is corrected."""
+
     def swinging(time_s: float) -> dict[str, float]:
         currents_a = {"motor": 100.0 * math.sin(3.0 * time_s), "heater": heater_a * math.sin(5.0 * time_s)}
-        return currents_a | {"battery": -1.1 * sum(currents_a.values())}
+        return currents_a | {"battery": offset_a - 1.1 * sum(currents_a.values())}
 
-    junction = Watched(corrected_sd_a=1.0, corrected_sd_per_a=sd_per_a)
+    faults = {"battery": SensorFault(offset_a=offset_a)}
+    junction = Watched(faults=faults, corrected_sd_a=1.0, corrected_sd_per_a=sd_per_a)
     junction.run(7.0, swinging)
     assert junction.watch.verdict == verdict
 
