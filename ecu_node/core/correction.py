@@ -111,11 +111,11 @@ class IntegerPlan:
         """Whether the result depends on the voltage."""
         return self.voltage_gain != 0
 
-    def apply(self, code: int, voltage_code: int = 0) -> int:
+    def apply(self, code: int, voltage_code: int) -> int:
         """Correct one code; the result is clipped to the codes of the signal (lowest, highest), never wrapped."""
         return min(max(self.unbounded(code, voltage_code), self.lowest), self.highest)
 
-    def unbounded(self, code: int, voltage_code: int = 0) -> int:
+    def unbounded(self, code: int, voltage_code: int) -> int:
         """Correct one code, without clipping the result."""
         return (code * self.gain + voltage_code * self.voltage_gain + self.bias + (1 << (self.shift - 1))) >> self.shift
 

@@ -11,6 +11,7 @@ itself (gateway). What does not change from frame to frame is looked up once per
 correction of a branch changes.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
@@ -81,8 +82,7 @@ def _in_one_word(
             return otherwise
         bias = plan.bias + (1 << (plan.shift - 1)) + place.lowest * plan.gain - (written.place.lowest << plan.shift)
         at, to_at = place.shift_in(length), written.place.shift_in(made_length)
-        ones = (1 << place.length) - 1
-        cells.append((at, ones, first - place.lowest, last - place.lowest, plan.gain, bias, plan.shift, to_at))
+        cells.append((at, place.ones, first - place.lowest, last - place.lowest, plan.gain, bias, plan.shift, to_at))
         place.put(signs, place.lowest)
         written.place.put(ready, written.place.lowest)
         written.place.put(taken, written.place.highest)  # all but a sign bit, which is set anew
@@ -149,6 +149,17 @@ class _Ways(NamedTuple):
     """For an overlay: messages that answer such a payload, each with the function that fills it."""
 
 
+class _WaysByLength(dict[int, _Ways]):
+    """What is done with payloads, by their length; found when the first one of a length comes."""
+
+    def __init__(self, find: Callable[[int], _Ways]) -> None:
+        self._find = find
+
+    def __missing__(self, length: int) -> _Ways:
+        found = self[length] = self._find(length)
+        return found
+
+
 class Source:
     """One incoming message, what is read from it and which messages answer it.
 
@@ -186,12 +197,12 @@ class Source:
         self._counters, self.targets = counters, tuple(targets)
         self.branches = [part for part, _ in readers if isinstance(part, LiveBranch)]
         self._others = [part for part, _ in readers if not isinstance(part, LiveBranch)]
-        self.timeout_s = max((branch.timeout_s for branch in self.branches), default=float("inf"))
+        self.timeout_s = max((branch.timeout_s for branch in self.branches), default=math.inf)
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch in self.branches)])
-        self._silent_from_s = float("inf")
+        self._silent_from_s = math.inf
         self._frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
-        self.ways: dict[int, _Ways] = {}
-        """What is done with payloads, by their length; must be cleared when the correction of a branch changes."""
+        self.ways = _WaysByLength(self._find)
+        """What is done with payloads; must be cleared when the correction of a branch changes."""
         for part, signal in readers:
             part.follow(signal, self._frames)
 
@@ -215,13 +226,13 @@ class Source:
         sequence of OwnMessage
             Messages to be sent; none if the frame is corrupt, repeated, or its counter jumped.
         """
-        ways = self.ways.get(len(payload)) or self._find(len(payload))
+        ways = self.ways[len(payload)]
         if self._take(payload, now_s, ways) > _LAST_USABLE:
             return ()
         if self.is_invalid:
             for branch in self.branches:
                 branch.spoil(now_s)
-            ways = self.ways.get(0) or self._find(0)  # as for an empty payload: nothing is read from it
+            ways = self.ways[0]  # as for an empty payload: nothing is read from it
         for target, rewrite in ways.answers:
             made = rewrite(payload, target.data, now_s)
             if target.protection is not None:
@@ -247,7 +258,7 @@ class Source:
             branch and is corrupt, repeated, or its counter jumped: then it is not passed on. That too many frames of
             the message fail their check holds nothing up: its receivers judge that for themselves.
         """
-        ways = self.ways.get(len(payload)) or self._find(len(payload))
+        ways = self.ways[len(payload)]
         if self._take(payload, now_s, ways) > _LAST_USABLE:
             if not self.branches:
                 return payload
@@ -287,19 +298,18 @@ class Source:
         return check
 
     def _find(self, length: int) -> _Ways:
-        """Prepare what is done with payloads of this length [byte], and remember it."""
+        """Prepare what is done with payloads of this length. [byte]"""
         inside = {item: Written(item.signal.place) for item in self.branches if item.signal.end <= length}
 
         def way(branches: Mapping[LiveBranch, Written], made_length: int) -> _Rewrite:
             plain = _signal_by_signal(branches, inside, self._counters)
             return _in_one_word(branches, inside, length, made_length, plain)
 
-        found = self.ways[length] = _Ways(
+        return _Ways(
             missing=[branch for branch in self.branches if branch not in inside],
             in_place=way(inside, length),
             answers=[(target, way(target.branches, len(target.data))) for target in self.targets],
         )
-        return found
 
 
 OF_ONE_DRIVE = frozenset((Reason.BRANCH_STALE, Reason.BRANCH_STUCK))
@@ -319,7 +329,7 @@ class StatusFields(NamedTuple):
 
 
 class Corrector:
-    """The pure core of the node; built by :func:`ecu_node.bus.wiring.wire`.
+    """The pure core of the node; built by :func:`ecu_node.bus.wiring.wire`, and ready after the first :meth:`begin`.
 
     Parameters
     ----------
@@ -352,21 +362,21 @@ class Corrector:
     ) -> None:
         self.branches, self.shadow, self.watch, self._sleep_s = branches, shadow, watch, sleep_s
         self.counters = counters
-        self.reason = Reason.NO_PARAMETERS
+        self.reason: Reason
         """Why the parameters cannot be applied and measured values are passed through; NONE if they can."""
-        self.latched = Reason.NONE
+        self.latched: Reason
         """Why the node has fallen back to passing through; NONE if it has not. Lasts until parameters are put in force,
         until :meth:`release`, or, if a branch was silent or stuck, until the bus has slept."""
-        self.latched_branches: tuple[str, ...] = ()
-        self.parameter_set = 0
+        self.latched_branches: tuple[str, ...]
+        self.parameter_set: int
         self.sources: dict[tuple[int, bool], Source] = dict(sources.items())
         """Which source takes which frames, by identifier and whether it has 29 bits."""
         self.branch_keys = {key for key, source in self.sources.items() if source.branches}
         """Identifiers of the messages that carry branches, which a gateway rewrites."""
         self.own_keys = {target.key for source in self.sources.values() for target in source.targets}
         """Identifiers of the messages that it makes itself: answers and status."""
-        self._looked_s = self._foreign_until_s = float("-inf")
-        self._silent, self._silent_since_s, self._was_awake = True, float("inf"), False
+        self._looked_s = self._foreign_until_s = -math.inf
+        self._silent, self._silent_since_s, self._was_awake = True, math.inf, False
         self._foreign, self._alive = counters.foreign, 0
         self._status_fields = status_fields
         if status_fields is not None:
@@ -455,8 +465,8 @@ class Corrector:
         """
         silent = all(branch.is_old(now_s) for branch in self.branches)
         if not silent:
-            self._silent_since_s = float("inf")
-        elif self._silent_since_s == float("inf"):
+            self._silent_since_s = math.inf
+        elif self._silent_since_s == math.inf:
             self.watch.forget()
             self._silent_since_s = now_s
         if self.latched in OF_ONE_DRIVE and now_s - self._silent_since_s >= self._sleep_s:

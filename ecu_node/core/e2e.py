@@ -4,7 +4,6 @@ So a frame that came in corrupt can never go out with a valid CRC. Supported are
 P05, P06, P07 and P11, computed by autosar-e2e, and a counter with a CRC-8 (fastcrc), as many control units have it.
 """
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -133,10 +132,11 @@ class Receiver:
         self.state = E2EState.INIT
         self._protection = protection
         self._expected: int | None = None  # the first intact frame may have any counter
-        self._past: deque[Check] = deque(maxlen=max(window.window for window in protection.windows))
+        self._past: list[Check] = []
+        self._remembered = max(window.window for window in protection.windows)
         place = protection.counter
         self._is_short = place.end - place.first == 1
-        self._is_steady = False  # VALID, all that is remembered was in order, and the counter is within a byte
+        self._is_steady = False  # all that is remembered was in order, and the counter is within a byte
         self._check, self._identity, self._least_bytes = protection.check, protection.identity, protection.least_bytes
         self._byte, self._shift, self._ones = place.first, place.shift, place.highest
         self._modulus = protection.modulus
@@ -158,8 +158,7 @@ class Receiver:
         if self._is_steady and len(payload) >= self._least_bytes:
             counter = payload[self._byte] >> self._shift & self._ones
             if counter == self._expected and self._check(payload, self._identity):
-                counter += 1
-                self._expected = counter if counter < self._modulus else 0
+                self._expected = (counter + 1) % self._modulus
                 return _OK
         check = self._checked(payload)
         self._judge(check)
@@ -187,16 +186,15 @@ class Receiver:
         """Update the state of the message after the check of one more frame."""
         if check is Check.CORRUPT and not self._past and self.state is E2EState.INIT:
             return  # nothing was received yet
-        self._past.append(check)
+        self._past = [*self._past, check][-self._remembered :]
         allowed = self._protection.windows[self.state]
-        last = [*self._past][-allowed.window :]
+        last = self._past[-allowed.window :]
         errors = last.count(Check.CORRUPT)
         if errors <= allowed.max_error and sum(item <= Check.LOST for item in last) >= allowed.min_ok:
             self.state = E2EState.VALID
         elif self.state is E2EState.VALID or errors > allowed.max_error:
             self.state = E2EState.INVALID
-        is_valid = self.state is E2EState.VALID and len(self._past) == self._past.maxlen
-        self._is_steady = self._is_short and is_valid and max(self._past) <= Check.LOST
+        self._is_steady = self._is_short and self._past == [_OK] * self._remembered
 
 
 class _Profile(NamedTuple):
@@ -254,9 +252,10 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
         If the signal of its counter or CRC is a floating-point number or wider than 64 bits.
     """
     layout = database.layout
-    place, entry = next((pair for pair in layout.protections if message.name in pair[1].messages), ("", None))
-    if entry is None:
+    found = next((pair for pair in layout.protections if message.name in pair[1].messages), None)
+    if found is None:
         return None
+    place, entry = found
     where = f"{layout.path}: {place}: message {message.name}"
     if message.length > _LONGEST_CLASSIC and message.length not in _FD_LENGTHS:
         raise LayoutError(
@@ -278,7 +277,7 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
     return protection
 
 
-def _data_id(given: dict[str, int], message: Message, highest: int = 0xFFFF) -> int:
+def _data_id(given: dict[str, int], message: Message, highest: int) -> int:
     """Return the data identifier that is given for a message, else the message's own identifier, cut to `highest`."""
     return given.get(message.name, message.frame_id & highest)
 
@@ -319,7 +318,8 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
         if name not in signals:
             raise LayoutError(f"{where} has no signal {name!r}; it has {', '.join(signals)}")
     counter_place, crc_place = bit_place(signals[entry.counter]), bit_place(signals[entry.crc])
-    modulus, data_id = entry.counter_modulus or counter_place.highest + 1, _data_id(entry.data_id, message)
+    modulus, largest_id = entry.counter_modulus or counter_place.highest + 1, (1 << 8 * entry.data_id_bytes) - 1
+    data_id = _data_id(entry.data_id, message, largest_id)
     for is_wrong, text in (
         (crc_place.length != 8 or crc_place.shift, f"signal {entry.crc} must be one whole byte to be a CRC-8"),
         (
@@ -335,7 +335,7 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
             f"signal {entry.counter} cannot count from 0 to {modulus - 1}",
         ),
         (
-            message.name in entry.data_id and data_id >= 1 << 8 * entry.data_id_bytes,
+            data_id > largest_id,
             f"data_id {data_id} does not fit into data_id_bytes = {entry.data_id_bytes}",
         ),
     ):
@@ -370,5 +370,5 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
         "counter": counter_place,
         "check": lambda payload, identity: payload[byte] == crc(payload, identity),
         "protect": protect,
-        "identity": data_id.to_bytes(2, "little")[: entry.data_id_bytes],
+        "identity": data_id.to_bytes(entry.data_id_bytes, "little"),
     }

@@ -44,12 +44,13 @@ class HeardSignal:
 
     def __init__(self, codes: Codes, timeout_s: float) -> None:
         self.codes, self.timeout_s = codes, timeout_s
-        self.signal = PlacedSignal(place=codes.place)
+        self.signal: PlacedSignal
+        """The signal in its message; only where :meth:`follow` said which."""
         self._frames: Frames = deque()
         self._read: tuple[float, bytearray] | None = None
         """The last frame that was read."""
         self._past: deque[tuple[float, int]] = deque(maxlen=REMEMBERED_FRAMES)
-        self._spoilt_s = float("-inf")
+        self._spoilt_s = -math.inf
 
     def follow(self, signal: PlacedSignal, frames: Frames) -> None:
         """Read the signal from these frames, to which its message goes on adding."""
@@ -152,10 +153,12 @@ class LiveBranch(HeardSignal):
     ) -> None:
         super().__init__(codes, timeout_s)
         self.name, self.voltage, self._start_s = name, voltage, start_s
-        self.fault, self.delay_s = NO_FAULT, 0.0
+        self.fault = NO_FAULT
+        self.delay_s: float
+        """How much later its values are seen than they were at the junction, as :meth:`take` said. [s]"""
         self.plan = self._passing = self._correcting = AS_IT_IS
         self.quality = Quality.PASSED_THROUGH
-        self._time_s = self._awake_s = self._waited_s = float("-inf")
+        self._time_s = self._awake_s = self._waited_s = -math.inf
         self._is_named = False
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
 
@@ -222,7 +225,7 @@ class LiveBranch(HeardSignal):
         """Instant by which the next frame of the branch is due; infinity if the vehicle has no such branch. [s]"""
         if self.seen:
             return self.time_s + self.timeout_s
-        return self._waited_s + max(self.timeout_s, self._start_s) if self._is_named else float("inf")
+        return self._waited_s + max(self.timeout_s, self._start_s) if self._is_named else math.inf
 
     def is_stale(self, now_s: float) -> bool:
         """Check whether the next frame of the branch is overdue."""
@@ -346,7 +349,9 @@ class LiveBranch(HeardSignal):
         if self.voltage is None:
             return 1.0
         code = self.voltage.code_at(time_s)
-        volts = 0.0 if code is None else float(self.voltage.codes.worth(code))
+        if code is None:
+            return None
+        volts = float(self.voltage.codes.worth(code))
         return volts if volts >= _LEAST_VOLTAGE_V else None
 
     def _code_between(self, time_s: float) -> float | None:
@@ -544,7 +549,7 @@ class JunctionWatch:
         self._sd_a, self._sd_per_a = max(sd_a, self._margin_a), _UNKNOWN_SD_PER_A if sd_per_a is None else sd_per_a
         self.sums: JunctionSums | None = None
         self.currents_a: Currents = {}
-        self.instant_s = self._judged_s = float("-inf")
+        self.instant_s = self._judged_s = -math.inf
         self.forget()
 
     def forget(self) -> None:
@@ -636,7 +641,7 @@ class JunctionWatch:
         measured_a = [moment.terms[0] for moment in moments]
         rows = self._rows(moments, corrected=False)
         lines = [_line(row, measured_a) for name, row in rows.items() if name not in still]
-        if any(explains and abs(slope) < _LARGEST_SLOPE for slope, explains in lines):
+        if any(explains and not is_steep for is_steep, explains in lines):
             return ()
         return self._frozen(still)
 
@@ -657,10 +662,10 @@ class JunctionWatch:
         still = [name for name, row in rows.items() if min(row) == max(row)]
         if frozen := self._frozen(still):  # a branch that moved in one step is left out: its own sensor may have jumped
             lines = [_line(row, residual) for name, row in rows.items() if name not in still and not _is_step(row)]
-            if any(explains and abs(slope) >= _LARGEST_SLOPE for slope, explains in lines):
+            if any(explains and is_steep for is_steep, explains in lines):
                 return Reason.BRANCH_STUCK, frozen
         left = {name: _left_of_gain(row, residual) for name, row in rows.items()}
-        of_offset, best = len(residual) * _covariance(residual, residual), min(left.values())
+        of_offset, best = _common_change(residual, residual), min(left.values())
         enough = _NEARLY_AS_GOOD * best + _ROUNDING * math.fsum(map(mul, residual, residual))
         near = [name for name in left if left[name] <= enough or of_offset <= enough]
         return Reason.SUM_IMPLAUSIBLE, tuple(sorted(near, key=left.__getitem__))
@@ -674,17 +679,16 @@ def _is_step(current: Sequence[float]) -> bool:
 def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
     """Return the sum of squares of the residual that the best gain error of a branch leaves. [A^2]"""
     own, both = math.fsum(map(mul, current, current)), math.fsum(map(mul, current, residual))
-    return math.fsum(map(mul, residual, residual)) - (both * both / own if own else 0.0)
+    return math.fsum(map(mul, residual, residual)) - both * both / (own or math.inf)
 
 
-def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
-    """Return the covariance of two columns; it is enough that one of them has its mean taken out."""
+def _common_change(x: Sequence[float], y: Sequence[float]) -> float:
+    """Return the sum of products of two columns about their means; it is enough that one has its mean taken out."""
     mean_y = math.fsum(y) / len(y)
-    return math.fsum(map(mul, x, (b - mean_y for b in y))) / len(x)
+    return math.fsum(map(mul, x, (b - mean_y for b in y)))
 
 
-def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, bool]:
-    """Return the slope of the line through points, and whether it explains them: y hardly scatters around it."""
-    xx, xy, yy = _covariance(x, x), _covariance(x, y), _covariance(y, y)
-    slope = xy / xx if xx else 0.0
-    return slope, slope * xy >= _EXPLAINS * yy
+def _line(x: Sequence[float], y: Sequence[float]) -> tuple[bool, bool]:
+    """Return whether the line through points has a large slope, and explains them: y hardly scatters around it."""
+    xx, xy, yy = _common_change(x, x), _common_change(x, y), _common_change(y, y)
+    return abs(xy) >= _LARGEST_SLOPE * xx, xy * xy >= _EXPLAINS * xx * yy

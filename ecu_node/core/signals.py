@@ -138,9 +138,14 @@ class BitPlace:
         return (1 << (self.length - self.signed)) - 1
 
     @cached_property
+    def ones(self) -> int:
+        """All bits of the width."""
+        return (1 << self.length) - 1
+
+    @cached_property
     def mask(self) -> int:
         """The signal's bits in the payload read as one little-endian integer."""
-        field = ((1 << self.length) - 1) << self.shift
+        field = self.ones << self.shift
         placed = bytes(self.first) + field.to_bytes(self.end - self.first, self.order)
         return int.from_bytes(placed, "little")
 
@@ -164,7 +169,7 @@ class BitPlace:
         if len(payload) < self.end:
             return None
         field = int.from_bytes(payload[self.first : self.end], self.order) >> self.shift
-        raw = field & ((1 << self.length) - 1)
+        raw = field & self.ones
         return raw - (1 << self.length) if raw > self.highest else raw
 
     def put(self, payload: bytearray, raw: int) -> None:
@@ -184,9 +189,8 @@ class BitPlace:
         """
         if not self.lowest <= raw <= self.highest:
             raise ValueError(f"raw code {raw} does not fit into {self.length} bits")
-        ones = (1 << self.length) - 1
         field = int.from_bytes(payload[self.first : self.end], self.order)
-        field = field & ~(ones << self.shift) | (raw & ones) << self.shift
+        field = field & ~(self.ones << self.shift) | (raw & self.ones) << self.shift
         payload[self.first : self.end] = field.to_bytes(self.end - self.first, self.order)
 
 

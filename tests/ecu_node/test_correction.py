@@ -95,7 +95,7 @@ def test_every_16_bit_code_is_corrected_exactly(
     plan = integer_plan(source, target, sign=sign, drift=float(drift), offset_a=float(offset))
     gain, bias, common = exact_line(source, target, sign=sign, drift=drift, offset_a=offset)
     low, high = writable_range(target, "test")
-    got = [plan.apply(code) for code in whole_range(source)]
+    got = [plan.apply(code, 0) for code in whole_range(source)]
     wanted = [(2 * (gain * code + bias) + common) // (2 * common) for code in whole_range(source)]
     assert got == [min(max(code, low), high) for code in wanted]
 

@@ -150,6 +150,22 @@ def test_silent_branch_stops_the_correction_until_the_bus_has_slept(
             assert {branch.quality for branch in corrector.branches} == {Quality.PASSED_THROUGH}
 
 
+@pytest.mark.parametrize(("last_s", "is_missed"), [(0.1, False), (0.11, True)])
+def test_branch_is_missed_if_another_one_sends_after_its_deadline(
+    database: VehicleDatabase, last_s: float, is_missed: bool
+) -> None:
+    """5 s after the look that first finds the bus silent, the node tries again."""
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    answers(corrector, motor(database, 0), 0.0)
+    for counter, now_s in enumerate((0.0, last_s)):
+        answers(corrector, battery(database, counter), now_s)
+        corrector.look(now_s)
+    missed = Reason.BRANCH_STALE if is_missed else Reason.NONE
+    for now_s, latched in ((0.15, missed), (1.0, missed), (5.9, missed), (6.0, Reason.NONE)):
+        corrector.look(now_s)
+        assert corrector.latched is latched
+
+
 @pytest.mark.parametrize(("fault", "state"), [((0.0, 0.0), State.PASSING_THROUGH), ((0.25, 5.0), State.CORRECTING)])
 def test_node_does_not_wait_for_branches_without_parameters(
     database: VehicleDatabase, fault: tuple[float, float], state: State
@@ -588,6 +604,16 @@ def test_first_two_frames_after_a_silence_are_not_used(database: VehicleDatabase
     corrector = corrector_for(database, battery=(0.02, 3.0))
     at_20_ms(database, corrector, 0.0, 0.4)
     assert at_20_ms(database, corrector, 3.0, 3.1) == [Quality.INVALID] * 2 + [Quality.CORRECTED] * 3
+
+
+@pytest.mark.parametrize(("silence_s", "repeated"), [(1.0, 1), (1.01, 0)])
+def test_any_counter_is_accepted_after_a_silence_of_more_than_a_second(
+    database: VehicleDatabase, silence_s: float, repeated: int
+) -> None:
+    corrector = corrector_for(database, battery=(0.02, 3.0))
+    for now_s in (0.0, silence_s):
+        answers(corrector, battery(database, 3), now_s)
+    assert corrector.counters.repeated == repeated
 
 
 def test_gateway_forwards_the_intact_frames_of_an_invalid_message(database: VehicleDatabase) -> None:

@@ -93,6 +93,14 @@ def test_counter_starts_at_0_and_wraps_and_frames_in_order_are_ok(kind: str, pro
     assert {check(frame) for frame in frames} == {Check.OK}
 
 
+def test_frame_repeated_after_a_long_time_in_order_is_noticed_at_any_counter(protection: Protection) -> None:
+    frames = stream(protection, 45)
+    for last in range(29, 45):
+        check = Receiver(protection).check
+        assert {check(frame) for frame in frames[: last + 1]} == {Check.OK}
+        assert check(frames[last]) is Check.REPEATED
+
+
 def test_protection_writes_only_the_bits_of_its_header_mask(kind: str, protection: Protection) -> None:
     header = bytes.fromhex(KINDS[kind][2])
     assert protection.header_mask == int.from_bytes(header, "little")

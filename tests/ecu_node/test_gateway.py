@@ -35,13 +35,13 @@ def test_frames_passed_unchanged_are_not_counted_as_rewritten(database: VehicleD
 
 def test_status_reason_is_foreign_frames_for_10_s_after_such_a_frame(database: VehicleDatabase) -> None:
     corrector, found = gateway_for(database, battery=(0.25, 5.0)), []
-    for k in range(1200):
-        passed_on(corrector, battery(database, k % 15), 0.01 * k)
-        corrector.counters.foreign += k == 100
-        corrector.look(0.01 * k)
+    for k in range(720):
+        passed_on(corrector, battery(database, k % 15), k / 64)
+        corrector.counters.foreign += k == 64
+        corrector.look(k / 64)
         found.append(corrector.state()[1])
     is_told = [reason is Reason.FOREIGN_FRAMES for reason in found]
-    assert [is_told[k] for k in (99, 101, 1099, 1101)] == [False, True, True, False]
+    assert [is_told[k] for k in (63, 64, 703, 704)] == [False, True, True, False]
 
 
 @pytest.mark.parametrize("code", [-32768, 32501, -32501])

@@ -101,6 +101,12 @@ def test_branch_that_no_parameters_name_and_that_never_sent_is_neither_fitted_no
     assert (branch.is_fitted, branch.is_stale(100.0), branch.is_old(100.0)) == (False, False, True)
 
 
+def test_branch_that_parameters_name_is_stale_if_it_has_not_sent_by_its_timeout() -> None:
+    branch = LiveBranch(name="motor", codes=codes(Fraction(1)), sign=1, timeout_s=0.5)
+    branch.take(SensorFault(), correcting=AS_IT_IS, passing=AS_IT_IS, delay_s=0.0, expected_since_s=2.0)
+    assert (branch.is_fitted, branch.is_stale(2.5), branch.is_stale(2.51)) == (True, False, True)
+
+
 def test_range_of_ordinary_codes_excludes_named_and_clipped_codes() -> None:
     branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
     branch.codes = codes(Fraction(1), -32767, 32767)
@@ -193,21 +199,25 @@ def test_sums_of_right_sensors_give_no_verdict() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sd_per_a", "heater_a", "verdict"),
+    ("sd_per_a", "heater_a", "offset_a", "verdict"),
     [
-        (0.0, 10.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
-        (0.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery", "motor"))),
-        (0.1, 10.0, None),
+        (0.0, 10.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
+        (0.0, 10.0, 100.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
+        (0.0, 0.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery", "motor"))),
+        (0.1, 10.0, 0.0, None),
     ],
 )
 def test_gain_error_beyond_its_uncertainty_is_found_from_an_alternating_current(
-    sd_per_a: float, heater_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
+    sd_per_a: float, heater_a: float, offset_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
+    """The battery's offset is corrected."""
+
     def swinging(time_s: float) -> dict[str, float]:
         currents_a = {"motor": 100.0 * math.sin(3.0 * time_s), "heater": heater_a * math.sin(5.0 * time_s)}
-        return currents_a | {"battery": -1.1 * sum(currents_a.values())}
+        return currents_a | {"battery": offset_a - 1.1 * sum(currents_a.values())}
 
-    junction = Watched(corrected_sd_a=1.0, corrected_sd_per_a=sd_per_a)
+    faults = {"battery": SensorFault(offset_a=offset_a)}
+    junction = Watched(faults=faults, corrected_sd_a=1.0, corrected_sd_per_a=sd_per_a)
     junction.run(7.0, swinging)
     assert junction.watch.verdict == verdict
 
@@ -266,29 +276,56 @@ def test_current_that_never_changes_is_stuck_unless_it_is_small(
 
 
 @pytest.mark.parametrize(
-    ("jump_a", "period_s", "looks"), [(50.0, 1 / 32, 3), (50.0, 1 / 128, 5), (-21.0, 1 / 32, 3), (-20.0, 1 / 32, None)]
+    ("jump_a", "since_s", "period_s", "looks"),
+    [
+        (50.0, 1.0, 1 / 32, 3),
+        (50.0, 1.0, 1 / 128, 5),
+        (50.0, 0.0, 0.015, 3),
+        (-21.0, 1.0, 1 / 32, 3),
+        (-20.0, 1.0, 1 / 32, None),
+    ],
 )
 def test_jump_counts_if_it_lasts_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
-    jump_a: float, period_s: float, looks: int | None
+    jump_a: float, since_s: float, period_s: float, looks: int | None
 ) -> None:
     junction = Watched(corrected_sd_a=1.0)
     junction.run(
         2.0,
-        lambda now_s: {"battery": 50.0 + (jump_a if now_s >= 1.0 else 0.0), "motor": -45.0, "heater": -5.0},
+        lambda now_s: {"battery": 50.0 + (jump_a if now_s >= since_s else 0.0), "motor": -45.0, "heater": -5.0},
         period_s=period_s,
     )
     assert junction.watch.verdict == (None if looks is None else (Reason.SUM_IMPLAUSIBLE, ("battery",)))
-    assert looks is None or junction.now_s == 1.0 + (looks - 1) * period_s
+    assert looks is None or junction.now_s == since_s + (looks - 1) * period_s
 
 
 @pytest.mark.parametrize(
-    ("still_a", "verdict"), [(5.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (20.0, (Reason.BRANCH_STUCK, ("heater",)))]
+    ("still_a", "verdict"),
+    [(10.5, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (10.6, (Reason.BRANCH_STUCK, ("heater",)))],
 )
-def test_branch_that_does_not_follow_another_ones_rise_is_stuck_if_it_carries_half_of_the_sum(
+def test_branch_that_does_not_follow_another_ones_rise_is_stuck_if_it_carries_more_than_half_of_the_sum(
     still_a: float, verdict: tuple[Reason, tuple[str, ...]]
 ) -> None:
+    """The sum has jumped once it is 21 A."""
     junction = Watched(corrected_sd_a=1.0)
     junction.run(2.0, lambda now_s: {"battery": still_a + 96.0 * max(now_s - 1.0, 0.0), "heater": -still_a})
+    assert junction.watch.verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("rises", "verdict"),
+    [(2, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (3, (Reason.BRANCH_STUCK, ("heater",)))],
+)
+def test_still_branch_is_stuck_if_another_one_jumps_but_not_by_half_in_one_step(
+    rises: int, verdict: tuple[Reason, tuple[str, ...]]
+) -> None:
+    """The battery rises by 24 A in frames one after the other."""
+
+    def rising(now_s: float) -> dict[str, float]:
+        level = min(max(round((now_s - 1.0) / PERIOD_S), 0), rises)
+        return {"battery": 20.0 + 24.0 * level / rises, "heater": -20.0}
+
+    junction = Watched(corrected_sd_a=1.0, corrected_sd_per_a=0.0)
+    junction.run(2.0, rising)
     assert junction.watch.verdict == verdict
 
 
