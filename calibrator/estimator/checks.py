@@ -34,6 +34,9 @@ TAIL = 12.0
 """Degrees of freedom of Student's t, by which usual misfits are distributed over vehicles: heavy tails. [1]"""
 LEAST_MISFIT = 1e-5
 """Least value of the usual misfit of a fleet, in fractions of full scale: a smaller one harms no correction. [1]"""
+LEAST_FOLLOWS, MOST_FOLLOWS = 2e-4, 0.05
+"""Least usual value of what sensors show of another branch's current, over full scale, and usual share of that current
+from which on nothing is told: errors of the fleet model then look the same. [1]"""
 LARGEST_MISFIT = 0.2
 """Largest misfit, in fractions of full scale; before anything is seen, its size is log-uniform up to it. [1]"""
 EXPLAINED = 0.7
@@ -104,6 +107,9 @@ class UsualMisfits:
     slope_spread, model_error_a : ndarray of shape (K,)
         Robust standard deviation over vehicles of the slopes over the fleet model [1], and median standard deviation of
         the currents about it [A].
+    follows, follows_a : ndarray of shape (K,)
+        Median share of another branch's current that each sensor shows beside its own [1], and how far vehicles usually
+        are from it [A].
     spike_rate : float
         Share of samples that are spikes. [1]
     """
@@ -114,6 +120,8 @@ class UsualMisfits:
     residual_spread: float
     slope_spread: Array
     model_error_a: Array
+    follows: Array
+    follows_a: Array
     spike_rate: float
 
 
@@ -155,6 +163,9 @@ class _Checked:
         Variance of the residual over the model times the number of neighbouring samples that are alike. [A^2]
     moves_a, error_a : ndarray of shape (N, K)
         Standard deviations of the model and of the residual over it. [A]
+    follows, other_a : ndarray of shape (N, K)
+        Share of another branch's fleet model that each current shows beside its own [1], and the root mean square of
+        that model beyond what goes with its own [A].
     fit : ndarray of shape (N, C)
         Log likelihood of each of :data:`CAUSES` relative to linear sensors, less a penalty for its parameters.
     size, place : ndarray of shape (N, C)
@@ -185,6 +196,7 @@ class _Checked:
         self.samples = self.total[:, -1, -1]
         self._regress_law()
         self._regress_on_model(read_out)
+        self._regress_on_others(read_out)
         middle = np.concatenate([np.cumsum(n := s.moments[:, -1, -1]) - n / 2.0 for s in summaries])
         warm_c = np.concatenate([fit.temperature_c for fit in fits])
         causes = [
@@ -265,6 +277,23 @@ class _Checked:
         self.slope, self.zero_a = fitted[..., 0], fitted[..., 1]
         self.moves_a = np.sqrt(np.maximum(determinant, 0.0)) / self.samples[:, None]
         self.variance_a2, self.error_a = repeated * left, np.sqrt(left)
+
+    def _regress_on_others(self, read_out: Array) -> None:
+        """Regress each current on its own fleet model, 1, and the model of the branch that moves most besides."""
+        K, measured = self.fleet.branches, slice(self.fleet.inputs, -1)
+        models = np.column_stack([read_out, np.eye(len(read_out))[-1]])  # K models and 1
+        gram = models.T @ self.total[:, self.columns[:, None], self.columns] @ models
+        right = models.T @ self.total[:, self.columns, measured]
+        self.follows, self.other_a = np.zeros((2, len(self.fleet), K))
+        for k in range(K if self.has_fleet else 0):
+            own, others = [k, K], [i for i in range(K) if i != k]
+            with_own = gram[:, others][:, :, own]
+            of_own = np.linalg.pinv(gram[:, own][:, :, own], hermitian=True)
+            left = gram[:, others, others] - np.einsum("nla,nab,nlb->nl", with_own, of_own, with_own)
+            shown = right[:, others, k] - np.einsum("nla,nab,nb->nl", with_own, of_own, right[:, own, k])
+            other = int(np.argmax(np.median(left, axis=0)))
+            self.follows[:, k] = shown[:, other] / np.maximum(left[:, other], TINY)
+            self.other_a[:, k] = np.sqrt(np.maximum(left[:, other], 0.0) / self.samples)
 
     def _cause(
         self,
@@ -493,6 +522,8 @@ def learn_usual_misfits(
     found = _Checked(known, read_out, full_scale_a)
     left = np.log(np.maximum(found.residual_a2[:, -1], TINY))
     centre = np.median(left)
+    follows = np.median(found.follows, axis=0)
+    apart_a = np.abs(found.follows - follows) * found.other_a
     return UsualMisfits(
         # The size of a misfit has half of a symmetric distribution, whose median is 0.67 standard deviations.
         misfit_a=np.maximum(MAD_TO_SD * np.median(found.misfit_a, axis=0), LEAST_MISFIT * full_scale_a),
@@ -501,6 +532,8 @@ def learn_usual_misfits(
         residual_spread=max(MAD_TO_SD * float(np.median(np.abs(left - centre))), LEAST_NOISE_SPREAD),
         slope_spread=MAD_TO_SD * np.median(np.abs(found.slope - np.median(found.slope, axis=0)), axis=0),
         model_error_a=np.median(found.error_a, axis=0),
+        follows=follows,
+        follows_a=np.maximum(MAD_TO_SD * np.median(apart_a, axis=0), LEAST_FOLLOWS * full_scale_a),
         spike_rate=max(float(np.median(found.spikes.sum(axis=2))), SPIKE_RATE),
     )
 
@@ -531,8 +564,9 @@ def find_misfits(
     Returns
     -------
     list of N tuples of SensorFinding
-        By falling probability; causes are ``inverted``, ``dead``, ``clipped``, ``saturating``, ``quadratic``,
-        ``cubic``, ``sign``, ``step``, ``ramp``, ``temperature``, ``spikes``, ``outliers``, ``noise`` and ``switching``.
+        By falling probability; causes are ``inverted``, ``dead``, ``follows``, ``clipped``, ``saturating``,
+        ``quadratic``, ``cubic``, ``sign``, ``step``, ``ramp``, ``temperature``, ``spikes``, ``outliers``, ``noise`` and
+        ``switching``.
         No branch is named where the evidence does not tell the sensor, or the cause is no sensor.
     """
     found: list[tuple[SensorFinding, ...]] = [()] * len(summaries)
@@ -547,9 +581,15 @@ def find_misfits(
     factor = usual.residual_spread / (NOISE_RANGE * np.maximum(student_t.pdf(above, TAIL), TINY))
     unusual = np.where(above > 0.0, _posterior(PRIOR * factor), 0.0)
     inverted, dead = misfits.of_slopes(usual)
+    # As above, where the rest of a current is larger than usual.
+    follows_a = np.abs(misfits.follows - usual.follows) * misfits.other_a
+    rest_a = np.sqrt(np.maximum(misfits.error_a**2 - follows_a**2, 0.0))
+    usual_a = usual.follows_a * np.maximum(rest_a / np.maximum(usual.model_error_a, TINY), 1.0)
+    follows = _probability(follows_a, usual_a, LARGEST_MISFIT * full_scale_a)
+    follows[usual_a > MOST_FOLLOWS * misfits.other_a] = 0.0
     for i, j in enumerate(places):
         vehicle = _Vehicle(misfits, usual, i, branches)
-        mine = vehicle.of_slopes(inverted[i], dead[i])
+        mine = vehicle.of_slopes(inverted[i], dead[i]) + vehicle.of_others(follows[i])
         if not any(each.cause == "dead" for each in mine):  # without its current the junction law tells nothing
             mine += vehicle.of_law(shape[i], unusual[i])
             clipped = {each.branch for each in mine if each.cause == "clipped"}
@@ -606,6 +646,16 @@ class _Vehicle(NamedTuple):
                 if probability >= LEAST_PROBABILITY:
                     found.append(_finding(name, cause, probability, f"sensor {name} {text}"))
         return found
+
+    def of_others(self, follows: Array) -> list[SensorFinding]:
+        """Report sensors that show a share of another branch's current, by the probability of each, shape (K,)."""
+        shares = 100.0 * (self.misfits.follows[self.j] - self.usual.follows)
+        text = "% of another branch's current, too: a stray field, or a load that depends on it"
+        return [
+            _finding(name, "follows", probability, f"sensor {name} shows {share:+.1f} {text}")
+            for name, probability, share in zip(self.branches, follows, shares, strict=True)
+            if probability >= LEAST_PROBABILITY
+        ]
 
     def of_law(self, shape: Array, unusual: Array) -> list[SensorFinding]:
         """Report the cause that explains most of the junction law's residual; noise or switching if too much is left.

@@ -446,6 +446,8 @@ def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a
         residual_spread=USUAL_SPREAD,
         slope_spread=np.ones(K),
         model_error_a=np.full(K, scale_a),
+        follows=np.zeros(K),
+        follows_a=np.full(K, scale_a),
         spike_rate=1.0,
     )
     found = find_misfits(summaries, np.zeros((1, K)), usual, full_scale_a=scale_a, branches=branches)
