@@ -101,7 +101,7 @@ def blf_frames(file: BinaryIO, name: str) -> Frames:
     """
     parts: list[Frames] = []
     try:
-        size, start_ns = _file_header(file)
+        size, start_ns = _file_header(file, name)
         tail, fd = b"", False
         for batch in _batches(file):
             contents = [tail, *(content for content, _ in batch)]
@@ -151,11 +151,16 @@ def _batches(file: BinaryIO) -> Iterator[list[tuple[bytes, int]]]:
         yield batch
 
 
-def _file_header(file: BinaryIO) -> tuple[int, int]:
+def _file_header(file: BinaryIO, name: str) -> tuple[int, int]:
     """Read the header; return the file size that it states (0: none), and the start in ns since 1970 (0: no date)."""
     head = file.read(_FILE_HEADER_BYTES)
-    if len(head) < _FILE_HEADER_BYTES or head[:4] != b"LOGG":
-        raise _DamageError(0, f"the header 'LOGG' of {_FILE_HEADER_BYTES} bytes is expected, found {head[:4]!r}")
+    if head[:4] != b"LOGG":
+        raise LogError(
+            f"{name}: not a BLF log, which begins with 'LOGG' (found {head[:4]!r}); give the file the suffix of its "
+            f"format, or copy it again"
+        )
+    if len(head) < _FILE_HEADER_BYTES:
+        raise _DamageError(0, f"a header of {_FILE_HEADER_BYTES} bytes is expected, found {len(head)}")
     _, length, size, year, month, _, day, hour, minute, second, milliseconds = _FILE_HEADER.unpack_from(head)
     if not _FILE_HEADER_BYTES <= length <= LARGEST_OBJECT:
         raise _DamageError(4, f"the size of the header is {length}")

@@ -220,7 +220,7 @@ class LogTime:
     disordered : int
         Number of frames whose time is before that of a frame logged earlier.
     clock_steps : int
-        Number of steps of the clock, each replaced by a gap of :data:`CLOCK_GAP_S`.
+        Number of jumps of the clock, or long pauses, each replaced by a gap of :data:`CLOCK_GAP_S`.
     """
 
     order: NDArray[np.int64]

@@ -20,7 +20,14 @@ from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.align import at_instants, evaluate_formula
 from calibrator.errors import LogError
 from calibrator.recordings.decode import decode_signal, message_is_sound, signal_range
-from calibrator.recordings.frame_arrays import CLOCK_GAP_S, EXTENDED_BIT, Frames, frame_key, repaired_time
+from calibrator.recordings.frame_arrays import (
+    CLOCK_GAP_S,
+    EXTENDED_BIT,
+    LONGEST_PAUSE_S,
+    Frames,
+    frame_key,
+    repaired_time,
+)
 from calibrator.recordings.log_formats import is_table, read_frames
 from calibrator.recordings.tables import Table, read_table
 from calibrator.terminal.text import Notice
@@ -57,7 +64,7 @@ class RecordingReport:
     frames, error_frames, damaged : int
         Numbers of data frames, of error frames, and of damaged lines or frames in the whole log; rows in a table.
     disordered, clock_steps : int
-        Frames whose time is before that of a frame logged earlier; steps of the clock that became gaps.
+        Frames whose time is before that of a frame logged earlier; jumps of the clock, or pauses, that became gaps.
     ignored : mapping of str to int
         Number of frames left out because they come from a bus that is not the layout's, by channel.
     found : str
@@ -99,7 +106,8 @@ class RecordingReport:
             "{} damaged lines or frames left out": self.damaged,
             "{} error frames": self.error_frames,
             "{} frames out of order, sorted": self.disordered,
-            f"the clock was set {{}} times, each step became a gap of {CLOCK_GAP_S:g} s": self.clock_steps,
+            f"jumps of the clock, or pauses of more than {LONGEST_PAUSE_S / 60.0:g} min, which became gaps of "
+            f"{CLOCK_GAP_S:g} s: {{}}": self.clock_steps,
             f"{{}} frames of other buses ignored ({', '.join(self.ignored)})": sum(self.ignored.values()),
         }
         told = [Notice(text=text, counts=(count,)) for text, count in texts.items() if count]

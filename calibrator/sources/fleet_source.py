@@ -367,9 +367,9 @@ def probe_equipment(
 ) -> Equipment:
     """Find out from some vehicles which branches and inputs the fleet has.
 
-    The first drive of each of the first :data:`PROBED_VEHICLES` readable vehicles is read. The fleet has a branch if
-    more than half of these drives have it, and an input if at least one has it. A vehicle that lacks a chosen branch is
-    left out later.
+    The first readable drive of each of the first :data:`PROBED_VEHICLES` readable vehicles is read. The fleet has a
+    branch if more than half of these drives have it, and an input if at least one has it. A vehicle that lacks a chosen
+    branch is left out later.
 
     Parameters
     ----------
@@ -380,7 +380,7 @@ def probe_equipment(
     branches : sequence of str, optional
         Branches to use instead of those found, each named once.
     limit_s : float
-        Longest time for one drive. [s]
+        Longest time for one vehicle. [s]
     modelled : bool
         Whether the branches are modelled from inputs, as in a fleet; if not, no inputs are chosen.
     drives : sequence of Drive
@@ -401,8 +401,8 @@ def probe_equipment(
     layout = database.layout
     names, errors = [_names_in(drive) for drive in drives], list[str]()
     if not names:
-        first = (entries[0] for entries in fleet.vehicles.values() if entries)
-        with closing(try_many(partial(_names, database=database), first, Workers(), limit_s=limit_s)) as read:
+        vehicles = filter(None, fleet.vehicles.values())
+        with closing(try_many(partial(_names, database=database), vehicles, Workers(), limit_s=limit_s)) as read:
             for _, outcome in read:
                 if isinstance(outcome, Failed):
                     errors.append(outcome.reason)
@@ -448,13 +448,19 @@ def probe_equipment(
     return Equipment(branches=chosen, inputs=inputs, fleet_inputs=fleet_inputs, notices=notices)
 
 
-def _names(entry: DriveFile, database: VehicleDatabase) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Read the names of the branches and inputs that a drive has."""
-    if not is_onboard(entry):
-        return _names_in(load_drive(entry, database))
-    with local_copy(entry.place) as path:
-        record = read_onboard_record(path, database)
-    return tuple(record.branches), tuple(record.recorded)
+def _names(entries: Sequence[DriveFile], database: VehicleDatabase) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Read the names of the branches and inputs that the first readable drive has; UserError if none is readable."""
+    problems = list[UserError]()
+    for entry in entries:
+        try:
+            if not is_onboard(entry):
+                return _names_in(load_drive(entry, database))
+            with local_copy(entry.place) as path:
+                record = read_onboard_record(path, database)
+            return tuple(record.branches), tuple(record.recorded)
+        except UserError as error:
+            problems.append(error)
+    raise problems[0]
 
 
 def _names_in(drive: Drive) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from calibrator.errors import FleetError
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.command_line import example
@@ -44,6 +45,7 @@ def summarise(
         from calibrator.processes.run_many import Workers
         from calibrator.summaries.filter_bank import read_bank
         from calibrator.summaries.summarise_fleet import summarise_fleet
+        from calibrator.summaries.summary_store import existing_store
 
     report = summarise_fleet(
         fleet,
@@ -56,6 +58,8 @@ def summarise(
     )
     print_report(report, json=json)
     end_if_internal(report.left_out)
+    if not report.vehicles and existing_store(out).is_empty():
+        raise FleetError(f"no vehicle could be summarised, for the reasons given above; {out} holds only these reasons")
 
 
 @store_app.command(epilog=example("calibrator store info summaries"))

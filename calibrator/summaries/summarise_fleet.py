@@ -36,8 +36,9 @@ from calibrator.summaries.vehicle_summary import (
     summarise_drives,
 )
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.text import counted, dumps, left_out_text
+from calibrator.terminal.text import counted, dumps, few, few_reasons, left_out_text
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
 from ecu_node.summary import SummaryFile, unpacked
 
 __all__ = [
@@ -64,7 +65,8 @@ class SummariseReport:
         Number of vehicles with newly summarised drives, and of these drives; drives that the store had before, or that
         were left out, do not count.
     left_out : dict of str to str
-        Why drives were not used: by name of the vehicle, or as ``problem 1`` ... for files whose vehicle is unclear.
+        Why drives were not used: by name of the vehicle, as ``VEHICLE/DRIVE`` if the vehicle has other drives, or as
+        ``problem 1`` ... for files whose vehicle is unclear.
     notices : list of str
         Further notices for the user.
     """
@@ -162,7 +164,7 @@ def add_drives(
     Returns
     -------
     SummariseReport
-        What was added and left out. A vehicle whose drives cannot be used gets a record that says why.
+        What was added and left out. Drives that cannot be used get a record that says why.
 
     Raises
     ------
@@ -172,7 +174,7 @@ def add_drives(
     report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
     summarised = dict[str, tuple[int, int]]()  # number of drives, and hash of their names, as names take memory
     outcomes = try_many_shown(
-        partial(_read_record, store=store.identity, database=database),
+        partial(_read_records, store=store.identity, database=database),
         _tasks(store, fleet, owners),
         workers,
         limit_s=time_limit_s,
@@ -182,16 +184,21 @@ def add_drives(
     )
     with closing(outcomes):
         for bucket, group in groupby(outcomes, key=lambda pair: pair[0].bucket):
-            records = [
-                _record(task.drives, problem=outcome.reason) if isinstance(outcome, Failed) else outcome
-                for task, outcome in group
-            ]
+            records = list[Record]()
+            for task, outcome in group:
+                if isinstance(outcome, Failed):
+                    records.append(_record(task.drives, problem=outcome.reason))
+                    report.left_out[task.drives[0].vehicle] = outcome.reason
+                else:
+                    records += outcome
+                    problems = {f"{each.vehicle}/{few(each.drives)}": each.problem for each in outcome}
+                    report.left_out |= {name: problem for name, problem in problems.items() if problem}
             known = store.read(bucket, whole=False)
             if new := [each for each in records if each.found or not _is_known(each, known.get(each.vehicle, ()))]:
                 store.append(bucket, new)
             for record in records:
                 owners.add(record.vehicle, record.digests)
-                _report(record, report)
+                report.notices += _twins(record)
                 if not record.problem:
                     summarised[record.vehicle] = len(record.drives), hash(record.drives)
     for bucket, vehicles in store.by_bucket(set().union(*owners.shared.values())).items():
@@ -279,24 +286,44 @@ def _stays(record: Record, versions: Mapping[str, str]) -> bool:
     return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
 
 
-def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase) -> Record:
-    """Read the drives of a task and summarise them; a recording that the store has of this vehicle is skipped."""
-    drives, made, digests = dict[str, Drive](), dict[str, VehicleSummary](), list[str]()
+def _read_records(task: _Task, *, store: StoreIdentity, database: VehicleDatabase) -> list[Record]:
+    """Read the drives of a task and summarise them; each that cannot be read has a record of its own, which says why.
+
+    A recording that the store has of this vehicle is skipped. DriveError if the vehicle has no drive that can be used.
+    """
+    found, digests, unreadable = dict[str, Drive | VehicleSummary](), dict[DriveFile, str](), dict[DriveFile, str]()
     for entry in task.drives:
-        if is_onboard(entry):
-            with local_copy(entry.place) as path:
-                digests.append(hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest())
-                made[digests[-1]] = _read_onboard(path, store, database, vehicle=entry.vehicle, name=entry.name)
-        else:
-            drive = load_drive(entry, database)
-            digests.append(recording_digest(drive))
-            drives[digests[-1]] = drive
-    parts = [summary for digest, summary in made.items() if digest not in task.digests]
-    if new := [drive for digest, drive in drives.items() if digest not in task.digests]:
-        parts.insert(0, summarise_drives(new, store.equipment, database, bank=store.bank, known_s=task.known_s))
-    if not parts:
-        return _record(task.drives, digests, problem=f"{COPY} one that this vehicle has already; it counts once")
-    return _record(task.drives, digests, found=added_summaries(parts))
+        try:
+            digests[entry], content = _read(entry, store, database)
+            found[digests[entry]] = content
+        except UserError as error:
+            unreadable[entry] = str(error)
+    if not digests and not task.digests:
+        raise DriveError(unreadable[task.drives[0]])
+    records = [_record([entry], problem=why) for entry, why in unreadable.items()]
+    new = [content for digest, content in found.items() if digest not in task.digests]
+    parts = [content for content in new if isinstance(content, VehicleSummary)]
+    if drives := [content for content in new if isinstance(content, Drive)]:
+        try:
+            parts.insert(0, summarise_drives(drives, store.equipment, database, bank=store.bank, known_s=task.known_s))
+        except DriveError as error:
+            raise DriveError(f"{error}{few_reasons({entry.name: why for entry, why in unreadable.items()})}") from None
+    if parts:
+        records.append(_record([*digests], [*digests.values()], found=added_summaries(parts)))
+    elif digests:
+        problem = f"{COPY} one that this vehicle has already; it counts once"
+        records.append(_record([*digests], [*digests.values()], problem=problem))
+    return records
+
+
+def _read(entry: DriveFile, store: StoreIdentity, database: VehicleDatabase) -> tuple[str, Drive | VehicleSummary]:
+    """Read a drive, or the record that a node made of it; return the digest of its content, and itself."""
+    if is_onboard(entry):
+        with local_copy(entry.place) as path:
+            digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+            return digest, _read_onboard(path, store, database, vehicle=entry.vehicle, name=entry.name)
+    drive = load_drive(entry, database)
+    return recording_digest(drive), drive
 
 
 def _record(
@@ -313,14 +340,11 @@ def _record(
     )
 
 
-def _report(record: Record, report: SummariseReport) -> None:
-    if record.problem:
-        report.left_out[record.vehicle] = record.problem
+def _twins(record: Record) -> list[str]:
+    """Say which drives of a record hold the same recording."""
     twins = [n for n, d in zip(record.drives, record.digests, strict=False) if record.digests.count(d) > 1]
-    if twins:
-        report.notices.append(
-            f"vehicle {record.vehicle}: drives {', '.join(twins)} hold the same recording, which counts once"
-        )
+    where = f"vehicle {record.vehicle}: drives {', '.join(twins)}"
+    return [f"{where} hold the same recording, which counts once"] if twins else []
 
 
 # ---- vehicles whose drives are still to be loaded

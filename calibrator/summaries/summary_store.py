@@ -135,6 +135,10 @@ class SummaryStore:
         """Return the outline of each vehicle of a bucket without reading summaries; errors as for :meth:`read`."""
         return [Outline.of(records) for records in self.read(bucket, whole=False).values()]
 
+    def is_empty(self) -> bool:
+        """Check whether the store has no usable drive; errors as for :meth:`read`."""
+        return not any(outline.drives for bucket in self.buckets() for outline in self.outlines(bucket))
+
     def append(self, bucket: int, records: Iterable[Record]) -> None:
         """Write records as a new file of a bucket, and merge its files if they are many; UserError if that fails."""
         with self.storage.locked():

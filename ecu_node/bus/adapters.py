@@ -107,7 +107,7 @@ def error_text(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
         return "this kernel has no SocketCAN (modules can, can_raw and, for virtual buses, vcan)"
     if isinstance(error, OSError) and error.errno == errno.ENODEV:
-        return "no such interface (see 'ip link')"
+        return "no CAN interface of this name (see 'ip -details link')"
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 

@@ -155,13 +155,13 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             return f"correcting {', '.join(faulty) or 'nothing'}{sends_nothing}"
 
         at_start = correcting(in_force)
+        to, shadow = f" to {options.gateway}" if is_gateway else "", ", shadow mode" if options.shadow else ""
+        once_open = [f"running on {options.interface} {options.channel}{to}{shadow}, {at_start}"]
 
         def ready() -> None:
             if routes is not None:
                 routes.set()
-            to, shadow = f" to {options.gateway}" if is_gateway else "", ", shadow mode" if options.shadow else ""
-            say(f"running on {options.interface} {options.channel}{to}{shadow}, {at_start}")
-            manager.ready(at_start)
+            manager.ready("waiting for the bus")
 
         looks: list[Callable[[float], None]] = [] if routes is None else [routes.look]
         records: list[Callable[[float], None]] = []
@@ -181,6 +181,9 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
                 manager.alive(now_s)
             for each in buses:
                 each.count_dropped()
+            if once_open and all(each.state != "gone" for each in buses):
+                say(once_open.pop())
+                manager.status(at_start)
             if store is not None and store.look(corrector, now_s):
                 manager.status(f"parameter set {corrector.parameter_set} is in force, {correcting(store.in_force)}")
             for look in looks:

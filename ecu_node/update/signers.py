@@ -73,12 +73,17 @@ def signer_of(text: str) -> Signer:
     except OSError as error:
         raise UserError(f"{path}: cannot read the private key: {error.strerror}; give NAME.key of a signer") from None
     is_encrypted = b"ENCRYPTED" in content
+    secret: str | None = None
     for secret in _secrets(f"passphrase of {path}") if is_encrypted else (None,):
         with suppress(ValueError, TypeError, UnsupportedAlgorithm):
             signer = CryptoSigner(load_pem_private_key(content, os.fsencode(secret) if secret else None))
             break
     else:
-        why = f"it is encrypted; give its passphrase in ${PASSPHRASE_VARIABLE}" if is_encrypted else "none, or damaged"
+        why = "none, or damaged"
+        if secret:
+            why = f"it is encrypted, and the passphrase (${PASSPHRASE_VARIABLE}, or typed) does not fit it"
+        elif is_encrypted:
+            why = f"it is encrypted; give its passphrase in ${PASSPHRASE_VARIABLE}"
         raise UserError(f"{path}: cannot be used as a private key (PEM, PKCS #8): {why}")
     if rights & 0o066:
         raise UserError(

@@ -84,6 +84,7 @@ def broken_fleet(fleet: Path, tmp_path: Path) -> Path:
     for name, content in logs.items():
         (copy / name).mkdir()
         (copy / name / "drive.log").write_bytes(content)
+    (copy / "V003" / "empty.log").touch()  # costs the vehicle this log alone
     (copy / "blf").mkdir()
     (copy / "blf" / "drive.blf").write_bytes(b"LOGG" + bytes(300))
     shutil.copytree(copy / "V001", copy / "elsewhere" / "V001")

@@ -197,6 +197,31 @@ def test_revocation_during_bus_sleep_is_not_logged_as_waking_up(database: Vehicl
     assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None
 
 
+DOWN = """
+import errno, sys
+from can.interfaces.virtual import VirtualBus
+receive, failures = VirtualBus._recv_internal, iter(range(5))
+def receive_once_up(bus, timeout):
+    if next(failures, None) is not None:
+        raise OSError(errno.ENETDOWN, "Network is down")
+    return receive(bus, timeout)
+VirtualBus._recv_internal = receive_once_up
+from ecu_node.__main__ import ecu_node_program
+sys.argv[1:] = {arguments!r}
+sys.exit(ecu_node_program())
+"""
+
+
+def test_node_says_that_it_runs_once_its_bus_is_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["run", "--unsigned", *files(tmp_path), "--interface", "virtual", "--channel", "down"]
+    manager = ServiceManagerHere(tmp_path / "notify", monkeypatch)
+    with manager.socket, running(program=["-c", DOWN.format(arguments=arguments)]) as log:
+        events = [line for line in log if "bus" in line or "running" in line]
+        waiting, working = manager.wait_for("READY"), manager.wait_for("STATUS")
+    assert ["failed" in events[0], "open again" in events[1], "running on virtual down" in events[2]] == [True] * 3
+    assert (waiting, working) == ("READY=1\nSTATUS=waiting for the bus", "STATUS=correcting nothing")
+
+
 # ---- signals at the very moment when the node opens its layout, or begins to import a library
 
 AT = """

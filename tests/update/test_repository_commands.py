@@ -142,7 +142,7 @@ def test_encrypted_key_needs_its_own_passphrase(repo: Repo, monkeypatch: pytest.
     assert subprocess.run(read, capture_output=True, check=True).stdout == (tmp_path / "dora.pub").read_bytes()
     failed(repo, "belongs to no role here", "publish", repo.path, "--key", private)
     monkeypatch.setenv(PASSPHRASE_VARIABLE, "another passphrase")
-    failed(repo, "it is encrypted; give its passphrase in", "publish", repo.path, "--key", private)
+    failed(repo, "it is encrypted, and the passphrase", "publish", repo.path, "--key", private)
     monkeypatch.delenv(PASSPHRASE_VARIABLE)
     failed(repo, "give its passphrase in", "publish", repo.path, "--key", private)
     failed(repo, "give either a passphrase", "key", "e", "--out", tmp_path, code=2)

@@ -80,9 +80,10 @@ def test_sigterm_or_sigint_ends_the_node_within_a_second(start_node: StartNode, 
     assert node.messages.splitlines()[-1] == "ecu-node: ended: no frames"
 
 
-def test_nonexistent_interface_is_refused_in_one_line(tmp_path: Path, start_node: StartNode) -> None:
-    words = "nocan0: cannot open the bus: no such interface"
-    with pytest.raises(AssertionError, match=words), start_node("--channel", "nocan0"):
+@pytest.mark.parametrize("name", ["nocan0", "lo"])
+def test_nonexistent_interface_is_refused_in_one_line(tmp_path: Path, start_node: StartNode, name: str) -> None:
+    words = f"{name}: cannot open the bus: no CAN interface of this name"
+    with pytest.raises(AssertionError, match=words), start_node("--channel", name):
         pass  # it does not start
     assert (tmp_path / "node.err").read_text().count("\n") == 1
 

@@ -140,11 +140,16 @@ def test_blf_object_that_cannot_be_a_frame_is_counted_as_damaged(spoilt: bytes) 
     (of_objects(SOUND, b"no object at all"), "something that is no object"),
     (of_objects(SOUND)[:-2], "the file ends before"),
     (of_objects(SOUND[:-4]), "the last object is cut"),
-    (b"LOGG", "the header 'LOGG' of 144 bytes is expected"),
+    (b"LOGG", "a header of 144 bytes is expected, found 4"),
 ])  # fmt: skip
 def test_damaged_blf_is_refused_with_the_byte_position(content: bytes, message: str) -> None:
     with pytest.raises(LogError, match=rf"x\.blf: truncated or damaged BLF: at byte \d+ .*{message}.* before it"):
         blf_frames(io.BytesIO(content), "x.blf")
+
+
+def test_log_of_another_format_under_the_name_of_a_blf_is_refused() -> None:
+    with pytest.raises(LogError, match=r"x\.blf: not a BLF log, .*found b'\(1\.0'\); give the file the suffix"):
+        blf_frames(io.BytesIO(b"(1.000000) can0 123#00\n"), "x.blf")
 
 
 @pytest.mark.parametrize("wrong", [b"LOBJ" + bytes(60), b"no object" + bytes(40)])

@@ -114,6 +114,11 @@ def test_branches_not_recorded_or_not_requested_are_named_in_notices(
     assert notices == ["branches not recorded, taken as not fitted: dcdc, motor_rear", *beside]
 
 
+def test_branches_of_a_vehicle_are_those_of_its_first_readable_drive(store: Path, database: VehicleDatabase) -> None:
+    (store / "drives" / "V" / "a.parquet").touch()
+    assert probe_equipment(find_fleet(store), database, None).branches == ("battery", "motor", "auxiliary")
+
+
 @pytest.mark.parametrize(("branches", "words"), [
     (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
     (["pack", "battery"], "no branch 'pack'; known are battery, motor"),

@@ -19,6 +19,8 @@ from calibrator.summaries.record import Record, joined_records
 from calibrator.summaries.summarise_fleet import SummariseReport, add_drives, read_vehicle_summary
 from calibrator.summaries.summary_store import SummaryStore, open_store
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.conftest import run_command
+from tests.ecu_node.vehicles import LAYOUT
 
 EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("speed",), fleet_inputs=("speed",), notices=())
 Change = Callable[[dict[str, Array]], object]
@@ -114,6 +116,46 @@ def test_vehicle_with_a_bad_drive_is_left_out_and_tried_again(fleet: SmallFleet)
     again = fleet.add()
     assert (again.vehicles, again.left_out) == (1, {})
     assert fleet.kept() == {"V1": [("a",)], "V2": [("a",)]}
+
+
+def test_drive_that_cannot_be_read_is_left_out_alone_and_tried_again(fleet: SmallFleet) -> None:
+    for name in "abcd":
+        fleet.write("V1", name)
+    whole = {name: fleet.file(f"V1/{name}").read_bytes() for name in "ac"}
+    for name, content in whole.items():
+        fleet.file(f"V1/{name}").write_bytes(content[:1000])
+    first = fleet.add()
+    assert (first.vehicles, first.drives, list(first.left_out)) == (1, 2, ["V1/a", "V1/c"])
+    assert all("not a drive" in why for why in first.left_out.values())
+    again = fleet.add()
+    assert (again.vehicles, again.left_out) == (0, first.left_out)
+    assert fleet.kept() == {"V1": [("a",), ("c",), ("b", "d")]}, "what is known is not noted again"
+    fleet.file("V1/a").write_bytes(whole["a"])
+    assert fleet.add().left_out == {"V1/c": first.left_out["V1/c"]}
+    assert fleet.kept() == {"V1": [("c",), ("b", "d"), ("a",)]}
+    assert fleet.total("V1").duration_s > 890.0
+
+
+def test_reason_of_a_vehicle_names_its_drives_that_cannot_be_read(fleet: SmallFleet) -> None:
+    fleet.write("V1", samples=601)
+    fleet.write("V1", "b")
+    fleet.file("V1/b").write_bytes(b"")
+    why = fleet.add().left_out["V1"]
+    assert re.search("s of usable data in 1 drive; at least 120 s are needed; b: .*b.parquet: not a drive", why)
+
+
+def test_summarise_fails_as_long_as_the_store_has_no_usable_vehicle(
+    fleet: SmallFleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["summarise", str(fleet.drives), "--layout", str(LAYOUT), "--out", str(fleet.out)]
+    fleet.write("V1", samples=601)
+    assert run_command(arguments) == 1
+    said = capsys.readouterr()
+    assert "V1: 60" in said.out
+    assert "no vehicle could be summarised, for the reasons given above" in said.err
+    fleet.write("V2")
+    for _ in range(2):  # the second run adds nothing
+        assert run_command(arguments) == 0
 
 
 def test_drives_of_other_branches_cannot_be_added(fleet: SmallFleet) -> None:
