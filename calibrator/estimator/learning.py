@@ -194,7 +194,8 @@ def learn_fault_models(
     )
     starter = replace(learner, rows=some_rows(MOST_STARTED))
     spreads = [(common, 0.0) for common in COMMON_SPREADS]
-    if any(np.median(rows.shown(rows.places.ratio(k))[1]) > OWN_SPREAD for k in range(1, rows.branches)):
+    ratio_sds = [rows.shown(rows.places.ratio(k))[1] for k in range(1, rows.branches)]
+    if any(not len(sd) or np.median(sd) > OWN_SPREAD for sd in ratio_sds):
         spreads.append((0.0, OWN_SPREAD))
     starts = [starter.initial_model(centre, *spread) for centre, spread in product(learner.initial_centres(), spreads)]
     climbed = [starter.climb(start, START_ROUNDS) for start in starts]

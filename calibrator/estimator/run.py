@@ -128,8 +128,7 @@ def calibrate_fleet(
                 equipment, part, details, notices = at_once(source, identity, workers=workers)
                 write_atomically(part_file(result, 0), part)
                 return complete_result(result, out, identity, equipment, details=details, notices=notices)
-            others = source.left_out
-            source = _summarised(source, summaries, identity, workers)
+            source, others = _summarised(source, summaries, identity, workers)
         details, notices = _calibrate_store(source, result, identity, workers, since)
         return complete_result(
             result,
@@ -213,8 +212,13 @@ def _require_named(settings: CalibrationSettings, problems: Problems, place: str
             raise FleetError(f"{place}: no usable vehicle {few(sorted(names))} to {what}{reasons}")
 
 
-def _summarised(fleet: FleetSource, folder: str, identity: RunIdentity, workers: Workers) -> SummaryStore:
-    """Summarise the drives of a fleet into a new store; wrong names and bench readings are refused before that."""
+def _summarised(
+    fleet: FleetSource, folder: str, identity: RunIdentity, workers: Workers
+) -> tuple[SummaryStore, Problems]:
+    """Summarise the drives of a fleet into a new store; return it, and why files and drives of no part are left out.
+
+    Wrong names and bench readings are refused before that.
+    """
     database, settings, problems = identity.database, identity.settings, _problems(fleet)
     limit_s, scale_a = settings.time_limit_s, database.layout.full_scale_a
     _require_named(settings, problems, f"fleet {fleet.name}")
@@ -222,8 +226,8 @@ def _summarised(fleet: FleetSource, folder: str, identity: RunIdentity, workers:
     equipment = probe_equipment(fleet, database, settings.branches, limit_s=limit_s)
     read_bench_table(settings.readings, equipment.branches, problems, trusted=settings.trusted, full_scale_a=scale_a)
     store = open_store(open_storage(folder), equipment, database, fleet)
-    add_drives(store, fleet, database, workers=workers, time_limit_s=limit_s)
-    return store
+    report = add_drives(store, fleet, database, workers=workers, time_limit_s=limit_s)
+    return store, {name: why for name, why in report.left_out.items() if name not in fleet.vehicles}
 
 
 def _calibrate_store(

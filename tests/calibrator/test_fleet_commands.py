@@ -107,6 +107,7 @@ def test_unusable_vehicles_are_left_out_and_named(broken_fleet: Path, tmp_path: 
         "empty": "drive.log: the log is empty",
         "no_branch": "expected HV_Battery (0x110)",
         "no_motor": "no branch motor; it has battery",
+        "V003/empty": "empty.log: the log is empty",
         "blf": "drive.blf: truncated or damaged BLF",
         "other": "same recording as V002; it cannot be told whose it is",
         "V002": "same recording as other; it cannot be told whose it is",

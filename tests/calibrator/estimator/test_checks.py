@@ -96,6 +96,19 @@ def test_switched_load_is_found_without_blaming_a_sensor(K: int) -> None:
     assert "load without a sensor" in found[BAD][0].text
 
 
+@pytest.mark.parametrize("share", [0.15, -0.15])
+def test_sensor_that_shows_a_share_of_another_branch_is_named_and_no_other(share: float) -> None:
+    faults = random_faults(3, vehicles=9, branches=3, full_scale_a=FULL_SCALE_A)
+    drives = [a_drive(10 + j, faults.take(j), None) for j in range(9)]
+    stray = drives[BAD].currents_a.copy()
+    stray[:, 2] += share * stray[:, 1]
+    drives[BAD] = replace(drives[BAD], currents_a=stray)
+    found = checked([summarise_samples([drive], period_s=PERIOD_S) for drive in drives], 3)
+    assert [(each.cause, each.branch) for each in found[BAD]] == [("follows", "auxiliary")]
+    assert "of another branch's current, too: a stray field" in found[BAD][0].text
+    assert [j for j, mine in enumerate(found) if mine] == [BAD]
+
+
 def test_finding_of_a_gain_that_differs_by_sign_also_names_a_load_proportional_to_a_current() -> None:
     faults = no_faults(9, 2)
     drives = [a_drive(10 + j, faults.take(j), None) for j in range(9)]

@@ -13,7 +13,13 @@ import pytest
 
 from calibrator.drive import Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
+from calibrator.estimator.fleet_estimate import (
+    FleetEstimate,
+    FleetReference,
+    _growing_sums,
+    estimate_vehicles,
+    learn_fleet,
+)
 from calibrator.estimator.fleet_task import _distrust
 from calibrator.estimator.prior import known_prior
 from calibrator.estimator.vehicle_parameters import deciding_evidence
@@ -195,6 +201,39 @@ def test_gain_error_shared_by_all_sensors_of_a_branch_gives_a_notice_and_is_not_
     learnt = learned(summaries)
     assert any("a gain error that a batch of sensors shares" in notice for notice in learnt.notices)
     assert not estimate_vehicles(summaries, learnt).corrected.any()
+
+
+def test_gain_errors_that_two_of_three_branches_share_are_given_to_no_pair() -> None:
+    """A factor on all currents is invisible, so each pair explains the gain ratios as well as any other."""
+    batch, names = no_faults(12, 3), [*NAMES, "auxiliary"]
+    batch.drift[:, 1:] = 0.03, -0.04
+    summaries = summaries_of(batch, Conditions(samples=900), seed=3)
+    learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=names)
+    (notice,) = (each for each in learnt.notices if "a batch of sensors shares" in each)
+    assert set(notice.rpartition("in branch ")[2].split(" or ")) == set(names)
+    found = estimate_vehicles(summaries, learnt)
+    assert not found.corrected.any()
+    assert found.confidence.max() < 0.6
+
+
+def test_branches_in_parallel_that_share_a_current_differently_in_each_vehicle_are_not_corrected() -> None:
+    rng, summaries = np.random.default_rng(11), []
+    for share in 0.5 + 0.015 * rng.normal(size=20):
+        drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=900, model_error_a=0.3, noise_a=0.0))
+        battery_a, motor_a = drive.currents_a.T
+        currents_a = np.column_stack([share * battery_a, (1.0 - share) * battery_a, motor_a])
+        currents_a += 0.3 * rng.normal(size=currents_a.shape)
+        drive = replace(drive, branch_names=("one", "other", "motor"), currents_a=currents_a)
+        summaries.append(summarise_samples([drive], period_s=PERIOD_S))
+    learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=["one", "other", "motor"])
+    assert not estimate_vehicles(summaries, learnt).corrected.any()
+
+
+@pytest.mark.parametrize(("gain", "grows"), [((1.0, 1.0), False), ((1.0, 0.99), False), ((1.0, 0.6), True)])
+def test_estimate_with_which_the_currents_sum_to_more_is_a_finding(gain: tuple[float, float], grows: bool) -> None:
+    balanced = 30.0**2 * np.array([[[1.0, -1.0], [-1.0, 1.0]]]) + 0.09 * np.eye(2)
+    (found,) = _growing_sums(balanced, np.array([gain]), SCALE_A)
+    assert [each.cause for each in found] == ["sum"] * grows
 
 
 @pytest.mark.parametrize(("drift", "suspected"), [(0.02, False), (-0.02, False), (0.06, True)])
