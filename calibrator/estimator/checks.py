@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t as student_t
 
 from calibrator.drive import Array
@@ -35,8 +35,10 @@ TAIL = 12.0
 LEAST_MISFIT = 1e-5
 """Least value of the usual misfit of a fleet, in fractions of full scale: a smaller one harms no correction. [1]"""
 LEAST_FOLLOWS, MOST_FOLLOWS = 2e-4, 0.05
-"""Least usual value of what sensors show of another branch's current, over full scale, and usual share of that current
-from which on nothing is told: errors of the fleet model then look the same. [1]"""
+"""Least scale of what sensors usually show of another branch's current, over full scale; and its share of that current
+from which on no sensor is said to show one: errors of the fleet model look the same. [1]"""
+AS_MUCH = 0.99
+"""Share of the largest variance from which on a branch moves as much as the one that moves most. [1]"""
 LARGEST_MISFIT = 0.2
 """Largest misfit, in fractions of full scale; before anything is seen, its size is log-uniform up to it. [1]"""
 EXPLAINED = 0.7
@@ -107,9 +109,11 @@ class UsualMisfits:
     slope_spread, model_error_a : ndarray of shape (K,)
         Robust standard deviation over vehicles of the slopes over the fleet model [1], and median standard deviation of
         the currents about it [A].
+    other : ndarray of int of shape (K,)
+        For each branch, the other one whose fleet model moves most besides.
     follows, follows_a : ndarray of shape (K,)
-        Median share of another branch's current that each sensor shows beside its own [1], and how far vehicles usually
-        are from it [A].
+        Median share of that branch's current that each sensor shows beside its own [1], and how far from it vehicles
+        usually are [A].
     spike_rate : float
         Share of samples that are spikes. [1]
     """
@@ -120,6 +124,7 @@ class UsualMisfits:
     residual_spread: float
     slope_spread: Array
     model_error_a: Array
+    other: NDArray[np.intp]
     follows: Array
     follows_a: Array
     spike_rate: float
@@ -163,9 +168,11 @@ class _Checked:
         Variance of the residual over the model times the number of neighbouring samples that are alike. [A^2]
     moves_a, error_a : ndarray of shape (N, K)
         Standard deviations of the model and of the residual over it. [A]
-    follows, other_a : ndarray of shape (N, K)
-        Share of another branch's fleet model that each current shows beside its own [1], and the root mean square of
-        that model beyond what goes with its own [A].
+    other : ndarray of int of shape (K,)
+        For each branch, the other one whose fleet model moves most besides.
+    follows, sum_follows, other_a : ndarray of shape (N, K)
+        Share of that model which each current shows beside its own, and which the sum of the currents shows [1]; root
+        mean square of that model beyond what goes with its own [A].
     fit : ndarray of shape (N, C)
         Log likelihood of each of :data:`CAUSES` relative to linear sensors, less a penalty for its parameters.
     size, place : ndarray of shape (N, C)
@@ -187,7 +194,13 @@ class _Checked:
         Share of samples that are upward and downward spikes. [1]
     """
 
-    def __init__(self, summaries: Sequence[DriveSummary], read_out: Array, full_scale_a: float) -> None:
+    def __init__(
+        self,
+        summaries: Sequence[DriveSummary],
+        read_out: Array,
+        full_scale_a: float,
+        other: NDArray[np.intp] | None = None,
+    ) -> None:
         self.fleet, self.full_scale_a, self.has_fleet = stack_summaries(summaries), full_scale_a, len(read_out) > 1
         fits = [summary.fit for summary in summaries if summary.fit is not None]
         self.fast = np.stack([fit.fast_a2.sum(axis=0) for fit in fits])
@@ -196,7 +209,7 @@ class _Checked:
         self.samples = self.total[:, -1, -1]
         self._regress_law()
         self._regress_on_model(read_out)
-        self._regress_on_others(read_out)
+        self._regress_on_others(read_out, other)
         middle = np.concatenate([np.cumsum(n := s.moments[:, -1, -1]) - n / 2.0 for s in summaries])
         warm_c = np.concatenate([fit.temperature_c for fit in fits])
         causes = [
@@ -278,22 +291,29 @@ class _Checked:
         self.moves_a = np.sqrt(np.maximum(determinant, 0.0)) / self.samples[:, None]
         self.variance_a2, self.error_a = repeated * left, np.sqrt(left)
 
-    def _regress_on_others(self, read_out: Array) -> None:
-        """Regress each current on its own fleet model, 1, and the model of the branch that moves most besides."""
-        K, measured = self.fleet.branches, slice(self.fleet.inputs, -1)
+    def _regress_on_others(self, read_out: Array, other: NDArray[np.intp] | None) -> None:
+        """Regress each current, and the sum of all, on its own fleet model, 1, and the model of another branch.
+
+        ``other`` (K,) are the other branches; None: the one that moves most beside the branch in half of the vehicles.
+        """
+        N, K, measured = len(self.fleet), self.fleet.branches, slice(self.fleet.inputs, -1)
         models = np.column_stack([read_out, np.eye(len(read_out))[-1]])  # K models and 1
         gram = models.T @ self.total[:, self.columns[:, None], self.columns] @ models
         right = models.T @ self.total[:, self.columns, measured]
-        self.follows, self.other_a = np.zeros((2, len(self.fleet), K))
+        self.other = np.zeros(K, np.intp) if other is None else other
+        self.follows, self.sum_follows, self.other_a = np.zeros((3, N, K))
         for k in range(K if self.has_fleet else 0):
-            own, others = [k, K], [i for i in range(K) if i != k]
-            with_own = gram[:, others][:, :, own]
-            of_own = np.linalg.pinv(gram[:, own][:, :, own], hermitian=True)
-            left = gram[:, others, others] - np.einsum("nla,nab,nlb->nl", with_own, of_own, with_own)
-            shown = right[:, others, k] - np.einsum("nla,nab,nb->nl", with_own, of_own, right[:, own, k])
-            other = int(np.argmax(np.median(left, axis=0)))
-            self.follows[:, k] = shown[:, other] / np.maximum(left[:, other], TINY)
-            self.other_a[:, k] = np.sqrt(np.maximum(left[:, other], 0.0) / self.samples)
+            own = [k, K]
+            on_own = gram[:, :, own] @ np.linalg.pinv(gram[:, own][:, :, own], hermitian=True)
+            left = np.maximum(np.einsum("nll->nl", gram - on_own @ gram[:, own])[:, :K], 0.0)
+            if other is None:  # two branches that move alike differ by rounding
+                moves = np.median(np.delete(left, k, axis=1), axis=0)
+                self.other[k] = np.delete(np.arange(K), k)[np.argmax(moves >= AS_MUCH * moves.max())]
+            at = self.other[k]
+            shown = np.stack([right[:, :, k], right.sum(axis=2)])
+            shared = shown[:, :, at] - np.einsum("na,sna->sn", on_own[:, at], shown[:, :, own])
+            self.follows[:, k], self.sum_follows[:, k] = shared / np.maximum(left[:, at], TINY)
+            self.other_a[:, k] = np.sqrt(left[:, at] / self.samples)
 
     def _cause(
         self,
@@ -532,6 +552,7 @@ def learn_usual_misfits(
         residual_spread=max(MAD_TO_SD * float(np.median(np.abs(left - centre))), LEAST_NOISE_SPREAD),
         slope_spread=MAD_TO_SD * np.median(np.abs(found.slope - np.median(found.slope, axis=0)), axis=0),
         model_error_a=np.median(found.error_a, axis=0),
+        other=found.other,
         follows=follows,
         follows_a=np.maximum(MAD_TO_SD * np.median(apart_a, axis=0), LEAST_FOLLOWS * full_scale_a),
         spike_rate=max(float(np.median(found.spikes.sum(axis=2))), SPIKE_RATE),
@@ -573,7 +594,7 @@ def find_misfits(
     places = [j for j, summary in enumerate(summaries) if summary.fit is not None]
     if usual is None or not places:
         return found
-    misfits = _Checked([summaries[j] for j in places], read_out, full_scale_a)
+    misfits = _Checked([summaries[j] for j in places], read_out, full_scale_a, usual.other)
     # Where there is more noise than usual, larger misfits come by chance.
     noisier = np.sqrt(np.maximum(misfits.residual_a2[:, :-1] / usual.residual_a2, 1.0))
     shape = _probability(misfits.misfit_a, usual.misfit_a * noisier, LARGEST_MISFIT * full_scale_a)
@@ -582,7 +603,10 @@ def find_misfits(
     unusual = np.where(above > 0.0, _posterior(PRIOR * factor), 0.0)
     inverted, dead = misfits.of_slopes(usual)
     # As above, where the rest of a current is larger than usual.
-    follows_a = np.abs(misfits.follows - usual.follows) * misfits.other_a
+    # A load that takes more with another current makes no sum: only what the sum shows, too, is a sensor's.
+    apart = misfits.follows - usual.follows
+    by_sensor = np.minimum(np.abs(apart), np.maximum(misfits.sum_follows * np.sign(apart), 0.0))
+    follows_a = by_sensor * misfits.other_a
     rest_a = np.sqrt(np.maximum(misfits.error_a**2 - follows_a**2, 0.0))
     usual_a = usual.follows_a * np.maximum(rest_a / np.maximum(usual.model_error_a, TINY), 1.0)
     follows = _probability(follows_a, usual_a, LARGEST_MISFIT * full_scale_a)
@@ -649,13 +673,14 @@ class _Vehicle(NamedTuple):
 
     def of_others(self, follows: Array) -> list[SensorFinding]:
         """Report sensors that show a share of another branch's current, by the probability of each, shape (K,)."""
-        shares = 100.0 * (self.misfits.follows[self.j] - self.usual.follows)
-        text = "% of another branch's current, too: a stray field, or a load that depends on it"
-        return [
-            _finding(name, "follows", probability, f"sensor {name} shows {share:+.1f} {text}")
-            for name, probability, share in zip(self.branches, follows, shares, strict=True)
-            if probability >= LEAST_PROBABILITY
-        ]
+        found, shares = [], 100.0 * (self.misfits.follows[self.j] - self.usual.follows)
+        for name, other, probability, share in zip(self.branches, self.usual.other, follows, shares, strict=True):
+            if probability >= LEAST_PROBABILITY:
+                text = (
+                    f"sensor {name} shows {share:+.1f} % of the current of {self.branches[other]}, too: a stray field?"
+                )
+                found.append(_finding(name, "follows", probability, text))
+        return found
 
     def of_law(self, shape: Array, unusual: Array) -> list[SensorFinding]:
         """Report the cause that explains most of the junction law's residual; noise or switching if too much is left.

@@ -37,7 +37,13 @@ from calibrator.estimator.evidence import (
 from calibrator.estimator.learning import LEAST_SHARED, centre_rows, learn_fault_models
 from calibrator.estimator.posterior import FaultModel, Spread
 from calibrator.estimator.prior import Prior
-from calibrator.estimator.readings import FEWEST_TRUSTED, untrusted_vehicles, with_knowledge
+from calibrator.estimator.readings import (
+    CONTRADICTION,
+    FEWEST_TRUSTED,
+    TRUSTED_OFFSET_SD,
+    untrusted_vehicles,
+    with_knowledge,
+)
 from calibrator.estimator.settings import CONFIDENT, FEWEST_VEHICLES, HARM_LIMIT, SUSPECTED
 from calibrator.summaries.moments import DriveSummary
 from calibrator.terminal.text import counted
@@ -185,7 +191,7 @@ class FleetReference:
         constant = best.spread.mean[RowPlaces(K).junction]
         trusted_a, others_a = self.sums_a
         apart = (
-            f"the currents of the trusted vehicles sum to {trusted_a:+.1f} A, those of most others to {others_a:+.1f} A"
+            f"the currents of trusted vehicles sum to {trusted_a:+z.1f} A, those of most others to {others_a:+z.1f} A"
         )
         if not self.zero_trusted:
             notices.append(
@@ -193,8 +199,8 @@ class FleetReference:
             )
         elif abs(trusted_a - others_a) > LEAST_SHARED * scale_a:
             notices.append(
-                f"{apart}: the others share an offset, and are corrected for it, or the zero of the trusted ones is "
-                f"wrong; read an offset of one of the others"
+                f"{apart}: the others are compared with the trusted ones, as if they shared an offset; read an "
+                f"offset of one of them, as the zero of the trusted ones may be wrong"
             )
         elif self.load is None and abs(constant) > LEAST_SHARED:
             notices.append(
@@ -287,8 +293,8 @@ def learn_fleet(
     broken = untrusted_vehicles(measured, carriers, ordered, full_scale_a=full_scale_a, load=load)
     carriers[list(broken)] = False
     carried = int(carriers.sum()) >= FEWEST_TRUSTED
-    sums_a = _sums_a(measured, carriers, full_scale_a) if carried else (np.nan, np.nan)
-    zero = _says_zero(*sums_a, full_scale_a, load)
+    sums_a = _sums_a(measured, carriers, full_scale_a)
+    zero = _says_zero(*sums_a, full_scale_a, load, count=int(carriers.sum()), branches=len(branches))
     rows = with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load, zero=zero)
 
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
@@ -357,21 +363,28 @@ def _balanced(fleet: FleetMoments, branches: Sequence[str]) -> Mask:
 
 def _sums_a(rows: EvidenceRows, carriers: Mask, full_scale_a: float) -> tuple[float, float]:
     """Return what the currents of trusted vehicles sum to, and those of most others, see :class:`FleetReference`."""
-    junction = rows.places.junction
-    others = rows.take(~carriers).shown(junction)
-    found = densest_clusters(*others, widest=1.0) if len(others[0]) >= FEWEST_TRUSTED else []
-    shared = found[0].centre if found and found[0].share > 0.5 else np.nan
-    return float(np.median(rows.values[carriers, junction])) * full_scale_a, shared * full_scale_a
+    trusted, others = (rows.take(some).shown(rows.places.junction) for some in (carriers, ~carriers))
+    if min(len(trusted[0]), len(others[0])) < FEWEST_TRUSTED:
+        return np.nan, np.nan
+    found = densest_clusters(*others, widest=1.0)[0]
+    shared = found.centre if found.share > 0.5 else np.nan
+    return float(np.median(trusted[0])) * full_scale_a, shared * full_scale_a
 
 
-def _says_zero(trusted_a: float, others_a: float, full_scale_a: float, load: UnmeasuredLoad | None) -> bool:
-    """Return whether trusted vehicles say where zero is: not if only the currents of the others sum to the load.
+def _says_zero(
+    trusted_a: float, others_a: float, full_scale_a: float, load: UnmeasuredLoad | None, *, count: int, branches: int
+) -> bool:
+    """Return whether ``count`` trusted vehicles say where zero is: not if only the others' currents sum to the load.
 
     The others would have to share an offset that happens to cancel a load of all vehicles. It is likelier that the
-    trusted vehicles share a wrong zero, or a load such as a recorder.
+    trusted vehicles share a wrong zero, or a load such as a recorder. They may differ by chance, as loads and bench
+    checks do.
     """
-    expected_a, least_a = 0.0 if load is None else load.mean_a, LEAST_SHARED * full_scale_a
-    return not (abs(others_a - expected_a) < least_a < abs(trusted_a - others_a))
+    mean_a, sd_a = (0.0, 0.0) if load is None else (load.mean_a, load.sd_a)
+    least_a = LEAST_SHARED * full_scale_a
+    chance_a = np.sqrt((sd_a**2 + branches * (TRUSTED_OFFSET_SD * full_scale_a) ** 2) / max(count, 1))
+    apart = abs(trusted_a - others_a) > max(least_a, CONTRADICTION * float(chance_a))
+    return not (apart and abs(others_a - mean_a) < max(least_a, sd_a))
 
 
 def _carried_centre(rows: EvidenceRows, carriers: Mask, doubtful: Mask, *, zero: bool) -> Array:
@@ -528,10 +541,8 @@ def _growing_sums(covariance_a2: Array, gain: Array, full_scale_a: float) -> lis
     found = list[tuple[SensorFinding, ...]]()
     for before, after in zip(before_a, after_a, strict=True):
         grows = after > max(WORSE_SUM * before, before + WORSE_SUM_A * full_scale_a)
-        text = (
-            f"corrected, its currents would sum to {after:.1f} A RMS about their mean, now {before:.1f} A: a variant?"
-        )
-        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=text),) * grows)
+        so = f"so estimated, its currents would sum to {after:.1f} A RMS about their mean, now {before:.1f}: a variant?"
+        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=so),) if grows else ())
     return found
 
 

@@ -446,6 +446,7 @@ def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a
         residual_spread=USUAL_SPREAD,
         slope_spread=np.ones(K),
         model_error_a=np.full(K, scale_a),
+        other=np.zeros(K, np.intp),
         follows=np.zeros(K),
         follows_a=np.full(K, scale_a),
         spike_rate=1.0,

@@ -441,28 +441,29 @@ class _Learner:
     def _shared_gains(self) -> list[Array]:
         """List gains that sensors may share (:attr:`.Spread.shared`), if many vehicles break the junction law alike."""
         K, at = self.rows.branches, self.at
-        centre, sd, broken = np.zeros(K), np.full(K, np.inf), np.zeros(K, bool)
+        centre, sd = np.zeros(K), np.full(K, np.inf)  # of ratios that are alike in many vehicles; infinite: unknown
         for k in range(1, K):
             values, errors = self.rows.shown(at.ratio(k))
             if self.free[at.ratio(k)] or not len(values):
                 continue
-            sd[k] = np.median(errors)
             for cluster in densest_clusters(values, errors, widest=1.0):  # at most one
-                centre[k] = cluster.centre
-                alike = cluster.spread < MOST_SHARED_SPREAD and cluster.share > LEAST_SHARED_GAIN[0]
-                broken[k] = alike and abs(centre[k]) > max(LEAST_SHARED_GAIN[1], SURELY_SHARED * sd[k])
+                if cluster.spread < MOST_SHARED_SPREAD and cluster.share > LEAST_SHARED_GAIN[0]:
+                    centre[k], sd[k] = cluster.centre, np.median(errors)
+        broken = np.abs(centre) > np.maximum(LEAST_SHARED_GAIN[1], SURELY_SHARED * sd)
         if not broken.any():
             return []
-        # The centres are lambda_1 - lambda_k. One lambda can be chosen: those that leave the fewest branches wrong are.
+        # Ratios show lambda_1 - lambda_k only, so lambda_1 is free. 0 and each centre are tried; those count that leave
+        # the fewest branches wrong.
+        found: dict[tuple[bool, ...], Array] = {tuple(broken): np.where(broken, -centre, 0.0)}
         tolerance = LEAST_SHARED_GAIN[1] + SURELY_SHARED * sd
-        found: dict[tuple[bool, ...], Array] = {}
-        for first in (0.0, *centre[broken]):
+        for first in centre[broken]:
             alike = broken & (np.abs(centre - first) <= tolerance)
-            of_first = np.average(centre[alike], weights=sd[alike] ** -2.0) if first and alike.any() else first
-            gains = np.append(of_first, np.where(np.abs(centre - of_first) > tolerance, of_first - centre, 0.0)[1:])
-            found.setdefault(tuple(gains != 0.0), np.concatenate([np.zeros(K), gains, [0.0]]))
+            first_gain = np.average(centre[alike], weights=sd[alike] ** -2.0)
+            gains = np.where(np.abs(centre - first_gain) > tolerance, first_gain - centre, 0.0)
+            gains[0] = first_gain
+            found.setdefault(tuple(gains != 0.0), gains)
         fewest = min(sum(wrong) for wrong in found)
-        return [shared for wrong, shared in found.items() if sum(wrong) == fewest]
+        return [np.concatenate([np.zeros(K), gains, [0.0]]) for wrong, gains in found.items() if sum(wrong) == fewest]
 
     def with_modes(self, model: FaultModel) -> FaultModel:
         """Return the model with all priors that explain the fleet nearly as well as the best one.

@@ -134,8 +134,8 @@ def _pairs(vehicles: Sequence[VehicleSummary]) -> Iterator[tuple[Array, Array]]:
 def flow_findings(vehicle: VehicleSummary) -> list[SensorFinding]:
     """Return a finding if :func:`current_flows` in the zero-current windows of a vehicle, else none."""
     text = f"{FLOWS}; its zero-current windows are not used; check [contactor] in the layout"
-    found = bool(current_flows([vehicle])[0])
-    return [SensorFinding(branch=None, cause="window", probability=1.0, text=text)] * found
+    finding = SensorFinding(branch=None, cause="window", probability=1.0, text=text)
+    return [finding] if current_flows([vehicle])[0] else []
 
 
 def bench_readings(bench: BenchTable, vehicles: Sequence[str], branches: Sequence[str]) -> Array:

@@ -44,7 +44,7 @@ from calibrator.summaries.summarise_fleet import add_drives
 from calibrator.summaries.summary_store import SummaryStore, open_store
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.terminal.progress import progress_bar, shown
-from calibrator.terminal.text import few, few_reasons
+from calibrator.terminal.text import counted, few, few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.documents import write_atomically
 from ecu_node.layout import Layout
@@ -122,14 +122,18 @@ def calibrate_fleet(
     identity = RunIdentity(database=database, settings=settings, fleet=name, created=time_of_run())
     with whole_folder(out) as result, TemporaryDirectory(dir=result) as summaries:
         (result / PARTS).mkdir()
-        others: Mapping[str, str] = {}
+        others: Problems = {}
+        lost: Problems = {}
         if isinstance(source, FleetSource):
             if at_once := _at_once(source, settings, layout):
                 equipment, part, details, notices = at_once(source, identity, workers=workers)
                 write_atomically(part_file(result, 0), part)
                 return complete_result(result, out, identity, equipment, details=details, notices=notices)
-            source, others = _summarised(source, summaries, identity, workers)
+            others = source.left_out
+            source, lost = _summarised(source, summaries, identity, workers)
         details, notices = _calibrate_store(source, result, identity, workers, since)
+        if lost:
+            notices.append(f"{counted(len(lost), 'log')} left out{few_reasons(lost)}")
         return complete_result(
             result,
             out,
@@ -215,7 +219,7 @@ def _require_named(settings: CalibrationSettings, problems: Problems, place: str
 def _summarised(
     fleet: FleetSource, folder: str, identity: RunIdentity, workers: Workers
 ) -> tuple[SummaryStore, Problems]:
-    """Summarise the drives of a fleet into a new store; return it, and why files and drives of no part are left out.
+    """Summarise the drives of a fleet into a new store; return it, and why single drives are left out.
 
     Wrong names and bench readings are refused before that.
     """
@@ -227,7 +231,8 @@ def _summarised(
     read_bench_table(settings.readings, equipment.branches, problems, trusted=settings.trusted, full_scale_a=scale_a)
     store = open_store(open_storage(folder), equipment, database, fleet)
     report = add_drives(store, fleet, database, workers=workers, time_limit_s=limit_s)
-    return store, {name: why for name, why in report.left_out.items() if name not in fleet.vehicles}
+    whole = {*fleet.vehicles, *fleet.left_out}
+    return store, {name: why for name, why in report.left_out.items() if name not in whole}
 
 
 def _calibrate_store(

@@ -154,9 +154,8 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             sends_nothing = " (only in its figures: --listen-only)" if options.listen_only else ""
             return f"correcting {', '.join(faulty) or 'nothing'}{sends_nothing}"
 
-        at_start = correcting(in_force)
         to, shadow = f" to {options.gateway}" if is_gateway else "", ", shadow mode" if options.shadow else ""
-        once_open = [f"running on {options.interface} {options.channel}{to}{shadow}, {at_start}"]
+        running, is_said = f"running on {options.interface} {options.channel}{to}{shadow}", False
 
         def ready() -> None:
             if routes is not None:
@@ -179,11 +178,14 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         def tick(now_s: float, works: bool) -> None:
             if works:
                 manager.alive(now_s)
+            nonlocal is_said
             for each in buses:
                 each.count_dropped()
-            if once_open and all(each.state != "gone" for each in buses):
-                say(once_open.pop())
-                manager.status(at_start)
+            if not is_said and all(each.state != "gone" for each in buses):
+                is_said = True
+                now_correcting = correcting(in_force if store is None else store.in_force)
+                say(f"{running}, {now_correcting}")
+                manager.status(now_correcting)
             if store is not None and store.look(corrector, now_s):
                 manager.status(f"parameter set {corrector.parameter_set} is in force, {correcting(store.in_force)}")
             for look in looks:

@@ -107,13 +107,14 @@ def test_unusable_vehicles_are_left_out_and_named(broken_fleet: Path, tmp_path: 
         "empty": "drive.log: the log is empty",
         "no_branch": "expected HV_Battery (0x110)",
         "no_motor": "no branch motor; it has battery",
-        "V003/empty": "empty.log: the log is empty",
         "blf": "drive.blf: truncated or damaged BLF",
         "other": "same recording as V002; it cannot be told whose it is",
         "V002": "same recording as other; it cannot be told whose it is",
     }.items():
         assert reason in left_out[vehicle]
     assert any("V001" in reason and "elsewhere" in reason for reason in left_out.values()), left_out
+    (notice,) = (text for text in report["run"]["notices"] if "left out" in text)
+    assert "V003/empty: " in notice
     assert any("my,drive" in reason for reason in left_out.values()), left_out
     assert sorted(path.stem for path in (out / "params").iterdir()) == ["V003", "V004", "V005", "V006"]
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)

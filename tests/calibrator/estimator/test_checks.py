@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -101,12 +102,33 @@ def test_sensor_that_shows_a_share_of_another_branch_is_named_and_no_other(share
     faults = random_faults(3, vehicles=9, branches=3, full_scale_a=FULL_SCALE_A)
     drives = [a_drive(10 + j, faults.take(j), None) for j in range(9)]
     stray = drives[BAD].currents_a.copy()
-    stray[:, 2] += share * stray[:, 1]
+    stray[:, 2] += share * stray[:, 0]
     drives[BAD] = replace(drives[BAD], currents_a=stray)
     found = checked([summarise_samples([drive], period_s=PERIOD_S) for drive in drives], 3)
     assert [(each.cause, each.branch) for each in found[BAD]] == [("follows", "auxiliary")]
-    assert "of another branch's current, too: a stray field" in found[BAD][0].text
+    sign, text = "+" if share > 0.0 else "-", found[BAD][0].text
+    assert text.startswith(f"sensor auxiliary shows {sign}1")
+    assert text.endswith("% of the current of battery, too: a stray field?")
     assert [j for j, mine in enumerate(found) if mine] == [BAD]
+
+
+def test_share_of_another_branch_that_all_sensors_show_is_usual_also_for_a_vehicle_checked_alone() -> None:
+    drives = [a_drive(10 + j, no_faults(1, 3).take(0), None) for j in range(9)]
+    for drive in drives:
+        drive.currents_a[:, 2] += 0.1 * drive.currents_a[:, 1]
+    summaries = [summarise_samples([drive], period_s=PERIOD_S) for drive in drives]
+    usual = learn_usual_misfits(summaries, read_out(3), full_scale_a=FULL_SCALE_A)
+    check = partial(find_misfits, read_out=read_out(3), usual=usual, full_scale_a=FULL_SCALE_A, branches=BRANCHES)
+    assert check(summaries) == [()] * 9
+    assert [check([each]) for each in summaries] == [[()]] * 9
+
+
+def test_vehicle_whose_third_branch_draws_more_has_no_finding() -> None:
+    drives = [a_drive(10 + j, no_faults(1, 3).take(0), None) for j in range(9)]
+    currents_a = drives[BAD].currents_a
+    currents_a[:, 0] -= 0.5 * currents_a[:, 2]
+    currents_a[:, 2] *= 1.5
+    assert checked([summarise_samples([drive], period_s=PERIOD_S) for drive in drives], 3) == [()] * 9
 
 
 def test_finding_of_a_gain_that_differs_by_sign_also_names_a_load_proportional_to_a_current() -> None:

@@ -203,6 +203,13 @@ def test_gain_error_shared_by_all_sensors_of_a_branch_gives_a_notice_and_is_not_
     assert not estimate_vehicles(summaries, learnt).corrected.any()
 
 
+def test_small_gain_error_that_all_sensors_of_a_branch_share_is_told() -> None:
+    batch = no_faults(12, K)
+    batch.drift[:, 1] = 0.006
+    learnt = learned(summaries_of(batch, Conditions(samples=1800, noise_a=0.1), seed=2))
+    assert any("by 0.6%: a gain error that a batch of sensors shares" in notice for notice in learnt.notices)
+
+
 def test_gain_errors_that_two_of_three_branches_share_are_given_to_no_pair() -> None:
     """A factor on all currents is invisible, so each pair explains the gain ratios as well as any other."""
     batch, names = no_faults(12, 3), [*NAMES, "auxiliary"]
@@ -324,7 +331,7 @@ def test_trusted_vehicles_set_the_reference_of_a_fleet_with_a_shared_offset() ->
     assert reference.distrusted == {}
     assert not found.offset_a[:3].any()
     assert np.median(found.offset_a[3:, 0]) == pytest.approx(12.0, abs=1.0)
-    assert "trusted vehicles sum to -0.0 A, those of most others to +12.0 A" in reference.notices[0]
+    assert "trusted vehicles sum to +0.0 A, those of most others to +12.0 A" in reference.notices[0]
 
 
 @pytest.mark.parametrize("load_a", [0.0, 3.0])
