@@ -17,6 +17,7 @@ from calibrator.estimator.fleet_estimate import (
     FleetEstimate,
     FleetReference,
     _growing_sums,
+    _says_zero,
     estimate_vehicles,
     learn_fleet,
 )
@@ -236,6 +237,23 @@ def test_branches_in_parallel_that_share_a_current_differently_in_each_vehicle_a
     assert not estimate_vehicles(summaries, learnt).corrected.any()
 
 
+def test_vehicles_with_a_branch_that_others_lack_are_not_corrected() -> None:
+    rng, summaries = np.random.default_rng(5), []
+    for j in range(14):
+        drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=900, model_error_a=0.3, noise_a=0.0))
+        battery_a, motor_a = drive.currents_a.T
+        front = 0.4 * (j % 5 not in {0, 2})
+        currents_a = np.column_stack([battery_a, front * motor_a, (1.0 - front) * motor_a])
+        currents_a += 0.3 * rng.normal(size=currents_a.shape)
+        drive = replace(drive, branch_names=("battery", "front", "rear"), currents_a=currents_a)
+        summaries.append(summarise_samples([drive], period_s=PERIOD_S))
+    found = estimate_vehicles(
+        summaries, learn_fleet(summaries, full_scale_a=SCALE_A, branches=["battery", "front", "rear"])
+    )
+    assert not found.corrected.any()
+    assert any(each.cause == "sum" for mine in found.findings for each in mine)
+
+
 @pytest.mark.parametrize(("gain", "grows"), [((1.0, 1.0), False), ((1.0, 0.99), False), ((1.0, 0.6), True)])
 def test_estimate_with_which_the_currents_sum_to_more_is_a_finding(gain: tuple[float, float], grows: bool) -> None:
     balanced = 30.0**2 * np.array([[[1.0, -1.0], [-1.0, 1.0]]]) + 0.09 * np.eye(2)
@@ -344,6 +362,21 @@ def test_wrong_zero_of_all_trusted_vehicles_turns_no_other_vehicle(load_a: float
     assert np.abs(found.offset_a[3:]).max() < 0.3
     assert found.drift[5, 1] == pytest.approx(0.1, abs=0.01)
     assert found.corrected[:, 1].tolist() == [j == 5 for j in range(16)]
+
+
+@pytest.mark.parametrize(("trusted_a", "others_a", "load", "says"), [
+    (1.5, 0.1, None, False),
+    (0.6, 0.1, None, True),  # as bench checks differ by chance
+    (4.5, 3.0, None, True),  # beside a load that nobody declared
+    (4.5, 3.0, UnmeasuredLoad(mean_a=3.0, sd_a=0.1), False),
+    (8.0, 6.3, UnmeasuredLoad(mean_a=6.0, sd_a=1.0), True),  # as loads differ
+    (0.0, 12.0, None, True),
+    (NAN, NAN, None, True),
+])  # fmt: skip
+def test_zero_of_trusted_vehicles_is_left_where_the_others_sum_to_the_load_and_they_do_not_by_chance(
+    trusted_a: float, others_a: float, load: UnmeasuredLoad | None, says: bool
+) -> None:
+    assert _says_zero(trusted_a, others_a, SCALE_A, load, count=3, branches=3) == says
 
 
 @pytest.mark.parametrize("load_a", [0.0, 3.0])
