@@ -104,7 +104,8 @@ class FleetReference:
         Sum of the currents of trusted vehicles that carry the reference, their median, and the sum on which most of the
         others agree; NaN if there are too few, or they do not agree. [A]
     zero_trusted : bool
-        Whether trusted vehicles, if there are any, say where zero is, see :func:`_says_zero`.
+        Whether trusted vehicles, if there are any, say where zero is: not if only the currents of the others sum to the
+        load.
     agreeing : tuple of float
         For each branch in ``branches``, share of the vehicles whose slopes agree. [1]
     variants : tuple of float
