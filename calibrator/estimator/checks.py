@@ -602,11 +602,11 @@ def find_misfits(
     factor = usual.residual_spread / (NOISE_RANGE * np.maximum(student_t.pdf(above, TAIL), TINY))
     unusual = np.where(above > 0.0, _posterior(PRIOR * factor), 0.0)
     inverted, dead = misfits.of_slopes(usual)
-    # As above, where the rest of a current is larger than usual.
-    # A load that takes more with another current makes no sum: only what the sum shows, too, is a sensor's.
+    # A load that grows with another current leaves the sum as it is, so only what the sum shows, too, is the sensor's.
     apart = misfits.follows - usual.follows
     by_sensor = np.minimum(np.abs(apart), np.maximum(misfits.sum_follows * np.sign(apart), 0.0))
     follows_a = by_sensor * misfits.other_a
+    # Where more than usual is left of a current, larger shares come by chance.
     rest_a = np.sqrt(np.maximum(misfits.error_a**2 - follows_a**2, 0.0))
     usual_a = usual.follows_a * np.maximum(rest_a / np.maximum(usual.model_error_a, TINY), 1.0)
     follows = _probability(follows_a, usual_a, LARGEST_MISFIT * full_scale_a)

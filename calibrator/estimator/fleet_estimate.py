@@ -542,8 +542,9 @@ def _growing_sums(covariance_a2: Array, gain: Array, full_scale_a: float) -> lis
     found = list[tuple[SensorFinding, ...]]()
     for before, after in zip(before_a, after_a, strict=True):
         grows = after > max(WORSE_SUM * before, before + WORSE_SUM_A * full_scale_a)
-        so = f"so estimated, its currents would sum to {after:.1f} A RMS about their mean, now {before:.1f}: a variant?"
-        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=so),) if grows else ())
+        sums = f"{after:.1f} A RMS about their mean, not to {before:.1f} A"
+        text = f"with these gains the currents would sum to {sums}: is it a variant of the vehicle?"
+        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=text),) if grows else ())
     return found
 
 

@@ -679,7 +679,7 @@ def _is_step(current: Sequence[float]) -> bool:
 def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
     """Return the sum of squares of the residual that the best gain error of a branch leaves. [A^2]"""
     own, both = math.fsum(map(mul, current, current)), math.fsum(map(mul, current, residual))
-    return math.fsum(map(mul, residual, residual)) - both * both / (own or math.inf)
+    return math.fsum(map(mul, residual, residual)) - both * both / (own or math.inf)  # no current explains nothing
 
 
 def _common_change(x: Sequence[float], y: Sequence[float]) -> float:

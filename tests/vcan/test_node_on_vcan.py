@@ -81,7 +81,7 @@ def test_sigterm_or_sigint_ends_the_node_within_a_second(start_node: StartNode, 
 
 
 @pytest.mark.parametrize("name", ["nocan0", "lo"])
-def test_nonexistent_interface_is_refused_in_one_line(tmp_path: Path, start_node: StartNode, name: str) -> None:
+def test_name_of_no_can_interface_is_refused_in_one_line(tmp_path: Path, start_node: StartNode, name: str) -> None:
     words = f"{name}: cannot open the bus: no CAN interface of this name"
     with pytest.raises(AssertionError, match=words), start_node("--channel", name):
         pass  # it does not start

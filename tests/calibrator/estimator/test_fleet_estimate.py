@@ -16,7 +16,6 @@ from calibrator.errors import FleetError
 from calibrator.estimator.fleet_estimate import (
     FleetEstimate,
     FleetReference,
-    _growing_sums,
     _says_zero,
     estimate_vehicles,
     learn_fleet,
@@ -252,13 +251,6 @@ def test_vehicles_with_a_branch_that_others_lack_are_not_corrected() -> None:
     )
     assert not found.corrected.any()
     assert any(each.cause == "sum" for mine in found.findings for each in mine)
-
-
-@pytest.mark.parametrize(("gain", "grows"), [((1.0, 1.0), False), ((1.0, 0.99), False), ((1.0, 0.6), True)])
-def test_estimate_with_which_the_currents_sum_to_more_is_a_finding(gain: tuple[float, float], grows: bool) -> None:
-    balanced = 30.0**2 * np.array([[[1.0, -1.0], [-1.0, 1.0]]]) + 0.09 * np.eye(2)
-    (found,) = _growing_sums(balanced, np.array([gain]), SCALE_A)
-    assert [each.cause for each in found] == ["sum"] * grows
 
 
 @pytest.mark.parametrize(("drift", "suspected"), [(0.02, False), (-0.02, False), (0.06, True)])
