@@ -78,7 +78,7 @@ class BranchParameters(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class HardwareFault(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Whether the vehicle itself differs from its fleet, (11) of the paper. Never corrected, only reported."""
+    """Whether and by how much the vehicle itself differs from its fleet, (11) of the paper. It is never corrected."""
 
     suspected: bool
     drift: Annotated[float, Meta(description="common relative change of all currents [1]")] = 0.0
@@ -311,10 +311,11 @@ _LARGEST_DELAY_S = 5.0
 
 
 def check_fit(parameters: VehicleParameters, database: "VehicleDatabase", vehicle: str | None) -> None:
-    """Check that parameters are for this vehicle, layout and DBC, fit their verdict, and keep to the layout's limits.
+    """Check that parameters are for this vehicle, layout and DBC, fit their verdict, and are within limits.
 
-    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Limits on drift and
-    offset hold for applied branches, those on delays and on the expected sum always.
+    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Drift and offset of
+    applied branches keep to the layout's limits, the expected sum always to its limit of offsets, and the delay of
+    every branch to 5 s. A branch that the layout lacks does not fit.
 
     Parameters
     ----------

@@ -75,8 +75,9 @@ class Facts:
           from it, and the longest distance; NaN with fewer than two frames [s]; ``late``: number of distances longer
           than its time-out;
         - ``bad``: numbers of frames that cannot be used, by reason; ``good``: number that can be used;
-        - ``low``, ``high``: least and greatest good value, of branches positive into the junction; NaN without any;
-        - ``clipped``: number of good values at an end of the signal's range, several in a row.
+        - ``low``, ``high``: least and greatest good value, a branch's with its current into the junction positive; NaN
+          without any;
+        - ``clipped``: number of good values at an end of the signal's range, :data:`FEWEST_CLIPPED` or more in a row.
     junction : RecordedJunction
         What the sum of the branches shows; its layout has a period that suits the logs, and voltages as more inputs.
     """

@@ -2,8 +2,8 @@
 
 The junction law is regressed once more on the vehicle's own data for each cause that is not linear, with a further
 column: a curve over the level of a current, or gains that change with time or temperature. The remaining residual shows
-noise and loads that switch. The fleet shows how large misfit and noise usually are; the junction law shows that
-something is wrong, and the fleet model in which sensor.
+noise and loads that switch. The fleet shows how large misfit and noise usually are. The junction law shows that
+something is wrong; the fleet model shows in which sensor.
 Equations: (M22) to (M25) of docs/method.md, section "Does the best explanation fit?".
 """
 

@@ -332,7 +332,7 @@ class FleetEstimate(SensorEstimate):
     corrected : ndarray of bool of shape (N, K)
         Whether the node is to correct the branch.
     held_back : ndarray of str of shape (N, K)
-        Why a fault that was found is not corrected; empty where it is, or where none was found.
+        Why a fault that was found is not corrected; empty if it is corrected, or no fault was found.
     verdicts : sequence of N str
         Verdict on each vehicle: "corrected", "no sensor fault" or "cannot tell".
     explanations : sequence of N sequences of Explanation
@@ -340,7 +340,8 @@ class FleetEstimate(SensorEstimate):
     findings : sequence of N sequences of SensorFinding
         What gain errors and offsets do not explain, and what the vehicle shares with others.
     evidence : ndarray of shape (N, 3, 5K)
-        Evidence rows for a report, see :func:`.reported_evidence`; there are none for single junctions.
+        Value, standard deviation and prediction of each row, see :func:`.reported_evidence`; (N, 3, 0) for single
+        junctions.
     """
 
     corrected: Mask

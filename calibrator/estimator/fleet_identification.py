@@ -86,7 +86,10 @@ def held_out_snr_db(summaries: Sequence[DriveSummary]) -> Array:
 
 
 def read_outs(moments: Array, branches: int) -> tuple[Array, Array]:
-    """Fit K currents over P columns, by moments (N, P+K+1, P+K+1): coefficients (N, P, K) [A], offsets (N, K) [A]."""
+    """Fit K currents over P columns, from moments of (columns, currents, 1), shape (N, P+K+1, P+K+1).
+
+    Returns coefficients (N, P, K) [A per unit of the column], and offsets (N, K) [A].
+    """
     mean = _mean(moments)
     covariance = covariances(mean)
     P = moments.shape[1] - branches - 1

@@ -431,7 +431,7 @@ def _refine(evidence: Evidence, j: int, chosen: Integers, theta: Array, root: Ar
 
 
 class Draws(NamedTuple):
-    """Draws from the explanations of N vehicles, not weighted yet: M from each of Q explanations.
+    """Draws from the explanations of N vehicles, not weighted yet: M (:data:`DRAWS`) from each of Q, of P parameters.
 
     Attributes
     ----------
@@ -443,7 +443,8 @@ class Draws(NamedTuple):
         Index of the size of each fault and load in :data:`~calibrator.estimator.prior.GRID`; :data:`NO_SIZE` where the
         support lacks it.
     base : ndarray of shape (N, Q, M)
-        Logarithm of p(rows | draw) / q(draw), with the probability of the signs and the change of variables to sizes.
+        Logarithm of p(rows | draw) / q(draw), where q is the density from which it was drawn; with the probability of
+        the signs and the change of variables to sizes.
     feed : int
         Number of the branch that carries loads without a sensor.
     shared : ndarray of shape (2K + 1,)

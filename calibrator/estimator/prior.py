@@ -72,8 +72,8 @@ class Prior:
     Attributes
     ----------
     counts : ndarray of shape (K + 1, 2K + 1)
-        Probability of each number of hardware faults (rows) and of sensor faults (columns); which parameters these are
-        is equally likely for all choices (supports).
+        Joint probability of how many of the K parameters of the hardware (rows) and of the 2K drifts and offsets of
+        sensors (columns) are not zero; all choices (supports) of as many are equally likely.
     gain, offset : Slab
         Sizes of drifts, and of offsets.
     load_share : float

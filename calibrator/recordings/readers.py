@@ -161,7 +161,11 @@ def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name:
 
 
 def open_recording(path: Path, database: VehicleDatabase) -> "SignalSource":
-    """Read a log or a table, and return its signals; raise LogError as :func:`read_recording` does."""
+    """Read a log or a table, and return its signals.
+
+    LogError if the file cannot be read, or a column could be two signals. Missing branches, and a message on several
+    buses, are found only when signals are read.
+    """
     if is_table(path):
         return TableSource(read_table(path), database)
     return FrameSource(read_frames(path), database, str(path))

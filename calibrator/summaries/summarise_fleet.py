@@ -118,7 +118,7 @@ def summarise_fleet(
     workers : Workers
         Where the drives are read.
     time_limit_s : float
-        Longest time for the drives of one vehicle. [s]
+        Longest time to read the drives of one vehicle, which is left out if that takes longer. [s]
 
     Returns
     -------
@@ -128,7 +128,7 @@ def summarise_fleet(
     Raises
     ------
     UserError
-        If the drives do not fit the store, or it cannot be written.
+        If no drive is found, the drives do not fit the store, or it cannot be written.
     """
     storage = open_storage(out)
     require_store_or_nothing(storage)
@@ -159,7 +159,7 @@ def add_drives(
     workers : Workers
         Where the drives are read.
     time_limit_s : float
-        Longest time for the drives of one vehicle. [s]
+        Longest time to read the drives of one vehicle, which is left out if that takes longer. [s]
 
     Returns
     -------

@@ -222,9 +222,11 @@ def _route(payload: bytes) -> _Route | None:
 def kernel_routes(
     channels: tuple[str, str], ours: Collection[tuple[int, bool]], *, fd: bool, say: Callable[[str], None]
 ) -> KernelRoutes | None:
-    """Return rules for all identifiers but ours; None if the kernel takes none, so that the node carries all frames.
+    """Make the rules by which the kernel carries all identifiers but ours; they hold from :meth:`KernelRoutes.set` on.
 
-    The log then says why, except for an interface that is missing.
+    ``ours`` are identifiers, each with whether it has 29 bits. The result is None if the kernel takes no rules, which
+    `say` is told, or if an interface is missing, which opening the bus says: the node then carries all frames.
+    BusError as :class:`KernelRoutes`.
     """
     if set(channels) - {name for _, name in socket.if_nameindex()}:
         return None  # opening the bus says so

@@ -125,8 +125,8 @@ class OwnMessage:
     key, fd, protection
         As given.
     data : bytearray
-        Payload that was made last; before the first one, zeros with the start of the protection. The next payload is a
-        new object, so one that was handed out does not change.
+        Payload that was made last; before the first one zeros, and with protection a counter whose next value is 0.
+        The next payload is a new object, so one that was handed out does not change.
     branches : dict of LiveBranch to Written
         The branches that are written into it.
     """

@@ -57,7 +57,10 @@ class HeardSignal:
         self.signal, self._frames = signal, frames
 
     def newest_first(self) -> Iterator[tuple[float, int]]:
-        """Return pairs of time [s] and code, backwards from the last frame with the signal; each frame is read once."""
+        """Return pairs of time [s] and code of the remembered frames with the signal, the newest first.
+
+        No frame is read twice, over all calls.
+        """
         if self._frames and self._frames[-1] is not self._read:
             new = list(takewhile(lambda frame: frame is not self._read, reversed(self._frames)))
             self._read = new[0]
