@@ -16,6 +16,7 @@ from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.checks import UsualMisfits, find_misfits, learn_usual_misfits
 from calibrator.estimator.decision import (
+    LEAST_HARDWARE,
     FleetEstimate,
     RowsEstimate,
     SensorEstimate,
@@ -64,9 +65,11 @@ LINEAR_CAUSES = (*LEFT_OUT_CAUSES, "noise", "switching")
 """Causes of findings with which a sensor still has a gain and an offset."""
 VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
 """Least share of the fleet, half width of the hardware drift, and least number of vehicles of a variant. [1]"""
-WORSE_SUM, WORSE_SUM_A = 1.5, 0.0025
+ALIKE = 0.02
+"""Distance up to which slopes of a vehicle count as alike, and as those of most: sound vehicles differ by less. [1]"""
+WORSE_SUM, WORSE_SUM_A, MOST_SUM_A = 1.5, 0.0025, 0.03
 """An estimate is wrong with which the sum of the currents scatters more by this factor [1] and by this share of full
-scale."""
+scale, or by the last share of it: loads without a sensor that switch are smaller."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +91,8 @@ class FleetReference:
         Usual correlation of the evidence rows that come from drives. [1]
     models : tuple of FaultModel
         Fault models that explain the fleet, by falling probability.
+    usual_slopes : ndarray of shape (K,)
+        Medians over the vehicles of the logarithms of the slopes, in the order of ``order``. [1]
     usual : ndarray of shape (2, K)
         Mean over full scale, and mean square over its square, of the measured currents: medians over the vehicles.
     misfits : UsualMisfits or None
@@ -106,6 +111,8 @@ class FleetReference:
     zero_trusted : bool
         Whether trusted vehicles, if there are any, say where zero is: not if only the currents of the others sum to the
         load.
+    load_denied : bool
+        Whether the currents of most vehicles sum to zero although a load is declared, and no offset was read.
     agreeing : tuple of float
         For each branch in ``branches``, share of the vehicles whose slopes agree. [1]
     variants : tuple of float
@@ -122,6 +129,7 @@ class FleetReference:
     read_out: Array
     usual_correlation: Array
     models: tuple[FaultModel, ...]
+    usual_slopes: Array
     usual: Array
     misfits: UsualMisfits | None
     full_scale_a: float
@@ -130,6 +138,7 @@ class FleetReference:
     carried: bool
     sums_a: tuple[float, float]
     zero_trusted: bool
+    load_denied: bool
     agreeing: tuple[float, ...]
     variants: tuple[float, ...]
     distrusted: Mapping[int, str]
@@ -142,8 +151,8 @@ class FleetReference:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether the fleet is too small to be its own reference, so that only trusted vehicles may be corrected."""
-        return not self.carried and self.vehicles < FEWEST_VEHICLES
+        """Whether the fleet is no reference, being small or not as declared: only trusted vehicles may be corrected."""
+        return not self.carried and (self.vehicles < FEWEST_VEHICLES or self.load_denied)
 
     @property
     def expected_a(self) -> float:
@@ -178,7 +187,12 @@ class FleetReference:
         scale_a, ordered = self.full_scale_a, self.ordered
         K, feed = len(ordered), ordered[self.feed]
         notices = []
-        if self.in_doubt:
+        if self.load is not None and self.load_denied:
+            notices.append(
+                f"the currents of most vehicles sum to {self.sums_a[1]:+z.1f} A, as if without a load, and one of "
+                f"{self.load.mean_a:g} A is declared: nothing is corrected; check it, or read an offset"
+            )
+        elif self.in_doubt:
             notices.append(
                 f"{self.vehicles} vehicles are few for a fleet that is compared with itself: nothing is corrected; at "
                 f"least {FEWEST_VEHICLES} are needed, or {FEWEST_TRUSTED} bench-checked vehicles (--trusted)"
@@ -297,6 +311,7 @@ def learn_fleet(
     sums_a = _sums_a(measured, carriers, full_scale_a)
     zero = _says_zero(*sums_a, full_scale_a, load, count=int(carriers.sum()), branches=len(branches))
     rows = with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load, zero=zero)
+    offsets_read = bool(rows.known[:, rows.places.offset_reads].any())
 
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
@@ -321,6 +336,7 @@ def learn_fleet(
         read_out=own_read_out,
         usual_correlation=usual_correlation,
         models=tuple(models),
+        usual_slopes=np.median(rows.relative[:, : len(order)], axis=0),
         usual=usual,
         misfits=learn_usual_misfits(summaries, own_read_out, full_scale_a=full_scale_a),
         full_scale_a=full_scale_a,
@@ -329,6 +345,7 @@ def learn_fleet(
         carried=carried,
         sums_a=sums_a,
         zero_trusted=zero,
+        load_denied=load is not None and not offsets_read and _is_denied(load, sums_a[1], full_scale_a),
         agreeing=tuple(_agreeing(rows, int(p)) for p in place),
         variants=_variants(everyone.hardware_drift),
         distrusted={used[j]: why for j, why in broken.items()}
@@ -365,11 +382,10 @@ def _balanced(fleet: FleetMoments, branches: Sequence[str]) -> Mask:
 def _sums_a(rows: EvidenceRows, carriers: Mask, full_scale_a: float) -> tuple[float, float]:
     """Return what the currents of trusted vehicles sum to, and those of most others, see :class:`FleetReference`."""
     trusted, others = (rows.take(some).shown(rows.places.junction) for some in (carriers, ~carriers))
-    if min(len(trusted[0]), len(others[0])) < FEWEST_TRUSTED:
-        return np.nan, np.nan
-    found = densest_clusters(*others, widest=1.0)[0]
-    shared = found.centre if found.share > 0.5 else np.nan
-    return float(np.median(trusted[0])) * full_scale_a, shared * full_scale_a
+    trusted_sum = float(np.median(trusted[0])) if len(trusted[0]) >= FEWEST_TRUSTED else np.nan
+    found = densest_clusters(*others, widest=1.0) if len(others[0]) >= FEWEST_TRUSTED else []
+    shared = found[0].centre if found and found[0].share > 0.5 else np.nan
+    return trusted_sum * full_scale_a, shared * full_scale_a
 
 
 def _says_zero(
@@ -386,6 +402,12 @@ def _says_zero(
     chance_a = np.sqrt((sd_a**2 + branches * (TRUSTED_OFFSET_SD * full_scale_a) ** 2) / max(count, 1))
     apart = abs(trusted_a - others_a) > max(least_a, CONTRADICTION * float(chance_a))
     return not (apart and abs(others_a - mean_a) < max(least_a, sd_a))
+
+
+def _is_denied(load: UnmeasuredLoad, others_a: float, full_scale_a: float) -> bool:
+    """Return whether a declared load is clearly not zero, but what most vehicles sum to (NaN: not known) is."""
+    least_a = LEAST_SHARED * full_scale_a
+    return abs(load.mean_a) > least_a + CONTRADICTION * load.sd_a and abs(others_a) < max(least_a, load.sd_a)
 
 
 def _carried_centre(rows: EvidenceRows, carriers: Mask, doubtful: Mask, *, zero: bool) -> Array:
@@ -500,7 +522,9 @@ def estimate_vehicles(
     )
     covariance_a2 = fleet.covariance[:, fleet.inputs : -1, fleet.inputs : -1]
     growing = _growing_sums(covariance_a2, 1.0 + found.drift[:, order], scale_a)
-    unfit = [(*mine, *other) for mine, other in zip(unfit, growing, strict=True)]
+    slopes = rows.relative[:, : len(order)] - reference.usual_slopes
+    hiding = _hiding_sensors(slopes, found.faulty[:, order], found.drift[:, order], reference.ordered)
+    unfit = [(*mine, *sums, *hides) for mine, sums, hides in zip(unfit, growing, hiding, strict=True)]
     drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
     has_own_load = np.array([each.weight @ (each.load != 0.0) > SUSPECTED for each in found.points])
     is_read = rows.known[:, rows.places.offset_reads][:, reference.feed]  # then the load is no offset
@@ -531,7 +555,7 @@ def estimate_vehicles(
 
 
 def _growing_sums(covariance_a2: Array, gain: Array, full_scale_a: float) -> list[tuple[SensorFinding, ...]]:
-    """Find the vehicles whose currents would sum to more if these gains were right, which therefore are not.
+    """Find the vehicles whose currents would sum to more, or to much, if these gains were right: they are not.
 
     Gains of parallel branches, which the junction law does not tell apart, come from the fleet model alone.
     """
@@ -542,9 +566,34 @@ def _growing_sums(covariance_a2: Array, gain: Array, full_scale_a: float) -> lis
     found = list[tuple[SensorFinding, ...]]()
     for before, after in zip(before_a, after_a, strict=True):
         grows = after > max(WORSE_SUM * before, before + WORSE_SUM_A * full_scale_a)
-        sums = f"{after:.1f} A RMS about their mean, not to {before:.1f} A"
-        text = f"with these gains the currents would sum to {sums}: is it a variant of the vehicle?"
-        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=text),) if grows else ())
+        sums = f"with these gains the currents would sum to {after:.1f} A RMS about their mean, "
+        if grows:
+            sums += f"not to {before:.1f} A: is it a variant of the vehicle?"
+        else:
+            sums += "whatever they are: is a signal late by more than half a second, or a branch missing?"
+        is_wrong = grows or after > MOST_SUM_A * full_scale_a
+        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=sums),) if is_wrong else ())
+    return found
+
+
+def _hiding_sensors(
+    slopes: Array, faulty: Mask, drift: Array, branches: Sequence[str]
+) -> list[tuple[SensorFinding, ...]]:
+    """Find the vehicles in which the only faulty gain is that of the one sensor which shows what the fleet's do.
+
+    The vehicle would draw more, and this sensor happen to hide it. That the others share a gain error, as sensors of
+    one control unit do, is as probable. ``slopes`` (N, K) are logarithms, relative to the fleet.
+    """
+    found = list[tuple[SensorFinding, ...]]()
+    for own, is_faulty, gain_error in zip(slopes, faulty, drift, strict=True):
+        named = np.flatnonzero(is_faulty & (np.abs(gain_error) > LEAST_HARDWARE))
+        rest = np.delete(own, named)
+        hides = len(named) == 1 and len(rest) > 1 and abs(own[named[0]]) < ALIKE and np.ptp(rest) < ALIKE
+        if not hides:
+            found.append(())
+            continue
+        text = f"either the vehicle draws {np.expm1(rest.mean()):+.1%} and one sensor hides it, or the others share it"
+        found.append((SensorFinding(branch=branches[named[0]], cause="shared", probability=0.5, text=text),))
     return found
 
 

@@ -54,6 +54,8 @@ FINEST_PERIOD_S = 0.1
 """Shortest time base of data frames without a layout: that of logs. [s]"""
 LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
 """Currents that never reach the former share of full scale, or go beyond the latter, are in another unit. [1]"""
+LEAST_WHOLE = 100.0
+"""Spacing of an index of whole numbers from which on it is not taken for seconds unasked. [s]"""
 OTHER_SPACING = 20.0
 """Row spacing of the fleet over that of a frame from which on the latter's time is in another unit. [1]"""
 OTHER_UNIT = 100.0
@@ -356,6 +358,11 @@ def _seconds(frame: pd.DataFrame, where: str) -> Array:
         raise DriveError(
             f"{where}: the time does not rise at row {row + 1} ({index[row]} -> {index[row + 1]}); expected rising "
             f"times: sort by time, one row each, or give drives as frames of their own"
+        )
+    if pd.api.types.is_integer_dtype(index) and np.median(np.diff(time_s)) >= LEAST_WHOLE:
+        raise DriveError(
+            f"{where}: its index is whole numbers, {np.median(np.diff(time_s)):g} apart, which may be milliseconds; "
+            f"expected seconds as floating-point numbers: divide the index by 1000.0, or by 1.0 if it is seconds"
         )
     return np.asarray(time_s - time_s[0])
 

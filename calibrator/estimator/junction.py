@@ -63,6 +63,8 @@ MOST_OFFSETS, MARGIN = 3, 12.0
 """Most offsets of one explanation, and distance of its log weight below the best from which on it is left out."""
 DRAWS, FEWEST_DRAWS = 8192, 64
 """Draws in all, shared by weight of the explanations, and fewest of one: the usual harm limit of 0.001 is 8 draws."""
+CANCELLED = 0.02
+"""Offset of a sensor by a declared charge, over full scale, from which on the sum of the currents must show it. [1]"""
 USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
 """Usual misfit, due to curvature of good sensors, and usual residual of the sum, due to noise and switched loads, over
 full scale; and spread between cars of the logarithm of the square of that residual. [1]"""
@@ -364,6 +366,13 @@ def estimate_junction(
     S, places, contradictions = system.sensors, system.places, system.contradictions()
     scale_known, posterior = any(p < S for p in system.known), _posterior(system)
     mean, sd, draws, weight = posterior.mean, posterior.sd, posterior.draws, posterior.weight
+    for name in known.charge_a:
+        own_a, sum_a = float(mean[S + branches.index(name)]) * scale_a, system.laws[0].constant_a[0]
+        if abs(own_a) > CANCELLED * scale_a and abs(sum_a) < 0.5 * abs(own_a):
+            contradictions.append(
+                f"by the charge given for {name} its sensor has an offset of {own_a:+.1f} A, but at zero current the "
+                f"sensors sum to {sum_a:+.1f} A: check value and sign of --charge"
+            )
     gain_fault = _fault_probability(mean[:S], sd[:S], OPEN_GAIN_SD, TRUSTED_DRIFT_SD)
     offset_fault = _fault_probability(mean[S : 2 * S], sd[S : 2 * S], OPEN_OFFSET_SD, TRUSTED_OFFSET_SD)
     offset_read = [S + s in system.known for s in range(S)]

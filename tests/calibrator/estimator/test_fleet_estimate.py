@@ -253,6 +253,31 @@ def test_vehicles_with_a_branch_that_others_lack_are_not_corrected() -> None:
     assert any(each.cause == "sum" for mine in found.findings for each in mine)
 
 
+def test_gain_error_that_two_of_three_sensors_share_in_some_vehicles_is_not_corrected_in_the_third() -> None:
+    """As sensors of one control unit do; a vehicle that draws more, which the third sensor hides, looks the same."""
+    rng, faults = np.random.default_rng(1), no_faults(18, 3)
+    faults.drift[:7, 1:] = (rng.choice([-1.0, 1.0], 7) * rng.uniform(0.025, 0.08, 7))[:, None]
+    faults.drift[8, 0] = 0.1
+    faults.hardware_drift[:] = 0.01 * rng.normal(size=18)
+    summaries = summaries_of(faults, Conditions(samples=900, model_error_a=0.3), seed=1)
+    found = estimate_vehicles(summaries, learn_fleet(summaries, full_scale_a=SCALE_A, branches=[*NAMES, "auxiliary"]))
+    assert np.flatnonzero(found.corrected.any(axis=1)).tolist() == [8]
+    named = [[each.branch for each in mine if each.cause == "shared"] for mine in found.findings]
+    assert named == [["battery"]] * 7 + [[]] * 11
+    assert found.confidence[:7].max() <= 0.5
+
+
+def test_vehicles_whose_battery_signal_is_late_are_not_corrected() -> None:
+    rng, summaries = np.random.default_rng(6), []
+    for late in rng.integers(1, 4, 12):
+        drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=900, model_error_a=0.3))
+        currents_a = np.column_stack([np.roll(drive.currents_a[:, 0], late), drive.currents_a[:, 1]])
+        summaries.append(summarise_samples([replace(drive, currents_a=currents_a)], period_s=PERIOD_S))
+    found = estimate_vehicles(summaries, learned(summaries))
+    assert not found.corrected.any()
+    assert all(any("is a signal late" in each.text for each in mine) for mine in found.findings)
+
+
 @pytest.mark.parametrize(("drift", "suspected"), [(0.02, False), (-0.02, False), (0.06, True)])
 def test_vehicle_that_differs_by_no_more_than_sound_ones_do_has_no_hardware_fault(
     drift: float, suspected: bool
@@ -409,6 +434,14 @@ def test_load_is_estimated_from_the_fleet_or_taken_as_declared() -> None:
     assert declared.expected_a == pytest.approx(3.0)
     assert not declared.notices
     assert not estimate_vehicles(summaries, declared).corrected.any()
+
+
+def test_declared_load_that_the_currents_of_most_vehicles_deny_corrects_nothing() -> None:
+    summaries = drives("drift")
+    learnt = learned(summaries, load=UnmeasuredLoad(mean_a=4.0, sd_a=0.3))
+    assert any("as if without a load, and one of 4 A is declared" in text for text in learnt.notices)
+    assert not estimate_vehicles(summaries, learnt).corrected.any()
+    assert estimate_vehicles(summaries, learned(summaries)).corrected.any()
 
 
 def test_expected_share_of_faulty_vehicles_and_known_prior_replace_learnt_ones() -> None:

@@ -110,18 +110,25 @@ def test_charge_balance_determines_an_offset(missing: float, gain: float) -> Non
     assert row.offset_sd_a < 0.5
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-def test_charge_of_the_wrong_sign_is_noticed_by_the_junction_sum(sign: int) -> None:
-    frame = recording(offset_a=(3.0, 0.0, 0.0)).add([10.0, -10.0, 0.0])
-    true_ah = float((frame["battery"] - 3.0).mean()) * SECONDS / 3600.0
-    calibrator = JunctionCalibrator(trusted=["motor"], charge_ah={"battery": (sign * true_ah, 0.01)}).fit(
-        frame, JUNCTION
-    )
-    noticed = [
-        text for text in calibrator.notices_ if "makes the junction sum worse; check the values and signs" in text
-    ]
-    assert len(noticed) == (sign < 0)
-    assert all("; vehicle: RMS 3.0" in text for text in noticed)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_offset_reading_of_the_wrong_sign_is_noticed_by_the_junction_sum(sign: float) -> None:
+    read = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "offset_a": [6.0 * sign], "offset_sd_a": [0.1]})
+    calibrator = JunctionCalibrator(trusted=["motor"], readings=read).fit(recording(offset_a=(6.0, 0.0, 0.0)), JUNCTION)
+    noticed = [text for text in calibrator.notices_ if "makes the junction sum worse; check the values and" in text]
+    assert len(noticed) == (sign < 0.0)
+    assert all("; vehicle: RMS 6.0" in text for text in noticed)
+
+
+@pytest.mark.parametrize("factor", [1.0, -1.0, 0.36, 0.0])
+def test_charge_that_only_a_second_opposite_offset_could_explain_corrects_nothing(factor: float) -> None:
+    """A slip of the sign, kWh for Ah, or none at all."""
+    frame = recording(offset_a=(5.0, 0.0, 0.0)).add([30.0, -30.0, 0.0])
+    true_ah = float((frame["battery"] - 5.0).mean()) * SECONDS / 3600.0
+    known = {"trusted": ["motor"], "load": (0.0, 0.1), "charge_ah": {"battery": (factor * true_ah, 0.01)}}
+    calibrator = JunctionCalibrator(**known).fit(frame, JUNCTION)
+    noticed = [text for text in calibrator.notices_ if "check value and sign of charge_ah" in text]
+    assert len(noticed) == (factor != 1.0)
+    assert calibrator.parameters_["corrected"].any() == (factor == 1.0)
 
 
 def test_several_junctions_are_calibrated_independently() -> None:
