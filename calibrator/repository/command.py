@@ -209,14 +209,14 @@ def publish(folder: FolderArgument, key: KeysOption, json: JsonOption = False) -
 
 @repository.command("status", epilog=example("calibrator repository status repo"))
 def status(folder: FolderArgument, json: JsonOption = False) -> None:
-    """Show until when vehicles take what is published, and what is staged and lacks signatures."""
+    """Show until when vehicles take what is published, what is staged, and whose signatures are missing."""
     from calibrator.repository.repository import missing_text
 
     found = _open(folder)
     staged, until = list(found.sign([])), found.valid_until
     words = [f"valid until {until:%Y-%m-%d}" if until else "nothing is published yet"]
-    words += [f"{counted(len(staged), 'role')} staged" + (f": {missing_text(found.waiting)}" if found.waiting else "")]
-    facts = {"valid_until": until, "staged": staged, "waiting": found.waiting}
+    words += [f"{counted(len(staged), 'role')} staged" + (f": {missing_text(found.missing)}" if staged else "")]
+    facts = {"valid_until": until, "staged": staged, "waiting": found.missing}
     _tell(facts, f"{folder}: {'; '.join(words)}", json=json)
 
 

@@ -345,6 +345,14 @@ class Repository:
                     self.waiting[role] = _lacking(len(found.signed), found.threshold, found.unsigned)
             yield role
 
+    @property
+    def missing(self) -> dict[str, str]:
+        """Signatures that what is staged still needs to be published, by role; call :meth:`sign` before.
+
+        Snapshot and timestamp are among them, as they are signed only when everything else is.
+        """
+        return self.waiting | _missing_online(self._latest("root"), []) if self._staged_versions else {}
+
     def publish(self, signers: Sequence[Signer]) -> None:
         """Publish what is staged; if some of it still lacks signatures, publish only a new snapshot and timestamp.
 
@@ -359,12 +367,7 @@ class Repository:
             If some of these keys are missing, or nothing can be published yet; vehicles then see what they saw before.
         """
         root = self._live("root") if self.waiting else self._latest("root")
-        missing = dict(self.waiting)
-        for role in ("snapshot", "timestamp"):
-            wanted = (root or self._latest("root")).roles[role]
-            given = {signer.public_key.keyid for signer in signers} & set(wanted.keyids)
-            if len(given) < wanted.threshold:
-                missing[role] = _lacking(len(given), wanted.threshold, set(wanted.keyids) - given)
+        missing = self.waiting | _missing_online(root or self._latest("root"), signers)
         if root is None or not missing.keys() <= self.waiting.keys():
             raise RepositoryStateError(
                 f"{self._folder}: not published: {missing_text(missing)}; publish again with --key of those who have "
@@ -441,6 +444,17 @@ def missing_text(missing: Mapping[str, str]) -> str:
     """Join what roles lack, ``{"root": "1 of 2 signatures ..."}``, into one text that names three roles at most."""
     words = [f"{role} has {what}" for role, what in [*missing.items()][:_SHOWN]]
     return "; ".join(words) + (f"; and {len(missing) - _SHOWN} roles more" if len(missing) > _SHOWN else "")
+
+
+def _missing_online(root: Root, signers: Sequence[Signer]) -> dict[str, str]:
+    """Return which signatures snapshot and timestamp would lack if only `signers` signed them."""
+    missing = {}
+    for role in ("snapshot", "timestamp"):
+        wanted = root.roles[role]
+        given = {signer.public_key.keyid for signer in signers} & set(wanted.keyids)
+        if len(given) < wanted.threshold:
+            missing[role] = _lacking(len(given), wanted.threshold, set(wanted.keyids) - given)
+    return missing
 
 
 def _lacking(signed: int, threshold: int, others: Iterable[str]) -> str:

@@ -43,7 +43,11 @@ def test_several_signers_can_sign_one_after_another(repo: Repo, new: Path, other
     lacking = f"not published: {repo.bin} has 1 of 2 signatures, not of {keyid(repo, 't2')}; snapshot has 0 of 1"
     failed(repo, lacking, "publish", repo.path, *keys(repo, "t1"))
     assert repo.updated(new).startswith("nothing new: "), "vehicles see nothing of it yet"
-    failed(repo, "not published: snapshot has 0 of 1 signatures", "publish", repo.path, *keys(repo, "t2"))
+    lacking = "; ".join(
+        f"{role} has 0 of 1 signatures, not of {keyid(repo, role)}" for role in ("snapshot", "timestamp")
+    )
+    failed(repo, f"not published: {lacking}; publish again", "publish", repo.path, *keys(repo, "t2"))
+    assert f"; 1 role staged: {lacking}\n" in repo.done("status", repo.path)
     repo.publish("snapshot", "timestamp")
     assert repo.updated(new).startswith("on trial: parameter set 301")
 
