@@ -219,12 +219,18 @@ def _verified_offer(state: VehicleState, source: str, now: datetime) -> _Offer:
                 (work / f"{role}.json").write_text(text)
         try:
             updater = Updater(name, "metadata", None, "targets", fetcher, _CONFIG, bootstrap=state.root.encode())
-            info = updater.get_targetinfo(target)
+            try:
+                info = updater.get_targetinfo(target)
+            except exceptions.RepositoryError as error:  # of a bin that was never published TUF tells only by its text
+                if "delegated but is not part of snapshot" not in str(error):
+                    raise
+                info = None
             for path in work.glob("*.json"):
                 _require_fresh(path, source, now)
             if info is None:
                 raise TrustError(
-                    Reason.NO_PARAMETERS, f"{source}: the repository has no parameters for vehicle {state.vehicle!r}"
+                    Reason.NO_PARAMETERS,
+                    f"{source}: nothing is published for vehicle {state.vehicle!r} yet; add and publish its parameters",
                 )
             if info.length > MAX_FILE_BYTES or set(info.hashes) != {"sha256"}:
                 raise TrustError(Reason.MALFORMED_PARAMETERS, f"{source}: {target} is no parameter file")

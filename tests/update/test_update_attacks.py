@@ -127,10 +127,13 @@ def test_bundle_or_repository_without_this_vehicle_is_refused(repo: Repo, new: P
     words = "is not in the bundle, which has v2.json; is it complete, and for vehicle 'v1', which this is?"
     repo.refused(new, words, repo.bundle("v2"))
     repo.provision(tmp_path / "v9", "v9")
-    repo.refused(tmp_path / "v9", "part of snapshot")
+    repo.refused(tmp_path / "v9", "nothing is published for vehicle 'v9' yet")
+    assert '"NoParameters"' in (tmp_path / "v9" / "decisions.log").read_text()
     repo.forge(repo.bin, lambda targets: targets.targets.clear(), "t1", "t2")
     repo.relist(repo.bin, "snapshot", "timestamp")
-    repo.refused(new, "the repository has no parameters for vehicle 'v1'")
+    repo.refused(new, "nothing is published for vehicle 'v1' yet")
+    repo.live(repo.bin).unlink()
+    repo.refused(new, f"{repo.bin}.json is not in the folder; is it complete")
 
 
 def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, new: Path) -> None:
