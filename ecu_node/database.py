@@ -179,7 +179,8 @@ def node_database(path: Path) -> VehicleDatabase:
     Raises
     ------
     LayoutError
-        If the layout cannot be read, is one for tables or for several buses, or has a branch that no signal carries.
+        If the layout cannot be read, is one for tables or for several buses, or has a branch that no integer signal
+        carries.
     DatabaseError
         If the DBC cannot be read, or lacks what the layout names.
     """
@@ -193,7 +194,14 @@ def node_database(path: Path) -> VehicleDatabase:
             f"{path}: branch {computed[0]} is computed by a formula; the node corrects only what a signal carries: "
             f"leave the branch out of the node's layout"
         )
-    return read_database(layout)
+    database = read_database(layout)
+    for branch in layout.branch:
+        if database.signal(branch.source)[1].is_float:
+            raise LayoutError(
+                f"{path}: branch {branch.name}: {branch.source} is a floating-point number in the DBC; the node "
+                f"corrects integer signals only: leave the branch out of the node's layout"
+            )
+    return database
 
 
 def _load(layout: Layout, file: str) -> tuple[Database, str]:

@@ -383,10 +383,12 @@ def test_damaged_database_is_refused_with_one_line(tmp_path: Path, layout: Path,
     (of_buses("pt", "aux"), "names several buses; the node corrects the signals of one bus"),
     (of_buses(), "has no 'dbc', so that it fits tables only"),
     (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
+    (LAYOUT.replace("car.dbc", "float.dbc"), "branch battery: Pack.Current is a floating-point number"),
 ])  # fmt: skip
-def test_node_refuses_layouts_of_several_or_no_dbc_or_with_a_computed_branch(
+def test_node_refuses_layouts_of_several_or_no_dbc_or_with_a_computed_or_floating_point_branch(
     layout: Path, text: str, words: str
 ) -> None:
+    layout.with_name("float.dbc").write_text(f"{DBC}SIG_VALTYPE_ 256 Current : 1;\n")
     layout.write_text(text)
     with pytest.raises(LayoutError, match=words):
         node_database(layout)
