@@ -64,7 +64,7 @@ def absent(facts: Facts) -> Findings:
             say, advice = warning, f"{where}; if the vehicle does not have it, it may stay in the layout"
         elif row.needed:
             say, advice = warning, f"{where}, or name other inputs: without it what is derived from it is left out"
-        yield say("not in log", row.name, f"no {what} {row.signal} in the logs", advice)
+        yield say("not in log", row.name, f"no {what} {row.signal} in the logs", row.elsewhere or advice)
     some = facts.channels.is_branch & facts.channels.in_logs.between(1, len(facts.drives) - 1)
     for row in facts.channels[some].itertuples():
         text = f"{row.in_logs} of {len(facts.drives)} logs have it; the others are not in the sum"

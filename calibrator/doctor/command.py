@@ -93,7 +93,7 @@ def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[st
     `steps`, from :func:`.readiness`, maps each command to why it is not ready, or to an empty text if it is ready.
     """
     sum_a, channels = facts.junction.sum_a, facts.channels
-    rows = channels.drop(columns=["is_branch", "needed", "good"]).set_index("name", drop=False)
+    rows = channels.drop(columns=["is_branch", "needed", "good", "elsewhere"]).set_index("name", drop=False)
     total = None
     if len(sum_a):
         instants = sum(len(comparison.valid) for comparison in facts.junction.comparisons)

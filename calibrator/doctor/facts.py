@@ -14,7 +14,7 @@ from calibrator.errors import LogError
 from calibrator.kirchhoff.junction import RecordedJunction, look_at_junction
 from calibrator.kirchhoff.sums import with_voltages
 from calibrator.recordings.decode import bit_range, signal_range
-from calibrator.recordings.readers import RecordingReport, SignalSource, open_recording
+from calibrator.recordings.readers import FrameSource, RecordingReport, SignalSource, open_recording, other_address
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import Branch, Input, Layout
 from ecu_node.summary import TIME_RESOLUTION_S
@@ -71,6 +71,7 @@ class Facts:
         - ``name``; ``signal``, column or formula; ``unit`` of ``low`` and ``high``; whether it ``is_branch``, and
           whether it is an input that is ``needed`` for the model;
         - ``frames``: frames, or rows of a table, that carry it; ``in_logs``: how many of all ``logs`` have any;
+          ``elsewhere``: what :func:`.other_address` says if none has;
         - ``period_s``, ``jitter_s``, ``gap_s``: median distance of frames, the 95th percentile of how far distances are
           from it, and the longest distance; NaN with fewer than two frames [s]; ``late``: number of distances longer
           than its time-out;
@@ -152,6 +153,9 @@ def _channel(
     value, step_s = np.concatenate(values), np.concatenate(steps)
     bad["no voltage"] = sum(frames) - sum(bad.values()) - len(value)
     period_s = float(np.median(step_s)) if len(step_s) else np.nan
+    is_absent = not any(frames) and not (branch and branch.computed)
+    sources = [log.source for log in logs if is_absent and isinstance(log.source, FrameSource)]
+    elsewhere = (other_address(source.frames, database.signal(signal)[0], database) for source in sources)
     return {
         "name": item.name,
         "is_branch": branch is not None,
@@ -161,6 +165,7 @@ def _channel(
         "frames": sum(frames),
         "in_logs": sum(count > 0 for count in frames),
         "logs": len(logs),
+        "elsewhere": next(filter(None, elsewhere), ""),
         "period_s": period_s,
         "jitter_s": float(np.quantile(np.abs(step_s - period_s), 0.95)) if len(step_s) else np.nan,
         "gap_s": float(step_s.max()) if len(step_s) else np.nan,

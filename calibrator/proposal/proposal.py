@@ -20,9 +20,10 @@ from calibrator.proposal.branches import (
     find_signs,
     judge_all,
 )
-from calibrator.proposal.candidates import Candidate, of_database, of_table, with_log, with_table
+from calibrator.proposal.candidates import FLOWS, Candidate, of_database, of_table, with_log, with_table
 from calibrator.proposal.inputs import FOR_FLEETS, computed_motor, derive, find_inputs
 from calibrator.recordings.log_formats import is_table, read_frames
+from calibrator.recordings.readers import other_address
 from calibrator.recordings.tables import bare_name, layout_from_branches, likely_full_scale_a, read_table
 from calibrator.words import places_of, words_of
 from ecu_node.database import read_database
@@ -75,6 +76,9 @@ class Proposal:
         Signals or columns from which branches and inputs are chosen: everything, or what the log has of it.
     voltage : Candidate or None
         Voltage by which powers are divided.
+    elsewhere : str
+        What :func:`.other_address` says of the first message with a current, power or voltage that comes from another
+        address; empty if none does.
     """
 
     name: str
@@ -84,6 +88,7 @@ class Proposal:
     everything: tuple[Candidate, ...]
     found: tuple[Candidate, ...]
     voltage: Candidate | None
+    elsewhere: str = ""
 
     @property
     def branches(self) -> list[Candidate]:
@@ -114,7 +119,8 @@ class Proposal:
         """Say why the branches that were guessed make no plausible layout; empty if they do."""
         battery = self.battery
         if battery is None:
-            return "no pack current found: no candidate is the current or power of a high-voltage battery"
+            what = "no pack current found: no candidate is the current or power of a high-voltage battery"
+            return f"{what}; {self.elsewhere}" if self.elsewhere else what
         if not any(item.place in {"motor", "charger"} for item in self.branches):
             wrong = "; it is signed, and unsigned in the database" if battery.wrong == "sign" else ""
             others = f"no current or power of a motor or charger was found, nor torque and speed of a motor{wrong}"
@@ -155,7 +161,7 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
     ProposalError
         If a log is given beside a table.
     """
-    database = None if is_table(source) else source
+    database, elsewhere = None if is_table(source) else source, ""
     if database is None:
         if log is not None:
             raise ProposalError(f"{source}: a table, which needs no --log; leave --log {log} out")
@@ -166,13 +172,18 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
             raise DatabaseError(f"{source}: no such file; a database (DBC, KCD, SYM, ARXML) or a table is expected")
         dbc, path = str(source.absolute()), Path("the layout")
         bare = Layout(schema=1, name=name, dbc=dbc, full_scale_a=1.0, branch=[], path=path, digest="")
-        everything = found = of_database(read_database(bare).databases[""])
+        vehicle = read_database(bare)
+        everything = found = of_database(vehicle.databases[""])
         if log is not None:
-            by_table = is_table(log)
-            found = with_table(everything, read_table(log)) if by_table else with_log(everything, read_frames(log))
+            frames = None if is_table(log) else read_frames(log)
+            found = with_table(everything, read_table(log)) if frames is None else with_log(everything, frames)
+            if frames is not None:
+                flows = [item.message for item in everything if item.message and item.quantity in FLOWS]
+                elsewhere = next(filter(None, (other_address(frames, flow, vehicle) for flow in flows)), "")
             if not found:
-                what = "columns" if by_table else "identifiers"
-                raise LogError(f"{log}: none of its {what} is in {source}; check that both belong to the same vehicle")
+                what = "columns" if frames is None else "identifiers"
+                advice = elsewhere or "check that both belong to the same vehicle"
+                raise LogError(f"{log}: none of its {what} is in {source}; {advice}")
     items = judge_all(found, everything)
     battery = next((item for item in items if item.place == "battery" and item.branch), None)
     voltage = find_inputs(found, battery=battery, roles=["voltage"]).get("voltage")
@@ -194,6 +205,7 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
         everything=tuple(everything),
         found=tuple(found),
         voltage=voltage,
+        elsewhere=elsewhere,
     )
 
 

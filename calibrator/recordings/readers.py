@@ -43,6 +43,7 @@ __all__ = [
     "SignalSource",
     "TableSource",
     "open_recording",
+    "other_address",
     "read_recording",
 ]
 
@@ -448,6 +449,20 @@ def _held(channel: Channel, time_s: Array, max_age_s: float) -> tuple[Array, Mas
         return np.zeros(len(time_s)), np.zeros(len(time_s), np.bool_)
     found = np.maximum(latest, 0)
     return known[found], (latest >= 0) & (time_s - known_s[found] <= max_age_s)
+
+
+def other_address(frames: Frames, message: Message, database: VehicleDatabase) -> str:
+    """Say which identifiers differ from that of a message in the last byte alone, which is J1939's source address.
+
+    Empty if the message itself is there, if its identifier has 11 bits, or if the DBC knows all such identifiers.
+    """
+    key, known = _key(message), {_key(each) for bus in database.databases.values() for each in bus.messages}
+    alike = set(np.unique(frames.key[frames.key >> 8 == key >> 8]).tolist())
+    if not alike - known or key in alike or not message.is_extended_frame:
+        return ""
+    others = ", ".join(map(_hex, sorted(alike - known)))
+    what = f"the log has {others}: if that is {message.name} ({_hex(key)}) from another source address (J1939)"
+    return f"{what}, change the identifier in the DBC"
 
 
 def _key(message: Message) -> int:

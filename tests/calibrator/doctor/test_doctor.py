@@ -319,6 +319,16 @@ def test_branch_missing_in_some_logs_gives_a_warning(log: Path, layout: Path, tm
     assert lacks.text.startswith("1 of 2 logs have it; the others are not in the sum")
 
 
+def test_branch_from_another_j1939_source_address_is_named(log: Path, layout: Path, tmp_path: Path) -> None:
+    dbc = layout.with_name("hv_powertrain.dbc")
+    dbc.write_text(dbc.read_text().replace(f" {0x120} ", f" {0x98FF51FE} "))
+    (tmp_path / "j1939.log").write_text(log.read_text().replace(" 120#", " 18FF5127#"))
+    (lacks,) = [
+        item for item in examined(layout, tmp_path / "j1939.log").findings("not in log") if item.subject == "motor"
+    ]
+    assert lacks.advice.startswith("the log has 0x18FF5127: if that is ")
+
+
 # ---- doctor, kirchhoff and calibrate say the same
 
 

@@ -232,6 +232,18 @@ def test_log_that_contradicts_the_database_is_refused_with_the_reason(
     assert (run.returncode, said in run.stderr) == (1, True), run.stderr
 
 
+@pytest.mark.parametrize(("others", "said"), [((INVERTER,), "no pack current found"), ((), "none of its identifiers")])
+def test_pack_current_from_another_j1939_source_address_is_named(
+    others: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    dbc = database_file(tmp_path, PACK.replace("BO_ 1 ", f"BO_ {0x98FF5127} "), *others)
+    log = log_file(dbc, DRIVING)
+    database_file(tmp_path, PACK.replace("BO_ 1 ", f"BO_ {0x98FF51FE} "), *others)
+    last = calibrator("layout", "init", dbc, "--log", log).stderr.splitlines()[-1]
+    assert said in last
+    assert "the log has 0x18FF5127: if that is PackStatus (0x18FF51FE) from another source address" in last
+
+
 def test_wrong_range_in_the_dbc_is_found_by_the_log(tmp_path: Path) -> None:
     pack = PACK.replace("16@1- (0.1,0) [-1000|1000]", "16@1+ (0.1,-819.2) [0|819]")
     dbc = database_file(tmp_path, pack, INVERTER)
