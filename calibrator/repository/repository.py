@@ -37,6 +37,7 @@ from tuf.api.serialization.json import JSONSerializer
 
 from calibrator.errors import RepositoryStateError
 from calibrator.files.folders import write_files
+from calibrator.terminal.text import counted
 from ecu_node.core.status import UnfitError
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import check_fit, decode_parameters, parameter_bytes
@@ -55,8 +56,8 @@ _DAYS = {"root": 730, "targets": 730, "bins": 400, "snapshot": 60, "timestamp": 
 _RENEW_DAYS = 60
 """Root, targets and bins that expire within this time are staged anew, to be signed again. [d]"""
 
-_SHOWN = 3
-"""Most roles that a message names. [1]"""
+_SHOWN = 4
+"""Most roles that a message names: all of a new repository. [1]"""
 
 _KINDS: Mapping[str, type[Signed]] = {"root": Root, "snapshot": Snapshot, "timestamp": Timestamp}
 """Class of the metadata of each role; for all other roles it is :class:`Targets`."""
@@ -441,9 +442,9 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def missing_text(missing: Mapping[str, str]) -> str:
-    """Join what roles lack, ``{"root": "1 of 2 signatures ..."}``, into one text that names three roles at most."""
+    """Join what roles lack, ``{"root": "1 of 2 signatures ..."}``, into one text that names four roles at most."""
     words = [f"{role} has {what}" for role, what in [*missing.items()][:_SHOWN]]
-    return "; ".join(words) + (f"; and {len(missing) - _SHOWN} roles more" if len(missing) > _SHOWN else "")
+    return "; ".join(words) + (f"; and {counted(len(missing) - _SHOWN, 'more role')}" if len(missing) > _SHOWN else "")
 
 
 def _missing_online(root: Root, signers: Sequence[Signer]) -> dict[str, str]:

@@ -64,12 +64,14 @@ def test_staged_unsigned_roles_do_not_block_a_new_timestamp(repo: Repo, state: P
     """Otherwise a signer who is away for 30 days would stop the updates of the whole fleet."""
     repo.updated(state)
     repo.add(other)
+    repo.add(other, vehicle="v3")
+    repo.add(other, vehicle="v4")
     repo.done("rotate", repo.path, "timestamp", "--public", repo.folder / "keys" / "new.pub")
     assert "the timestamp is new" in repo.done("publish", repo.path, *keys(repo, "snapshot", "timestamp"))
     assert repo.updated(state).startswith("nothing new: ")
     assert "timestamp 2, snapshot 2" in repo.node("inspect", "--state", state)[1]
-    assert "2 roles staged: " in repo.done("status", repo.path)
-    assert "2 staged roles dropped" in repo.done("unstage", repo.path)
+    assert "; and 2 more roles\n" in repo.done("status", repo.path)
+    assert "4 staged roles dropped" in repo.done("unstage", repo.path)
     assert "; 0 roles staged" in repo.done("status", repo.path)
     repo.publish()
     assert repo.updated(state).startswith("nothing new: ")
