@@ -51,6 +51,8 @@ _DELIMITERS = ("\t", ";", "|", ",", " ")
 _EMPTY = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "null", "none"))
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_THOUSANDS = r"[-+]?[1-9]\d{{0,2}}({0}\d{{3}})+"
+"""A whole number with separators of thousands, to be formatted with the separator."""
 _UNIT_BEHIND = re.compile(r"(.*\S)\s*[\[({<]([^\])}>]*)[\])}>]")
 _UNIT_SUFFIX = re.compile(r"(.*\w)\s*[_/, ]\s*(\w+)")
 _SUFFIXES = frozenset(["mA", "A", "kA", "mV", "V", "kV", "W", "kW", "ms", "us", "ns", "s"])
@@ -499,8 +501,14 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
         units, header = header, rows[above[-2]]
     names = _distinct([*header, *[""] * (width - len(header))])
     body = [cell for row in rows[first:] for cell in row]
-    commas = sum(_DECIMAL_COMMA.fullmatch(cell) is not None for cell in body)
-    decimal = "," if commas > sum("." in cell and _NUMBER.fullmatch(cell) is not None for cell in body) else "."
+    commas = [cell for cell in body if _DECIMAL_COMMA.fullmatch(cell)]
+    points = [cell for cell in body if "." in cell and _NUMBER.fullmatch(cell)]
+    if all(re.fullmatch(_THOUSANDS.format(","), cell) for cell in commas):
+        decimal = "."
+    elif len(commas) > len(points) or all(re.fullmatch(_THOUSANDS.format(r"\."), cell) for cell in points):
+        decimal = ","
+    else:
+        decimal = "."
     with io.TextIOWrapper(open_log(path), encoding=encoding, errors="replace", newline="") as file:
         separator = r"\s+" if delimiter == " " else delimiter
         frame, left_out = read_rows(
@@ -509,24 +517,39 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
     frame.attrs["left out"] = left_out
     frame = frame.drop(columns=[name for name in names if name not in header and frame[name].isna().all()])
     frame.attrs["line"] = first + 1
-    for name in frame.select_dtypes(exclude="number"):
-        frame[name] = _without_thousands(frame[name], decimal)
+    texts = _without_thousands(path, frame.select_dtypes(exclude="number"), decimal)
     if decimal == ",":  # pandas leaves the comma in columns that hold a text somewhere
-        texts = frame.select_dtypes(exclude="number")
-        frame[texts.columns] = texts.apply(lambda c: c.astype("string").str.replace(r"^([-+\d]*),", r"\1.", regex=True))
+        texts = texts.apply(lambda c: c.astype("string").str.replace(r"^([-+\d]*),", r"\1.", regex=True))
+    frame[texts.columns] = texts
     shown = {"\t": "tabs", " ": "blanks"}.get(delimiter, f"'{delimiter}'")
     about = f"columns between {shown}, decimal '{decimal}', {encoding}; "
     return frame, {name: usual_unit(unit) for name, unit in zip(names, units, strict=False) if unit}, about
 
 
-def _without_thousands(column: "pd.Series[str]", decimal: str) -> "pd.Series[str]":
-    """Remove the thousands separators of a column if any cell has these and a decimal sign, as 1,234.5 or 1.234,5."""
+def _without_thousands(path: Path, texts: pd.DataFrame, decimal: str) -> pd.DataFrame:
+    """Remove separators of thousands, which cells such as 1,234.5 or 1.234,5 prove, or 980 in a column with 1,234.
+
+    Without a proof 1,234 may have three decimals: with a decimal point it stays as it is, so that it is no number; with
+    a decimal comma, where 1.234 would be read as a number, it raises a LogError.
+    """
     comma, point = (",", r"\.") if decimal == "." else (r"\.", ",")
-    text = column.astype("string").str.strip()
-    if not text.str.fullmatch(rf"[-+]?\d{{1,3}}({comma}\d{{3}})+{point}\d*").any():
-        return column
-    grouped = text.str.fullmatch(rf"[-+]?\d{{1,3}}({comma}\d{{3}})+({point}\d*)?").fillna(value=False)
-    return text.mask(grouped, text.str.replace(comma, "", regex=True))
+    whole, separated, proved = _THOUSANDS.format(comma), dict[str, "pd.Series[str]"](), False
+    for name in texts:
+        text = texts[name].astype("string").str.strip()
+        is_whole = text.str.fullmatch(whole).fillna(value=False)
+        has_both = text.str.fullmatch(rf"{whole}{point}\d*").fillna(value=False)
+        if has_both.any() or (is_whole.any() and not (text.str.contains(comma) & ~is_whole).any()):
+            separated[name] = text.where(is_whole | has_both)
+            proved |= bool(has_both.any() or text.str.fullmatch(r"[-+]?[1-9]\d{0,2}").any())
+    if separated and not proved and decimal == ",":
+        name, text = next(iter(separated.items()))
+        cell = text.dropna().iloc[0]
+        raise LogError(
+            f"{path}: column {name!r}: {cell!r} may be {cell.replace('.', '')} or {cell.replace('.', ',')}; write it "
+            f"without separators of thousands, or with a decimal comma"
+        )
+    plain = {name: text.str.replace(comma, "", regex=True) for name, text in separated.items() if proved}
+    return texts.assign(**{name: text.fillna(texts[name].astype("string")) for name, text in plain.items()})
 
 
 def _cells(path: Path, head: str) -> tuple[str, list[list[str]]]:

@@ -61,6 +61,15 @@ def thousands(form: str) -> pd.DataFrame:
     return frame(**{"Ibat [mA]": 1e3 * BATTERY_A}).drop(columns="Ibat [A]").map(form.format)
 
 
+def whole_thousands(comma: str) -> pd.DataFrame:
+    """Whole numbers of mA with separators of thousands, beside times with the other sign before their decimals."""
+    table = pd.DataFrame(
+        {f"I{name} [mA]": 1e3 * k * BATTERY_A for name, k in (("bat", 1), ("mot", 0.9), ("heat", 0.08))}
+    )
+    table = table.map(lambda x: f"{x:,.0f}".replace(",", comma))
+    return table.assign(time=[f"{x:.1f}".replace(".", "," if comma == "." else ".") for x in TIME_S])
+
+
 HEAD = "# exported by X\nvehicle;7\n\ntime;Ibat;Imot;Iheat\ns;A;A;A\n"
 BODY = frame().to_csv(None, index=False, header=False, sep=";")
 UNITS = {"Ibat [A]": "Ibat", "Imot (A)": "Imot", "Iheat_A": "Iheat"}
@@ -73,6 +82,8 @@ TABLES: dict[str, tuple[str, Callable[[Path], object]]] = {
     "thousands": ("x.csv", csv(thousands("{:,.3f}"), sep=";")),
     "German thousands": ("x.csv", csv(thousands("{:,.3f}").map(lambda x: x.translate({44: ".", 46: ","})), sep=";")),
     "quoted thousands": ("x.csv", csv(thousands("{:,.3f}"), quoting=1)),
+    "whole thousands": ("x.csv", csv(whole_thousands(","), sep=";")),
+    "German whole thousands": ("x.csv", csv(whole_thousands("."), sep=";")),
     "BOM": ("x.csv", csv(frame(), encoding="utf-8-sig")),
     "archive": ("x.zip", zipped),
     "gzip": ("x.csv.gz", csv(frame())),
@@ -265,6 +276,8 @@ def test_branch_of_a_table_is_a_column_or_a_quotient_of_columns(tmp_path: Path, 
         ("a,b\n3,1\n2,2\n3,1\n", "a,b", "x.csv: no column is the time: none has it in its name and increases"),
         ("time,a\n0,1x\n1,2y\n", "a,b", "x.csv: no column of numbers beside the time"),
         ("time,Ibat,Imot\n0,1 A,2\n1,2 A,3\n", "Ibat,Imot", "column 'Ibat': its cells are no numbers, such as '1 A' i"),
+        ("time;I;J\n0.1;20,930;2\n0.2;-22,360;3\n", "I,J", "column 'I': its cells are no numbers, such as '20,930' in"),
+        ("time;I;J\n0,1;1.234;2\n0,2;2.345;3\n", "I,J", "x.csv: column 'I': '1.234' may be 1234 or 1,234; write it wi"),
         ("time,I [A],I (mA)\n0,1,2\n1,2,3\n", "I,Imot", "'I' stands for 'I [A]', 'I (mA)'; write it in full"),
         ("time,I [V],J\n0,1,2\n1,2,3\n", "I,J", "branch I: I is in 'V'; expected A, mA, kA"),
         ("time,I,J\n0,True,2\n1,False,3\n", "I,J", "branch I: I is in 'on/off'; expected A, mA, kA"),
