@@ -125,7 +125,7 @@ def text_head(path: Path) -> tuple[str, str]:
     except UnicodeDecodeError:
         encoding = "cp1252"
         text = head.decode(encoding, errors="replace")
-    return (text.rpartition("\n")[0] if len(head) == _HEAD_BYTES else text), encoding
+    return (text[: max(text.rfind("\n"), text.rfind("\r"), 0)] if len(head) == _HEAD_BYTES else text), encoding
 
 
 def read_rows(file: BinaryIO | TextIO, **options: Any) -> tuple[pd.DataFrame, int]:

@@ -71,8 +71,7 @@ class RecordingReport:
     found : str
         What was detected about a table, ``found`` of :class:`.Table`; empty for logs.
     unfit : tuple of str
-        Two texts: what the recording lacks (the channel of a ``[[bus]]``, or numbers in the column of a branch), and
-        what to do about it. Empty if it lacks neither.
+        Two texts: that the log lacks the channel of a ``[[bus]]``, and what to do about it. Empty if it does not.
     """
 
     channels: Collection[tuple[str, Channel]]
@@ -407,8 +406,14 @@ class TableSource(SignalSource):
         expected = ", ".join(repr(branch.source) for branch in self.database.layout.branch)
         return f"{self.table.known(self.database.layout.branch[0].source)}; expected {expected}"
 
+    def recording(self, vehicle: str, name: str) -> Recording:  # noqa: D102 (as above)
+        for branch in self.database.layout.branch:
+            for column in filter(None, (branch.signal, branch.power, branch.voltage)):
+                if complaint := self.table.no_numbers(column):
+                    raise LogError(f"{self.where}: {complaint[0]}", complaint[1])
+        return super().recording(vehicle, name)
+
     def report(self, channels: Collection[tuple[str, Channel]]) -> RecordingReport:  # noqa: D102 (as above)
-        names = [item.source for item in self.database.layout.branch if not item.computed]
         return RecordingReport(
             channels=channels,
             frames=len(self.table.time_s),
@@ -416,7 +421,6 @@ class TableSource(SignalSource):
             disordered=self.table.disordered,
             clock_steps=self.table.clock_steps,
             found=self.table.found,
-            unfit=next(filter(None, map(self.table.no_numbers, names)), ()),
         )
 
     def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:

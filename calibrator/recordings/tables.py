@@ -51,8 +51,14 @@ _DELIMITERS = ("\t", ";", "|", ",", " ")
 _EMPTY = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "null", "none"))
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_SIGNS = {"\N{MINUS SIGN}(?=[\\d.,])": "-", "(?<=\\d)['\N{RIGHT SINGLE QUOTATION MARK}](?=\\d{3})": ""}
+"""Patterns in numbers of spreadsheets, and what to read in their place: a typographic minus, Swiss thousands."""
 _THOUSANDS = r"[-+]?[1-9]\d{{0,2}}({0}\d{{3}})+"
 """A whole number with separators of thousands, to be formatted with the separator."""
+_LIKE_NUMBER = r"[-+.,(]?\d[^#]*"
+"""Beginning of a number, and its rest: ``20.9-``, ``(20.9)``, ``20.9 A``; 1.#QNAN is the NaN of some C programs."""
+MOST_UNREAD = 1e-3
+"""Largest share of cells like numbers, beside one, that are left out as damaged; with more a column is not read. [1]"""
 _UNIT_BEHIND = re.compile(r"(.*\S)\s*[\[({<]([^\])}>]*)[\])}>]")
 _UNIT_SUFFIX = re.compile(r"(.*\w)\s*[_/, ]\s*(\w+)")
 _SUFFIXES = frozenset(["mA", "A", "kA", "mV", "V", "kV", "W", "kW", "ms", "us", "ns", "s"])
@@ -102,7 +108,8 @@ class Table:
         Rows in which a column has a text or an infinite number instead of a number; columns without such rows are
         absent.
     texts : dict of str to str
-        For columns without any number, by header: the first cell that is no number and where it stands, for messages.
+        For columns that are not read, as they have no number, or numbers that cannot be read such as ``20.9-``, by
+        header: the first such cell and where it stands, for messages.
     found : str
         What was detected about the file, in words, such as ``decimal ',', utf-8-sig; time 'Zeit' in s``.
     disordered, clock_steps, without_time : int
@@ -330,14 +337,19 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
     columns, bad, texts = {}, {}, {}
     for name in frame.columns.difference(names, sort=False):
         value, is_bad = _numbers(frame[name])
-        if np.isfinite(value).any() or not is_bad.any():
+        bad_rows, numbers = np.flatnonzero(is_bad), int(np.isfinite(value).sum())
+        cells = frame[name].iloc[bad_rows].astype("string").str.strip()
+        unread = bad_rows[cells.str.fullmatch(_LIKE_NUMBER).to_numpy(np.bool_)]
+        most = max(1.0, MOST_UNREAD * (numbers + len(bad_rows)))
+        if not is_bad.any() or (numbers and len(unread) <= most):
             columns[name] = value[rows]
             if is_bad[rows].any():
                 bad[name] = is_bad[rows]
         else:
-            row = int(np.argmax(is_bad))
+            row = int([*unread, *bad_rows][0])
+            which = f"{len(bad_rows):,} of its {len(frame):,} cells" if numbers else "its cells"
             line = f"line {frame.attrs['line'] + row}" if "line" in frame.attrs else f"row {row + 1}"
-            texts[name] = f"its cells are no numbers, such as {str(frame[name].iloc[row])!r} in {line}"
+            texts[name] = f"{which} are no numbers, such as {str(frame[name].iloc[row])!r} in {line}"
     if not columns:
         name = next(iter(frame.columns.difference(names, sort=False)), "")
         shown = f"; '{name}' begins with {str(frame[name].iloc[0])!r}" if name else ""
@@ -487,6 +499,8 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
         raise LogError(f"{path}: binary data under the name of a text; give the file the suffix of its format")
     if not head.strip():
         raise LogError(f"{path}: the file is empty; a header and rows of numbers are expected")
+    for pattern, sign in _SIGNS.items():
+        head = re.sub(pattern, sign, head)
     delimiter, rows = _cells(path, head)
     width = _usual_width(rows)
     first = next((k for k, row in enumerate(rows) if len(row) >= width and _has_values(row)), None)
@@ -517,7 +531,8 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
     frame.attrs["left out"] = left_out
     frame = frame.drop(columns=[name for name in names if name not in header and frame[name].isna().all()])
     frame.attrs["line"] = first + 1
-    texts = _without_thousands(path, frame.select_dtypes(exclude="number"), decimal)
+    texts = frame.select_dtypes(exclude=["number", "bool"]).astype("string").replace(_SIGNS, regex=True)
+    texts = _without_thousands(path, texts, decimal)
     if decimal == ",":  # pandas leaves the comma in columns that hold a text somewhere
         texts = texts.apply(lambda c: c.astype("string").str.replace(r"^([-+\d]*),", r"\1.", regex=True))
     frame[texts.columns] = texts
@@ -578,7 +593,7 @@ def _usual_width(rows: Sequence[Sequence[str]]) -> int:
 def _has_values(cells: Sequence[str]) -> bool:
     """Check whether most cells that are not empty begin like a number or a date."""
     filled = [cell for cell in cells if cell.lower() not in _EMPTY]
-    return 2 * sum(re.match(r"[-+.,]?\d", cell) is not None for cell in filled) > len(filled)
+    return 2 * sum(re.match(r"[-+.,(]?\d", cell) is not None for cell in filled) > len(filled)
 
 
 def _are_units(cells: Sequence[str]) -> bool:

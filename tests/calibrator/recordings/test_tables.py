@@ -57,6 +57,11 @@ def zipped(path: Path) -> None:
         archive.writestr("bench/x.csv", frame().to_csv(index=False))
 
 
+def long() -> pd.DataFrame:
+    """More text than what delimiter and decimal sign are told from."""
+    return pd.concat([frame()] * 40).assign(time=0.1 * np.arange(40 * ROWS))
+
+
 def thousands(form: str) -> pd.DataFrame:
     return frame(**{"Ibat [mA]": 1e3 * BATTERY_A}).drop(columns="Ibat [A]").map(form.format)
 
@@ -84,6 +89,9 @@ TABLES: dict[str, tuple[str, Callable[[Path], object]]] = {
     "quoted thousands": ("x.csv", csv(thousands("{:,.3f}"), quoting=1)),
     "whole thousands": ("x.csv", csv(whole_thousands(","), sep=";")),
     "German whole thousands": ("x.csv", csv(whole_thousands("."), sep=";")),
+    "Swiss thousands": ("x.csv", csv(thousands("{:,.3f}").map(lambda x: x.replace(",", "'")))),
+    "typographic minus": ("x.csv", csv(frame().map(lambda x: str(x).replace("-", "\N{MINUS SIGN}")))),
+    "line ends of an old Mac": ("x.csv", csv(long(), lineterminator="\r")),
     "BOM": ("x.csv", csv(frame(), encoding="utf-8-sig")),
     "archive": ("x.zip", zipped),
     "gzip": ("x.csv.gz", csv(frame())),
@@ -252,8 +260,32 @@ def test_column_that_fits_two_messages_is_refused(tmp_path: Path) -> None:
 def test_branch_column_that_holds_texts_is_named_with_the_first_text(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text(LAYOUT)
     csv(powers().assign(**{"Ibat [A]": [f"{value:.1f} A" for value in BATTERY_A]}))(tmp_path / "x.csv")
-    said = calibrator("kirchhoff", tmp_path / "x.csv", "--layout", tmp_path / "car.toml").stdout
+    said = refused("kirchhoff", tmp_path / "x.csv", "--layout", tmp_path / "car.toml")
     assert "column 'Ibat [A]': its cells are no numbers, such as '0.0 A' in line 2" in said
+
+
+@pytest.mark.parametrize("form", ["{}-", "({})"])
+def test_branch_column_with_some_numbers_that_cannot_be_read_is_named_by_all_commands(
+    tmp_path: Path, form: str
+) -> None:
+    (tmp_path / "car.toml").write_text(LAYOUT)
+    minus = [form.format(f"{-value:.1f}") if value < 0.0 else f"{value:.1f}" for value in BATTERY_A]
+    csv(powers().assign(**{"Ibat [A]": minus}))(tmp_path / "x.csv")
+    table, layout = tmp_path / "x.csv", ("--layout", tmp_path / "car.toml")
+    for command in (
+        ("kirchhoff", table, *layout),
+        ("kirchhoff", table, "--branches", "battery=Ibat,-motor=Imot"),
+        ("doctor", "--log", table, *layout),
+        ("calibrate", table, *layout, "--trusted", "battery", "--out", tmp_path / "result"),
+    ):
+        done = calibrator(*command)
+        assert done.returncode == 1
+        assert "column 'Ibat [A]': 37 of its 100 cells are no numbers, such as '" in done.stdout + done.stderr
+
+
+def test_one_damaged_number_is_left_out(tmp_path: Path) -> None:
+    csv(frame(**{"Ibat [A]": ["1.2.3", *BATTERY_A[1:]]}))(tmp_path / "x.csv")
+    require_sum(before(tmp_path / "x.csv", "--branches", BRANCHES))
 
 
 @pytest.mark.parametrize("heater", ['power = "Pheat", voltage = "Ubat"', 'formula = "1e3 * Pheat / Ubat"'])
