@@ -93,6 +93,7 @@ MISTAKES = [
     ("calibrator kirchhoff drive.csv CURRENTS --plot sum.doc", 2, "sum.doc"),
     ("calibrator kirchhoff drive.csv CURRENTS --table drive.csv", 2, "drive.csv"),
     ("calibrator kirchhoff drive.csv CURRENTS --parameters noise", 2, "--parameters belong to a layout"),
+    ("calibrator kirchhoff other.csv CAR", 1, "there is no column 'Imot'; the columns are 'Iother', 'Ibat'"),
     ("calibrator kirchhoff CAR", 2, "Missing argument 'LOG'"),
     ("calibrator kirchhoff drive.csv --branches sum=Ibat,motor=Imot", 1, "branch 'sum' is called like the sum"),
     ("calibrator layout init none.dbc --log drive.csv --out x", 1, "none.dbc"),
@@ -163,6 +164,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     rows = [f"{0.1 * k:.1f},{10 * math.sin(k / 7):.2f},{10 * math.sin(k / 7):.2f},0.0" for k in range(600)]
     for name, number in {"drive.csv": 600, "short.csv": 30}.items():
         (tmp_path / name).write_text("\n".join(["time_s,Ibat,Imot,Iheat", *rows[:number]]))
+    (tmp_path / "other.csv").write_text("\n".join(["time_s,Ibat,Iother,Iheat", *rows]))
     (tmp_path / "still.csv").write_text("\n".join(["time_s,speed", *(f"{0.1 * k:.1f},0.0" for k in range(600))]))
     branches = "".join(
         f'[[branch]]\nname = "{name}"\nsignal = "{column}"\nsign = {sign}\n'

@@ -56,7 +56,7 @@ def kirchhoff(
         from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
         from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_text, save_table
         from calibrator.recordings.log_formats import is_log, is_table, logs_in
-        from calibrator.recordings.readers import open_recording
+        from calibrator.recordings.readers import TableSource, open_recording
         from calibrator.recordings.tables import layout_from_branches, read_table
         from ecu_node.parameters import check_fit, read_parameters
 
@@ -80,7 +80,11 @@ def kirchhoff(
     found = None if parameters is None else read_parameters(parameters)
     if found is not None:
         check_fit(found, database, None)
-    recording = open_recording(log, database).recording(database.layout.name, log.name.partition(".")[0])
+    source = open_recording(log, database)
+    if isinstance(source, TableSource):
+        for column in source.branch_columns():
+            source.table.column(column)  # a name that the table does not have is an error, not a branch to leave out
+    recording = source.recording(database.layout.name, log.name.partition(".")[0])
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:
         draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {log.name}")

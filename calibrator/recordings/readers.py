@@ -388,9 +388,8 @@ class TableSource(SignalSource):
         super().__init__(database, str(table.path), table.time_s)
         self.table = table
         layout = database.layout
-        names = {name for item in layout.branch for name in (item.signal, item.power, item.voltage) if name is not None}
         owners: dict[str, str] = {}
-        for name in sorted(names | {item.signal for item in layout.input}):
+        for name in sorted({*self.branch_columns(), *(item.signal for item in layout.input)}):
             header = table.header(name)
             if header is not None and owners.setdefault(header, name) != name:
                 raise LogError(
@@ -407,11 +406,15 @@ class TableSource(SignalSource):
         return f"{self.table.known(self.database.layout.branch[0].source)}; expected {expected}"
 
     def recording(self, vehicle: str, name: str) -> Recording:  # noqa: D102 (as above)
-        for branch in self.database.layout.branch:
-            for column in filter(None, (branch.signal, branch.power, branch.voltage)):
-                if complaint := self.table.no_numbers(column):
-                    raise LogError(f"{self.where}: {complaint[0]}", complaint[1])
+        for column in self.branch_columns():
+            if complaint := self.table.no_numbers(column):
+                raise LogError(f"{self.where}: {complaint[0]}", complaint[1])
         return super().recording(vehicle, name)
+
+    def branch_columns(self) -> list[str]:
+        """Return the names of the columns that the branches are read from; formulas name their own."""
+        sources = ((item.signal, item.power, item.voltage) for item in self.database.layout.branch)
+        return [name for names in sources for name in names if name is not None]
 
     def report(self, channels: Collection[tuple[str, Channel]]) -> RecordingReport:  # noqa: D102 (as above)
         return RecordingReport(
