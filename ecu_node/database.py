@@ -215,6 +215,11 @@ def _load(layout: Layout, file: str) -> tuple[Database, str]:
         raise DatabaseError(f"{path}: cannot read the DBC: {error.strerror}; {line}") from None
     except (cantools.Error, ValueError, KeyError, TypeError) as error:
         first_line = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if isinstance(error.__cause__, IndexError):
+            raise DatabaseError(
+                f"{path}: the library cantools cannot read it ({first_line}), as if an attribute (BA_) had a value "
+                f"outside its enumeration (BA_DEF_); open it in a DBC editor, correct that and save it"
+            ) from None
         raise DatabaseError(f"{path}: not a CAN database: {first_line}") from None
     if not isinstance(database, Database):
         raise DatabaseError(f"{path}: a diagnostics database; a CAN database (DBC) is needed")

@@ -75,6 +75,13 @@ def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: st
     assert "\n" not in str(caught.value)
 
 
+BEYOND_ENUM = """
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
+BA_ "VFrameFormat" BO_ 256 14;
+"""
+
+
 @pytest.mark.parametrize(
     ("dbc", "words"),
     [
@@ -83,6 +90,7 @@ def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: st
         (SMALL_DBC.replace('"V" Node', '"A" Node'), "branch heater: signal Voltage is in 'A'; expected V, mV, kV"),
         (SMALL_DBC.replace('"W" Node', '"V" Node'), "branch heater: signal Power is in 'V'; expected W"),
         (SMALL_DBC + "BO_ 258 Old: 2 Node\n", "small.dbc: messages Net and Old have one identifier, 0x102; take out"),
+        (SMALL_DBC + BEYOND_ENUM, r"cannot read it \(DBC: \"list index .*\"\), as if an attribute \(BA_\) had a value"),
         ("this is no dbc", "small.dbc: not a CAN database"),
         ("", "small.dbc: the DBC has no message"),
     ],
