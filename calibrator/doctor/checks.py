@@ -12,6 +12,7 @@ import numpy as np
 from calibrator.doctor.facts import Facts
 from calibrator.drive import Drive, good_values
 from calibrator.drives.align import choose_inputs
+from calibrator.errors import LogError
 from calibrator.estimator.junction_run import summarise_junction
 from calibrator.findings import Finding, Findings, error, hint, warning, worst_first
 from calibrator.kirchhoff.findings import sum_findings, times
@@ -51,6 +52,26 @@ def logs_as_a_whole(facts: Facts) -> Findings:
         notices, unfit = [*map(str, log.report.log_notices())], "; ".join(log.report.unfit)
         for text in notices[1:] if log.report.found else notices:  # how a table was read is no finding
             yield (warning if text == unfit else hint)("log", log.name, text)
+
+
+def counted_twice(facts: Facts) -> Findings:
+    """Report logs with the same recording, as in two formats: with twice the samples, errors look too small."""
+    for k, log in enumerate(facts.logs):
+        if other := next((each.name for each in facts.logs[:k] if _same_recording(each.drive, log.drive)), None):
+            yield warning("twice", log.name, f"the same recording as {other}, counted twice", "leave one of them out")
+
+
+def _same_recording(one: Drive | LogError, other: Drive | LogError) -> bool:
+    """Check whether two drives have the same branches and values; formats round times in different ways."""
+    if isinstance(one, LogError) or isinstance(other, LogError) or one.branches.keys() != other.branches.keys():
+        return False
+    pairs = [(channel, other.branches[name]) for name, channel in one.branches.items()]
+    return all(
+        len(a.time_s) == len(b.time_s)
+        and np.allclose(a.time_s, b.time_s, rtol=0.0, atol=TIME_RESOLUTION_S)
+        and np.array_equal(a.value, b.value, equal_nan=True)
+        for a, b in pairs
+    )
 
 
 def absent(facts: Facts) -> Findings:
@@ -166,7 +187,7 @@ def full_scale(facts: Facts) -> Findings:
 
 
 CHECKS: Sequence[Callable[[Facts], Findings]] = (
-    logs_as_a_whole, absent, late, bad_frames, values, impossible_voltage, full_scale,
+    logs_as_a_whole, counted_twice, absent, late, bad_frames, values, impossible_voltage, full_scale,
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import can
 import numpy as np
 import pandas as pd
 import pytest
@@ -82,6 +83,15 @@ def test_text_of_doctor_names_the_next_commands_and_its_tables_fit_80_columns(lo
     assert f"calibrator calibrate {log} --layout {layout} --trusted battery --out result" in lines[-2]
     assert lines[-1].startswith("5 vehicles or more: calibrator calibrate FOLDER_OF_VEHICLES")
     assert all(len(line) <= 80 for line in lines[1:14]), lines
+
+
+def test_recording_that_is_given_in_two_formats_is_reported(log: Path, layout: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.blf"  # which rounds times in another way
+    with can.CanutilsLogReader(log) as frames, can.BLFWriter(copy) as writer:
+        for frame in frames:
+            writer.on_message_received(frame)
+    said = succeeded("doctor", "--layout", layout, "--log", log, "--log", copy)
+    assert f"warning  {copy}: the same recording as {log}, counted twice; leave one of them out" in said
 
 
 @pytest.mark.parametrize(("declared_a", "reported"), [(2.5, False), (1.5, False), (0.5, True)])
