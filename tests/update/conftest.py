@@ -1,6 +1,5 @@
-"""A repository, a vehicle that trusts it, and their commands in this process."""
+"""A repository, and a vehicle that trusts it."""
 
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,16 +10,8 @@ from msgspec.structs import replace
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.update.signers import PASSPHRASE_VARIABLE
-from tests.calibrator.command_here import calibrator as calibrator_here
-from tests.ecu_node.processes import Done, ecu_node
 from tests.ecu_node.vehicles import parameters_for
-from tests.update.repo import Repo, pass_trial
-
-
-def calibrator(*arguments: object) -> Done:
-    """Run a command of the calibrator in this process."""
-    done = calibrator_here(*(os.fsdecode(item) if isinstance(item, bytes) else item for item in arguments))
-    return Done(done.returncode, done.stdout, done.stderr)
+from tests.update.repo import Repo, drifting, pass_trial
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -38,14 +29,13 @@ def parameters(database: VehicleDatabase) -> VehicleParameters:
 @pytest.fixture(scope="session")
 def other(parameters: VehicleParameters) -> VehicleParameters:
     """Newer parameters of the same vehicle, a small step from the first."""
-    battery = replace(parameters.branches["battery"], drift=0.06)
-    return replace(parameters, number=301, branches={**parameters.branches, "battery": battery})
+    return replace(drifting(parameters, 0.06), number=301)
 
 
 @pytest.fixture(scope="session")
 def offered(tmp_path_factory: pytest.TempPathFactory, parameters: VehicleParameters) -> Repo:
     """A repository that offers parameters for v1 and v2; not to be changed, see :func:`repo`."""
-    made = Repo(tmp_path_factory.mktemp("offered"), calibrator, ecu_node)
+    made = Repo(tmp_path_factory.mktemp("offered"))
     made.create()
     made.add(parameters)
     made.offer(parameters, vehicle="v2")

@@ -18,6 +18,11 @@ def a_pipe(path: Path) -> None:
     os.mkfifo(path)
 
 
+def a_device(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
 def cut(path: Path) -> None:
     os.truncate(path, path.stat().st_size // 2)
 

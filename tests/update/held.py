@@ -1,8 +1,9 @@
 """Parameter sets put into the state of a vehicle without a repository, and the node that uses them."""
 
-from concurrent.futures import Executor
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from msgspec.structs import replace
 
@@ -13,7 +14,7 @@ from ecu_node.update.state import ParameterSet, read_state, write_state
 from ecu_node.update.store import ParameterStore
 from tests.ecu_node.vehicles import AtOnce
 
-NOW, AT_ONCE = datetime.now(UTC), AtOnce()
+NOW = datetime.now(UTC)
 
 
 def held(parameters: VehicleParameters, *, days: int = 365) -> ParameterSet:
@@ -28,11 +29,11 @@ def put_on_trial(vehicle: Path, parameters: VehicleParameters, *, days: int = 36
 class Running:
     """The core of a node with the store of its parameters, in simulated time."""
 
-    def __init__(self, state: Path, database: VehicleDatabase, *, background: Executor = AT_ONCE) -> None:
+    def __init__(self, state: Path, database: VehicleDatabase, **options: Any) -> None:
         self.database, self.now, self.said = database, NOW, list[str]()
-        self.store = ParameterStore(
-            state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.now, background=background
-        )
+        options.setdefault("background", AtOnce())
+        make = partial(ParameterStore, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.now)
+        self.store = make(state, database, **options)
         self.corrector = wire(database, self.store.in_force, 0.0)
 
     def look(self, *times_s: float) -> list[bool]:

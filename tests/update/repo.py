@@ -1,8 +1,10 @@
 """A repository with its keys, a vehicle that trusts it, and an attacker who has some of the keys."""
 
+import os
 import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +16,25 @@ from ecu_node.parameters import VehicleParameters, write_parameters
 from ecu_node.update.signers import signer_of
 from ecu_node.update.state import read_state
 from ecu_node.update.store import conclude
-from tests.ecu_node.processes import Done
+from tests.calibrator.command_here import calibrator as calibrator_here
+from tests.ecu_node.processes import Done, ecu_node
 from tests.ecu_node.vehicles import LAYOUT
 
 VEHICLE = "v1"
-Run = Callable[..., Done]
-"""Runs a command line; returns exit code and output."""
 ALL = ("r1", "r2", "t1", "t2", "snapshot", "timestamp")
 """Names of the keys in the folder of a repository."""
+
+
+def calibrator(*arguments: object) -> Done:
+    """Run a command of the calibrator in this process."""
+    done = calibrator_here(*(os.fsdecode(item) if isinstance(item, bytes) else item for item in arguments))
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
+def drifting(parameters: VehicleParameters, drift: float) -> VehicleParameters:
+    """Parameters with another gain error of the battery's sensor."""
+    battery = replace(parameters.branches["battery"], drift=drift)
+    return replace(parameters, branches={**parameters.branches, "battery": battery})
 
 
 def pass_trial(state: Path, *, passed: bool = True) -> None:
@@ -42,8 +55,10 @@ def one_line(found: Done, *words: object) -> None:
 class Repo:
     """A repository in ``folder / "repo"``, its keys in ``folder / "keys"``; the commands make it."""
 
-    def __init__(self, folder: Path, calibrator: Run, node: Run) -> None:
-        self.folder, self.calibrator, self.node, self.vehicle = folder, calibrator, node, VEHICLE
+    calibrator, node = staticmethod(calibrator), staticmethod(ecu_node)
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.vehicle = folder, VEHICLE
         self.path, self.metadata = folder / "repo", folder / "repo" / "metadata"
 
     def done(self, *words: object) -> str:
@@ -57,10 +72,8 @@ class Repo:
         for name in (*ALL, "mallory", "new"):
             self.done("key", name, "--no-passphrase", "--out", keys)
         roles = {"root": ("r1", "r2"), "targets": ("t1", "t2"), "snapshot": ("snapshot",), "timestamp": ("timestamp",)}
-        options = [
-            word for role, names in roles.items() for name in names for word in (f"--{role}", keys / f"{name}.pub")
-        ]
-        self.done("init", self.path, *options)
+        options = [(f"--{role}", keys / f"{name}.pub") for role, names in roles.items() for name in names]
+        self.done("init", self.path, *chain(*options))
 
     def key(self, name: str) -> Path:
         return self.folder / "keys" / f"{name}.key"
@@ -91,9 +104,8 @@ class Repo:
         return self.folder / "bundles" / f"{vehicle}.json.xz"
 
     def provision(self, state: Path, vehicle: str = VEHICLE) -> None:
-        code, _, err = self.node(
-            "provision", "--vehicle", vehicle, "--root", self.metadata / "1.root.json", "--state", state
-        )
+        root = self.metadata / "1.root.json"
+        code, _, err = self.node("provision", "--vehicle", vehicle, "--root", root, "--state", state)
         assert code == 0, err
 
     def update(self, state: Path, source: object = None, *options: object) -> Done:
@@ -116,7 +128,7 @@ class Repo:
         """Copy the repository and its keys into another folder."""
         shutil.copytree(self.path, place / "repo")
         shutil.copytree(self.folder / "keys", place / "keys")
-        return Repo(place, self.calibrator, self.node)
+        return Repo(place)
 
     def live(self, role: str) -> Path:
         """Newest metadata of a role."""

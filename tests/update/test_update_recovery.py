@@ -31,8 +31,8 @@ def section(name: str) -> list[str]:
 class Place(Repo):
     """A folder with a layout and a result, where the document's commands run; a vehicle that a thief attacks."""
 
-    def __init__(self, folder: Path, other: Repo, parameters: VehicleParameters) -> None:
-        super().__init__(folder, other.calibrator, other.node)
+    def __init__(self, folder: Path, parameters: VehicleParameters) -> None:
+        super().__init__(folder)
         self.vehicle, self.state, self.parameters = "V1", folder / "state", replace(parameters, vehicle="V1")
         self.params = folder / "result" / "params"
         self.params.mkdir(parents=True)
@@ -82,12 +82,12 @@ class Place(Repo):
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, offered: Repo, parameters: VehicleParameters) -> Place:
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parameters: VehicleParameters) -> Place:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(PASSPHRASE_VARIABLE, "a passphrase for tests")
     shutil.copy(LAYOUT, tmp_path / "my_car.toml")
     shutil.copy(LAYOUT.with_suffix(".dbc"), tmp_path)
-    return Place(tmp_path, offered, parameters)
+    return Place(tmp_path, parameters)
 
 
 def test_documented_commands_work_and_recover_from_each_stolen_key(place: Place) -> None:

@@ -11,17 +11,15 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from ecu_node.bus.wiring import Mode
 from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.update.state import VehicleState, locked, read_state, write_state
-from ecu_node.update.store import ParameterStore
 from ecu_node.update.trial import ParameterTrial, TrialResult
 from tests.ecu_node.processes import ServiceManagerHere, running
 from tests.ecu_node.vehicles import LAYOUT
 from tests.update.damage import a_folder, cut, without
-from tests.update.held import AT_ONCE, NOW, Running, held, put_on_trial
+from tests.update.held import NOW, Running, held, put_on_trial
 
 DRIFT, OTHER_DRIFT = 0.05, 0.06
 
@@ -71,11 +69,9 @@ def test_running_node_keeps_its_parameters_while_the_state_is_damaged(
 
 
 def test_state_of_another_vehicle_is_not_used(state: Path, database: VehicleDatabase) -> None:
-    store = ParameterStore(
-        state, database, mode=Mode.OVERLAY, say=print, now=lambda: NOW, vehicle="v2", background=AT_ONCE
-    )
-    assert store.in_force.reason is Reason.WRONG_VEHICLE
-    assert store.in_force.why_not is not None
+    in_force = Running(state, database, vehicle="v2").store.in_force
+    assert in_force.reason is Reason.WRONG_VEHICLE
+    assert in_force.why_not is not None
 
 
 def test_end_of_a_trial_is_written_later_if_the_state_is_locked(state: Path, ended: Running) -> None:
@@ -87,13 +83,6 @@ def test_end_of_a_trial_is_written_later_if_the_state_is_locked(state: Path, end
     ]
     ended.look(*range(60, 70, 2))
     assert (ended.drift, read_state(state).on_trial) == (OTHER_DRIFT, None)
-
-
-def test_end_of_a_trial_in_a_damaged_state_does_not_end_the_node(state: Path, ended: Running) -> None:
-    cut(state / "state.json")
-    ended.look(1.0, 3.0, 5.0)
-    assert ended.drift == DRIFT
-    assert all(line.isprintable() for line in ended.said)
 
 
 def test_changed_state_is_read_again_after_a_read_error(
@@ -169,16 +158,3 @@ def test_running_node_loads_a_set_written_to_its_state(
         said = manager.wait_for("STATUS=parameter set")
     assert said == "STATUS=parameter set 44 is in force, correcting battery, motor"
     assert any("of vehicle v1 is in force" in line for line in log)
-
-
-def test_writer_waits_while_another_one_changes_the_state(state: Path) -> None:
-    def change() -> None:
-        with locked(state):
-            pass
-
-    with ThreadPoolExecutor(1) as pool:
-        with locked(state):
-            waiting = pool.submit(change)
-            with pytest.raises(TimeoutError):
-                waiting.result(0.1)
-        waiting.result(30.0)
