@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
+from itertools import takewhile
+from typing import Any
 
 import can
 import pytest
@@ -21,7 +23,7 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from tests.ecu_node.processes import LONGEST_WAIT_S, wait_until
-from tests.ecu_node.test_node import Adapter, at_work, battery_frame, receive
+from tests.ecu_node.test_node import Adapter, Hook, at_work, battery_frame, failing, receive, undisturbed
 from tests.ecu_node.test_socketcan import fields, random_frame
 from tests.ecu_node.vehicles import corrector_for, decoded
 
@@ -39,13 +41,14 @@ def ends(channel: str) -> Iterator[Ends]:
 
 
 @contextmanager
-def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> Iterator[tuple[Corrector, Future[None]]]:
+def gateway(
+    database: VehicleDatabase, name: str, other: str = "b", sending: Hook = undisturbed, **options: Any
+) -> Iterator[tuple[Corrector, Future[None]]]:
     """A gateway between the two buses, with a fault of the battery's sensor in force."""
     corrector = corrector_for(database, Mode.GATEWAY, time.monotonic(), battery=(0.25, 5.0))
-    near, far = (
-        SteadyBus(partial(VirtualBus, channel), corrector.counters) for channel in (f"{name} a", other or f"{name} b")
-    )
-    node = Node(near, far, corrector, period_s=0.02)
+    near = SteadyBus(lambda: Adapter(f"{name} a", sending=sending), corrector.counters)
+    far = SteadyBus(lambda: VirtualBus(f"{name} {other}"), corrector.counters)
+    node = Node(near, far, corrector, period_s=0.02, **options)
     with closing(near), closing(far), at_work(node, may_end=True) as running:
         yield corrector, running
 
@@ -83,13 +86,9 @@ def test_watchdog_is_not_fed_while_a_send_to_the_sensor_bus_is_stuck(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, channel: str
 ) -> None:
     monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)
-    corrector = corrector_for(database, Mode.GATEWAY)
     let_go, works = threading.Event(), deque[bool](maxlen=20)
-    near = Adapter(f"{channel} a", sending=lambda _: let_go.wait(LONGEST_WAIT_S))
-    sensors = SteadyBus(lambda: near, corrector.counters)
-    vehicle = SteadyBus(lambda: VirtualBus(f"{channel} b"), corrector.counters)
-    node = Node(sensors, vehicle, corrector, period_s=0.02, on_tick=lambda _, fed: works.append(fed))
-    with closing(sensors), closing(vehicle), at_work(node):
+    hooks: Any = {"sending": lambda _: let_go.wait(LONGEST_WAIT_S), "on_tick": lambda _, fed: works.append(fed)}
+    with gateway(database, channel, **hooks):
         try:
             wait_until(lambda: True in works)
             ends[1].send(can.Message(arbitration_id=0x300))
@@ -134,6 +133,13 @@ def test_remote_frames_of_branches_and_status_pass_from_vehicle_to_sensors(
         wait_until(lambda: corrector.counters.returned == 2)
 
 
+def test_gateway_stops_if_one_direction_fails(database: VehicleDatabase, ends: Ends, channel: str) -> None:
+    with gateway(database, channel, sending=failing(RuntimeError("defect"))) as (_, running):
+        ends[1].send(can.Message(arbitration_id=0x222, is_extended_id=False))
+        with pytest.raises(RuntimeError, match="defect"):
+            running.result(LONGEST_WAIT_S)
+
+
 WORDS = "another node sends frames 0x(110|5F0), which only this one may send there; two nodes on one bus, or two buses"
 
 
@@ -158,11 +164,10 @@ def test_frames_that_only_the_gateway_may_send_are_dropped_and_counted_if_foreig
 
 def test_gateway_with_both_ends_on_one_bus_stops(database: VehicleDatabase, ends: Ends, channel: str) -> None:
     sensors, _ = ends
-    with gateway(database, channel, f"{channel} a") as (_, running):
-        for counter in range(100):
-            if not running.done():
-                sensors.send(battery_frame(database, counter))
-                time.sleep(0.005)
+    with gateway(database, channel, "a") as (_, running):
+        for counter in takewhile(lambda _: not running.done(), range(100)):
+            sensors.send(battery_frame(database, counter))
+            time.sleep(0.005)
         with pytest.raises(BusError, match=WORDS):
             running.result(LONGEST_WAIT_S)
 

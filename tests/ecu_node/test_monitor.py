@@ -6,7 +6,6 @@ import pty
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from itertools import cycle
 from typing import Any
 
@@ -14,10 +13,10 @@ import can
 import pytest
 
 from ecu_node.bus.wiring import key_of
-from ecu_node.cli import run_ecu_node
 from ecu_node.core.status import Counters, Quality, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.monitor import BusMonitor, View, view_lines
+from tests.ecu_node.processes import ecu_node
 from tests.ecu_node.vehicles import LAYOUT, MakeDatabase, protected
 
 CHANNEL = "monitor"
@@ -100,9 +99,8 @@ def test_sums_are_taken_at_one_instant_however_late_the_answers_are(bus: Bus) ->
         bus.pair("Motor", t + 0.003, 1000.0 * (t + 0.003))
         waiting.append(1000.0 * (t + 0.003))
         bus.send("HV_BatteryCorrected", t + 0.008, BatteryCurrentCorrected=1000.0 * t + 5.0, BatteryCurrentQuality=1)
-        for motor_a in waiting if k % 3 == 2 else ():
-            bus.send("HV_MotorCorrected", t + 0.012, MotorCurrentCorrected=motor_a, MotorCurrentQuality=1)
-        waiting = waiting if k % 3 != 2 else []
+        while k % 3 == 2 and waiting:
+            bus.send("HV_MotorCorrected", t + 0.012, MotorCurrentCorrected=waiting.pop(0), MotorCurrentQuality=1)
         for look_s in (t + 0.001, t + 0.013):
             measured_a, corrected_a = bus.sums(look_s)
             if corrected_a is not None:
@@ -173,20 +171,10 @@ def test_monitor_shows_silent_branches_bus_errors_and_unread_frames(make_databas
     assert closed[0].startswith("can0: this computer's interface failed or is down; trying to open it again")
 
 
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    """Leave signal handlers as they were."""
-    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-    before = [signal.getsignal(number) for number in numbers]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("handlers")
 def test_monitor_once_prints_a_view_and_sends_nothing(
-    database: VehicleDatabase, capsys: pytest.CaptureFixture[str]
+    database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the handlers of the tests stay
     counters = cycle(range(15))
 
     def count_on(message: can.Message) -> None:
@@ -195,22 +183,19 @@ def test_monitor_once_prints_a_view_and_sends_nothing(
     with can.Bus(interface="virtual", channel=CHANNEL) as bus:
         frame = can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8))
         bus.send_periodic(frame, 0.01, modifier_callback=count_on)
-        assert run_ecu_node([*MONITOR, "--listen-only", "--once", "0.2"]) == 0
-        lines = capsys.readouterr().out.splitlines()
-        assert run_ecu_node([*MONITOR, "--once", "0.2", "--json"]) == 0
-        document = json.loads(capsys.readouterr().out)
+        shown, reported = (ecu_node(*MONITOR, *more, "--once", "0.2") for more in (["--listen-only"], ["--json"]))
         bus.stop_all_periodic_tasks()
         assert bus.recv(0.0) is None
-        assert run_ecu_node([*MONITOR, "--once", "0.1"]) == 1
+        silent = ecu_node(*MONITOR, "--once", "0.1")
+    lines, document = shown.out.splitlines(), json.loads(reported.out)
     assert lines[0] == f"virtual {CHANNEL}: no node on this bus"
     assert next(line.split() for line in lines if line.startswith("battery"))[1] == "+100.00"
     assert lines[-1] == "no corrected messages on this bus: the currents are shown as they are on it"
     assert document["branches"][0]["measured_a"] == pytest.approx(100.0)
     assert document["is_bus_open"] is True
-    said = capsys.readouterr()
     line = f"ecu-node: virtual {CHANNEL}: no branch of {LAYOUT} was seen; see that the bus is the right one\n"
-    assert said.err == line
-    assert said.out.splitlines()[-1].startswith("no frame of any branch")
+    assert (shown.code, reported.code, silent.code, silent.err) == (0, 0, 1, line)
+    assert silent.out.splitlines()[-1].startswith("no frame of any branch")
 
 
 def test_monitor_draws_a_table_in_a_terminal_and_exits_with_0_on_ctrl_c() -> None:
