@@ -59,24 +59,24 @@ def node(make_database: MakeDatabase, tmp_path: Path) -> list[str]:
 # ---- the speed of a bus
 
 
-@pytest.mark.parametrize(
-    ("interfaces", "config", "settings", "words"),
-    [
-        ("pcan kvaser vector slcan gs_usb ixxat cantact", {}, {}, "no bitrate: .* into section .* --bitrate BIT_PER_S"),
-        ("kvaser vector ixxat", {}, {"fd": True, "bitrate": 500_000}, "no data_bitrate: .* --data-bitrate BIT_PER_S"),
-        ("pcan slcan nixnet", {}, FD_RATES, r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"),
-        ("socketcan virtual udp_multicast serial", {}, {"bitrate": 250_000}, "the bit rate of .* is not set from here"),
-        ("pcan", {"bitrate": "250k"}, {}, "bitrate = 250k: a number of bit/s is expected"),
-        ("pcan", {"bitrate": -1}, {}, "bitrate = -1: a number of bit/s is expected"),
-        ("pcan", {"bitrate": 83_300}, {}, "bitrate = 83300: pcan has 1000000, .*; or give the bit timing"),
-        ("pcan", {"f_clock": 8_000_000, "bitrate": 250_000}, {}, "incomplete, .* classic CAN .* brp, tseg1"),
-        ("pcan", FD_TIMING, {}, "not one of classic CAN"),
-        ("pcan", CLASSIC_TIMING, {"fd": True}, "not one of CAN FD, which has f_clock, nom_brp"),
-        ("pcan", {**CLASSIC_TIMING, "bitrate": 500_000}, {}, "500000 contradicts the bit timing .BR: 250_000"),
-        ("pcan", {**FD_TIMING, "data_bitrate": 4_000_000}, {"fd": True}, "data_bitrate = 4000000 contradicts"),
-        ("ixxat", CLASSIC_TIMING, {}, "python-can cannot set a bit timing there; take f_clock out"),
-    ],
-)
+RATES = [
+    ("pcan kvaser vector slcan gs_usb ixxat cantact", {}, {}, "no bitrate: .* into section .* --bitrate BIT_PER_S"),
+    ("kvaser vector ixxat", {}, {"fd": True, "bitrate": 500_000}, "no data_bitrate: .* --data-bitrate BIT_PER_S"),
+    ("pcan slcan nixnet", {}, FD_RATES, r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"),
+    ("socketcan virtual udp_multicast serial", {}, {"bitrate": 250_000}, "the bit rate of .* is not set from here"),
+    ("pcan", {"bitrate": "250k"}, {}, "bitrate = 250k: a number of bit/s is expected"),
+    ("pcan", {"bitrate": -1}, {}, "bitrate = -1: a number of bit/s is expected"),
+    ("pcan", {"bitrate": 83_300}, {}, "bitrate = 83300: pcan has 1000000, .*; or give the bit timing"),
+    ("pcan", {"f_clock": 8_000_000, "bitrate": 250_000}, {}, "incomplete, .* classic CAN .* brp, tseg1"),
+    ("pcan", FD_TIMING, {}, "not one of classic CAN"),
+    ("pcan", CLASSIC_TIMING, {"fd": True}, "not one of CAN FD, which has f_clock, nom_brp"),
+    ("pcan", {**CLASSIC_TIMING, "bitrate": 500_000}, {}, "500000 contradicts the bit timing .BR: 250_000"),
+    ("pcan", {**FD_TIMING, "data_bitrate": 4_000_000}, {"fd": True}, "data_bitrate = 4000000 contradicts"),
+    ("ixxat", CLASSIC_TIMING, {}, "python-can cannot set a bit timing there; take f_clock out"),
+]
+
+
+@pytest.mark.parametrize(("interfaces", "config", "settings", "words"), RATES)
 def test_missing_or_contradictory_bit_rate_is_refused(
     interfaces: str, config: dict[str, object], settings: Any, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,15 +170,15 @@ def test_dry_run_of_a_gateway_prints_both_directions(dry_run: Callable[..., list
 # ---- listening only
 
 
-@pytest.mark.parametrize(
-    ("interface", "words"),
-    [
-        ("slcan", "nothing is sent, and no frame acknowledged"),
-        ("gs_usb", "the adapter acknowledges frames, as python-can has no listen-only mode of gs_usb"),
-        ("socketcan", r"acknowledges frames, unless .*'ip link set c0 type can listen-only on'"),
-        ("virtual", "nothing is sent$"),
-    ],
-)
+ACKNOWLEDGED = [
+    ("slcan", "nothing is sent, and no frame acknowledged"),
+    ("gs_usb", "the adapter acknowledges frames, as python-can has no listen-only mode of gs_usb"),
+    ("socketcan", r"acknowledges frames, unless .*'ip link set c0 type can listen-only on'"),
+    ("virtual", "nothing is sent$"),
+]
+
+
+@pytest.mark.parametrize(("interface", "words"), ACKNOWLEDGED)
 def test_dry_run_with_listen_only_says_whether_frames_are_acknowledged(
     interface: str, words: str, dry_run: Callable[..., list[str]]
 ) -> None:

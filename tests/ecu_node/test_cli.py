@@ -22,6 +22,7 @@ from ecu_node.parameters import write_parameters
 from ecu_node.program import FAILED, INTERNAL_ERROR, end_of, split_debug
 from tests.ecu_node.processes import ecu_node
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase, parameters_for
+from tests.update.damage import a_device, a_folder, a_pipe, huge
 
 
 @pytest.fixture
@@ -117,16 +118,16 @@ def test_parameter_template_takes_the_expected_sum_from_the_unmeasured_load_of_t
 # ---- errors: one line each, the traceback only with --debug
 
 
-@pytest.mark.parametrize(
-    ("error", "code", "text"),
-    [
-        (LayoutError("my.toml: a field is wrong"), FAILED, "prog: my.toml: a field is wrong"),
-        (UserError("a name\nwith a line end\x1b[31m"), FAILED, "prog: a name with a line end\\x1b[31m"),
-        (PermissionError(13, "Permission denied", "out/x"), FAILED, "prog: out/x: Permission denied; see that it is "),
-        (MemoryError(), FAILED, "prog: there is not enough memory; give it less at a time"),
-        (TypeError("a\nb"), INTERNAL_ERROR, "prog: internal error: TypeError: a b; run again with --debug and report "),
-    ],
-)
+ERRORS = [
+    (LayoutError("my.toml: a field is wrong"), FAILED, "prog: my.toml: a field is wrong"),
+    (UserError("a name\nwith a line end\x1b[31m"), FAILED, "prog: a name with a line end\\x1b[31m"),
+    (PermissionError(13, "Permission denied", "out/x"), FAILED, "prog: out/x: Permission denied; see that it is "),
+    (MemoryError(), FAILED, "prog: there is not enough memory; give it less at a time"),
+    (TypeError("a\nb"), INTERNAL_ERROR, "prog: internal error: TypeError: a b; run again with --debug and report "),
+]
+
+
+@pytest.mark.parametrize(("error", "code", "text"), ERRORS)
 def test_program_prints_each_error_as_one_line_and_returns_its_exit_code(
     error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -157,23 +158,10 @@ def test_debug_option_works_anywhere_before_a_double_dash() -> None:
     assert split_debug(["run", "--", "--debug"]) == (["run", "--", "--debug"], False)
 
 
-def pipe(path: Path) -> None:
-    os.mkfifo(path)
-
-
-def endless(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def huge(path: Path) -> None:
-    path.touch()
-    os.truncate(path, 1 << 40)  # sparse: no disk is filled
-
-
 UNSUITABLE = {
-    pipe: "it is a pipe; a file is expected",
-    endless: "it is a device; a file is expected",
-    Path.mkdir: "it is a folder; a file is expected",
+    a_pipe: "it is a pipe; a file is expected",
+    a_device: "it is a device; a file is expected",
+    a_folder: "it is a folder; a file is expected",
     huge: "it is larger than [0-9]+ bytes",
 }
 ROLES = {
@@ -187,6 +175,7 @@ ROLES = {
 @pytest.mark.parametrize("role", ROLES)
 def test_input_that_is_no_regular_file_or_huge_is_refused_in_one_line(make: Any, role: str, tmp_path: Path) -> None:
     """It is not read: a pipe would keep the reader waiting, and a device never ends."""
+    (tmp_path / role).touch()
     make(tmp_path / role)
     (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
     layout = {"small.dbc": tmp_path / "small.toml", "other.toml": tmp_path / role}.get(role, LAYOUT)

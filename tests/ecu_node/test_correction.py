@@ -141,15 +141,15 @@ def test_offset_of_a_power_branch_is_its_current_offset_times_the_voltage(
     require_bound(plan, wanted, code, volts)
 
 
-@pytest.mark.parametrize(
-    ("source", "drift", "offset_a"),
-    [
-        (current(), 0.0, 0.0),
-        (current(signed=False, limits=(0.0, 65534 * 0.02)), 0.0, 0.0),
-        (current(offset=1000.0), 0.0, 0.0),
-        (current(), -0.3, 100.0),
-    ],
-)
+LARGE = [
+    (current(), 0.0, 0.0),
+    (current(signed=False, limits=(0.0, 65534 * 0.02)), 0.0, 0.0),
+    (current(offset=1000.0), 0.0, 0.0),
+    (current(), -0.3, 100.0),
+]
+
+
+@pytest.mark.parametrize(("source", "drift", "offset_a"), LARGE)
 def test_largest_sum_of_the_integer_plan_has_59_bits_and_fits_a_64_bit_word(
     source: Codes, drift: float, offset_a: float
 ) -> None:
@@ -158,20 +158,20 @@ def test_largest_sum_of_the_integer_plan_has_59_bits_and_fits_a_64_bit_word(
     assert 1 << 58 <= largest < 1 << 59
 
 
-@pytest.mark.parametrize(
-    ("unit", "known", "factor"),
-    [
-        ("", AMPERE, 1.0),
-        (" [A] ", AMPERE, 1.0),
-        ("Unit_Amper", AMPERE, 1.0),
-        ("A_DC", AMPERE, 1.0),
-        ("milliamps", AMPERE, 1e-3),
-        ("kilovolt", VOLT, 1e3),
-        ("KW", WATT, 1e3),
-        ("mW", WATT, 1e-3),
-        ("MW", WATT, 1e6),
-    ],
-)
+UNITS = [
+    ("", AMPERE, 1.0),
+    (" [A] ", AMPERE, 1.0),
+    ("Unit_Amper", AMPERE, 1.0),
+    ("A_DC", AMPERE, 1.0),
+    ("milliamps", AMPERE, 1e-3),
+    ("kilovolt", VOLT, 1e3),
+    ("KW", WATT, 1e3),
+    ("mW", WATT, 1e-3),
+    ("MW", WATT, 1e6),
+]
+
+
+@pytest.mark.parametrize(("unit", "known", "factor"), UNITS)
 def test_unit_is_known_in_the_spellings_of_several_makers(unit: str, known: Mapping[str, float], factor: float) -> None:
     assert factor_of(unit, known, "test") == factor
 
@@ -217,15 +217,15 @@ def test_values_that_a_scaled_signal_cannot_have_are_found() -> None:
     assert impossible_values(TEMPERATURE, [-40.0, 0.5, 87.5, -40.5, 0.25, 88.0]) == [-40.5, 0.25, 88.0]
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"scale": 0.0}, "signal I has scale 0 and offset 0 in the DBC"),
-        ({"offset": math.inf}, "signal I has scale 0.02 and offset inf in the DBC"),
-        ({"limits": (1000.0, 2000.0)}, "no code of signal I lies in its range in the DBC"),
-        ({"unit": "W"}, "signal I is in 'W'; expected A, mA, kA"),
-    ],
-)
+NO_CURRENTS = [
+    ({"scale": 0.0}, "signal I has scale 0 and offset 0 in the DBC"),
+    ({"offset": math.inf}, "signal I has scale 0.02 and offset inf in the DBC"),
+    ({"limits": (1000.0, 2000.0)}, "no code of signal I lies in its range in the DBC"),
+    ({"unit": "W"}, "signal I is in 'W'; expected A, mA, kA"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "words"), NO_CURRENTS)
 def test_signal_that_cannot_be_a_current_is_refused(wrong: dict[str, Any], words: str) -> None:
     with pytest.raises(DatabaseError, match=f"test: .*{words}"):
         current(**wrong)
@@ -235,15 +235,15 @@ LARGEST = float("1.79769313486232E+308")
 """The largest double, as tools write it in 15 digits."""
 
 
-@pytest.mark.parametrize(
-    ("limits", "codes"),
-    [
-        ((-LARGEST, LARGEST), whole_range(current())),
-        ((2.0, 2.0), whole_range(current())),
-        ((2.0, -2.0), whole_range(current())),
-        ((1.99, 2.01), range(100, 101)),
-    ],
-)
+LIMITS = [
+    ((-LARGEST, LARGEST), whole_range(current())),
+    ((2.0, 2.0), whole_range(current())),
+    ((2.0, -2.0), whole_range(current())),
+    ((1.99, 2.01), range(100, 101)),
+]
+
+
+@pytest.mark.parametrize(("limits", "codes"), LIMITS)
 def test_dbc_limits_restrict_the_codes_only_if_minimum_is_below_maximum(
     limits: tuple[float, float], codes: range
 ) -> None:

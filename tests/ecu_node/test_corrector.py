@@ -123,13 +123,7 @@ BOTH, LATE = ("battery", "motor"), ("motor",)
     "phases",
     [
         [(1.0, (), CORRECTING), (0.5, LATE, STALE), (1.5, (), STALE)],
-        [
-            (1.0, (), CORRECTING),
-            (0.5, LATE, STALE),
-            (1.5, BOTH, STALE),
-            (6.0, BOTH, ASLEEP),
-            (1.0, (), CORRECTING),
-        ],
+        [(1.0, (), CORRECTING), (0.5, LATE, STALE), (1.5, BOTH, STALE), (6.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
         [(2.9, LATE, STARTING), (0.4, LATE, STALE)],
         [(10.0, BOTH, STARTING), (1.0, (), CORRECTING), (2.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
     ],
@@ -309,16 +303,16 @@ LOADED = JunctionResidual(measured_a=0.0, corrected_a=3.0, measured_mean_a=0.0, 
 """Battery and motor sum to 0 A; with a load of 3 A that no branch measures right sensors would not."""
 
 
-@pytest.mark.parametrize(
-    ("offset_a", "sums", "reason"),
-    [
-        (1.5, JunctionResidual(measured_a=0.0, corrected_a=0.0), Reason.CORRECTION_WORSE),
-        (0.5, JunctionResidual(measured_a=0.0, corrected_a=0.0), Reason.NONE),
-        (3.0, JunctionResidual(measured_a=0.0, corrected_a=3.0), Reason.NONE),
-        (3.0, LOADED, Reason.NONE),
-        (-3.0, LOADED, Reason.CORRECTION_WORSE),
-    ],
-)
+EXPECTED = [
+    (1.5, JunctionResidual(measured_a=0.0, corrected_a=0.0), Reason.CORRECTION_WORSE),
+    (0.5, JunctionResidual(measured_a=0.0, corrected_a=0.0), Reason.NONE),
+    (3.0, JunctionResidual(measured_a=0.0, corrected_a=3.0), Reason.NONE),
+    (3.0, LOADED, Reason.NONE),
+    (-3.0, LOADED, Reason.CORRECTION_WORSE),
+]
+
+
+@pytest.mark.parametrize(("offset_a", "sums", "reason"), EXPECTED)
 def test_junction_sum_is_judged_relative_to_the_expected_sum(
     database: VehicleDatabase, offset_a: float, sums: JunctionResidual, reason: Reason
 ) -> None:
@@ -330,10 +324,7 @@ def test_junction_sum_is_judged_relative_to_the_expected_sum(
 
 @pytest.mark.parametrize(
     ("drift", "base_a", "swing_a", "motor_a", "stuck"),
-    [
-        (0.1, 100.0, 50.0, 60.0, ("motor",)),
-        (-0.2, 0.0, 10.0, 0.0, ()),
-    ],
+    [(0.1, 100.0, 50.0, 60.0, ("motor",)), (-0.2, 0.0, 10.0, 0.0, ())],
     ids=["stuck", "at rest"],
 )
 def test_branch_is_stuck_if_it_stays_constant_while_the_sum_moves(
@@ -513,37 +504,29 @@ OWN_SUM = OWN_STATUS + 'sum_measured = "Sum"\n'
 WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1- (0.1,0) [0|0] "A" Node\n'
 
 
-@pytest.mark.parametrize(
-    ("layout", "dbc", "words"),
-    [
-        (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC.replace(*SPARE), "Pair would be both received and sent"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("8 Corrector", "8 Node"), r"small\.dbc has PairOut by Node; all corrected"),
-        (SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER, "PairOut by Corrector, Own by Other; all corrected values and the"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("Motor : 16|16", "Motor : 15|16"), "PairOut.Motor is written twice"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 64|2"), "Quality ends in byte 9"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("Out: 8", "Out: 65"), r"small\.dbc: message PairOut, .* has 65 bytes; .* 64"),
-        (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
-        (
-            SMALL_LAYOUT,
-            SMALL_DBC.replace(*PAGE),
-            "PairOut.Quality is multiplexed; what the node sends .* in every frame",
-        ),
-        (SMALL_LAYOUT, SMALL_DBC.replace(MOTOR_SNA, '512 Motor 32767 "Max"'), "Motor needs a code named SNA"),
-        (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
-        (
-            SMALL_LAYOUT + OWN_SUM,
-            WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n',
-            "code 3 of signal Sum means 'SNA', .* beyond 0.2",
-        ),
-        (SMALL_LAYOUT, SMALL_DBC.replace(*INIT), "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
-        (
-            SMALL_LAYOUT,
-            SMALL_DBC.replace(MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"'),
-            r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'",
-        ),
-        (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery is written twice, or overlaps .*, or the E2E header"),
-    ],
-)
+DISTURBING = [
+    (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC.replace(*SPARE), "Pair would be both received and sent"),
+    (SMALL_LAYOUT, SMALL_DBC.replace("8 Corrector", "8 Node"), r"small\.dbc has PairOut by Node; all corrected"),
+    (SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER, "PairOut by Corrector, Own by Other; all corrected values and the"),
+    (SMALL_LAYOUT, SMALL_DBC.replace("Motor : 16|16", "Motor : 15|16"), "PairOut.Motor is written twice"),
+    (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 64|2"), "Quality ends in byte 9"),
+    (SMALL_LAYOUT, SMALL_DBC.replace("Out: 8", "Out: 65"), r"small\.dbc: message PairOut, .* has 65 bytes; .* 64"),
+    (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
+    (SMALL_LAYOUT, SMALL_DBC.replace(*PAGE), "PairOut.Quality is multiplexed; what the node sends .* in every frame"),
+    (SMALL_LAYOUT, SMALL_DBC.replace(MOTOR_SNA, '512 Motor 32767 "Max"'), "Motor needs a code named SNA"),
+    (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
+    (SMALL_LAYOUT + OWN_SUM, WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n', "code 3 of signal Sum means 'SNA', .* beyond 0.2"),
+    (SMALL_LAYOUT, SMALL_DBC.replace(*INIT), "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
+    (
+        SMALL_LAYOUT,
+        SMALL_DBC.replace(MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"'),
+        r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'",
+    ),
+    (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery is written twice, or overlaps .*, or the E2E header"),
+]
+
+
+@pytest.mark.parametrize(("layout", "dbc", "words"), DISTURBING)
 def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layout: str, dbc: str, words: str) -> None:
     with pytest.raises((LayoutError, DatabaseError), match=words):
         corrector_for(make_database(layout, dbc))
@@ -640,14 +623,14 @@ def test_branch_of_a_frozen_control_unit_becomes_stale(make_database: MakeDataba
     assert (used, corrector.latched, corrector.latched_branches) == (51, Reason.BRANCH_STALE, ("battery",))
 
 
-@pytest.mark.parametrize(
-    ("faulty", "name", "corrected_a", "quality"),
-    [
-        ("battery", "battery", (100.0 - 5.0) / 1.25, Quality.CORRECTED),
-        ("motor", "motor", -(-100.0 - 5.0) / 1.25, Quality.CORRECTED),
-        ("battery", "motor", 100.0, Quality.PASSED_THROUGH),
-    ],
-)
+ANSWERS = [
+    ("battery", "battery", (100.0 - 5.0) / 1.25, Quality.CORRECTED),
+    ("motor", "motor", -(-100.0 - 5.0) / 1.25, Quality.CORRECTED),
+    ("battery", "motor", 100.0, Quality.PASSED_THROUGH),
+]
+
+
+@pytest.mark.parametrize(("faulty", "name", "corrected_a", "quality"), ANSWERS)
 def test_answer_is_corrected_if_parameters_apply_a_fault_to_its_branch(
     database: VehicleDatabase, faulty: str, name: str, corrected_a: float, quality: Quality
 ) -> None:

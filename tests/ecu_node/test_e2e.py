@@ -112,9 +112,7 @@ def test_protection_writes_only_the_bits_of_its_header_mask(kind: str, protectio
     assert {Receiver(protection).check(bytearray(size)) for size in range(len(header))} == {Check.CORRUPT}
 
 
-def test_corrupt_frame_changes_neither_the_expected_counter_nor_the_e2e_state(
-    protection: Protection,
-) -> None:
+def test_corrupt_frame_changes_neither_the_expected_counter_nor_the_e2e_state(protection: Protection) -> None:
     (first, second), receiver = stream(protection, 2), Receiver(protection)
     found = [(receiver.check(frame), receiver.state) for frame in (damaged(first), first, damaged(second), second)]
     ok, corrupt = (Check.OK, E2EState.VALID), (Check.CORRUPT, E2EState.VALID)
@@ -132,17 +130,17 @@ def test_any_flipped_bit_is_detected_and_sealing_keeps_the_counter(protection: P
         assert protection.counter_of(flipped) == counter
 
 
-@pytest.mark.parametrize(
-    ("entry", "expected"),
-    [
-        (ENTRIES["P04"], "001000000a0b0c0d862b055600000000"),
-        (ENTRIES["P05"].replace("offset = 2", "data_id = { Room = 0x1234 }"), "1cca000000000000"),
-        (ENTRIES["P06"], "b155000800000000"),
-        (ENTRIES["P07"], "1fb2e737fcedbcd900000018000000000a0b0c0d00000000"),
-        (ENTRIES["P11"], "cc00000000000000"),
-        (ENTRIES["P11"] + '\ndata_id_mode = "nibble"', "2a10000000000000"),
-    ],
-)
+EXAMPLES = [
+    (ENTRIES["P04"], "001000000a0b0c0d862b055600000000"),
+    (ENTRIES["P05"].replace("offset = 2", "data_id = { Room = 0x1234 }"), "1cca000000000000"),
+    (ENTRIES["P06"], "b155000800000000"),
+    (ENTRIES["P07"], "1fb2e737fcedbcd900000018000000000a0b0c0d00000000"),
+    (ENTRIES["P11"], "cc00000000000000"),
+    (ENTRIES["P11"] + '\ndata_id_mode = "nibble"', "2a10000000000000"),
+]
+
+
+@pytest.mark.parametrize(("entry", "expected"), EXAMPLES)
 def test_first_frame_equals_autosar_example(protect: Callable[..., Protection], entry: str, expected: str) -> None:
     payload = bytearray(len(bytes.fromhex(expected)))
     protection = protect(entry)
@@ -172,14 +170,14 @@ def crc8(data: bytes, polynomial: int) -> int:
     return crc ^ 0xFF
 
 
-@pytest.mark.parametrize(
-    ("entry", "before", "after", "polynomial"),
-    [
-        (ENTRIES["OEM"], (700).to_bytes(2, "little"), b"", 0x1D),
-        (ENTRIES["OEM after"], b"", bytes([700 & 0xFF]), 0x2F),
-        (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 255 }", b"\xff", b"", 0x1D),
-    ],
-)
+CRCS = [
+    (ENTRIES["OEM"], (700).to_bytes(2, "little"), b"", 0x1D),
+    (ENTRIES["OEM after"], b"", bytes([700 & 0xFF]), 0x2F),
+    (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 255 }", b"\xff", b"", 0x1D),
+]
+
+
+@pytest.mark.parametrize(("entry", "before", "after", "polynomial"), CRCS)
 def test_manufacturer_crc_covers_the_bytes_described_in_the_layout(
     protect: Callable[..., Protection], entry: str, before: bytes, after: bytes, polynomial: int
 ) -> None:
@@ -295,24 +293,24 @@ def test_checks_and_e2e_state_of_random_frames_follow_autosar(
 HEADS = [("[e2e]", "[e2e]"), ('[[e2e]]\nprofile = "P01"\nmessages = ["Net"]\n[[e2e]]', "[[e2e]] entry number 2")]
 
 
-@pytest.mark.parametrize(
-    ("entry", "words"),
-    [
-        (autosar("P99"), ", profile: expected one of P01, P02, P04, P05, P06, P07, P11, counter"),
-        ('profile = "P01"\nmessages = ["Room", "Room"]', ", messages: Room is named twice"),
-        (autosar("P01", "data_id = { Hall = 3 }"), ", data_id: Hall is not in 'messages'"),
-        (autosar("P02", "data_id_list = {}"), ", data_id_list: Room has none"),
-        (autosar("P05", 'crc = "C"'), ": unknown key 'crc'; allowed are profile, messages"),
-        (autosar("P06", "data_id = { Room = 65536 }"), ", data_id, Room: "),
-        (autosar("P01", "max_delta_counter = 15"), ": message Room: max_delta_counter is 15"),
-        (autosar("P06", "offset = 20"), ": message Room has 24 bytes, too few for the header of 25 bytes"),
-        (OEM.replace('"Count"', '"Alive"'), ": message Room has no signal 'Alive'; it has Count, Sum"),
-        (OEM.replace('crc = "Sum"', 'crc = "Count"'), ": message Room: signal Count must be one whole byte"),
-        (OEM + "\ncounter_modulus = 17", ": message Room: signal Count cannot count from 0 to 16"),
-        (OEM + '\nalgorithm = "md5"', ": message Room: algorithm 'md5' is not known; known are autosar, bluetooth,"),
-        (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 256 }", "256 does not fit into data_id_bytes = 1"),
-    ],
-)
+MISTAKES = [
+    (autosar("P99"), ", profile: expected one of P01, P02, P04, P05, P06, P07, P11, counter"),
+    ('profile = "P01"\nmessages = ["Room", "Room"]', ", messages: Room is named twice"),
+    (autosar("P01", "data_id = { Hall = 3 }"), ", data_id: Hall is not in 'messages'"),
+    (autosar("P02", "data_id_list = {}"), ", data_id_list: Room has none"),
+    (autosar("P05", 'crc = "C"'), ": unknown key 'crc'; allowed are profile, messages"),
+    (autosar("P06", "data_id = { Room = 65536 }"), ", data_id, Room: "),
+    (autosar("P01", "max_delta_counter = 15"), ": message Room: max_delta_counter is 15"),
+    (autosar("P06", "offset = 20"), ": message Room has 24 bytes, too few for the header of 25 bytes"),
+    (OEM.replace('"Count"', '"Alive"'), ": message Room has no signal 'Alive'; it has Count, Sum"),
+    (OEM.replace('crc = "Sum"', 'crc = "Count"'), ": message Room: signal Count must be one whole byte"),
+    (OEM + "\ncounter_modulus = 17", ": message Room: signal Count cannot count from 0 to 16"),
+    (OEM + '\nalgorithm = "md5"', ": message Room: algorithm 'md5' is not known; known are autosar, bluetooth,"),
+    (COUNTER_CRC8 + "data_id_bytes = 1\ndata_id = { Room = 256 }", "256 does not fit into data_id_bytes = 1"),
+]
+
+
+@pytest.mark.parametrize(("entry", "words"), MISTAKES)
 @pytest.mark.parametrize(("head", "place"), HEADS)
 def test_mistake_in_an_e2e_entry_is_refused_naming_its_place_in_the_layout(
     protect: Callable[..., Protection], head: str, place: str, entry: str, words: str
@@ -322,15 +320,15 @@ def test_mistake_in_an_e2e_entry_is_refused_naming_its_place_in_the_layout(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("entry", "old", "new", "words"),
-    [
-        (ENTRIES["P01"], "Room: 24", "Room: 10", "10 bytes in the DBC; CAN FD pads it, .* 12, 16, 20, 24, 32,"),
-        (OEM, "56|8@1+", "57|8@1+", "signal Sum must be one whole byte to be a CRC-8$"),
-        (OEM, "36|4@1+", "38|4@1+", "signal Count must be within one byte to be a counter$"),
-        (OEM, "36|4@1+", "36|4@1-", "signal Count cannot count from 0 to 7$"),
-    ],
-)
+UNFIT = [
+    (ENTRIES["P01"], "Room: 24", "Room: 10", "10 bytes in the DBC; CAN FD pads it, .* 12, 16, 20, 24, 32,"),
+    (OEM, "56|8@1+", "57|8@1+", "signal Sum must be one whole byte to be a CRC-8$"),
+    (OEM, "36|4@1+", "38|4@1+", "signal Count must be within one byte to be a counter$"),
+    (OEM, "36|4@1+", "36|4@1-", "signal Count cannot count from 0 to 7$"),
+]
+
+
+@pytest.mark.parametrize(("entry", "old", "new", "words"), UNFIT)
 def test_message_that_cannot_carry_its_protection_is_refused(
     protect: Callable[..., Protection], entry: str, old: str, new: str, words: str
 ) -> None:

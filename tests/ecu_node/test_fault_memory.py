@@ -149,14 +149,14 @@ def test_cleared_faults_do_not_return(vehicle: Vehicle) -> None:
     assert vehicle.clear() == "no faults"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "why"),
-    [
-        ("[", "{", "cannot read the fault memory: "),
-        ("BRANCH_STALE", "OF_A_LATER_VERSION", "cannot read the fault memory: unknown reason 'OF_A_LATER_VERSION'"),
-        ("", None, "cannot read the fault memory: it is a folder"),
-    ],
-)
+DAMAGE = [
+    ("[", "{", "cannot read the fault memory: "),
+    ("BRANCH_STALE", "OF_A_LATER_VERSION", "cannot read the fault memory: unknown reason 'OF_A_LATER_VERSION'"),
+    ("", None, "cannot read the fault memory: it is a folder"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "why"), DAMAGE)
 def test_node_passes_values_through_if_it_cannot_read_the_fault_memory_until_it_is_cleared(
     vehicle: Vehicle, old: str, new: str | None, why: str
 ) -> None:

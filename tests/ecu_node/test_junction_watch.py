@@ -198,15 +198,15 @@ def test_sums_of_right_sensors_give_no_verdict() -> None:
     assert junction.watch.verdict is None
 
 
-@pytest.mark.parametrize(
-    ("sd_per_a", "heater_a", "offset_a", "verdict"),
-    [
-        (0.0, 10.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
-        (0.0, 10.0, 100.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
-        (0.0, 0.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery", "motor"))),
-        (0.1, 10.0, 0.0, None),
-    ],
-)
+GAIN_ERRORS = [
+    (0.0, 10.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
+    (0.0, 10.0, 100.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
+    (0.0, 0.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery", "motor"))),
+    (0.1, 10.0, 0.0, None),
+]
+
+
+@pytest.mark.parametrize(("sd_per_a", "heater_a", "offset_a", "verdict"), GAIN_ERRORS)
 def test_gain_error_beyond_its_uncertainty_is_found_from_an_alternating_current(
     sd_per_a: float, heater_a: float, offset_a: float, verdict: tuple[Reason, tuple[str, ...]] | None
 ) -> None:
@@ -275,16 +275,16 @@ def test_current_that_never_changes_is_stuck_unless_it_is_small(
     assert junction.watch.verdict == verdict
 
 
-@pytest.mark.parametrize(
-    ("jump_a", "since_s", "period_s", "looks"),
-    [
-        (50.0, 1.0, 1 / 32, 3),
-        (50.0, 1.0, 1 / 128, 5),
-        (50.0, 0.0, 0.015, 3),
-        (-21.0, 1.0, 1 / 32, 3),
-        (-20.0, 1.0, 1 / 32, None),
-    ],
-)
+JUMPS = [
+    (50.0, 1.0, 1 / 32, 3),
+    (50.0, 1.0, 1 / 128, 5),
+    (50.0, 0.0, 0.015, 3),
+    (-21.0, 1.0, 1 / 32, 3),
+    (-20.0, 1.0, 1 / 32, None),
+]
+
+
+@pytest.mark.parametrize(("jump_a", "since_s", "period_s", "looks"), JUMPS)
 def test_jump_counts_if_it_lasts_three_looks_and_30_ms_and_exceeds_5_percent_of_full_scale(
     jump_a: float, since_s: float, period_s: float, looks: int | None
 ) -> None:
@@ -299,8 +299,7 @@ def test_jump_counts_if_it_lasts_three_looks_and_30_ms_and_exceeds_5_percent_of_
 
 
 @pytest.mark.parametrize(
-    ("still_a", "verdict"),
-    [(10.5, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (10.6, (Reason.BRANCH_STUCK, ("heater",)))],
+    ("still_a", "verdict"), [(10.5, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (10.6, (Reason.BRANCH_STUCK, ("heater",)))]
 )
 def test_branch_that_does_not_follow_another_ones_rise_is_stuck_if_it_carries_more_than_half_of_the_sum(
     still_a: float, verdict: tuple[Reason, tuple[str, ...]]
@@ -312,8 +311,7 @@ def test_branch_that_does_not_follow_another_ones_rise_is_stuck_if_it_carries_mo
 
 
 @pytest.mark.parametrize(
-    ("rises", "verdict"),
-    [(2, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (3, (Reason.BRANCH_STUCK, ("heater",)))],
+    ("rises", "verdict"), [(2, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (3, (Reason.BRANCH_STUCK, ("heater",)))]
 )
 def test_still_branch_is_stuck_if_another_one_jumps_but_not_by_half_in_one_step(
     rises: int, verdict: tuple[Reason, tuple[str, ...]]
@@ -330,8 +328,7 @@ def test_still_branch_is_stuck_if_another_one_jumps_but_not_by_half_in_one_step(
 
 
 @pytest.mark.parametrize(
-    ("rises", "verdict"),
-    [(3, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (4, (Reason.BRANCH_STUCK, ("heater",)))],
+    ("rises", "verdict"), [(3, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (4, (Reason.BRANCH_STUCK, ("heater",)))]
 )
 def test_still_branch_is_stuck_if_another_one_moves_as_the_sum_does_but_not_in_one_step(
     rises: int, verdict: tuple[Reason, tuple[str, ...]]

@@ -29,43 +29,39 @@ E2E = '\n]\n[e2e]\nmessages = ["Net"]\nprofile ='
 BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("schema = 1", "schema = 2", "schema"),
-        ('name = "small"', 'name = "small"\nextra = 1', "unknown key 'extra'; allowed are schema, name"),
-        ('name = "small"', 'name = "small"\ndigest = "x"', "unknown key 'digest'"),
-        ("schema = 1", f"schema = {'9' * 5000}", "not TOML"),
-        ("full_scale_a = 400.0", "", "'full_scale_a' is missing"),
-        ('name = "battery", sign = 1', 'name = "battery", sign = 2', "sign"),
-        ('"Pair.Battery"', '"Battery"', r"'Message.Signal' as in the DBC is expected, found \"Battery\""),
-        ("sign = 1", "sign = 1, timout_s = 1", "'battery': unknown key 'timout_s'; did you mean 'timeout_s'"),
-        ("sign = 1", 'sign = 1, timeout_s = "x"', "'battery', timeout_s: Expected float, got str, found \"x\""),
-        ('name = "battery"', 'name = "motor"', "motor is named twice"),
-        (BATTERY, BATTERY + ', power = "Heater.Power"', "branch battery: give either 'signal'"),
-        (', voltage = "Net.Voltage"', "", "branch heater: give either 'signal'"),
-        ('"Net.Voltage"', '"Net.Voltage", quality = "PairOut.Quality"', "'quality' without 'corrected'"),
-        ("full_scale_a", 'watch.input = "x"\nwatch.valid = [1]\nfull_scale_a', r"input: 'x' is no \[\[input\]\]"),
-        ("full_scale_a", "watch.valid = [1]\nfull_scale_a", "give both 'input' and 'valid', or neither"),
-        ("full_scale_a", "watch.valid = [nan]\nfull_scale_a", r"\[watch\], valid, entry number 1: .* found NaN"),
-        ("\n]\n", f'{E2E} "P01"\nvalid = {{ window = 3, min_ok = 5, max_error = 0 }}\n', "min_ok = 5 of 3 frames;"),
-        ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
-        (
-            "\n]\n",
-            '\n]\n[status]\nmessage = "S"\nstate = "A"\nreason = "B"\nperiod_s = 0.001\n',
-            "period_s: .* >= 0.01, ",
-        ),
-        ("\n]\n", f'{E2E} ["P01"]\n', r"profile: expected one of P01.*found \[\"P01\"\]"),
-        ("sign = ", 'vss = "Vehicle.A", sign = ', "vss 'Vehicle.A' stands at two branches; each needs a name of"),
-        ("sign = ", 'vss = "vehicle.A", sign = ', "'battery', vss: expected a name of the Vehicle Signal Spec"),
-        ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: 'speed' is no"),
-        ('"Pair.Motor"', '"Pair.Battery"', "branches battery and motor: both read Pair.Battery"),
-        ('"PairOut.Motor"', '"PairOut.Battery"', "PairOut.Battery is written twice"),
-        ('"PairOut.Motor"', '"Pair.Motor"', "Pair.Motor is both read and written"),
-        ("sign = ", "balance = true, sign = ", "more than one branch has 'balance = true'"),
-        ("\n]\n", '\n]\ninput = [{ name = "x", signal = "PairOut.Quality" }]\n', "Quality is both read and written"),
-    ],
-)
+MISTAKES = [
+    ("schema = 1", "schema = 2", "schema"),
+    ('name = "small"', 'name = "small"\nextra = 1', "unknown key 'extra'; allowed are schema, name"),
+    ('name = "small"', 'name = "small"\ndigest = "x"', "unknown key 'digest'"),
+    ("schema = 1", f"schema = {'9' * 5000}", "not TOML"),
+    ("full_scale_a = 400.0", "", "'full_scale_a' is missing"),
+    ('name = "battery", sign = 1', 'name = "battery", sign = 2', "sign"),
+    ('"Pair.Battery"', '"Battery"', r"'Message.Signal' as in the DBC is expected, found \"Battery\""),
+    ("sign = 1", "sign = 1, timout_s = 1", "'battery': unknown key 'timout_s'; did you mean 'timeout_s'"),
+    ("sign = 1", 'sign = 1, timeout_s = "x"', "'battery', timeout_s: Expected float, got str, found \"x\""),
+    ('name = "battery"', 'name = "motor"', "motor is named twice"),
+    (BATTERY, BATTERY + ', power = "Heater.Power"', "branch battery: give either 'signal'"),
+    (', voltage = "Net.Voltage"', "", "branch heater: give either 'signal'"),
+    ('"Net.Voltage"', '"Net.Voltage", quality = "PairOut.Quality"', "'quality' without 'corrected'"),
+    ("full_scale_a", 'watch.input = "x"\nwatch.valid = [1]\nfull_scale_a', r"input: 'x' is no \[\[input\]\]"),
+    ("full_scale_a", "watch.valid = [1]\nfull_scale_a", "give both 'input' and 'valid', or neither"),
+    ("full_scale_a", "watch.valid = [nan]\nfull_scale_a", r"\[watch\], valid, entry number 1: .* found NaN"),
+    ("\n]\n", f'{E2E} "P01"\nvalid = {{ window = 3, min_ok = 5, max_error = 0 }}\n', "min_ok = 5 of 3 frames;"),
+    ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
+    ("\n]\n", '\n]\n[status]\nmessage = "S"\nstate = "A"\nreason = "B"\nperiod_s = 0.001\n', "period_s: .* >= 0.01, "),
+    ("\n]\n", f'{E2E} ["P01"]\n', r"profile: expected one of P01.*found \[\"P01\"\]"),
+    ("sign = ", 'vss = "Vehicle.A", sign = ', "vss 'Vehicle.A' stands at two branches; each needs a name of"),
+    ("sign = ", 'vss = "vehicle.A", sign = ', "'battery', vss: expected a name of the Vehicle Signal Spec"),
+    ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: 'speed' is no"),
+    ('"Pair.Motor"', '"Pair.Battery"', "branches battery and motor: both read Pair.Battery"),
+    ('"PairOut.Motor"', '"PairOut.Battery"', "PairOut.Battery is written twice"),
+    ('"PairOut.Motor"', '"Pair.Motor"', "Pair.Motor is both read and written"),
+    ("sign = ", "balance = true, sign = ", "more than one branch has 'balance = true'"),
+    ("\n]\n", '\n]\ninput = [{ name = "x", signal = "PairOut.Quality" }]\n', "Quality is both read and written"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "words"), MISTAKES)
 def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: str, new: str, words: str) -> None:
     assert old in SMALL_LAYOUT
     with pytest.raises(LayoutError, match=words) as caught:
@@ -80,21 +76,19 @@ BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";
 BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
 BA_ "VFrameFormat" BO_ 256 14;
 """
+WRONG_DBCS = [
+    (SMALL_DBC.replace("BO_ 256 Pair:", "BO_ 256 Other:"), "no message 'Pair', which .*small.toml names"),
+    (SMALL_DBC.replace("SG_ Voltage", "SG_ Volt"), "message Net has no signal 'Voltage', .* it has Volt"),
+    (SMALL_DBC.replace('"V" Node', '"A" Node'), "branch heater: signal Voltage is in 'A'; expected V, mV, kV"),
+    (SMALL_DBC.replace('"W" Node', '"V" Node'), "branch heater: signal Power is in 'V'; expected W"),
+    (SMALL_DBC + "BO_ 258 Old: 2 Node\n", "small.dbc: messages Net and Old have one identifier, 0x102; take out"),
+    (SMALL_DBC + BEYOND_ENUM, r"cannot read it \(DBC: \"list index .*\"\), as if an attribute \(BA_\) had a value"),
+    ("this is no dbc", "small.dbc: not a CAN database"),
+    ("", "small.dbc: the DBC has no message"),
+]
 
 
-@pytest.mark.parametrize(
-    ("dbc", "words"),
-    [
-        (SMALL_DBC.replace("BO_ 256 Pair:", "BO_ 256 Other:"), "no message 'Pair', which .*small.toml names"),
-        (SMALL_DBC.replace("SG_ Voltage", "SG_ Volt"), "message Net has no signal 'Voltage', .* it has Volt"),
-        (SMALL_DBC.replace('"V" Node', '"A" Node'), "branch heater: signal Voltage is in 'A'; expected V, mV, kV"),
-        (SMALL_DBC.replace('"W" Node', '"V" Node'), "branch heater: signal Power is in 'V'; expected W"),
-        (SMALL_DBC + "BO_ 258 Old: 2 Node\n", "small.dbc: messages Net and Old have one identifier, 0x102; take out"),
-        (SMALL_DBC + BEYOND_ENUM, r"cannot read it \(DBC: \"list index .*\"\), as if an attribute \(BA_\) had a value"),
-        ("this is no dbc", "small.dbc: not a CAN database"),
-        ("", "small.dbc: the DBC has no message"),
-    ],
-)
+@pytest.mark.parametrize(("dbc", "words"), WRONG_DBCS)
 def test_a_dbc_that_lacks_what_the_layout_names_is_refused(make_database: MakeDatabase, dbc: str, words: str) -> None:
     with pytest.raises(DatabaseError, match=words) as caught:
         make_database(SMALL_LAYOUT, dbc)

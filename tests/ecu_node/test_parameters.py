@@ -65,18 +65,18 @@ def test_written_parameters_are_read_back_and_match_the_schema(database: Vehicle
 SOUND = BranchParameters(drift=0.1, offset_a=-2.5, apply=True)
 
 
+VIOLATIONS = [
+    ("branches", lambda x: {"battery": replace(SOUND, drift=x)}, r"branches\[\.\.\.\]\.drift"),
+    ("branches", lambda x: {"battery": replace(SOUND, drift_sd=x)}, "a standard deviation .* is not finite"),
+    ("confidence", lambda x: x, "the confidence is not finite"),
+    ("hardware_fault", lambda x: HardwareFault(suspected=True, offset_a={"motor": x}), r"hardware_fault\.offset_a"),
+    ("junction_residual", lambda x: JunctionResidual(measured_a=x, corrected_a=0), r"residual\.measured_a"),
+    ("number", lambda _: 0, r"\$\.number"),
+]
+
+
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize(
-    ("field", "change", "words"),
-    [
-        ("branches", lambda x: {"battery": replace(SOUND, drift=x)}, r"branches\[\.\.\.\]\.drift"),
-        ("branches", lambda x: {"battery": replace(SOUND, drift_sd=x)}, "a standard deviation .* is not finite"),
-        ("confidence", lambda x: x, "the confidence is not finite"),
-        ("hardware_fault", lambda x: HardwareFault(suspected=True, offset_a={"motor": x}), r"hardware_fault\.offset_a"),
-        ("junction_residual", lambda x: JunctionResidual(measured_a=x, corrected_a=0), r"residual\.measured_a"),
-        ("number", lambda _: 0, r"\$\.number"),
-    ],
-)
+@pytest.mark.parametrize(("field", "change", "words"), VIOLATIONS)
 def test_parameters_that_violate_the_schema_are_not_written(
     database: VehicleDatabase, tmp_path: Path, field: str, change: Callable[[float], object], words: str, number: float
 ) -> None:
@@ -121,15 +121,15 @@ SHA = "0" * 64
 DIGESTS = r"\(0{12}\), this is .*hv_powertrain\.\w+ \([0-9a-f]{12}\); calibrate with this"
 
 
-@pytest.mark.parametrize(
-    ("branch", "change", "reason", "words"),
-    [
-        ("battery", {"vehicle": "v3"}, Reason.WRONG_VEHICLE, "are for vehicle 'v3', this is 'v1'"),
-        ("battery", {"layout": {"name": "l", "sha256": SHA}}, Reason.WRONG_LAYOUT, rf"with layout l {DIGESTS} layout;"),
-        ("battery", {"dbc": {"name": "d", "sha256": SHA}}, Reason.WRONG_DBC, rf"with DBC d {DIGESTS} DBC; .*template"),
-        ("fridge", {}, Reason.WRONG_LAYOUT, "branch 'fridge', which .* does not have"),
-    ],
-)
+FOREIGN = [
+    ("battery", {"vehicle": "v3"}, Reason.WRONG_VEHICLE, "are for vehicle 'v3', this is 'v1'"),
+    ("battery", {"layout": {"name": "l", "sha256": SHA}}, Reason.WRONG_LAYOUT, rf"with layout l {DIGESTS} layout;"),
+    ("battery", {"dbc": {"name": "d", "sha256": SHA}}, Reason.WRONG_DBC, rf"with DBC d {DIGESTS} DBC; .*template"),
+    ("fridge", {}, Reason.WRONG_LAYOUT, "branch 'fridge', which .* does not have"),
+]
+
+
+@pytest.mark.parametrize(("branch", "change", "reason", "words"), FOREIGN)
 def test_parameters_of_another_vehicle_layout_or_dbc_are_unfit(
     database: VehicleDatabase, branch: str, change: dict[str, Any], reason: Reason, words: str
 ) -> None:
@@ -173,20 +173,20 @@ def test_file_of_version_1_0_is_read_unless_it_has_a_sensor_model(database: Vehi
         read_parameters(tmp_path / "p.json")
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"expected_a": 150.5}, r"an expected Kirchhoff sum of \+150\.5 A is beyond .* limit of offsets, 150 A$"),
-        ({"expected_a": -150.5}, r"an expected Kirchhoff sum of -150\.5 A is beyond"),
-        ({"delay_s": 5.5, "apply": False}, r"branch battery: delay \+5\.5 s is beyond 5 s"),
-        ({"delay_s": -5.5}, r"branch battery: delay -5\.5 s is beyond 5 s"),
-        ({"drift": -0.5}, r"branch battery: drift -0\.5 is beyond the layout's limit of 0\.4"),
-        ({"offset_a": 151.0}, r"branch battery: offset \+151 A is beyond the layout's limit of 150 A"),
-        ({"drift": 0.4, "offset_a": -150.0, "delay_s": 5.0}, None),
-        ({"drift": -0.5, "offset_a": 151.0, "apply": False}, None),
-        ({"expected_a": -150.0, "delay_s": None}, None),
-    ],
-)
+BEYOND_LIMITS = [
+    ({"expected_a": 150.5}, r"an expected Kirchhoff sum of \+150\.5 A is beyond .* limit of offsets, 150 A$"),
+    ({"expected_a": -150.5}, r"an expected Kirchhoff sum of -150\.5 A is beyond"),
+    ({"delay_s": 5.5, "apply": False}, r"branch battery: delay \+5\.5 s is beyond 5 s"),
+    ({"delay_s": -5.5}, r"branch battery: delay -5\.5 s is beyond 5 s"),
+    ({"drift": -0.5}, r"branch battery: drift -0\.5 is beyond the layout's limit of 0\.4"),
+    ({"offset_a": 151.0}, r"branch battery: offset \+151 A is beyond the layout's limit of 150 A"),
+    ({"drift": 0.4, "offset_a": -150.0, "delay_s": 5.0}, None),
+    ({"drift": -0.5, "offset_a": 151.0, "apply": False}, None),
+    ({"expected_a": -150.0, "delay_s": None}, None),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), BEYOND_LIMITS)
 def test_parameters_beyond_the_limits_of_drift_offset_sum_or_delay_are_unfit(
     database: VehicleDatabase, change: dict[str, Any], words: str | None
 ) -> None:
@@ -238,37 +238,36 @@ def with_value(value: object, *place: str) -> Callable[[bytes], bytes]:
 NUMBER = b'"number":300'
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"", "it is empty; correct it, or write it anew with 'calibrator calibrate'"),
-        (b"{", "JSON is malformed|Input data was truncated"),
-        (b"[]", "Expected object, got array"),
-        (b"\xff\xfe{}", "JSON is malformed"),
-        (b'{"vehicle": "\xff"}', "it is no text in UTF-8; correct it"),
-        (b'{"branches": ' + b'{"a":' * 100_000, "it is nested too deeply; correct it"),
-        (b'{"vehicle": v1}', r"JSON is malformed: .*\(byte 12\)"),
-        (b" " * (MAX_FILE_BYTES + 1), f"it is larger than {MAX_FILE_BYTES} bytes"),
-        (instead(b"{", codecs.BOM_UTF8 + b"{"), r"it begins with .*\(BOM\); save it as UTF-8 without one; correct"),
-        (instead(NUMBER, b'"number":9007199254740992'), "number: "),
-        *((instead(b"-2.5", number), "") for number in (b"NaN", b"Infinity", b"-Infinity", b"1e999", b"9" * 400)),
-        (instead(NUMBER, b'"number":' + b"[" * 100_000 + b"]" * 100_000), "it is nested too deeply"),
-        (instead(b'"v1"', b'"' + b"v" * 300 + b'"'), r"vehicle: .*\.\.\. \(300 characters\)"),
-        (with_value("x", "branches", "motor", "drift"), 'branches, motor, drift: Expected float, got str, found "x"'),
-        (with_value(2, "branches", "motor", "drift"), "branches, motor, drift: Expected float < 1.0, found 2;"),
-        (with_value(0, "branches", "motor", "drifts"), "branches, motor: unknown key 'drifts'; did you mean 'drift'"),
-        (
-            with_value({"c": True}, "hardware_fault", "offset_a"),
-            "hardware_fault, offset_a, c: Expected float, got bool, found true",
-        ),
-        (with_value("fine", "verdict"), "verdict: .*'cannot tell' or .*, found \"fine\""),
-        (with_value([1], "provenance", "drives"), "provenance, drives, entry number 1: Expected str, got int, found 1"),
-        (with_value("", "vehicle"), 'vehicle: Expected str of length >= 1, found ""'),
-        (with_value({}, "branches"), "branches: Expected object of length >= 1, found {}"),
-        (with_value("abc", "dbc", "sha256"), 'dbc, sha256: expected SHA-256: 64 digits 0-9 and a-f, found "abc"'),
-    ],
-    ids=count(),
-)
+MALFORMED = [
+    (b"", "it is empty; correct it, or write it anew with 'calibrator calibrate'"),
+    (b"{", "JSON is malformed|Input data was truncated"),
+    (b"[]", "Expected object, got array"),
+    (b"\xff\xfe{}", "JSON is malformed"),
+    (b'{"vehicle": "\xff"}', "it is no text in UTF-8; correct it"),
+    (b'{"branches": ' + b'{"a":' * 100_000, "it is nested too deeply; correct it"),
+    (b'{"vehicle": v1}', r"JSON is malformed: .*\(byte 12\)"),
+    (b" " * (MAX_FILE_BYTES + 1), f"it is larger than {MAX_FILE_BYTES} bytes"),
+    (instead(b"{", codecs.BOM_UTF8 + b"{"), r"it begins with .*\(BOM\); save it as UTF-8 without one; correct"),
+    (instead(NUMBER, b'"number":9007199254740992'), "number: "),
+    *((instead(b"-2.5", number), "") for number in (b"NaN", b"Infinity", b"-Infinity", b"1e999", b"9" * 400)),
+    (instead(NUMBER, b'"number":' + b"[" * 100_000 + b"]" * 100_000), "it is nested too deeply"),
+    (instead(b'"v1"', b'"' + b"v" * 300 + b'"'), r"vehicle: .*\.\.\. \(300 characters\)"),
+    (with_value("x", "branches", "motor", "drift"), 'branches, motor, drift: Expected float, got str, found "x"'),
+    (with_value(2, "branches", "motor", "drift"), "branches, motor, drift: Expected float < 1.0, found 2;"),
+    (with_value(0, "branches", "motor", "drifts"), "branches, motor: unknown key 'drifts'; did you mean 'drift'"),
+    (
+        with_value({"c": True}, "hardware_fault", "offset_a"),
+        "hardware_fault, offset_a, c: Expected float, got bool, found true",
+    ),
+    (with_value("fine", "verdict"), "verdict: .*'cannot tell' or .*, found \"fine\""),
+    (with_value([1], "provenance", "drives"), "provenance, drives, entry number 1: Expected str, got int, found 1"),
+    (with_value("", "vehicle"), 'vehicle: Expected str of length >= 1, found ""'),
+    (with_value({}, "branches"), "branches: Expected object of length >= 1, found {}"),
+    (with_value("abc", "dbc", "sha256"), 'dbc, sha256: expected SHA-256: 64 digits 0-9 and a-f, found "abc"'),
+]
+
+
+@pytest.mark.parametrize(("content", "words"), MALFORMED, ids=count())
 def test_malformed_parameter_file_is_refused_in_one_line(
     database: VehicleDatabase, tmp_path: Path, content: bytes | Callable[[bytes], bytes], words: str
 ) -> None:
@@ -281,14 +280,14 @@ def test_malformed_parameter_file_is_refused_in_one_line(
     assert not {"$", "`"} & set(str(caught.value))
 
 
-@pytest.mark.parametrize(
-    ("name", "words", "reason"),
-    [
-        ("missing.json", r"missing\.json: no such parameter file", Reason.NO_PARAMETERS),
-        ("p.json/within", "/within: cannot read the parameter file: Not a directory; name", Reason.NO_PARAMETERS),
-        ("", "not a parameter file: it is a folder", Reason.MALFORMED_PARAMETERS),
-    ],
-)
+UNREADABLE = [
+    ("missing.json", r"missing\.json: no such parameter file", Reason.NO_PARAMETERS),
+    ("p.json/within", "/within: cannot read the parameter file: Not a directory; name", Reason.NO_PARAMETERS),
+    ("", "not a parameter file: it is a folder", Reason.MALFORMED_PARAMETERS),
+]
+
+
+@pytest.mark.parametrize(("name", "words", "reason"), UNREADABLE)
 def test_missing_or_unreadable_parameter_file_is_refused_by_name(
     tmp_path: Path, name: str, words: str, reason: Reason
 ) -> None:

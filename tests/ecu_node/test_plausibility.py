@@ -26,10 +26,10 @@ def test_jump_of_a_sensor_stops_the_correction_within_100_ms(junction: Junction,
     assert junction.qualities == others | {name: Quality.IMPLAUSIBLE}
 
 
-@pytest.mark.parametrize(
-    ("name", "gain", "growth_per_s", "within_s"),
-    [("motor", 1.2, 0, 5), ("battery", 0.8, 0, 5), ("battery", 3, 0, 5), ("battery", 1, 0.01, 30)],
-)
+GAIN_CHANGES = [("motor", 1.2, 0, 5), ("battery", 0.8, 0, 5), ("battery", 3, 0, 5), ("battery", 1, 0.01, 30)]
+
+
+@pytest.mark.parametrize(("name", "gain", "growth_per_s", "within_s"), GAIN_CHANGES)
 def test_gain_change_of_a_sensor_stops_the_correction(
     junction: Junction, name: str, gain: float, growth_per_s: float, within_s: float
 ) -> None:

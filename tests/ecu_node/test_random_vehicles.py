@@ -35,16 +35,16 @@ def test_frames_of_random_vehicles_match_the_oracle_in_both_modes(seed: int, tmp
         require_right(database, parameters, mode, drawn)
 
 
+BYTES = [
+    (SMALL_LAYOUT, "-", "0", "-128", -0.2),
+    (SMALL_LAYOUT, "+", "-12.8", "255", -0.2),
+    (SMALL_LAYOUT, "+", "-12.8", "255", 0.2),
+    (SMALL_LAYOUT.replace(MOTOR_ENTRY, ""), "-", "0", "-128", 0.2),
+]
+
+
 @pytest.mark.parametrize("mode", Mode)
-@pytest.mark.parametrize(
-    ("layout", "sign", "offset", "missing", "drift"),
-    [
-        (SMALL_LAYOUT, "-", "0", "-128", -0.2),
-        (SMALL_LAYOUT, "+", "-12.8", "255", -0.2),
-        (SMALL_LAYOUT, "+", "-12.8", "255", 0.2),
-        (SMALL_LAYOUT.replace(MOTOR_ENTRY, ""), "-", "0", "-128", 0.2),
-    ],
-)
+@pytest.mark.parametrize(("layout", "sign", "offset", "missing", "drift"), BYTES)
 def test_every_8_bit_code_matches_the_oracle_whatever_the_other_bits_are(
     make_database: MakeDatabase, mode: Mode, layout: str, sign: str, offset: str, missing: str, drift: float
 ) -> None:
