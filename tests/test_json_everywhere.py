@@ -11,11 +11,12 @@ import pytest
 import typer
 
 from calibrator.cli import app
-from calibrator.terminal.command_line import run_app
 from ecu_node import cli as node_cli
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_parameters
+from tests.ecu_node.processes import ecu_node
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
+from tests.update.repo import calibrator
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "json.md"
 WITHOUT = {
@@ -28,27 +29,21 @@ WITHOUT = {
 """Commands that have no --json, and why."""
 
 
-def calibrator_commands() -> Iterator[tuple[str, list[str]]]:
-    """Name and options of every command."""
-
-    def inner(name: str, command: Any) -> Iterator[tuple[str, list[str]]]:
-        if commands := getattr(command, "commands", {}):
-            for word, each in commands.items():
-                yield from inner(f"{name} {word}", each)
-        else:
-            yield name, [option for parameter in command.params for option in parameter.opts]
-
-    yield from inner("calibrator", typer.main.get_command(app))
+def commands_of(name: str, command: Any) -> Iterator[tuple[str, Any]]:
+    """Name and command of a group and of all in it."""
+    yield name, command
+    for word, each in getattr(command, "commands", {}).items():
+        yield from commands_of(f"{name} {word}", each)
 
 
-def node_commands() -> Iterator[tuple[str, list[str]]]:
-    parser = node_cli._parser()
-    (subparsers,) = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    for name, command in subparsers.choices.items():
-        yield f"ecu-node {name}", list(command._option_string_actions)
-
-
-COMMANDS = dict([*calibrator_commands(), *node_commands()])
+CALIBRATOR = dict(commands_of("calibrator", typer.main.get_command(app)))
+(_SUBPARSERS,) = [item for item in node_cli._parser()._actions if isinstance(item, argparse._SubParsersAction)]
+ECU_NODE = {f"ecu-node {name}": list(command._option_string_actions) for name, command in _SUBPARSERS.choices.items()}
+COMMANDS = ECU_NODE | {
+    name: [option for parameter in command.params for option in parameter.opts]
+    for name, command in CALIBRATOR.items()
+    if not hasattr(command, "commands")
+}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -56,18 +51,15 @@ def test_every_command_has_json_unless_listed_as_an_exception(command: str) -> N
     assert ("--json" in COMMANDS[command]) is (command not in WITHOUT)
 
 
-def test_json_of_each_step_of_an_update_has_documented_keys(
-    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_of_each_step_of_an_update_has_documented_keys(database: VehicleDatabase, tmp_path: Path) -> None:
     """Each step prints one document whose keys are documented, and which names what the next step needs."""
     documented = set(re.findall(r"`([a-z0-9_]+)`", DOCUMENT.read_text()))
 
     def done(command: str, *arguments: object) -> dict[str, Any]:
-        program, *words = [*command.split(), *map(str, arguments), "--json"]
-        code = node_cli.run_ecu_node(words) if program == "ecu-node" else run_app(app, program, words)
-        printed = capsys.readouterr()
-        assert (code, printed.err) == (0, "")
-        found: dict[str, Any] = json.loads(printed.out)
+        program, *words = command.split()
+        ended = {"ecu-node": ecu_node, "calibrator": calibrator}[program](*words, *arguments, "--json")
+        assert (ended.code, ended.err) == (0, "")
+        found: dict[str, Any] = json.loads(ended.out)
         assert found.keys() <= documented
         return found
 
@@ -94,11 +86,3 @@ def test_json_of_each_step_of_an_update_has_documented_keys(
     assert done("ecu-node update", repo, *state, *layout)["on_trial"] is None
     after = done("ecu-node inspect", *state)
     assert (after["ended"], after["trusted"]["root"], after["problems"]) == ("revoked", 2, [])
-
-
-def test_refused_command_prints_no_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["repository", "add", str(tmp_path), str(tmp_path / "none.json"), "--json"]
-    assert run_app(app, "calibrator", words) == 1
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.count("\n") == 1

@@ -8,9 +8,9 @@ import pytest
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
-from tests.calibrator.command_here import calibrator
 from tests.ecu_node.processes import Done, ecu_node
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
+from tests.update.repo import calibrator
 
 MISTAKES = [
     # layouts
@@ -129,24 +129,20 @@ MISTAKES = [
     ("calibrator repository publish x --key none.key", 1, "none.key: cannot read the private key: No such file"),
     ("calibrator repository publish x --key empty", 1, "empty: cannot be used as a private key (PEM, PKCS #8)"),
     ("calibrator repository rotate x root --public empty", 1, "x: no repository; make one with"),
-    ("calibrator repository add empty v1.json", 1, "empty: no repository; make one with 'calibrator repository init'"),
+    (
+        "calibrator repository add empty v1.json --json",
+        1,
+        "empty: no repository; make one with 'calibrator repository init'",
+    ),
     ("ecu-node provision --vehicle v1 --root none.json --state s", 1, "none.json: cannot read the root: No such file"),
     ("ecu-node provision --vehicle v1 --root cut.json --state s", 1, "cut.json: 1.root.json of 'calibrator repository"),
     ("ecu-node update v1.json --state none LAYOUT", 1, "none: cannot be used as state: No such file or"),
     ("ecu-node inspect --state none", 1, "none: no state of a vehicle there; make one with 'ecu-node provision'"),
-    (
-        "ecu-node inspect --state empty",
-        1,
-        "cannot read the state: Not a directory; name a folder made by 'ecu-node prov",
-    ),
+    ("ecu-node inspect --state empty", 1, "cannot read the state: Not a directory; name a folder made by 'ecu-node p"),
     ("ecu-node faults --state none", 1, "none: no such state folder; name the one of 'ecu-node run --state'"),
     ("ecu-node clear --state none", 1, "none: no such state folder; name the one of 'ecu-node run --state'"),
     ("ecu-node clear --state folder", 1, "folder: neither a state nor faults there; name the folder of 'ecu-node run"),
-    (
-        "ecu-node monitor LAYOUT --channel x --interface kvaser --bitrate 500000",
-        1,
-        "an integer; see --channel, CAN_CON",
-    ),
+    ("ecu-node monitor LAYOUT --channel x --interface kvaser --bitrate 500000", 1, "an integer; see --channel, CAN_"),
     ("ecu-node run LAYOUT --channel c --interface pigeon UNSIGNED", 1, "pigeon c: cannot open"),
     ("ecu-node run LAYOUT --channel nobus0 UNSIGNED", 1, "socketcan nobus0: cannot open the bus: "),
     ("ecu-node run NONE --channel nobus0 UNSIGNED", 1, "none.toml: cannot read the layout: No such"),
@@ -158,22 +154,18 @@ MISTAKES = [
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with what a user may name by mistake, in which the commands run."""
     write_parameters(parameters_for(read_database(read_layout(LAYOUT)), battery=(0.05, 2.3)), tmp_path / "v1.json")
-    (tmp_path / "empty").touch()
-    (tmp_path / "empty.csv").touch()
+    for name in ("empty", "empty.csv", "logs/v1/drive.log"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
     (tmp_path / "texts.csv").write_text("time_s,I,J\n0.0,on,off\n0.1,on,off\n")
     rows = [f"{0.1 * k:.1f},{10 * math.sin(k / 7):.2f},{10 * math.sin(k / 7):.2f},0.0" for k in range(600)]
     for name, number in {"drive.csv": 600, "short.csv": 30}.items():
         (tmp_path / name).write_text("\n".join(["time_s,Ibat,Imot,Iheat", *rows[:number]]))
     (tmp_path / "other.csv").write_text("\n".join(["time_s,Ibat,Iother,Iheat", *rows]))
     (tmp_path / "still.csv").write_text("\n".join(["time_s,speed", *(f"{0.1 * k:.1f},0.0" for k in range(600))]))
-    branches = "".join(
-        f'[[branch]]\nname = "{name}"\nsignal = "{column}"\nsign = {sign}\n'
-        for name, column, sign in (("battery", "Ibat", 1), ("motor", "Imot", -1))
-    )
-    (tmp_path / "car.toml").write_text(f'schema = 1\nname = "car"\nfull_scale_a = 100.0\n{branches}')
+    branches = '{ name = "battery", signal = "Ibat", sign = 1 }, { name = "motor", signal = "Imot", sign = -1 }'
+    (tmp_path / "car.toml").write_text(f'schema = 1\nname = "car"\nfull_scale_a = 100.0\nbranch = [{branches}]\n')
     (tmp_path / "folder").mkdir()
-    (tmp_path / "logs" / "v1").mkdir(parents=True)
-    (tmp_path / "logs" / "v1" / "drive.log").touch()
     (tmp_path / "noise").write_bytes(bytes(range(128, 256)))
     (tmp_path / "cut.json").write_bytes((tmp_path / "v1.json").read_bytes()[:200])
     monkeypatch.chdir(tmp_path)
@@ -185,10 +177,7 @@ def run(command: str) -> Done:
     command = command.replace("NONE", "--layout none.toml").replace("PUBLISHED", "--method published")
     command = command.replace("UNSIGNED", "--params v1.json --unsigned")
     words = command.replace("LAYOUT", f"--layout {LAYOUT}").replace("DBC", str(LAYOUT.with_suffix(".dbc"))).split()
-    if words[0] == "ecu-node":
-        return ecu_node(*words[1:])
-    done = calibrator(*words[1:])
-    return Done(done.returncode, done.stdout, done.stderr)
+    return {"ecu-node": ecu_node, "calibrator": calibrator}[words[0]](*words[1:])
 
 
 @pytest.mark.parametrize(("command", "code", "words"), MISTAKES)
@@ -199,6 +188,7 @@ def test_user_mistake_is_reported_in_one_line_and_writes_nothing(
     done = run(command)
     (line,) = done.err.splitlines()
     assert done.code == code
+    assert not done.out or "given above" in line
     assert line.startswith(command.partition(" ")[0])
     assert words in line
     assert sorted(path.name for path in place.rglob("*")) == before

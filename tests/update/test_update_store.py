@@ -158,3 +158,16 @@ def test_running_node_loads_a_set_written_to_its_state(
         said = manager.wait_for("STATUS=parameter set")
     assert said == "STATUS=parameter set 44 is in force, correcting battery, motor"
     assert any("of vehicle v1 is in force" in line for line in log)
+
+
+def test_writer_waits_while_another_one_changes_the_state(state: Path) -> None:
+    def change() -> None:
+        with locked(state):
+            pass
+
+    with ThreadPoolExecutor(1) as pool:
+        with locked(state):
+            waiting = pool.submit(change)
+            with pytest.raises(TimeoutError):
+                waiting.result(0.1)
+        waiting.result(30.0)
