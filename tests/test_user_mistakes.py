@@ -181,9 +181,7 @@ def run(command: str) -> Done:
 
 
 @pytest.mark.parametrize(("command", "code", "words"), MISTAKES)
-def test_user_mistake_is_reported_in_one_line_and_writes_nothing(
-    command: str, code: int, words: str, place: Path
-) -> None:
+def test_mistake_is_reported_in_one_line_and_writes_nothing(command: str, code: int, words: str, place: Path) -> None:
     before = sorted(path.name for path in place.rglob("*"))
     done = run(command)
     (line,) = done.err.splitlines()

@@ -121,8 +121,11 @@ PCAN = ("--interface", "pcan", "--channel", "PCAN_USBBUS1")
 """An adapter whose library is not installed here: opening it would fail."""
 
 
+DryRun = Callable[..., list[str]]
+
+
 @pytest.fixture
-def dry_run(node: list[str]) -> Callable[..., list[str]]:
+def dry_run(node: list[str]) -> DryRun:
     """Lines that the node with these options prints of what it would do."""
 
     def run(*options: str) -> list[str]:
@@ -133,7 +136,7 @@ def dry_run(node: list[str]) -> Callable[..., list[str]]:
     return run
 
 
-def test_dry_run_prints_the_bus_that_would_be_opened(node: list[str], dry_run: Callable[..., list[str]]) -> None:
+def test_dry_run_prints_the_bus_that_would_be_opened(node: list[str], dry_run: DryRun) -> None:
     rate = ("--bitrate", "250000")
     reads, sends = "  reads Pair (0x100), Heater (0x200), Net (0x102)", "  sends PairOut (0x200)"
     assert dry_run(*PCAN, *rate) == ["would open pcan PCAN_USBBUS1: bitrate 250000", reads, sends]
@@ -146,7 +149,7 @@ def test_dry_run_prints_the_bus_that_would_be_opened(node: list[str], dry_run: C
 
 @pytest.mark.parametrize("timing", [can.BitTiming(**CLASSIC_TIMING), can.BitTimingFd(**FD_TIMING)])
 def test_dry_run_prints_bit_timing_of_can_conf_once(
-    timing: can.BitTiming | can.BitTimingFd, tmp_path: Path, dry_run: Callable[..., list[str]]
+    timing: can.BitTiming | can.BitTimingFd, tmp_path: Path, dry_run: DryRun
 ) -> None:
     lines = [f"{name} = {value}" for name, value in timing.items()]
     (tmp_path / "can.conf").write_text("\n".join(["[PCAN_USBBUS1]", *lines]))
@@ -156,7 +159,7 @@ def test_dry_run_prints_bit_timing_of_can_conf_once(
     assert "f_clock" not in opened
 
 
-def test_dry_run_of_a_gateway_prints_both_directions(dry_run: Callable[..., list[str]]) -> None:
+def test_dry_run_of_a_gateway_prints_both_directions(dry_run: DryRun) -> None:
     assert dry_run("--interface", "virtual", "--channel", "a", "--gateway", "b") == [
         "would open virtual a: no settings",
         "  reads all frames; corrects Pair (0x100), Heater (0x200)",
@@ -179,9 +182,7 @@ ACKNOWLEDGED = [
 
 
 @pytest.mark.parametrize(("interface", "words"), ACKNOWLEDGED)
-def test_dry_run_with_listen_only_says_whether_frames_are_acknowledged(
-    interface: str, words: str, dry_run: Callable[..., list[str]]
-) -> None:
+def test_dry_run_says_whether_frames_are_acknowledged(interface: str, words: str, dry_run: DryRun) -> None:
     rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
     *_, sends, last = dry_run("--interface", interface, "--channel", "c0", *rate, "--listen-only")
     assert sends == "  sends nothing"

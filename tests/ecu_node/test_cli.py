@@ -60,9 +60,7 @@ def test_check_shows_fit_parameters_and_their_integer_plan(params: Path) -> None
     assert max(map(len, lines)) <= 80
 
 
-def test_check_of_unfit_parameters_exits_with_1_and_gives_the_reason(
-    params: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_of_unfit_parameters_exits_with_1_and_says_why(params: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done = ecu_node(*check(params, "--vehicle", "v2", "--json"))
     report = json.loads(done.out)
     assert (done.code, report["fit"], report["reason"]) == (1, False, "WRONG_VEHICLE")
@@ -73,9 +71,7 @@ def test_check_of_unfit_parameters_exits_with_1_and_gives_the_reason(
     assert done.out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
 
 
-def test_check_of_a_layout_without_corrected_signals_fails_except_for_a_gateway(
-    make_database: MakeDatabase, tmp_path: Path
-) -> None:
+def test_layout_without_corrected_signals_fits_only_a_gateway(make_database: MakeDatabase, tmp_path: Path) -> None:
     """'ecu-node run' has the same option --gateway."""
     database = make_database(re.sub(r', (corrected|quality) = "[\w.]+"', "", SMALL_LAYOUT))
     write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
@@ -91,9 +87,7 @@ def test_check_of_a_layout_without_corrected_signals_fails_except_for_a_gateway(
 NARROW_AND_FD = SMALL_DBC.replace("PairOut: 8", "PairOut: 12").replace("1- (0.1,0) [-3000|3000]", "1- (0.1,0) [-50|50]")
 
 
-def test_check_shows_an_unapplied_fault_and_warns_of_fd_messages_and_narrow_signals(
-    make_database: MakeDatabase, tmp_path: Path
-) -> None:
+def test_check_warns_of_unapplied_faults_fd_and_narrow_signals(make_database: MakeDatabase, tmp_path: Path) -> None:
     database = make_database(dbc=NARROW_AND_FD)
     parameters = parameters_for(database, battery=(0.25, 5.0))
     held = {"battery": replace(parameters.branches["battery"], apply=False)}

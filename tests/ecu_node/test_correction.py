@@ -89,9 +89,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("source", "target", "sign", "drift", "offset"), CASES)
-def test_every_16_bit_code_is_corrected_exactly(
-    source: Codes, target: Codes, sign: int, drift: str, offset: str
-) -> None:
+def test_16_bit_codes_are_corrected_exactly(source: Codes, target: Codes, sign: int, drift: str, offset: str) -> None:
     plan = integer_plan(source, target, sign=sign, drift=float(drift), offset_a=float(offset))
     gain, bias, common = exact_line(source, target, sign=sign, drift=drift, offset_a=offset)
     low, high = writable_range(target, "test")
@@ -130,9 +128,7 @@ def test_correction_error_stays_within_its_bound_at_any_signal_width(
     offset=st.floats(-150, 150),
     sign=st.sampled_from([1, -1]),
 )
-def test_offset_of_a_power_branch_is_its_current_offset_times_the_voltage(
-    code: int, volts: int, drift: float, offset: float, sign: int
-) -> None:
+def test_power_offset_scales_with_the_voltage(code: int, volts: int, drift: float, offset: float, sign: int) -> None:
     power, voltage = current(2.0, limits=(-60000, 60000)), current(0.02, signed=False, limits=(0, 1000))
     signals = Signals(source=power, target=power, sign=sign, voltage=voltage)
     plan = correction_plan(signals, SensorFault(drift=drift, offset_a=offset))
@@ -150,9 +146,7 @@ LARGE = [
 
 
 @pytest.mark.parametrize(("source", "drift", "offset_a"), LARGE)
-def test_largest_sum_of_the_integer_plan_has_59_bits_and_fits_a_64_bit_word(
-    source: Codes, drift: float, offset_a: float
-) -> None:
+def test_largest_sum_of_the_integer_plan_has_59_bits(source: Codes, drift: float, offset_a: float) -> None:
     plan = integer_plan(source, current(), sign=1, drift=drift, offset_a=offset_a)
     largest = max(abs(source.lowest), abs(source.highest)) * plan.gain + abs(plan.bias) + (1 << (plan.shift - 1))
     assert 1 << 58 <= largest < 1 << 59
@@ -244,7 +238,5 @@ LIMITS = [
 
 
 @pytest.mark.parametrize(("limits", "codes"), LIMITS)
-def test_dbc_limits_restrict_the_codes_only_if_minimum_is_below_maximum(
-    limits: tuple[float, float], codes: range
-) -> None:
+def test_dbc_limits_restrict_codes_only_if_minimum_is_below_maximum(limits: tuple[float, float], codes: range) -> None:
     assert whole_range(current(limits=limits)) == codes

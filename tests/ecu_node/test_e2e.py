@@ -150,9 +150,7 @@ def test_first_frame_equals_autosar_example(protect: Callable[..., Protection], 
 
 
 @pytest.mark.parametrize(("profile", "identity"), [("P04", 0x12345678), ("P05", 0x5678), ("P07", 0x12345678)])
-def test_default_data_id_is_the_message_id_cut_to_its_width(
-    protect: Callable[..., Protection], profile: str, identity: int
-) -> None:
+def test_default_data_id_is_the_cut_message_id(protect: Callable[..., Protection], profile: str, identity: int) -> None:
     long = ROOM.replace("BO_ 700", f"BO_ {0x80000000 | 0x12345678}")
     protection = protect(autosar(profile, "offset = 3"), room=long)
     assert protection.identity == identity
@@ -178,7 +176,7 @@ CRCS = [
 
 
 @pytest.mark.parametrize(("entry", "before", "after", "polynomial"), CRCS)
-def test_manufacturer_crc_covers_the_bytes_described_in_the_layout(
+def test_manufacturer_crc_covers_the_bytes_of_the_layout(
     protect: Callable[..., Protection], entry: str, before: bytes, after: bytes, polynomial: int
 ) -> None:
     protection = protect(entry)
@@ -312,7 +310,7 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("entry", "words"), MISTAKES)
 @pytest.mark.parametrize(("head", "place"), HEADS)
-def test_mistake_in_an_e2e_entry_is_refused_naming_its_place_in_the_layout(
+def test_mistake_in_an_e2e_entry_is_refused_with_its_place(
     protect: Callable[..., Protection], head: str, place: str, entry: str, words: str
 ) -> None:
     with pytest.raises(LayoutError, match=rf"small\.toml: {re.escape(place)}.*{re.escape(words)}") as caught:

@@ -82,9 +82,7 @@ def test_gateway_writes_a_corrected_power_as_power(make_database: MakeDatabase) 
     ("profile", "offset", "branch"),
     [("P01", 0, "battery"), ("P04", 0, "battery"), ("P06", 1, "battery"), ("P07", 3, "motor"), ("P11", 2, "motor")],
 )
-def test_branch_signal_that_overlaps_the_e2e_header_is_refused(
-    make_database: MakeDatabase, profile: str, offset: int, branch: str
-) -> None:
+def test_branch_in_e2e_header_is_refused(make_database: MakeDatabase, profile: str, offset: int, branch: str) -> None:
     layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'
     with pytest.raises(LayoutError, match=rf"branch {branch}: Pair\.{branch.title()} is written twice, or overlaps"):
         gateway_for(make_database(layout, SMALL_DBC.replace("Pair: 8", "Pair: 24")))

@@ -171,9 +171,7 @@ def test_monitor_shows_silent_branches_bus_errors_and_unread_frames(make_databas
     assert closed[0].startswith("can0: this computer's interface failed or is down; trying to open it again")
 
 
-def test_monitor_once_prints_a_view_and_sends_nothing(
-    database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_monitor_once_prints_and_sends_nothing(database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # the handlers of the tests stay
     counters = cycle(range(15))
 

@@ -158,9 +158,7 @@ def test_echo_of_own_frames_is_counted_and_ignored(database: VehicleDatabase, pe
     assert (corrector.counters.frames_in, corrector.counters.answers) == (1, 1)
 
 
-def test_full_send_queue_is_logged_once_and_shown_as_state_until_it_is_free(
-    channel: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_send_queue_is_logged_once_and_shown_as_state(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     said, states = list[str](), list[str]()
     full = Adapter(channel, sending=failing(can.CanOperationError("Transmit buffer full")))
     now_s, frame = time.monotonic(), can.Message(arbitration_id=1)
@@ -219,9 +217,7 @@ def test_pause_of_the_process_makes_no_branch_stale(database: VehicleDatabase, c
     assert corrector.counters.clock_steps == 0
 
 
-def test_pause_of_the_process_after_a_receive_timeout_is_not_time_of_listening(
-    channel: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pause_of_the_process_is_not_time_of_listening(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     silent, now_s = VirtualBus(channel), time.monotonic()
     with closing(SteadyBus(lambda: silent, Counters())) as bus:
         clock = iter([now_s, now_s + 5.0])

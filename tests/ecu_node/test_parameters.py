@@ -203,9 +203,7 @@ def test_parameters_beyond_the_limits_of_drift_offset_sum_or_delay_are_unfit(
 
 
 @pytest.mark.parametrize("verdict", ["cannot tell", "not enough data"])
-def test_parameters_that_apply_a_branch_without_a_decisive_verdict_are_unfit(
-    database: VehicleDatabase, verdict: Verdict
-) -> None:
+def test_branch_applied_without_a_decisive_verdict_is_unfit(database: VehicleDatabase, verdict: Verdict) -> None:
     parameters = replace(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)), verdict=verdict)
     withheld = {name: replace(branch, apply=False) for name, branch in parameters.branches.items()}
     check_fit(replace(parameters, branches=withheld), database, "v1")
@@ -288,9 +286,7 @@ UNREADABLE = [
 
 
 @pytest.mark.parametrize(("name", "words", "reason"), UNREADABLE)
-def test_missing_or_unreadable_parameter_file_is_refused_by_name(
-    tmp_path: Path, name: str, words: str, reason: Reason
-) -> None:
+def test_missing_or_unreadable_parameter_file_is_refused(tmp_path: Path, name: str, words: str, reason: Reason) -> None:
     (tmp_path / "p.json").write_bytes(b"{}")
     with pytest.raises(UnfitError, match=words) as caught:
         read_parameters(tmp_path / name)

@@ -164,9 +164,7 @@ class Node:
 
 @pytest.mark.parametrize("before", [Reason.NONE, Reason.BRANCH_STALE])
 @pytest.mark.parametrize("revoked", [False, True])
-def test_start_and_end_of_every_bus_silence_are_logged_once(
-    database: VehicleDatabase, before: Reason, revoked: bool
-) -> None:
+def test_start_and_end_of_bus_silence_are_logged_once(database: VehicleDatabase, before: Reason, revoked: bool) -> None:
     """In the same way after a fall-back, and without parameters."""
     node = Node(database)
     assert node.drive() is None

@@ -114,7 +114,7 @@ def test_telemetry_lines_lost_on_a_full_disk_are_counted_and_logged_once(make_ou
 
 
 @pytest.mark.parametrize("target", [".", "pipe", ("no-such-host.invalid", 5000), ("a" * 64, 5000)])
-def test_unusable_telemetry_target_is_logged_and_does_not_block_the_node(
+def test_unusable_telemetry_target_does_not_block_the_node(
     target: str | tuple[str, int], make_outlet: Any, tmp_path: Path
 ) -> None:
     """A folder, a pipe without a reader, a host without an address, and one that no name server could know."""
@@ -151,9 +151,7 @@ def test_mqtt_example_extracts_the_currents_from_a_line(make_outlet: Any, tmp_pa
     assert currents((tmp_path / "node.jsonl").read_text()) == {VSS: -60.0, "motor": -80.0}
 
 
-def test_partly_written_telemetry_line_is_removed_from_the_file(
-    make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_partly_written_line_is_removed(make_outlet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, write = tmp_path / "node.jsonl", os.write
     outlet = make_outlet(path)
     monkeypatch.setattr(os, "write", lambda file, line: write(file, line[:7] if line.startswith(b'{"time"') else line))

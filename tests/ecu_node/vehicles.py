@@ -81,26 +81,20 @@ def whole_vehicle(make_database: MakeDatabase, more: str, *changes: tuple[str, s
 def parameters_for(database: VehicleDatabase, **faults: tuple[float, float]) -> VehicleParameters:
     """Parameters with drift and offset [A] per branch."""
     layout = database.layout
+    branches = {name: BranchParameters(drift=fault[0], offset_a=fault[1], apply=True) for name, fault in faults.items()}
+    provenance = Provenance(
+        tool="test", method="truth", created="2026-01-01T00:00:00Z", fleet="f", fleet_size=1, drives=[], duration_s=1
+    )
     return VehicleParameters(
         vehicle="v1",
         number=300,
         layout=FileReference(name=layout.path.name, sha256=layout.digest),
         dbc=FileReference(name=layout.dbc_path.name, sha256=database.digest),
         verdict="corrected",
-        branches={
-            name: BranchParameters(drift=drift, offset_a=offset, apply=True) for name, (drift, offset) in faults.items()
-        },
+        branches=branches,
         hardware_fault=HardwareFault(suspected=False),
         junction_residual=JunctionResidual(measured_a=1.0, corrected_a=0.1),
-        provenance=Provenance(
-            tool="test",
-            method="truth",
-            created="2026-01-01T00:00:00Z",
-            fleet="f",
-            fleet_size=1,
-            drives=[],
-            duration_s=1,
-        ),
+        provenance=provenance,
     )
 
 

@@ -113,9 +113,7 @@ def test_unusable_cells_are_labelled_as_not_good_in_every_channel_computed_from_
     assert any(text.startswith(notice) for text in trip.notices) if notice else not trip.notices
 
 
-def test_files_with_a_column_missing_no_usable_value_or_less_than_10_s_are_refused(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_files_without_a_column_usable_values_or_10_s_are_refused(tmp_path: Path, database: VehicleDatabase) -> None:
     path = write_csv(tmp_path / "a.csv", columns(), "Battery V", "Batery V")
     words = r"a\.csv: there is no column 'Battery Voltage \[V\]'; the columns are 'Batery V"
     with pytest.raises(LogError, match=words):

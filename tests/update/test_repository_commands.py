@@ -194,9 +194,7 @@ def test_partly_written_key_is_removed(free_bytes: int, repo: Repo) -> None:
     assert not list(repo.folder.glob("*anna*"))
 
 
-def test_each_mistake_is_refused_in_one_line_and_changes_nothing(
-    repo: Repo, other: VehicleParameters, tmp_path: Path
-) -> None:
+def test_mistakes_are_refused_and_change_nothing(repo: Repo, other: VehicleParameters, tmp_path: Path) -> None:
     def files() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in repo.path.rglob("*") if path.is_file()}
 

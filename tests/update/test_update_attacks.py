@@ -182,7 +182,7 @@ def server(repo: Repo) -> Iterator[str]:
         thread.join()
 
 
-def test_update_from_a_web_server_is_limited_in_size_and_time(
+def test_web_server_is_limited_in_size_and_time(
     repo: Repo, new: Path, server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     timestamp = repo.metadata / "timestamp.json"

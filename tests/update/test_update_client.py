@@ -136,7 +136,7 @@ def test_none_of_many_revocations_is_forgotten(repo: Repo, state: Path) -> None:
     assert "nothing is in force now" in repo.updated(state)
 
 
-def test_same_set_with_a_later_expiry_needs_no_trial(
+def test_same_set_with_later_expiry_needs_no_trial(
     repo: Repo, state: Path, parameters: VehicleParameters, other: VehicleParameters
 ) -> None:
     assert repo.updated(state).startswith("nothing new: parameter set 300 (")
@@ -176,7 +176,7 @@ def test_expired_set_neither_comes_nor_stays_in_force(
     assert read_state(state).ended == "expired"
 
 
-def test_latest_time_seen_is_kept_when_the_clock_is_set_back(
+def test_latest_time_is_kept_if_the_clock_goes_back(
     repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters
 ) -> None:
     now = datetime.now(UTC)
@@ -234,9 +234,7 @@ def test_signed_but_inconsistent_description_is_refused(
 
 
 @pytest.mark.parametrize("damage", [without, cut, zeros, a_folder, a_pipe, huge])
-def test_damaged_bundle_or_state_is_refused_in_one_line(
-    damage: Callable[[Path], None], repo: Repo, state: Path
-) -> None:
+def test_damaged_bundle_or_state_is_refused(damage: Callable[[Path], None], repo: Repo, state: Path) -> None:
     bundle = repo.bundle()
     damage(bundle)
     repo.refused(state, str(bundle), bundle)

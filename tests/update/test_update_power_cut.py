@@ -77,9 +77,7 @@ def cuts(folder: Path, files: list[Path], place: Path) -> Iterator[Path]:
     ["conclude", *(pytest.param(name, marks=pytest.mark.long) for name in ("update", "revoke"))],
     indirect=True,
 )
-def test_power_cut_leaves_the_old_or_new_state(
-    command: Callable[[Path], list[str]], state: Path, tmp_path: Path
-) -> None:
+def test_power_cut_leaves_old_or_new_state(command: Callable[[Path], list[str]], state: Path, tmp_path: Path) -> None:
     work, log = tmp_path / "work", tmp_path / "log"
     calls = calls_of(command(started(state, work)), work, FILES, log)
     before, after = timeless(state), timeless(work)

@@ -147,9 +147,7 @@ def test_removed_kernel_rules_are_restored(start_gateway: StartNode) -> None:
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin")
 
 
-def test_node_carries_frames_itself_without_cap_net_admin(
-    start_gateway: StartNode, here: Recording, there: Recording
-) -> None:
+def test_node_carries_frames_without_cap_net_admin(start_gateway: StartNode, here: Recording, there: Recording) -> None:
     with start_gateway(by=WITHOUT_RIGHTS) as node:
         with noise(50):
             pass
@@ -162,7 +160,7 @@ def test_node_carries_frames_itself_without_cap_net_admin(
     ) in node.messages
 
 
-def test_node_carries_frames_itself_without_module_can_gw(start_gateway: StartNode, there: Recording) -> None:
+def test_node_carries_frames_without_module_can_gw(start_gateway: StartNode, there: Recording) -> None:
     run_tool("rmmod", "can-gw")
     try:
         with start_gateway() as node:
@@ -281,9 +279,7 @@ def joined() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("killed", [False, True], ids=["gateway running", "gateway killed before"])
-def test_joined_buses_stop_the_gateway_and_no_frame_circulates(
-    drive: Path, tmp_path: Path, start_gateway: StartNode, killed: bool
-) -> None:
+def test_joined_buses_stop_the_gateway(drive: Path, tmp_path: Path, start_gateway: StartNode, killed: bool) -> None:
     words = "which only this one may send there; two nodes on one bus, or two buses that are joined? Stop one"
     with start_gateway() as node:
         if killed:
