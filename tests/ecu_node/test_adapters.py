@@ -140,8 +140,9 @@ def test_dry_run_prints_the_bus_that_would_be_opened(node: list[str], dry_run: D
     rate = ("--bitrate", "250000")
     reads, sends = "  reads Pair (0x100), Heater (0x200), Net (0x102)", "  sends PairOut (0x200)"
     assert dry_run(*PCAN, *rate) == ["would open pcan PCAN_USBBUS1: bitrate 250000", reads, sends]
-    last = dry_run(*PCAN, *rate, "--params", "none.json")[-1]
-    assert last.startswith("would correct nothing: none.json: no such parameter")
+    foreign = f"{node[node.index('--params') + 1]}: parameters are for vehicle 'v1', this is 'v2'"
+    for option, value, why in (("--params", "none.json", "none.json: no such parameter"), ("--vehicle", "v2", foreign)):
+        assert dry_run(*PCAN, *rate, option, value)[-1].startswith(f"would correct nothing: {why}")
     done = ecu_node(*node, *PCAN, "--dry-run")
     assert done.code == 1
     assert "no bitrate" in done.err

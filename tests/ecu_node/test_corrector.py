@@ -475,7 +475,7 @@ def test_a_signal_beyond_the_end_of_its_frame_is_invalid(make_database: MakeData
 
 
 MOTOR_SNA = '512 Motor -32768 "SNA"'
-INIT = (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"')
+INIT, OFF = (MOTOR_SNA, f'{MOTOR_SNA} -1 "Init"'), (MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"')
 PAGE = (" SG_ Quality", ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1')
 OWN_E2E = '\n[e2e]\nprofile = "P01"\nmessages = ["PairOut"]\n'
 LOOP = ("PairOut.Motor", "Pair.Spare")
@@ -505,11 +505,7 @@ DISTURBING = [
     (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
     (SMALL_LAYOUT + OWN_SUM, WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n', "code 3 of signal Sum means 'SNA', .* beyond 0.2"),
     (SMALL_LAYOUT, SMALL_DBC.replace(*INIT), "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
-    (
-        SMALL_LAYOUT,
-        SMALL_DBC.replace(MOTOR_SNA, f'{MOTOR_SNA} 0 "Off"'),
-        r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'",
-    ),
+    (SMALL_LAYOUT, SMALL_DBC.replace(*OFF), r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'"),
     (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery is written twice, or overlaps .*, or the E2E header"),
 ]
 

@@ -22,6 +22,7 @@ from ecu_node.bus.service import Log, ServiceManager, be_real_time
 from ecu_node.bus.wiring import InForce, Mode, put_in_force
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import VehicleParameters
 from tests.ecu_node.processes import ServiceManagerHere, running
 from tests.ecu_node.vehicles import LAYOUT, answers, battery, corrector_for, parameters_for
 
@@ -157,7 +158,8 @@ class Node:
         self.corrector.latch(reason, branches)
         return self.changes.news()
 
-    def load(self, in_force: InForce) -> str | None:
+    def load(self, parameters: VehicleParameters | None) -> str | None:
+        in_force = InForce(parameters=parameters, reason=Reason.NONE if parameters else Reason.REVOKED)
         put_in_force(self.corrector, self.database, in_force, self.now_s, mode=Mode.OVERLAY)
         return self.changes.news()
 
@@ -170,7 +172,7 @@ def test_start_and_end_of_bus_silence_are_logged_once(database: VehicleDatabase,
     assert node.drive() is None
     node.latch(before, "motor")
     if revoked:
-        assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None, "it does not correct again"
+        assert node.load(None) is None, "it does not correct again"
     for _ in range(2):
         assert [node.later(1.0), node.later(6.0), node.drive()] == ["no branch sends", None, "branches send again"]
 
@@ -183,8 +185,7 @@ def test_log_gives_reason_and_end_condition_of_a_fall_back_and_its_end(database:
     until = f"{FALLS_BACK} other parameters or 'ecu-node clear'"
     assert wrong == f"{until}: {Reason.SUM_IMPLAUSIBLE.words} (motor or dcdc)"
     assert node.latch(Reason.CORRECTION_WORSE) == f"{until}: {Reason.CORRECTION_WORSE.words}"
-    fit = InForce(parameters=parameters_for(database, battery=(0.0, 5.0)))
-    assert node.load(fit) == "correcting again"
+    assert node.load(parameters_for(database, battery=(0.0, 5.0))) == "correcting again"
     alone = Node(database, has_memory=False)
     assert f"{FALLS_BACK} a restart: " in (alone.latch(Reason.CORRECTION_WORSE) or "")
 
@@ -192,7 +193,7 @@ def test_log_gives_reason_and_end_condition_of_a_fall_back_and_its_end(database:
 def test_revocation_during_bus_sleep_is_not_logged_as_waking_up(database: VehicleDatabase) -> None:
     node = Node(database)
     assert [node.drive(), node.later(1.0)] == [None, "no branch sends"]
-    assert node.load(InForce(parameters=None, reason=Reason.REVOKED)) is None
+    assert node.load(None) is None
 
 
 DOWN = """
@@ -250,10 +251,9 @@ def test_ctrl_c_during_startup_prints_one_line_and_exits_with_130(tmp_path: Path
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ecu-node: interrupted\n")
     for nobody in ("2>&-", "2>/dev/full"):
-        done = subprocess.run(
-            ["sh", "-c", f'"$@" {nobody}', "sh", *command], stdout=subprocess.PIPE, text=True, check=False
-        )
-        assert (done.returncode, done.stdout) == (130, "")
+        shell = ["sh", "-c", f'"$@" {nobody}', "sh", *command]
+        silent = subprocess.run(shell, stdout=subprocess.PIPE, check=False)
+        assert (silent.returncode, silent.stdout) == (130, b"")
 
 
 @pytest.mark.parametrize(("event", "what"), MOMENTS)

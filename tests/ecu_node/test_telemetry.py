@@ -37,9 +37,8 @@ class Outlet:
         self.corrector = corrector_for(database, Mode.OVERLAY, time.monotonic(), battery=(0.25, 5.0))
         self.bus = SteadyBus(lambda: can.Bus("telemetry", "virtual"), self.corrector.counters)
         self.said: list[str] = []
-        self.telemetry = Telemetry(
-            target, self.corrector, layout=database.layout, latency=Latency(), buses=[self.bus], say=self.said.append
-        )
+        options: Any = {"layout": database.layout, "latency": Latency(), "buses": [self.bus], "say": self.said.append}
+        self.telemetry = Telemetry(target, self.corrector, **options)
         self.now_s = time.monotonic() - 1.0
 
     def wait_for_loss(self, count: int) -> None:

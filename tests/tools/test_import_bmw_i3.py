@@ -49,9 +49,8 @@ def columns(**changes: Any) -> dict[str, Array]:
 def write_csv(path: Path, values: dict[str, Array], old: str = "", new: str = "") -> Path:
     """Write a file as it is published; a value that is not a number is an empty cell."""
     header = ";".join({"time": "Time [s]", **COLUMNS}[key] + " " for key in values) + ";Battery Temperature [\xb0C]"
-    rows = [
-        "".join(f"{cell:g};".replace("nan", "") for cell in row) + "20" for row in zip(*values.values(), strict=True)
-    ]
+    cells = zip(*values.values(), strict=True)
+    rows = ["".join(f"{cell:g};".replace("nan", "") for cell in row) + "20" for row in cells]
     data = "\n".join([header.replace(old, new), *rows, ""]).encode("latin-1")
     path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
     return path
@@ -128,10 +127,9 @@ def test_files_without_a_column_usable_values_or_10_s_are_refused(tmp_path: Path
 
 def test_bad_file_does_not_stop_the_import_but_sets_the_exit_code(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
-    write_csv(tmp_path / "in" / "A.csv", columns())
-    write_csv(tmp_path / "in" / "B.csv.gz", columns())
+    for name in ("in/A.csv", "in/B.csv.gz", "B.csv"):
+        write_csv(tmp_path / name, columns())
     write_csv(tmp_path / "in" / "C.csv", columns(), "Throttle", "Trottle")
-    write_csv(tmp_path / "B.csv", columns())
     done = run(tmp_path / "in", tmp_path / "B.csv", "--layout", LAYOUT, "--out", tmp_path / "store")
     assert done.exit_code == 1
     assert [entry.vehicle for entry in list_drives(tmp_path / "store")] == ["A"]

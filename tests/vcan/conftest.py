@@ -3,10 +3,9 @@
 import os
 import shutil
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Protocol
 
 import pytest
 
@@ -26,12 +25,8 @@ def state_of(frame: bytes) -> tuple[State, Reason]:
     return State(frame[1] >> 4), Reason(frame[2])
 
 
-class StartNode(Protocol):
-    """Starts ``ecu-node run`` with some options, by another program if one is given."""
-
-    def __call__(
-        self, *options: str, params: Path | None = None, by: Sequence[str] = ()
-    ) -> AbstractContextManager[NodeProcess]: ...
+StartNode = Callable[..., AbstractContextManager[NodeProcess]]
+"""Starts ``ecu-node run`` with some options, with other `params` and `by` another program if they are given."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -97,8 +92,8 @@ def start_gateway(start_node: StartNode, there: Recording) -> StartNode:
     """The node as a gateway between vcan0 and vcan1, from when its status has come there."""
 
     @contextmanager
-    def start(*options: str, params: Path | None = None, by: Sequence[str] = ()) -> Iterator[NodeProcess]:
-        with start_node("--gateway", OTHER_CHANNEL, *options, params=params, by=by) as node:
+    def start(*options: str, by: Sequence[str] = ()) -> Iterator[NodeProcess]:
+        with start_node("--gateway", OTHER_CHANNEL, *options, by=by) as node:
             there.wait_for(STATUS, len(there.data_of(STATUS)) + 1)
             yield node
 

@@ -11,10 +11,10 @@ _TRUSTED_AT_ONCE = "invalid = {window = 10, min_ok = 1, max_error = 1}"
 """One intact frame after a silence is enough: whether a kernel pauses for longer than that is chance."""
 
 
-def write_patient_layout(folder: Path, *, timeout_s: float = TIMEOUT_S) -> Path:
+def write_patient_layout(folder: Path) -> Path:
     """Write layout and DBC into an existing folder; returns the layout's path."""
     shutil.copy(LAYOUT.with_suffix(".dbc"), folder)
     path = folder / LAYOUT.name
-    patient = re.sub(r"(?m)^timeout_s = [0-9.]+$", f"timeout_s = {timeout_s}", LAYOUT.read_text())
+    patient = re.sub(r"(?m)^timeout_s = [0-9.]+$", f"timeout_s = {TIMEOUT_S}", LAYOUT.read_text())
     path.write_text(patient.replace('profile = "P01"\n', f'profile = "P01"\n{_TRUSTED_AT_ONCE}\n', 1))
     return path

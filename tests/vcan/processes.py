@@ -152,7 +152,7 @@ def play(log: Path) -> None:
 @contextmanager
 def playing(log: Path, *, endlessly: bool = False) -> Iterator[subprocess.Popen[bytes]]:
     """Within the block, play a log of can0 on vcan0, once or again and again."""
-    command = ["canplayer", "-I", str(log), *(("-l", "i") if endlessly else ()), f"{CHANNEL}=can0"]
+    command = ["canplayer", "-I", str(log), *["-l", "i"] * endlessly, f"{CHANNEL}=can0"]
     with subprocess.Popen(command) as process:
         try:
             yield process

@@ -53,6 +53,11 @@ def true_currents(t: float) -> dict[str, float]:
     return {"battery": -motor - auxiliary, "motor": motor, "auxiliary": auxiliary}
 
 
+def frames_at(database: VehicleDatabase, k: int) -> list[LoggedFrame]:
+    """Frame k of each branch."""
+    return [BRANCHES[name].frame(database, k, i) for name, i in true_currents(k * PERIOD_S).items()]
+
+
 def true_parameters(database: VehicleDatabase) -> VehicleParameters:
     """A parameter file that states the true faults."""
     faults = {name: (branch.drift, branch.offset_a) for name, branch in BRANCHES.items()}
@@ -60,29 +65,20 @@ def true_parameters(database: VehicleDatabase) -> VehicleParameters:
     return replace(parameters_for(database, **faults), vehicle=VEHICLE, number=7, junction_residual=residual)
 
 
-def write_drive(
-    path: Path, database: VehicleDatabase, instants: int, *, standing_at_s: float | None = None
-) -> list[LoggedFrame]:
-    """Write the drive as a candump log of can0, among frames of others; returns all frames.
-
-    With `standing_at_s` all instants have the currents of this one: their sum is right whenever it is looked at.
-    """
+def write_drive(path: Path, database: VehicleDatabase, instants: int) -> list[LoggedFrame]:
+    """Write the drive as a candump log of can0, among frames of others; returns all frames."""
     lines = []
     for k in range(instants):
         t = k * PERIOD_S
-        frames = list(_foreign_frames(database, k))
-        for name, i in true_currents(t if standing_at_s is None else standing_at_s).items():
-            frames.append(BRANCHES[name].frame(database, k, i))
+        frames = [*_foreign_frames(database, k), *frames_at(database, k)]
         lines += [f"({t + 0.001 * n:.6f}) can0 {'#'.join(frame)}" for n, frame in enumerate(frames)]
     path.write_text("\n".join(lines) + "\n")
     return frames_of(path)
 
 
-def sent_by_core(
-    database: VehicleDatabase, mode: Mode, frames: Iterable[LoggedFrame], in_force: InForce | None = None
-) -> list[LoggedFrame]:
-    """What a node sends for some frames, with the true parameters unless others are given."""
-    corrector = wire(database, in_force or InForce(parameters=true_parameters(database)), 0.0, mode=mode)
+def sent_by_core(database: VehicleDatabase, mode: Mode, frames: Iterable[LoggedFrame]) -> list[LoggedFrame]:
+    """What a node with the true parameters sends for some frames."""
+    corrector = wire(database, InForce(parameters=true_parameters(database)), 0.0, mode=mode)
     sent = []
     for number, (identifier, data) in enumerate(frames):
         frame, now_s = Frame(FrameKey(int(identifier, 16), len(identifier) == 8), bytes.fromhex(data)), 1e-3 * number

@@ -26,7 +26,7 @@ from tests.vcan.processes import (
     send,
     wait_until,
 )
-from tests.vcan.small_drive import BRANCHES, sent_by_core, true_currents
+from tests.vcan.small_drive import frames_at, sent_by_core
 
 INSTANTS = 45
 """Length of the drive: a multiple of the counter's 15 codes, so that it can be played twice without a jump."""
@@ -42,8 +42,8 @@ def wait_for_correcting(here: Recording) -> None:
 
 def send_branches(database: VehicleDatabase, k: int) -> None:
     """Send one frame of each branch."""
-    for name, current_a in true_currents(0.02 * k).items():
-        send("#".join(BRANCHES[name].frame(database, k, current_a)))
+    for frame in frames_at(database, k):
+        send("#".join(frame))
 
 
 @pytest.fixture

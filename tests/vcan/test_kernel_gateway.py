@@ -65,11 +65,8 @@ def rules() -> list[tuple[str, ...]]:
 def noise(count: int) -> Iterator[None]:
     """Within the block, send numbered frames of others on both buses, one each 8 ms; at its end all have been sent."""
     ways = ((CHANNEL, NOISE), (OTHER_CHANNEL, BACK))
-    commands = [
-        ["cangen", channel, "-I", f"{identifier:X}", "-D", "i", "-L", "8", "-n", str(count), "-g", "8"]
-        for channel, identifier in ways
-    ]
-    running = [subprocess.Popen(command) for command in commands]
+    options = ["-D", "i", "-L", "8", "-n", str(count), "-g", "8"]
+    running = [subprocess.Popen(["cangen", channel, "-I", f"{number:X}", *options]) for channel, number in ways]
     try:
         yield
         assert [process.wait(LONGEST_WAIT_S) for process in running] == [0, 0]
@@ -154,10 +151,8 @@ def test_node_carries_frames_without_cap_net_admin(start_gateway: StartNode, her
         assert rules() == []
         assert len(there.wait_for(NOISE, 50)) == len(here.wait_for(BACK, 50)) == 50
         assert node.stop() == 0
-    assert (
-        "vcan0 and vcan1: the kernel carries no frames (CAP_NET_ADMIN is needed), so this program carries them all, "
-        "and they stop when it does"
-    ) in node.messages
+    why = "the kernel carries no frames (CAP_NET_ADMIN is needed), so this program carries them all, and they stop when"
+    assert f"vcan0 and vcan1: {why} it does" in node.messages
 
 
 def test_node_carries_frames_without_module_can_gw(start_gateway: StartNode, there: Recording) -> None:
@@ -217,9 +212,8 @@ def test_branch_frames_of_another_node_are_logged_and_dropped(
     passed = [data for data in there.data_of(BATTERY) if data != foreign]
     assert [data[1] & 15 for data in passed] == [k % 15 for k in range(INSTANTS)], "each frame of the branch arrives"
     assert passed != here.data_of(BATTERY), "corrected"
-    assert "vcan1': another node sends frames 0x110, which only this one may send there; they are dropped" in (
-        node.messages
-    )
+    words = "vcan1': another node sends frames 0x110, which only this one may send there; they are dropped"
+    assert words in node.messages
 
 
 def test_gateway_whose_standard_error_nobody_reads_forwards_frames_and_can_be_ended(
