@@ -30,12 +30,10 @@ message = "S"
 state = "State"
 reason = "Reason"
 """
-_DBC = """VERSION ""
-BU_: N C X
-{measured}{corrected}BO_ 48 S: 2 C
+_STATUS = """BO_ 48 S: 2 C
  SG_ State : 0|4@1+ (1,0) [0|15] "" X
  SG_ Reason : 8|8@1+ (1,0) [0|255] "" X
-{values}"""
+"""
 _CURRENT = ' SG_ I : 0|16@1- (0.1,0) [-3000|3000] "A" X\n'
 KEYS = {name: FrameKey(16 + number, False) for number, name in enumerate(NAMES)}
 PHASE_S = {"battery": 0.0, "motor": 0.003, "heater": 0.007}
@@ -50,8 +48,8 @@ def three_branches(folder: Path, quality_bits: int = 3) -> VehicleDatabase:
     quality = f' SG_ Q : 16|{quality_bits}@1+ (1,0) [0|7] "" X\n'
     corrected = (f"BO_ {32 + number} {letter}C: 3 C\n{_CURRENT}{quality}" for number, letter in enumerate("BMH"))
     values = (f'VAL_ {32 + number} I -32768 "SNA";\n' for number in range(3))
-    blocks = {"measured": "".join(measured), "corrected": "".join(corrected), "values": "".join(values)}
-    (folder / "three.dbc").write_text(_DBC.format(**blocks))
+    dbc = "".join(['VERSION ""\nBU_: N C X\n', *measured, *corrected, _STATUS, *values])
+    (folder / "three.dbc").write_text(dbc)
     (folder / "three.toml").write_text(LAYOUT)
     return read_database(read_layout(folder / "three.toml"))
 
@@ -86,8 +84,7 @@ class Junction:
         )
         parameters = msgspec.structs.replace(parameters, junction_residual=residual)
         self.corrector = wire(database, InForce(parameters=parameters), 0.0)
-        self.period_s, self.noise_a, self.random = period_s, noise_a, np.random.default_rng(seed)
-        self.step = 0
+        self.period_s, self.noise_a, self.random, self.step = period_s, noise_a, np.random.default_rng(seed), 0
         self.wrong: dict[str, Callable[[float], float]] = {}
         """By branch, what its broken sensor makes of the current that it showed before. [A]"""
         self.forged: dict[str, float] = {}
@@ -107,9 +104,8 @@ class Junction:
         for self.step in range(self.step, self.step + round(seconds / self.period_s)):  # noqa: B020
             for name, phase_s in PHASE_S.items():
                 now_s = self.now_s + phase_s
-                current_a = true_a(now_s)[name]
                 gain, offset_a = {"battery": (1.05, 2.0), "motor": (1.01, 0.0), "heater": (0.98, -0.5)}[name]
-                shown_a = gain * current_a + offset_a + self.noise_a * self.random.standard_normal()
+                shown_a = gain * true_a(now_s)[name] + offset_a + self.noise_a * self.random.standard_normal()
                 shown_a = self.wrong[name](shown_a) if name in self.wrong else shown_a
                 if name in self.forged:
                     self._send(name, shown_a + self.forged[name], now_s - 0.0002)

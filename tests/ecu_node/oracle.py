@@ -20,8 +20,6 @@ from ecu_node.layout import Branch
 from ecu_node.parameters import BranchParameters, VehicleParameters
 from tests.ecu_node.random_vehicles import Codes, mask_of
 
-__all__ = ["Oracle", "require_right"]
-
 _TOLERANCE = Fraction(1, 1024)
 """Share of a code by which the value that the node rounds may exceed the exact one."""
 
@@ -130,9 +128,8 @@ class Oracle:
             names.add(self._voltage[0].name)
         messages = [database.message(name) for name in names]
         self._messages = {item.frame_id | item.is_extended_frame << 31: item for item in messages}
-        self._protections = {
-            item.name: found for item in messages if (found := protection_of(database, item)) is not None
-        }
+        found = {item.name: protection_of(database, item) for item in messages}
+        self._protections = {name: protection for name, protection in found.items() if protection is not None}
         self._receivers = {name: Receiver(found) for name, found in self._protections.items()}
         self._counters = dict.fromkeys(names, -1)
 

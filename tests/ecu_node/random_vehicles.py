@@ -26,8 +26,6 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters
 
-__all__ = ["Codes", "draw_vehicle", "mask_of"]
-
 _SCALES = ("0.1", "-0.05", "1", "0.02", "0.001", "-0.25", "3", "0.0078125", "100", "-1")
 _OFFSETS = ("0", "0", "-400", "12.5", "-0.3")
 _LENGTHS = (1, 2, 3, 5, 8, 10, 12, 13, 15, 16, 17, 20, 24, 31, 32, 33, 47, 63, 64)
@@ -117,14 +115,9 @@ class _Draft:
 
     def message(self, *more: Signal) -> Message:
         """Return the message of cantools, with some more signals; cantools raises an error if signals overlap."""
-        return Message(
-            self.frame_id,
-            self.name,
-            self.size,
-            [*self.signals, *more],
-            is_extended_frame=self.extended,
-            senders=["Sensor" if self.name.startswith("In") else "Corrector"],
-        )
+        senders, signals = ["Sensor" if self.name.startswith("In") else "Corrector"], [*self.signals, *more]
+        extended = self.extended
+        return Message(self.frame_id, self.name, self.size, signals, is_extended_frame=extended, senders=senders)
 
     def place(self, rng: Random, signal: Signal, *, multiplexed: bool = False, little: bool = False) -> str | None:
         """Put a signal where no other one is; return its name in the layout, or None if there is no room."""
@@ -166,10 +159,9 @@ def draw_vehicle(
     tuple of VehicleDatabase and VehicleParameters
         Layout and DBC, and parameters that fit them.
     """
-    while True:
+    layout, messages, faults = _draw(rng, kinds)
+    while len(layout["branch"]) < 2 or not any("corrected" in branch for branch in layout["branch"]):
         layout, messages, faults = _draw(rng, kinds)
-        if len(layout["branch"]) >= 2 and any("corrected" in branch for branch in layout["branch"]):
-            break
     dbc = Database(messages, nodes=[Node("Sensor"), Node("Corrector")]).as_dbc_string()
     (folder / "fuzz.dbc").write_text(dbc)
     (folder / "fuzz.toml").write_text("".join(f"{key} = {_toml(value)}\n" for key, value in layout.items()))
@@ -210,8 +202,7 @@ def _draw(rng: Random, kinds: Collection[str]) -> tuple[dict[str, Any], list[Mes
     keys = ("signal", "power", "voltage", "corrected")
     named = {branch[key].split(".")[0] for branch in branches for key in keys if key in branch}
     used = [draft for draft in (*sources, *targets) if draft.name in named]
-    layout = {**_SETTINGS, "branch": branches}
-    layout["e2e"] = [draft.e2e for draft in used if draft.e2e]
+    layout = {**_SETTINGS, "branch": branches, "e2e": [draft.e2e for draft in used if draft.e2e]}
     return layout, [draft.message() for draft in used], faults
 
 
