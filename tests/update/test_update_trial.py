@@ -3,6 +3,7 @@
 import math
 import shutil
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,9 +19,8 @@ from tests.update.held import NOW, Running, put_on_trial
 
 DRIFT, OFFSET_A = 0.05, 2.0
 """Fault of the battery's sensor in this vehicle. [1, A]"""
-
-
 TRIAL_S = 30.0
+CORRECTING = (State.CORRECTING, Reason.NONE)
 
 
 @pytest.fixture(scope="module")
@@ -39,35 +39,20 @@ def own_vehicle(folder: Path, more: str = "") -> VehicleDatabase:
 class Drive(Running):
     """A vehicle whose battery's sensor is faulty."""
 
-    now_s = 0.0
+    now_s, contactor, moving = 0.0, 0, True
 
-    def go_on(
-        self,
-        duration_s: float,
-        *,
-        load_a: float = 0.0,
-        drift: float = DRIFT,
-        offset_a: float = OFFSET_A,
-        contactor: int = 0,
-        moving: bool = True,
-    ) -> None:
+    def go_on(self, duration_s: float, load_a: float = 0.0, drift: float = DRIFT, offset_a: float = OFFSET_A) -> None:
         """Drive, or stand; a load that nobody measures takes its share from the battery."""
 
         def motor_a(k: int) -> float:
-            return moving * (100.0 * math.sin(0.3 * k) + 40.0)
+            return self.moving * (100.0 * math.sin(0.3 * k) + 40.0)
 
-        drive(
-            self.database,
-            self.corrector,
-            self.now_s,
-            self.now_s + duration_s,
-            battery_a=lambda k: (1.0 + drift) * (motor_a(k) + load_a) + offset_a,
-            motor_a=motor_a,
-            period_s=0.1,
-            look=self.store.look,
-            ContactorState=contactor,
-        )
-        self.now_s += duration_s
+        def battery_a(k: int) -> float:
+            return (1.0 + drift) * (motor_a(k) + load_a) + offset_a
+
+        start_s, self.now_s = self.now_s, self.now_s + duration_s
+        go = partial(drive, self.database, self.corrector, start_s, self.now_s, ContactorState=self.contactor)
+        go(battery_a=battery_a, motor_a=motor_a, period_s=0.1, look=self.store.look)
 
     def has_said(self, words: str) -> bool:
         return any(words in line for line in self.said)
@@ -78,9 +63,9 @@ class Drive(Running):
 
 
 def right(
-    database: VehicleDatabase, drift: float = DRIFT, offset_a: float = OFFSET_A, *, left_a: float = 0.5
+    car: VehicleDatabase, drift: float = DRIFT, offset_a: float = OFFSET_A, left_a: float = 0.5
 ) -> VehicleParameters:
-    found = parameters_for(database, battery=(drift, offset_a), motor=(0.0, 0.0))
+    found = parameters_for(car, battery=(drift, offset_a), motor=(0.0, 0.0))
     residual = JunctionResidual(measured_a=math.hypot(left_a, 4.0), corrected_a=left_a, correction_a=4.0)
     return replace(found, junction_residual=residual)
 
@@ -92,7 +77,7 @@ def tried(vehicle: Path, parameters: VehicleParameters, database: VehicleDatabas
     """Put parameters on trial, and drive for longer than a trial takes."""
     put_on_trial(vehicle, parameters)
     drive = Drive(vehicle, database)
-    drive.go_on(1.1 * TRIAL_S, **conditions)  # type: ignore[arg-type]
+    drive.go_on(1.1 * TRIAL_S, **conditions)
     return drive
 
 
@@ -102,7 +87,7 @@ def test_right_set_comes_in_force_after_its_trial_and_not_before(new: Path, car:
     drive.go_on(0.9 * TRIAL_S)
     assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
     drive.go_on(0.2 * TRIAL_S)
-    assert drive.told == (State.CORRECTING, Reason.NONE)
+    assert drive.told == CORRECTING
     assert read_state(new).in_force is not None
     assert drive.has_said(PASSED)
     drive.go_on(10.0)
@@ -128,10 +113,10 @@ def test_previous_set_stays_in_force_during_and_after_a_failed_trial(new: Path, 
     drive = tried(new, right(car), car)
     put_on_trial(new, right(car, -DRIFT, 0.0))
     drive.go_on(0.5 * TRIAL_S)
-    assert drive.told == (State.CORRECTING, Reason.NONE)
+    assert drive.told == CORRECTING
     assert drive.corrector.branches[0].fault.drift == DRIFT
     drive.go_on(0.6 * TRIAL_S)
-    assert drive.told == (State.CORRECTING, Reason.NONE)
+    assert drive.told == CORRECTING
     assert drive.has_said(FAILED)
 
 
@@ -141,7 +126,7 @@ def test_set_on_trial_is_judged_relative_to_the_expected_sum(new: Path, car: Veh
     found = replace(right(car), junction_residual=expected)
     drive = tried(new, found, car, load_a=3.0)
     drive.go_on(30.0, load_a=3.0)
-    assert drive.told == (State.CORRECTING, Reason.NONE), "the watch does not take the load for an error either"
+    assert drive.told == CORRECTING, "the watch does not take the load for an error either"
     takes_load_for_offset = replace(right(car, 0.0, 3.0), junction_residual=expected)
     drive = tried(new, takes_load_for_offset, car, load_a=3.0, drift=0.0, offset_a=0.0)
     assert drive.has_said(FAILED)
@@ -178,11 +163,15 @@ def test_set_that_lowers_the_sum_as_predicted_passes_its_trial(
 def test_trial_time_counts_only_in_valid_watch_states_while_current_flows(new: Path, tmp_path: Path) -> None:
     """A layout may so exclude charging from the trial."""
     own = own_vehicle(tmp_path, '[watch]\ninput = "contactor_state"\nvalid = [2]\n')
-    drive = tried(new, right(own), own, contactor=1)
-    drive.go_on(1.1 * TRIAL_S, contactor=2, moving=False)
-    assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
-    drive.go_on(1.1 * TRIAL_S, contactor=2)
-    assert drive.told == (State.CORRECTING, Reason.NONE)
+    put_on_trial(new, right(own))
+    drive, no_trial_yet = Drive(new, own), (State.PASSING_THROUGH, Reason.ON_TRIAL)
+    for drive.contactor, drive.moving, told in (
+        (1, True, no_trial_yet),
+        (2, False, no_trial_yet),
+        (2, True, CORRECTING),
+    ):
+        drive.go_on(1.1 * TRIAL_S)
+        assert drive.told == told
 
 
 def test_revocation_takes_effect_at_once_in_a_running_node(new: Path, car: VehicleDatabase) -> None:
@@ -200,7 +189,7 @@ def test_set_expired_for_two_minutes_does_not_return_if_the_clock_goes_back(new:
     assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)
     drive.now = NOW  # the clock was wrong for a moment
     drive.go_on(2.0)
-    assert drive.told == (State.CORRECTING, Reason.NONE)
+    assert drive.told == CORRECTING
     for drive.now in (NOW + timedelta(days=366), NOW + timedelta(days=366, minutes=2), NOW):
         drive.go_on(3.0)
         assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)

@@ -203,9 +203,8 @@ def test_branch_frames_of_another_node_are_logged_and_dropped(
                 wait_for_state(there, State.CORRECTING, Reason.FOREIGN_FRAMES)
                 assert player.wait(LONGEST_WAIT_S) == 0
             foreigner.terminate()
-        sent = len(here.wait_for(BATTERY, INSTANTS))
+        here.wait_for(BATTERY, INSTANTS)
         there.wait_for(AUXILIARY, INSTANTS)
-        print(f"{len(there.data_of(BATTERY)) - sent} foreign frames among {sent}")
         assert node.stop() == 0
     foreign = bytes.fromhex(FOREIGN)
     assert foreign not in here.data_of(BATTERY), "none reaches the sensors' bus"
@@ -279,14 +278,12 @@ def test_joined_buses_stop_the_gateway(drive: Path, tmp_path: Path, start_gatewa
         if killed:
             node.stop(signal.SIGKILL)
         with joined(), playing(drive, endlessly=True):
-            joined_s = time.monotonic()
             if killed:
                 with pytest.raises(AssertionError, match=re.escape(words)), start_gateway():
                     pass  # it hears the branches where only it may send them, and removes what the first one left
             else:
                 assert node.wait_for_end() == 1
                 assert words in node.messages
-            print(f"ended {time.monotonic() - joined_s:.2f} s after the buses were joined")
             assert rules() == []
     with joined(), running_recording(tmp_path / "after.log", OTHER_CHANNEL) as after:
         send(f"{NOISE:X}#01")
