@@ -18,11 +18,8 @@ from tests.ecu_node.processes import ecu_node
 from tests.test_json_everywhere import CALIBRATOR, ECU_NODE
 
 ROOT = Path(__file__).parents[2]
-DOCUMENTS = sorted(
-    path
-    for pattern in ("*.md", "deploy/*.md", "docs/*.md", "docs/reference/*.md", "docs/results/*.md", "examples/*.ipynb")
-    for path in ROOT.glob(pattern)
-)
+PLACES = ("*.md", "deploy/*.md", "docs/*.md", "docs/reference/*.md", "docs/results/*.md", "examples/*.ipynb")
+DOCUMENTS = sorted(path for place in PLACES for path in ROOT.glob(place))
 
 
 def text_of(path: Path) -> str:
@@ -51,14 +48,10 @@ def links(path: Path) -> Iterator[tuple[str, str]]:
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_lead_to_files_and_headings_that_exist(path: Path) -> None:
-    wrong = [file for file, _ in links(path) if not (path.parent / file).exists()]
-    assert wrong == []
-    wrong = [
-        f"{file}#{heading}"
-        for file, heading in links(path)
-        if heading and heading not in headings(path.parent / file if file else path)
-    ]
-    assert wrong == []
+    for file, heading in links(path):
+        target = path.parent / file if file else path
+        assert target.exists(), file
+        assert not heading or heading in headings(target), f"{file}#{heading}"
 
 
 # ---- tables of hazards, faults and codes; the layout of the document
@@ -133,7 +126,6 @@ def test_reference_has_every_command_with_examples_that_calibrator_accepts() -> 
 
 def test_shell_completes_commands() -> None:
     words = {"_CALIBRATOR_COMPLETE": "complete_bash", "COMP_WORDS": "calibrator ki", "COMP_CWORD": "1"}
-    shown = subprocess.run(
-        [sys.executable, "-m", "calibrator"], capture_output=True, text=True, env=os.environ | words, check=False
-    )
+    command, environment = [sys.executable, "-m", "calibrator"], os.environ | words
+    shown = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert shown.stdout.split() == ["kirchhoff"]

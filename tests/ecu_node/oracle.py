@@ -47,11 +47,8 @@ def _codes(message: Message, data: bytes) -> dict[str, int]:
         others = [signal for signal in message.signals if not signal.multiplexer_ids and not signal.is_multiplexer]
         plain = Message(message.frame_id, message.name, message.length, others)
         found = plain.decode(whole, decode_choices=False, scaling=False)
-    return {
-        signal.name: found[signal.name]
-        for signal in message.signals
-        if signal.name in found and _end(message, signal) <= len(data)
-    }
+    names = [item.name for item in message.signals if item.name in found and _end(message, item) <= len(data)]
+    return {name: found[name] for name in names}
 
 
 class _Branch:

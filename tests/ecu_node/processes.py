@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
@@ -87,8 +87,7 @@ class ServiceManagerHere:
         """All messages received so far."""
         texts = []
         self.socket.settimeout(0.0)
-        while True:
-            try:
+        with suppress(BlockingIOError):
+            while True:
                 texts.append(self.socket.recv(4096).decode())
-            except BlockingIOError:
-                return texts
+        return texts

@@ -34,15 +34,9 @@ _FACTORS = {"mA": Fraction(1, 1000), "kW": Fraction(1000)}
 _TRIES = 50
 _LONGEST_WITH_RANGE = 24
 """Longest signal that gets a range: ends of longer ones have more digits than a floating-point number. [bit]"""
-_SETTINGS = {
-    "schema": 1,
-    "name": "fuzz",
-    "dbc": "fuzz.dbc",
-    "full_scale_a": 1e-9,  # every vehicle reaches it, wherever its signals have names
-    "max_age_s": 1e6,
-    "watch": {"window_s": 3600.0, "margin_a": 1e6},
-    "limits": {"drift": 0.4, "offset_a": 160.0},
-}
+# every vehicle reaches this full scale, wherever its signals have names
+_SETTINGS: dict[str, Any] = {"schema": 1, "name": "fuzz", "dbc": "fuzz.dbc", "full_scale_a": 1e-9, "max_age_s": 1e6}
+_SETTINGS |= {"watch": {"window_s": 3600.0, "margin_a": 1e6}, "limits": {"drift": 0.4, "offset_a": 160.0}}
 
 
 HEADER_BITS = {"P01": 12, "P02": 12, "P04": 96, "P05": 24, "P06": 40, "P07": 160, "P11": 12, "counter CRC8": 16}

@@ -21,13 +21,8 @@ def placed_signals(draw: st.DrawFn) -> tuple[Message, Signal]:
     length = draw(st.integers(1, min(64, 8 * size)))
     first = draw(st.integers(0, 8 * size - length))
     big = draw(st.booleans())
-    signal = Signal(
-        "S",
-        start=8 * (first // 8) + 7 - first % 8 if big else first,
-        length=length,
-        byte_order="big_endian" if big else "little_endian",
-        is_signed=draw(st.booleans()),
-    )
+    start = 8 * (first // 8) + 7 - first % 8 if big else first
+    signal = Signal("S", start, length, "big_endian" if big else "little_endian", draw(st.booleans()))
     return Message(frame_id=1, name="M", length=size, signals=[signal], is_fd=size > 8), signal
 
 
@@ -74,9 +69,8 @@ BA_ "SystemSignalLongSymbol" SG_ 1 {CUT_NAME} "{CUT_NAME}Index";
 
 
 def test_multiplexer_name_cut_to_32_characters_refers_to_the_full_name(tmp_path: Path) -> None:
-    branches = "".join(
-        f'[[branch]]\nname = "{name}"\nsignal = "{name}.Current"\nsign = 1\n' for name in ("Pack", "Motor")
-    )
+    branch = '[[branch]]\nname = "{0}"\nsignal = "{0}.Current"\nsign = 1\n'
+    branches = branch.format("Pack") + branch.format("Motor")
     (tmp_path / "a.dbc").write_text(CUT_DBC)
     (tmp_path / "a.toml").write_text(f'schema = 1\nname = "a"\ndbc = "a.dbc"\nfull_scale_a = 400\n{branches}')
     message, signal = read_database(read_layout(tmp_path / "a.toml")).signal("Pack.Current")

@@ -30,33 +30,17 @@ HALF = Fraction(1, 2)
 
 
 def current(
-    scale: float = 0.02,
-    offset: float = 0.0,
-    *,
-    length: int = 16,
-    signed: bool = True,
-    limits: tuple[float, float] | None = None,
-    unit: str = "A",
-    names: dict[int, str] | None = None,
+    scale: float = 0.02, offset: float = 0.0, *, limits: Any = (None, None), names: Any = None, **more: Any
 ) -> Codes:
-    low, high = limits if limits is not None else (None, None)
-    signal = Signal(
-        "I",
-        start=0,
-        length=length,
-        is_signed=signed,
-        conversion=BaseConversion.factory(scale=scale, offset=offset, choices=names),  # type: ignore[arg-type]
-        minimum=low,
-        maximum=high,
-        unit=unit,
-    )
-    return read_codes(signal, AMPERE, "test")
+    low, high = limits
+    conversion = BaseConversion.factory(scale=scale, offset=offset, choices=names)
+    options: dict[str, Any] = {"length": 16, "is_signed": True, "unit": "A"} | more
+    return read_codes(Signal("I", 0, conversion=conversion, minimum=low, maximum=high, **options), AMPERE, "test")
 
 
 def integer_plan(source: Codes, target: Codes, *, sign: int, drift: float, offset_a: float) -> IntegerPlan:
-    return correction_plan(
-        Signals(source=source, target=target, sign=sign), SensorFault(drift=drift, offset_a=offset_a)
-    )
+    signals = Signals(source=source, target=target, sign=sign)
+    return correction_plan(signals, SensorFault(drift=drift, offset_a=offset_a))
 
 
 def exact(source: Codes, target: Codes, code: int, *, sign: int, drift: str, offset_a: str) -> Fraction:
@@ -82,7 +66,7 @@ CASES = [
     pytest.param(current(), current(), 1, "0.25", "0.0025", id="exact halves"),
     pytest.param(current(), current(), -1, "-0.173", "12.34", id="consumer"),
     pytest.param(current(names={-32768: "SNA"}), current(names={-32768: "SNA"}), 1, "0.4", "-150", id="saturating"),
-    pytest.param(current(-0.05), current(0.1, -1600.0, signed=False), -1, "0.0123", "-3.3", id="negative scale"),
+    pytest.param(current(-0.05), current(0.1, -1600.0, is_signed=False), -1, "0.0123", "-3.3", id="negative scale"),
     pytest.param(current(limits=(-650, 650)), current(limits=(-650, 650)), -1, "0", "0", id="passing through"),
     pytest.param(current(20.0, unit="mA"), current(0.02), 1, "-0.4", "0.1", id="milliampere"),
 ]
@@ -105,17 +89,14 @@ def require_bound(plan: IntegerPlan, wanted: Fraction, code: int, voltage_code: 
     assert plan.apply(code, voltage_code) == min(max(math.floor(line + HALF), plan.lowest), plan.highest)
 
 
-@given(
-    length=st.integers(2, 64),
-    signed=st.booleans(),
-    drift=st.floats(-0.4, 0.4),
-    offset=st.floats(-150.0, 150.0),
-    data=st.data(),
-)
+OFFSETS_A = st.floats(-150.0, 150.0)
+
+
+@given(length=st.integers(2, 64), signed=st.booleans(), drift=st.floats(-0.4, 0.4), offset=OFFSETS_A, data=st.data())
 def test_correction_error_stays_within_its_bound_at_any_signal_width(
     length: int, signed: bool, drift: float, offset: float, data: st.DataObject
 ) -> None:
-    source = current(0.02, -7.0, length=length, signed=signed)
+    source = current(0.02, -7.0, length=length, is_signed=signed)
     plan = integer_plan(source, source, sign=1, drift=drift, offset_a=offset)
     code = data.draw(st.integers(source.lowest, source.highest))
     require_bound(plan, exact(source, source, code, sign=1, drift=repr(drift), offset_a=repr(offset)), code)
@@ -125,11 +106,11 @@ def test_correction_error_stays_within_its_bound_at_any_signal_width(
     code=st.integers(-30000, 30000),
     volts=st.integers(0, 50000),
     drift=st.floats(-0.4, 0.4),
-    offset=st.floats(-150, 150),
+    offset=OFFSETS_A,
     sign=st.sampled_from([1, -1]),
 )
 def test_power_offset_scales_with_the_voltage(code: int, volts: int, drift: float, offset: float, sign: int) -> None:
-    power, voltage = current(2.0, limits=(-60000, 60000)), current(0.02, signed=False, limits=(0, 1000))
+    power, voltage = current(2.0, limits=(-60000, 60000)), current(0.02, is_signed=False, limits=(0, 1000))
     signals = Signals(source=power, target=power, sign=sign, voltage=voltage)
     plan = correction_plan(signals, SensorFault(drift=drift, offset_a=offset))
     offset_w = sign * Fraction(repr(offset)) * voltage.scale * volts
@@ -139,7 +120,7 @@ def test_power_offset_scales_with_the_voltage(code: int, volts: int, drift: floa
 
 LARGE = [
     (current(), 0.0, 0.0),
-    (current(signed=False, limits=(0.0, 65534 * 0.02)), 0.0, 0.0),
+    (current(is_signed=False, limits=(0.0, 65534 * 0.02)), 0.0, 0.0),
     (current(offset=1000.0), 0.0, 0.0),
     (current(), -0.3, 100.0),
 ]

@@ -390,9 +390,8 @@ def test_dbc_names_all_status_codes(database: VehicleDatabase, signal: str, code
 
 @pytest.mark.parametrize("offset", ["0", "-20"])
 def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDatabase, offset: str) -> None:
-    database = make_database(
-        dbc=SMALL_DBC.replace("(0.01,0)", f"(0.01,{offset})").replace("(-0.05,0)", f"(-0.05,{offset})")
-    )
+    dbc = SMALL_DBC.replace("(0.01,0)", f"(0.01,{offset})").replace("(-0.05,0)", f"(-0.05,{offset})")
+    database = make_database(dbc=dbc)
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0), heater=(0.25, 0.0))
     answers(corrector, frame_of(database, "Pair", Battery=50.0, Motor=40.0), 0.0)
     heater = frame_of(database, "Heater", Power=4000)

@@ -7,8 +7,6 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["ROOT", "CleanVenv", "new_venv", "pins", "the_wheel"]
-
 ROOT = Path(__file__).parents[2]
 _PIN = re.compile(r"(?m)^(\S+==\S+(?: ; [^\\\n]+)?)")
 

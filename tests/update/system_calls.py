@@ -56,14 +56,12 @@ def traced(
         pytest.skip("no strace here (apt-get install strace)")
     paths = [item for path in (folder, *(folder / name for name in files)) for item in ("-P", str(path))]
     what = ["-f", "-qq", "-y", "-s", "0", "-o", str(log), "-e", f"trace={','.join(WRITING)}", *paths, *options]
-    return subprocess.run(
+    environment, line = (
+        {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"},
         [strace, *what, *command],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        timeout=LONGEST_RUN_S,
-        check=False,
+    )
+    return subprocess.run(
+        line, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LONGEST_RUN_S, check=False
     )
 
 

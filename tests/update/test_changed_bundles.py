@@ -36,10 +36,9 @@ def files_of(bundle: bytes) -> dict[str, str]:
 
 def signed_in(bundle: bytes) -> dict[str, Any]:
     """What is signed in the metadata that counts; a space between two values changes nothing of it."""
-    names = {
-        name: text for name, text in files_of(bundle).items() if name.startswith("metadata") and "root" not in name
-    }
-    return {name: Metadata.from_bytes(text.encode()).signed for name, text in names.items()}
+    files = files_of(bundle)
+    names = [name for name in files if name.startswith("metadata") and "root" not in name]
+    return {name: Metadata.from_bytes(files[name].encode()).signed for name in names}
 
 
 @st.composite
