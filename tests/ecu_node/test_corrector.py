@@ -117,16 +117,16 @@ STALE = (State.PASSING_THROUGH, Reason.BRANCH_STALE)
 BOTH, LATE = ("battery", "motor"), ("motor",)
 
 
-@pytest.mark.parametrize(
-    "phases",
-    [
-        [(1.0, (), CORRECTING), (0.5, LATE, STALE), (1.5, (), STALE)],
-        [(1.0, (), CORRECTING), (0.5, LATE, STALE), (1.5, BOTH, STALE), (6.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
-        [(2.9, LATE, STARTING), (0.4, LATE, STALE)],
-        [(10.0, BOTH, STARTING), (1.0, (), CORRECTING), (2.0, BOTH, ASLEEP), (1.0, (), CORRECTING)],
-    ],
-    ids=["silent branch", "tried again after the bus has slept", "branch never appears", "sleep is not a fault"],
-)
+DRIVEN = (1.0, (), CORRECTING)
+PHASES = {
+    "silent branch": [DRIVEN, (0.5, LATE, STALE), (1.5, (), STALE)],
+    "tried again after bus sleep": [DRIVEN, (0.5, LATE, STALE), (1.5, BOTH, STALE), (6.0, BOTH, ASLEEP), DRIVEN],
+    "branch never appears": [(2.9, LATE, STARTING), (0.4, LATE, STALE)],
+    "sleep is not a fault": [(10.0, BOTH, STARTING), DRIVEN, (2.0, BOTH, ASLEEP), DRIVEN],
+}
+
+
+@pytest.mark.parametrize("phases", PHASES.values(), ids=PHASES)
 def test_silent_branch_stops_the_correction_until_the_bus_has_slept(
     database: VehicleDatabase, phases: list[tuple[float, Collection[str], tuple[State, Reason]]]
 ) -> None:
@@ -310,11 +310,10 @@ def test_junction_sum_is_judged_relative_to_the_expected_sum(
     assert corrector.state()[1] == reason
 
 
-@pytest.mark.parametrize(
-    ("drift", "base_a", "swing_a", "motor_a", "stuck"),
-    [(0.1, 100.0, 50.0, 60.0, ("motor",)), (-0.2, 0.0, 10.0, 0.0, ())],
-    ids=["stuck", "at rest"],
-)
+MOVING, AT_REST = (0.1, 100.0, 50.0, 60.0, ("motor",)), (-0.2, 0.0, 10.0, 0.0, ())
+
+
+@pytest.mark.parametrize(("drift", "base_a", "swing_a", "motor_a", "stuck"), [MOVING, AT_REST])
 def test_branch_is_stuck_if_it_stays_constant_while_the_sum_moves(
     database: VehicleDatabase, drift: float, base_a: float, swing_a: float, motor_a: float, stuck: tuple[str, ...]
 ) -> None:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -209,35 +210,23 @@ def test_every_byte_of_a_multi_byte_counter_is_compared(protection: Protection, 
 # ---- the message as a whole
 
 
-@pytest.mark.parametrize(
-    ("windows", "sent", "spoilt", "states"),
-    [
-        (
-            "valid = { window = 6, min_ok = 1, max_error = 2 }\ninvalid = { window = 4, min_ok = 3, max_error = 0 }",
-            *(range(20), (12, 13, 14), "VVVVVVVVVVVVVVXXXXVV"),  # the third error of six; then four without one
-        ),
-        (
-            "init = { window = 4, min_ok = 3, max_error = 1 }\nvalid = { window = 4, min_ok = 4, max_error = 0 }",
-            *(range(0, 20, 2), (2,), "IIIVXVVVVV"),
-        ),
-        ("valid = { window = 5, min_ok = 1, max_error = 2 }", [0] * 6, (), "VVVVVX"),
-        (
-            "valid = { window = 6, min_ok = 3, max_error = 0 }\ninvalid = { window = 6, min_ok = 6, max_error = 0 }",
-            *(range(9), (), "VXXXXVVVV"),
-        ),
-    ],
-    ids=[
-        "corrupt frames are errors",
-        "lost frames are not errors",
-        "repeated frames are not intact",
-        "few frames are too few for the next state",
-    ],
-)
+THIRD_OF_SIX = {"valid": (6, 1, 2), "invalid": (4, 3, 0)}
+WINDOWS = {
+    "corrupt frames are errors": (THIRD_OF_SIX, range(20), (12, 13, 14), "VVVVVVVVVVVVVVXXXXVV"),
+    "lost frames are not errors": ({"init": (4, 3, 1), "valid": (4, 4, 0)}, range(0, 20, 2), (2,), "IIIVXVVVVV"),
+    "repeated frames are not intact": ({"valid": (5, 1, 2)}, [0] * 6, (), "VVVVVX"),
+    "too few frames for the next state": ({"valid": (6, 3, 0), "invalid": (6, 6, 0)}, range(9), (), "VXXXXVVVV"),
+}
+"""Window, `min_ok` and `max_error` by state; frames that are sent, those that are spoilt, and the states after each."""
+
+
+@pytest.mark.parametrize(("windows", "sent", "spoilt", "states"), WINDOWS.values(), ids=WINDOWS)
 def test_e2e_state_follows_the_windows_of_recent_frames(
-    kind: str, protect: Callable[..., Protection], windows: str, sent: Sequence[int], spoilt: Sequence[int], states: str
+    kind: str, protect: Callable[..., Protection], windows: Any, sent: Sequence[int], spoilt: Sequence[int], states: str
 ) -> None:
     """`sent` are places in a stream of frames; `states` has the state after each: initial, valid, or invalid (X)."""
-    protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
+    lines = [f"{key} = {{ window = {n}, min_ok = {ok}, max_error = {bad} }}" for key, (n, ok, bad) in windows.items()]
+    protection = protect("\n".join([ENTRIES[kind], "max_delta_counter = 4", *lines]))
     receiver, frames, found = Receiver(protection), stream(protection, 20), ""
     for place in sent:
         receiver.check(damaged(frames[place]) if place in spoilt else frames[place])

@@ -78,30 +78,37 @@ def test_gateway_writes_a_corrected_power_as_power(make_database: MakeDatabase) 
     assert corrector.state() == missing
 
 
-@pytest.mark.parametrize(
-    ("profile", "offset", "branch"),
-    [("P01", 0, "battery"), ("P04", 0, "battery"), ("P06", 1, "battery"), ("P07", 3, "motor"), ("P11", 2, "motor")],
-)
+HEADERS = [
+    ("P01", 0, "battery"),
+    ("P04", 0, "battery"),
+    ("P06", 1, "battery"),
+    ("P07", 3, "motor"),
+    ("P11", 2, "motor"),
+]
+
+
+@pytest.mark.parametrize(("profile", "offset", "branch"), HEADERS)
 def test_branch_in_e2e_header_is_refused(make_database: MakeDatabase, profile: str, offset: int, branch: str) -> None:
     layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'
     with pytest.raises(LayoutError, match=rf"branch {branch}: Pair\.{branch.title()} is written twice, or overlaps"):
         gateway_for(make_database(layout, SMALL_DBC.replace("Pair: 8", "Pair: 24")))
 
 
+NET_WITH_CRC = (
+    f'{SMALL_LAYOUT}\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\n',
+    SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "16|16@1+ (0.01"),
+)
+
+
 def test_message_without_branches_is_forwarded_even_if_corrupt(make_database: MakeDatabase) -> None:
-    entry = '\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\n'
-    dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "16|16@1+ (0.01")
-    database = make_database(SMALL_LAYOUT + entry, dbc)
-    corrector = gateway_for(database, heater=(0.25, -2.0))
+    corrector = gateway_for(make_database(*NET_WITH_CRC), heater=(0.25, -2.0))
     spoilt = Frame(NET, b"\x00\x01\x40\x9c")
     assert passed_on(corrector, spoilt, 0.0) == spoilt.data
     assert (corrector.counters.corrupt, corrector.counters.not_passed_on) == (1, 0)
 
 
 def test_power_is_not_corrected_with_the_voltage_of_an_invalid_message(make_database: MakeDatabase) -> None:
-    entry = '\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\n'
-    dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "16|16@1+ (0.01")
-    database = make_database(SMALL_LAYOUT + entry, dbc)
+    database = make_database(*NET_WITH_CRC)
     corrector, heater = gateway_for(database, heater=(0.25, -2.0)), frame_of(database, "Heater", Power=4000)
 
     def is_corrected(counter: int, now_s: float, *, spoilt: bool = False) -> bool:

@@ -84,13 +84,9 @@ def test_value_is_used_up_to_its_timeout_and_not_if_an_unusable_frame_came_at_it
     assert (branch.code_at(1.0), branch.latest(), branch.published(1.0)) == (None, None, (None, Quality.INVALID))
 
 
-def test_branch_that_no_parameters_name_and_that_never_sent_is_neither_fitted_nor_stale() -> None:
+def test_branch_that_never_sent_is_stale_after_its_timeout_only_if_parameters_name_it() -> None:
     branch = LiveBranch(name="motor", codes=codes(Fraction(1)), sign=1, timeout_s=0.5)
     assert (branch.is_fitted, branch.is_stale(100.0), branch.is_old(100.0)) == (False, False, True)
-
-
-def test_branch_that_parameters_name_is_stale_if_it_has_not_sent_by_its_timeout() -> None:
-    branch = LiveBranch(name="motor", codes=codes(Fraction(1)), sign=1, timeout_s=0.5)
     branch.take(SensorFault(), correcting=AS_IT_IS, passing=AS_IT_IS, delay_s=0.0, expected_since_s=2.0)
     assert (branch.is_fitted, branch.is_stale(2.5), branch.is_stale(2.51)) == (True, False, True)
 

@@ -306,15 +306,14 @@ def test_full_disk_keeps_the_previous_parameter_file(database: VehicleDatabase, 
 # ---- parameters of a node, at its start and while it runs
 
 
-@pytest.mark.parametrize(
-    ("spoil", "reason", "words"),
-    [
-        (lambda whole: whole[:300], Reason.MALFORMED_PARAMETERS, "not a parameter file"),
-        (instead(b'"v1"', b'"v2"'), Reason.WRONG_VEHICLE, "parameters are for vehicle 'v2', this is"),
-        (None, Reason.NO_PARAMETERS, "no such parameter file; name one that is there"),
-    ],
-    ids=["half written", "of another vehicle", "missing"],
-)
+SPOILT = {
+    "half written": (lambda whole: whole[:300], Reason.MALFORMED_PARAMETERS, "not a parameter file"),
+    "of another vehicle": (instead(b'"v1"', b'"v2"'), Reason.WRONG_VEHICLE, "parameters are for vehicle 'v2', this is"),
+    "missing": (None, Reason.NO_PARAMETERS, "no such parameter file; name one that is there"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "reason", "words"), SPOILT.values(), ids=SPOILT)
 def test_unfit_parameter_file_is_not_used(
     database: VehicleDatabase, tmp_path: Path, spoil: Callable[[bytes], bytes] | None, reason: Reason, words: str
 ) -> None:

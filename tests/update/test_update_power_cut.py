@@ -72,11 +72,10 @@ def cuts(folder: Path, files: list[Path], place: Path) -> Iterator[Path]:
     yield folder
 
 
-@pytest.mark.parametrize(
-    "command",
-    ["conclude", *(pytest.param(name, marks=pytest.mark.long) for name in ("update", "revoke"))],
-    indirect=True,
-)
+LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("update", "revoke")]
+
+
+@pytest.mark.parametrize("command", ["conclude", *LONG], indirect=True)
 def test_power_cut_leaves_old_or_new_state(command: Callable[[Path], list[str]], state: Path, tmp_path: Path) -> None:
     work, log = tmp_path / "work", tmp_path / "log"
     calls = calls_of(command(started(state, work)), work, FILES, log)

@@ -143,15 +143,16 @@ Numbers = dict[str, float]
 UNCHANGED = {"drift": 0.0, "offset_a": 0.0}
 
 
-@pytest.mark.parametrize(
-    ("fault", "residual", "conditions", "words"),
-    [
-        (UNCHANGED, None, UNCHANGED, "no change that counts"),
-        ({}, JunctionResidual(measured_a=4.0, corrected_a=0.5), {"load_a": -0.5}, PASSED),
-        ({}, JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0), {"load_a": -3.0}, PASSED),
-    ],
-    ids=["without a change", "without a predicted change, as written by hand", "promises half, and a load is half"],
-)
+BY_HAND = JunctionResidual(measured_a=4.0, corrected_a=0.5)
+PROMISES_HALF = JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0)
+LOWERING = {
+    "without a change": (UNCHANGED, None, UNCHANGED, "no change that counts"),
+    "without a predicted change, as written by hand": ({}, BY_HAND, {"load_a": -0.5}, PASSED),
+    "promises half, and a load is half": ({}, PROMISES_HALF, {"load_a": -3.0}, PASSED),
+}
+
+
+@pytest.mark.parametrize(("fault", "residual", "conditions", "words"), LOWERING.values(), ids=LOWERING)
 def test_set_that_lowers_the_sum_as_predicted_passes_its_trial(
     fault: Numbers, residual: JunctionResidual | None, conditions: Numbers, words: str, new: Path, car: VehicleDatabase
 ) -> None:
