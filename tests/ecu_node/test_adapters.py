@@ -149,9 +149,7 @@ def test_dry_run_prints_the_bus_that_would_be_opened(node: list[str], dry_run: D
 
 
 @pytest.mark.parametrize("timing", [can.BitTiming(**CLASSIC_TIMING), can.BitTimingFd(**FD_TIMING)])
-def test_dry_run_prints_bit_timing_of_can_conf_once(
-    timing: can.BitTiming | can.BitTimingFd, tmp_path: Path, dry_run: DryRun
-) -> None:
+def test_bit_timing_is_printed_once(timing: can.BitTiming | can.BitTimingFd, tmp_path: Path, dry_run: DryRun) -> None:
     lines = [f"{name} = {value}" for name, value in timing.items()]
     (tmp_path / "can.conf").write_text("\n".join(["[PCAN_USBBUS1]", *lines]))
     opened = dry_run(*PCAN, *(("--fd",) if isinstance(timing, can.BitTimingFd) else ()))[0]

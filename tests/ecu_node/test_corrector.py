@@ -409,9 +409,7 @@ def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDa
 
 
 @pytest.mark.parametrize(("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")])
-def test_scale_given_both_in_the_unit_and_as_factor_is_applied_once(
-    make_database: MakeDatabase, scale: str, unit: str
-) -> None:
+def test_scale_of_a_power_in_its_unit_is_applied_once(make_database: MakeDatabase, scale: str, unit: str) -> None:
     dbc = SMALL_DBC.replace('(1,0) [0|60000] "W"', f'({scale},0) [0|60000] "{unit}"')
     corrector = corrector_for(make_database(SMALL_LAYOUT, dbc), heater=(0.0, 0.0))
     answers(corrector, Frame(HEATER, (80).to_bytes(4, "little")), 0.0)

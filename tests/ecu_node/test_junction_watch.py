@@ -29,12 +29,7 @@ def frame(time_s: float, code: int) -> tuple[float, bytearray]:
 
 
 def live(
-    name: str,
-    frames: Frames,
-    fault: SensorFault,
-    unit: Fraction,
-    delay_s: float = 0.0,
-    voltage: HeardSignal | None = None,
+    name: str, frames: Frames, fault: SensorFault, unit: Fraction, delay_s: float, voltage: HeardSignal | None = None
 ) -> LiveBranch:
     branch = LiveBranch(name=name, codes=codes(unit), sign=1, timeout_s=0.5, voltage=voltage)
     branch.follow(PlacedSignal(place=PLACE), frames)
@@ -73,7 +68,7 @@ class Watched:
 
 def test_value_is_used_up_to_its_timeout_and_not_if_an_unusable_frame_came_at_its_time_or_later() -> None:
     """A value is a code, and the code is published as it is."""
-    branch = live("motor", deque([frame(1.0, 7)]), SensorFault(), Fraction(1))
+    branch = live("motor", deque([frame(1.0, 7)]), SensorFault(), Fraction(1), 0.0)
     for now_s, code, published in ((1.5, 7, (7, Quality.PASSED_THROUGH)), (1.51, None, (None, Quality.NOT_AVAILABLE))):
         assert (branch.code_at(now_s), branch.published(now_s)) == (code, published)
         assert branch.is_old(now_s) is branch.is_stale(now_s) is (code is None)
@@ -92,7 +87,7 @@ def test_branch_that_never_sent_is_stale_after_its_timeout_only_if_parameters_na
 
 
 def test_range_of_ordinary_codes_excludes_named_and_clipped_codes() -> None:
-    branch = live("motor", deque(), fault=SensorFault(), unit=Fraction(1))
+    branch = live("motor", deque(), SensorFault(), Fraction(1), 0.0)
     branch.codes = codes(Fraction(1), -32767, 32767)
     assert branch.ordinary_codes() == (-32766, 32766)
     none = 1, 0
@@ -179,9 +174,7 @@ GAIN_ERRORS = [
 
 
 @pytest.mark.parametrize(("sd_per_a", "heater_a", "offset_a", "verdict"), GAIN_ERRORS)
-def test_gain_error_is_found_from_an_alternating_current(
-    sd_per_a: float, heater_a: float, offset_a: float, verdict: Verdict
-) -> None:
+def test_gain_error_beyond_chance_is_found(sd_per_a: float, heater_a: float, offset_a: float, verdict: Verdict) -> None:
     """The battery's offset is corrected."""
 
     def swinging(time_s: float) -> dict[str, float]:
@@ -210,9 +203,7 @@ def test_branches_that_explain_the_sum_nearly_as_well_as_the_best_are_also_named
 
 
 @pytest.mark.parametrize(("drift", "verdict"), [(-0.25, (Reason.BRANCH_STUCK, ("battery",))), (0.9, None)])
-def test_stuck_branch_is_found_beside_a_large_gain_error_and_a_steady_one_is_not(
-    drift: float, verdict: Verdict
-) -> None:
+def test_stuck_branch_is_found_beside_a_gain_error_and_a_steady_one_is_not(drift: float, verdict: Verdict) -> None:
     battery_is_stuck = verdict is not None
 
     def shown_a(now_s: float) -> dict[str, float]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 _PIN = re.compile(r"(?m)^(\S+==\S+(?: ; [^\\\n]+)?)")
+"""A pin of a constraints file without its hashes: with them pip would want one of the built wheel, too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,11 +52,12 @@ class CleanVenv:
         CompletedProcess
             With what it printed.
         """
+        command, environment = [self.program(name), *map(str, arguments)], self.environment
         return subprocess.run(
-            [self.program(name), *map(str, arguments)],
+            command,
             cwd=folder,
-            env=self.environment,
-            stdin=subprocess.DEVNULL,
+            env=environment,
+            input="",
             capture_output=True,
             text=True,
             check=False,
@@ -65,7 +67,7 @@ class CleanVenv:
     def install(self, *what: str) -> None:
         """Install distributions, pinned by constraints.txt, or end the program with what pip says."""
         known = self.folder / "pins.txt"
-        known.write_text(pins((ROOT / "constraints.txt").read_text()))
+        known.write_text("\n".join(pin.strip() for pin in _PIN.findall((ROOT / "constraints.txt").read_text())))
         _pip(self, "install", "--no-compile", "--constraint", str(known), *what)
 
 
@@ -101,19 +103,6 @@ def new_venv(folder: Path, wheel: Path, *extras: str, interpreter: str = sys.exe
     _pip(venv, "uninstall", "--yes", "setuptools")
     venv.install(f"{wheel}[{','.join(extras)}]" if extras else str(wheel))
     return venv
-
-
-def pins(constraints: str) -> str:
-    """Pins of a constraints file without hashes: with them pip would want one of the built wheel, too."""
-    return "\n".join(pin.strip() for pin in _PIN.findall(constraints)) + "\n"
-
-
-def the_wheel(dist: Path) -> Path:
-    """The one wheel in a folder; ends the program if there is none, or more."""
-    found = sorted(dist.glob("*.whl"))
-    if len(found) != 1:
-        raise SystemExit(f"{dist}: one wheel is expected, found {len(found)}; run 'make package'")
-    return found[0].resolve()
 
 
 def _pip(venv: CleanVenv, *arguments: str) -> None:

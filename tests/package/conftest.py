@@ -15,7 +15,7 @@ from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
-from tests.package.clean_venv import ROOT, CleanVenv, new_venv, the_wheel
+from tests.package.clean_venv import ROOT, CleanVenv, new_venv
 
 DIST = ROOT / "dist"
 VEHICLE = "V001"
@@ -27,9 +27,9 @@ reload(can.io.mf4)  # with its writer: tests/conftest.py imports python-can with
 @pytest.fixture(scope="session")
 def wheel() -> Path:
     """The wheel of this version."""
-    found = the_wheel(DIST)
-    assert found.name == f"hv_current_correction-{__version__}-py3-none-any.whl", "dist/ is of another version"
-    return found
+    names = [path.name for path in DIST.glob("*.whl")]
+    assert names == [f"hv_current_correction-{__version__}-py3-none-any.whl"], "run 'make package'"
+    return DIST / names[0]
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,7 @@ from tests.ecu_node.vehicles import LAYOUT
 
 
 @pytest.mark.long
-def test_whole_chain_from_drives_to_corrected_vehicles_makes_no_vehicle_worse(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_whole_chain_makes_no_vehicle_worse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("fastsim")
     layout = tmp_path / LAYOUT.name
     layout.write_text(f"{LAYOUT.read_text()}\n[activation]\ntrial_s = 60\n")

@@ -182,9 +182,7 @@ def server(repo: Repo) -> Iterator[str]:
         thread.join()
 
 
-def test_web_server_is_limited_in_size_and_time(
-    repo: Repo, new: Path, server: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_downloads_are_limited(repo: Repo, new: Path, server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     timestamp = repo.metadata / "timestamp.json"
     whole = timestamp.read_bytes()
     os.truncate(timestamp, 10_000_000)

@@ -154,9 +154,7 @@ def test_dry_run_of_an_update_writes_nothing(repo: Repo, new: Path) -> None:
     assert {path.name: path.read_bytes() for path in new.iterdir()} == before
 
 
-def test_expired_set_neither_comes_nor_stays_in_force(
-    repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters
-) -> None:
+def test_expired_set_is_not_used(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
     update(state, str(repo.path), database, now)
@@ -176,9 +174,7 @@ def test_expired_set_neither_comes_nor_stays_in_force(
     assert read_state(state).ended == "expired"
 
 
-def test_latest_time_is_kept_if_the_clock_goes_back(
-    repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters
-) -> None:
+def test_latest_time_is_kept(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
     with pytest.raises(TrustError, match="expired at"):

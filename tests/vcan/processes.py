@@ -71,10 +71,6 @@ class NodeProcess:
         wait_until(lambda: words in self.messages or self.process.poll() is not None, f"the node to say {words!r}")
         assert words in self.messages, self.messages
 
-    def wait_for_end(self) -> int:
-        """Wait until it ends by itself; its exit code."""
-        return self.process.wait(timeout=LONGEST_WAIT_S)
-
     def stop(self, how: signal.Signals = signal.SIGTERM, *, within_s: float = LONGEST_WAIT_S) -> int:
         """End the node and return its exit code; one whose coverage is traced takes as long as it likes."""
         self.process.send_signal(how)
@@ -114,11 +110,6 @@ class Recording:
     def data_of(self, identifier: int) -> list[bytes]:
         """Data of the frames of one identifier (11 bits) so far."""
         return data_of(self.frames, identifier)
-
-    def wait_for_frames(self, count: int) -> list[LoggedFrame]:
-        """Wait until so many frames of any identifier are recorded; returns all of them."""
-        wait_until(lambda: len(self.frames) >= count, f"{count} frames")
-        return self.frames
 
     def wait_for_marker(self, identifier: int) -> None:
         """Send a frame on vcan0 that nobody else sends, and wait until it is recorded: what was before it is, too."""

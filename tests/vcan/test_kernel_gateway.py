@@ -282,7 +282,7 @@ def test_joined_buses_stop_the_gateway(drive: Path, tmp_path: Path, start_gatewa
                 with pytest.raises(AssertionError, match=re.escape(words)), start_gateway():
                     pass  # it hears the branches where only it may send them, and removes what the first one left
             else:
-                assert node.wait_for_end() == 1
+                assert node.process.wait(LONGEST_WAIT_S) == 1
                 assert words in node.messages
             assert rules() == []
     with joined(), running_recording(tmp_path / "after.log", OTHER_CHANNEL) as after:
