@@ -28,22 +28,16 @@ NOTHING_MAY_BE_SKIPPED = os.environ.get("HV_REQUIRE_ALL") == "1"
 settings.register_profile("patient", deadline=None)  # a busy machine or a first compilation may be slow
 settings.load_profile("patient")
 
-_open_buses: WeakSet[can.BusABC] = WeakSet()
-_bus_init, _bus_shutdown = can.BusABC.__init__, can.BusABC.shutdown
+_buses: WeakSet[can.BusABC] = WeakSet()
+_bus_init = can.BusABC.__init__
 
 
 def _init(self: can.BusABC, *arguments: Any, **options: Any) -> None:
     _bus_init(self, *arguments, **options)
-    _open_buses.add(self)
-
-
-def _shutdown(self: can.BusABC) -> None:
-    _bus_shutdown(self)
-    _open_buses.discard(self)
+    _buses.add(self)
 
 
 can.BusABC.__init__ = _init  # type: ignore[method-assign]
-can.BusABC.shutdown = _shutdown  # type: ignore[method-assign]
 
 
 @pytest.fixture(scope="session")
@@ -81,9 +75,9 @@ def channel(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(autouse=True)
 def no_bus_left_open() -> Iterator[None]:
     """Fail a test that leaves a bus open: its frames would reach the next one."""
-    before = set(_open_buses)
+    before = set(_buses)
     yield
-    left = set(_open_buses) - before
+    left = {bus for bus in set(_buses) - before if not bus._is_shutdown}
     for bus in left:
         bus.shutdown()
     assert not left, f"buses left open: {left}"

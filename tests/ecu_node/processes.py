@@ -15,6 +15,7 @@ from typing import NamedTuple
 import pytest
 
 from ecu_node.cli import run_ecu_node
+from tests.ecu_node.vehicles import LAYOUT
 
 LONGEST_WAIT_S = 60.0
 """A busy machine is slow; nothing here takes this long unless it is broken. [s]"""
@@ -44,6 +45,12 @@ def wait_until(done: Callable[[], bool]) -> None:
     while not done():
         assert time.monotonic() < give_up, "waited in vain"
         time.sleep(0.002)
+
+
+def bench_node(folder: Path, channel: str) -> list[str]:
+    """Command line of a node without parameters on a virtual bus."""
+    options = {"--params": folder / "none.json", "--layout": LAYOUT, "--vehicle": "V1", "--channel": channel}
+    return ["run", "--unsigned", "--interface", "virtual", *(str(word) for item in options.items() for word in item)]
 
 
 @contextmanager

@@ -16,8 +16,8 @@ from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.summary import SummaryFile, decode_summary, encode_summary, unpacked
-from tests.ecu_node.processes import running
-from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, MakeDatabase
+from tests.ecu_node.processes import bench_node, running
+from tests.ecu_node.vehicles import SMALL_LAYOUT, MakeDatabase
 
 OPEN_S, OFFSET_A, HEATER_W, NET_V = 8.0, 5.0, 2000, 400.0
 WITH_CONTACTOR = f"""{SMALL_LAYOUT}
@@ -164,8 +164,6 @@ def test_unusable_summary_folder_or_vehicle_is_refused(make_database: MakeDataba
 
 
 def test_node_with_summary_option_creates_the_folder_of_its_vehicle(tmp_path: Path) -> None:
-    options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]
-    bus = ["--interface", "virtual", "--channel", "sums", "--summary", str(tmp_path / "sums")]
-    with running("run", *options, *bus) as log:
+    with running(*bench_node(tmp_path, "sums"), "--summary", str(tmp_path / "sums")) as log:
         assert "running on virtual sums" in log[-1]
     assert list((tmp_path / "sums" / "V1").iterdir()) == []

@@ -23,7 +23,7 @@ from ecu_node.bus.wiring import InForce, Mode, put_in_force
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
-from tests.ecu_node.processes import ServiceManagerHere, running
+from tests.ecu_node.processes import ServiceManagerHere, bench_node, running
 from tests.ecu_node.vehicles import LAYOUT, answers, battery, corrector_for, parameters_for
 
 
@@ -208,7 +208,7 @@ sys.exit(ecu_node_program())
 
 
 def test_node_says_that_it_runs_once_its_bus_is_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = ["run", "--unsigned", *files(tmp_path), "--interface", "virtual", "--channel", "down"]
+    arguments = bench_node(tmp_path, "down")
     manager = ServiceManagerHere(tmp_path / "notify", monkeypatch)
     with manager.socket, running(program=["-c", DOWN.format(arguments=arguments)]) as log:
         events = [line for line in log if "bus" in line or "running" in line]
@@ -237,13 +237,12 @@ def program(event: str, what: str, number: int, arguments: list[str]) -> list[st
     return [sys.executable, "-c", AT.format(event=event, what=what, number=int(number), arguments=arguments)]
 
 
-def files(tmp_path: Path) -> list[str]:
-    return ["--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT)]
+CHECK = ["check", "--params", "none.json", "--layout", str(LAYOUT)]
 
 
 @pytest.mark.parametrize(("event", "what"), [("import", "ecu_node.cli"), *MOMENTS])
-def test_ctrl_c_during_startup_prints_one_line_and_exits_with_130(tmp_path: Path, event: str, what: str) -> None:
-    command = program(event, what, signal.SIGINT, ["check", *files(tmp_path)])
+def test_ctrl_c_during_startup_prints_one_line_and_exits_with_130(event: str, what: str) -> None:
+    command = program(event, what, signal.SIGINT, CHECK)
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ecu-node: interrupted\n")
     for nobody in ("2>&-", "2>/dev/full"):
@@ -254,13 +253,12 @@ def test_ctrl_c_during_startup_prints_one_line_and_exits_with_130(tmp_path: Path
 
 @pytest.mark.parametrize(("event", "what"), MOMENTS)
 def test_sighup_during_startup_does_not_end_a_node(tmp_path: Path, event: str, what: str) -> None:
-    bus = ["--interface", "virtual", "--channel", "hangup"]
-    _, *program_text = program(event, what, signal.SIGHUP, ["run", "--unsigned", *files(tmp_path), *bus])
+    _, *program_text = program(event, what, signal.SIGHUP, bench_node(tmp_path, "hangup"))
     with running(program=program_text) as log:
         assert "running on virtual hangup" in log[-1]
 
 
-def test_sighup_ends_commands_other_than_run(tmp_path: Path) -> None:
-    command = program("open", str(LAYOUT), signal.SIGHUP, ["check", *files(tmp_path)])
+def test_sighup_ends_commands_other_than_run() -> None:
+    command = program("open", str(LAYOUT), signal.SIGHUP, CHECK)
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == -signal.SIGHUP

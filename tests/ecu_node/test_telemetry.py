@@ -20,8 +20,8 @@ from ecu_node.bus.telemetry import Telemetry
 from ecu_node.bus.wiring import Mode
 from ecu_node.core.status import Counters, Latency
 from ecu_node.database import VehicleDatabase
-from tests.ecu_node.processes import running, wait_until
-from tests.ecu_node.vehicles import LAYOUT, PAIR, SMALL_LAYOUT, Frame, MakeDatabase, answers, corrector_for
+from tests.ecu_node.processes import bench_node, running, wait_until
+from tests.ecu_node.vehicles import PAIR, SMALL_LAYOUT, Frame, MakeDatabase, answers, corrector_for
 
 ROOT = Path(__file__).parents[2]
 VSS = "Vehicle.Powertrain.TractionBattery.CurrentCurrent"
@@ -177,8 +177,7 @@ def test_latency_histogram_has_bins_of_powers_of_two_in_microseconds(monkeypatch
 def test_internal_error_in_telemetry_does_not_stop_the_correction(tmp_path: Path) -> None:
     broken = "from ecu_node.bus.telemetry import Telemetry; Telemetry._record = lambda *_: 1 / 0"
     code = f"import sys; from ecu_node.cli import run_ecu_node; {broken}; sys.exit(run_ecu_node(sys.argv[1:]))"
-    options = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT), "--vehicle", "V1"]
-    bus = ["--interface", "virtual", "--channel", "records", "--telemetry", str(tmp_path / "node.jsonl")]
+    options = [*bench_node(tmp_path, "records"), "--telemetry", str(tmp_path / "node.jsonl")]
     fault = "internal error in Telemetry, which is off now; please report it: ZeroDivisionError"
-    with running("run", *options, *bus, program=("-c", code), until=fault) as log:
+    with running(*options, program=("-c", code), until=fault) as log:
         assert fault in log[-1]
