@@ -183,10 +183,8 @@ def test_input_that_is_no_regular_file_or_huge_is_refused_in_one_line(make: Any,
 
 
 def program(*arguments: str, stdout: int = subprocess.PIPE, **environment: str) -> "subprocess.CompletedProcess[str]":
-    command, settings = [sys.executable, "-m", "ecu_node", *arguments], {**os.environ, **environment}
-    return subprocess.run(
-        command, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=60, check=False, env=settings
-    )
+    command, env = [sys.executable, "-m", "ecu_node", *arguments], {**os.environ, **environment}
+    return subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=60, check=False, env=env)
 
 
 MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--channel", "full", "--once", "0.1"]

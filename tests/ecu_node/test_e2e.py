@@ -21,6 +21,9 @@ ROOM = (
 COUNTER_CRC8 = 'profile = "counter CRC8"\nmessages = ["Room"]\ncounter = "Count"\ncrc = "Sum"\n'
 
 
+OEM_AFTER = 'counter_modulus = 15\nalgorithm = "autosar"\ndata_id_bytes = 1\ndata_id_at = "after"'
+
+
 def autosar(profile: str, *more: str) -> str:
     return "\n".join([f'profile = "{profile}"\nmessages = ["Room"]', *more])
 
@@ -39,11 +42,7 @@ KINDS = {
     "P11": (autosar("P11", "data_id = { Room = 0x123 }"), 15, "ff0f"),
     "P11 nibble": (autosar("P11", 'data_id_mode = "nibble"\noffset = 4'), 15, "00000000ffff"),
     "OEM": (COUNTER_CRC8 + "data_id_bytes = 2", 16, "00000000f00000ff"),
-    "OEM after": (
-        COUNTER_CRC8 + 'counter_modulus = 15\nalgorithm = "autosar"\ndata_id_bytes = 1\ndata_id_at = "after"',
-        15,
-        "00000000f00000ff",
-    ),
+    "OEM after": (COUNTER_CRC8 + OEM_AFTER, 15, "00000000f00000ff"),
 }
 """Entry of the layout, number of codes of the counter, and the bits that the profile writes."""
 ENTRIES = {kind: entry for kind, (entry, _, _) in KINDS.items()}

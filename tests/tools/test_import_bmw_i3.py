@@ -75,33 +75,34 @@ def test_currents_are_positive_into_the_junction_and_sum_to_zero(tmp_path: Path,
     assert trip.drive.inputs["aircon_demand"].value[0] == 1000.0
 
 
-@pytest.mark.parametrize(
-    ("changes", "bad", "notice"),
-    [
-        (
-            {"heater": {range(200, 210): 5.52, range(400, 405): [1.0, 2.0, 3.0, 4.0, 5.0], range(405, 415): 5.52}},
-            dict.fromkeys(OF_HEATER, (*range(199, 211), *range(399, 416))),
-            "heater power reads its default of 5.52 kW 2 times: 29 samples of auxiliary, motor and heater_demand not",
-        ),
-        (
-            {"heater": 1.4},
-            dict.fromkeys(OF_HEATER, range(SAMPLES)),
-            "heater power is implausible over the whole trip: with the inverter idle it leaves -900 W",
-        ),
-        ({"heater": 1.4, "current": columns()["current"] - 1400.0 / 400.0}, {}, None),
-        (
-            {"voltage": {10: np.nan}},
-            {"auxiliary": [10], "motor": [10], "voltage": [10]},
-            "column 'Battery Voltage [V]': 1 cells without a number, the first at 1.0 s; labelled as not good",
-        ),
-        (
-            {"current": {100: -2000.0}, "voltage": {200: 1500.0}, "accelerator": {300: 250.0}},
-            {"battery": [100], "motor": [100, 200], "auxiliary": [200], "voltage": [200], "accelerator": [300]},
-            "accelerator: 1 samples beyond the DBC's 0 to 100; labelled as not good",
-        ),
-    ],
-    ids=["default and its ramps", "heater above battery", "heater within battery", "empty cell", "out of range"],
-)
+DEFAULT_AND_RAMPS = {range(200, 210): 5.52, range(400, 405): [1.0, 2.0, 3.0, 4.0, 5.0], range(405, 415): 5.52}
+OUT_OF_RANGE = {"current": {100: -2000.0}, "voltage": {200: 1500.0}, "accelerator": {300: 250.0}}
+CASES = {
+    "default and its ramps": (
+        {"heater": DEFAULT_AND_RAMPS},
+        dict.fromkeys(OF_HEATER, (*range(199, 211), *range(399, 416))),
+        "heater power reads its default of 5.52 kW 2 times: 29 samples of auxiliary, motor and heater_demand not",
+    ),
+    "heater above battery": (
+        {"heater": 1.4},
+        dict.fromkeys(OF_HEATER, range(SAMPLES)),
+        "heater power is implausible over the whole trip: with the inverter idle it leaves -900 W",
+    ),
+    "heater within battery": ({"heater": 1.4, "current": columns()["current"] - 1400.0 / 400.0}, {}, None),
+    "empty cell": (
+        {"voltage": {10: np.nan}},
+        {"auxiliary": [10], "motor": [10], "voltage": [10]},
+        "column 'Battery Voltage [V]': 1 cells without a number, the first at 1.0 s; labelled as not good",
+    ),
+    "out of range": (
+        OUT_OF_RANGE,
+        {"battery": [100], "motor": [100, 200], "auxiliary": [200], "voltage": [200], "accelerator": [300]},
+        "accelerator: 1 samples beyond the DBC's 0 to 100; labelled as not good",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "bad", "notice"), CASES.values(), ids=CASES)
 def test_unusable_cells_are_labelled_as_not_good_in_every_channel_computed_from_them(
     changes: dict[str, Any], bad: dict[str, Any], notice: str | None, tmp_path: Path, database: VehicleDatabase
 ) -> None:

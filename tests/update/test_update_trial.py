@@ -166,11 +166,8 @@ def test_trial_time_counts_only_in_valid_watch_states_while_current_flows(new: P
     own = own_vehicle(tmp_path, '[watch]\ninput = "contactor_state"\nvalid = [2]\n')
     put_on_trial(new, right(own))
     drive, no_trial_yet = Drive(new, own), (State.PASSING_THROUGH, Reason.ON_TRIAL)
-    for drive.contactor, drive.moving, told in (
-        (1, True, no_trial_yet),
-        (2, False, no_trial_yet),
-        (2, True, CORRECTING),
-    ):
+    phases = ((1, True, no_trial_yet), (2, False, no_trial_yet), (2, True, CORRECTING))
+    for drive.contactor, drive.moving, told in phases:
         drive.go_on(1.1 * TRIAL_S)
         assert drive.told == told
 
