@@ -297,12 +297,6 @@ def test_root_gives_files_to_the_owner_of_the_folder_and_follows_no_link(repo: R
     assert (repo.folder / "of root").stat().st_uid == 0
 
 
-def test_two_simultaneous_updates_do_not_disturb_each_other(repo: Repo, new: Path) -> None:
-    command = [sys.executable, "-m", "ecu_node", "update", repo.path, "--state", new, "--layout", LAYOUT]
-    both = [subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE) for _ in range(2)]
-    assert sorted(process.communicate(timeout=120)[0][:8] for process in both) == [b"nothing ", b"on trial"]
-
-
 def test_inspect_and_report_show_the_sets_and_the_root(repo: Repo, state: Path, other: VehicleParameters) -> None:
     repo.take(state, other)
     code, out, _ = repo.node("inspect", "--state", state)
