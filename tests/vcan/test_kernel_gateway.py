@@ -84,10 +84,6 @@ def delays_s(identifier: int, sent: Recording, arrived: Recording) -> list[float
     return [after - before for before, after in zip(*stamps, strict=True)]
 
 
-def wait_for_state(here: Recording, state: State, reason: Reason) -> None:
-    wait_until(lambda: state_of(here.data_of(STATUS)[-1]) == (state, reason), f"the state {state.name}")
-
-
 def test_frames_pass_while_the_gateway_is_killed(start_gateway: StartNode, here: Recording, there: Recording) -> None:
     with start_gateway() as node:
         at_work = rules()
@@ -200,7 +196,8 @@ def test_branch_frames_of_another_node_are_logged_and_dropped(
     with start_gateway() as node:
         with subprocess.Popen(command) as foreigner:
             with playing(drive) as player:
-                wait_for_state(there, State.CORRECTING, Reason.FOREIGN_FRAMES)
+                told = State.CORRECTING, Reason.FOREIGN_FRAMES
+                wait_until(lambda: state_of(there.data_of(STATUS)[-1]) == told, "the foreign frames to be told")
                 assert player.wait(LONGEST_WAIT_S) == 0
             foreigner.terminate()
         here.wait_for(BATTERY, INSTANTS)
