@@ -43,6 +43,8 @@ from tests.ecu_node.vehicles import (
 )
 
 STATUS, DCDC = FrameKey(0x5F0, False), FrameKey(0x140, False)
+NO_VALUE_A = -655.36
+"""What the code for no value would be as a current of the battery."""
 
 
 def status_of(database: VehicleDatabase, corrector: Corrector, now_s: float) -> dict[str, Any]:
@@ -224,8 +226,7 @@ def test_branches_going_silent_one_after_another_are_not_a_fault(database: Vehic
 def test_stray_frame_of_an_unfitted_branch_stops_the_correction_until_bus_sleep(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     drive(database, corrector, 0.0, 1.0)
-    data = protected(database, "HV_Dcdc", 0, DcdcCurrent=1.0)
-    answers(corrector, Frame(DCDC, data), 1.0)
+    answers(corrector, Frame(DCDC, protected(database, "HV_Dcdc", 0, DcdcCurrent=1.0)), 1.0)
     drive(database, corrector, 1.0, 3.0)
     assert corrector.latched_branches == ("dcdc",)
     drive(database, corrector, 3.0, 10.0, silent=BOTH)
@@ -270,9 +271,10 @@ def test_missing_input_of_the_junction_watch_is_reported_in_the_state(make_datab
         assert corrector.state() == state
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("[watch] valid", "4"), ("[watch] valid", "-1"), ("[contactor] open", "0.5")]
-)
+IMPOSSIBLE = [("[watch] valid", "4"), ("[watch] valid", "-1"), ("[contactor] open", "0.5")]
+
+
+@pytest.mark.parametrize(("key", "value"), IMPOSSIBLE)
 def test_layout_with_an_impossible_input_value_is_refused(make_database: MakeDatabase, key: str, value: str) -> None:
     name = key.partition(" ")[2]
     words = rf"{re.escape(key)}: {value} is no value of HV_Battery\.ContactorState, which has 2 bits"
@@ -346,11 +348,10 @@ def test_shadow_mode_reports_the_corrected_sum_but_publishes_measured_values(dat
 def test_delayed_branches_are_summed_at_the_same_instant(database: VehicleDatabase, slope_a: float) -> None:
     parameters = parameters_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
     late = {**parameters.branches, "motor": replace(parameters.branches["motor"], delay_s=0.2)}
-    start_s = 100.0
-    corrector = wire(database, InForce(parameters=replace(parameters, branches=late)), start_s=start_s)
+    corrector = wire(database, InForce(parameters=replace(parameters, branches=late)), start_s=100.0)
     sums_a = []
     for k in range(100):
-        now_s = start_s + 0.05 * k
+        now_s = 100.0 + 0.05 * k
         answers(corrector, battery(database, k % 15, slope_a * k), now_s)
         answers(corrector, motor(database, k % 15, slope_a * (k - 4)), now_s)
         sums_a.append(sums_at(corrector, now_s + 0.01)[0])
@@ -361,8 +362,7 @@ def test_delayed_branches_are_summed_at_the_same_instant(database: VehicleDataba
 
 def test_junction_sum_is_not_interpolated_across_a_frame_without_value(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
-    no_value_a = -655.36
-    for k, current_a in enumerate((80.0, no_value_a, 80.0)):
+    for k, current_a in enumerate((80.0, NO_VALUE_A, 80.0)):
         answers(corrector, battery(database, k, current_a), 0.03 * k)
     answers(corrector, motor(database, 0), 0.02)
     assert sums_at(corrector, 0.07) == (None, None)
@@ -373,7 +373,7 @@ def test_junction_sum_is_not_interpolated_across_a_frame_without_value(database:
 def test_value_after_a_frame_without_value_is_used_even_if_its_time_is_earlier(database: VehicleDatabase) -> None:
     """As after a clock step: the first frame has the time of its reading, the next one that of its arrival."""
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
-    answers(corrector, battery(database, 0, -655.36), 0.02)
+    answers(corrector, battery(database, 0, NO_VALUE_A), 0.02)
     answers(corrector, battery(database, 1, 80.0), 0.01)
     answers(corrector, motor(database, 0), 0.01)
     assert sums_at(corrector, 0.02) == pytest.approx((-20.0, -20.0))

@@ -139,7 +139,6 @@ LEADING_OUT = [
 @pytest.mark.parametrize(("name", "words"), LEADING_OUT)
 def test_names_in_metadata_cannot_lead_out_of_the_repository(name: str, words: str, repo: Repo, new: Path) -> None:
     """The attacker has the keys of targets, snapshot and timestamp."""
-    (repo.folder / "secret").touch()
 
     def lead_out(targets: Targets) -> None:
         targets.targets["v1.json"].hashes = {"sha256": name}
