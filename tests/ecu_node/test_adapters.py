@@ -107,9 +107,10 @@ def test_bit_rate_of_command_line_overrides_that_of_can_conf(tmp_path: Path, mon
     assert bus_config("vector", "1")["bitrate"] == 100_000
 
 
-@pytest.mark.parametrize(
-    ("interface", "channel", "fd"), [("socketcan", "lo", True), ("socketcan", "none", False), ("virtual", "lo", False)]
-)
+CARRIES_FD = [("socketcan", "lo", True), ("socketcan", "none", False), ("virtual", "lo", False)]
+
+
+@pytest.mark.parametrize(("interface", "channel", "fd"), CARRIES_FD)
 def test_can_fd_support_of_an_interface_is_read_from_its_mtu(interface: str, channel: str, fd: bool) -> None:
     assert carries_fd(interface, channel) == fd
 
@@ -189,14 +190,12 @@ def test_dry_run_says_whether_frames_are_acknowledged(interface: str, words: str
 
 
 class SerialLine:
-    """The far end of a serial line, to which the node's adapter is connected."""
+    """The far end of a serial line, to which the node's adapter is connected; `taken` is all that the node has sent."""
 
     def __init__(self) -> None:
         self._here, self._there = pty.openpty()
         tty.setraw(self._there)
-        self.path = os.ttyname(self._there)
-        self.taken = b""
-        """All that the node has sent."""
+        self.path, self.taken = os.ttyname(self._there), b""
 
     def put(self, data: bytes) -> None:
         os.write(self._here, data)
