@@ -3,7 +3,7 @@
 import codecs
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from ecu_node.parameters import (
 )
 from tests.disk import full_disk
 from tests.ecu_node.processes import ecu_node as run_node
-from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, as_document, corrector_for, parameters_for
+from tests.ecu_node.vehicles import SMALL_DBC, MakeDatabase, as_document, corrector_for, parameters_for, places
 
 SCHEMA_FILE = Path(ecu_node.__file__).parent / "parameters.schema.json"
 VALIDATOR = jsonschema.Draft202012Validator(parameter_schema())
@@ -88,13 +88,6 @@ def test_parameters_that_violate_the_schema_are_not_written(
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("p.json", "older")]
 
 
-def _paths(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    below: Iterable[tuple[Any, Any]] = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    )
-    return [path, *(deeper for key, item in below for deeper in _paths(item, (*path, key)))]
-
-
 values = st.one_of(
     st.none(), st.booleans(), st.integers(-3, 300), st.floats(-2, 2).filter(lambda x: x != int(x)), st.text(max_size=3),
     st.sampled_from([[], {}, {"a": 1}, *("a" * length for length in (64, 65, 500, 501))]),
@@ -106,14 +99,11 @@ values = st.one_of(
 def test_schema_and_reader_agree_on_any_change_of_a_document(database: VehicleDatabase, data: st.DataObject) -> None:
     finding = {"branch": "battery", "cause": "inverted", "probability": 0.99, "text": "battery: its sign is turned."}
     document = as_document(parameters_for(database, battery=(0.1, -2.5))) | {"findings": [finding]}
-    *outer, last = data.draw(st.sampled_from([*_paths(document)[1:], ("extra",)]))
-    place = document
-    for key in outer:
-        place = place[key]
-    if last == "extra" or data.draw(st.booleans()):
-        place[last] = data.draw(values)
+    container, key = data.draw(st.sampled_from([*places(document), (document, "extra")]))
+    if key == "extra" or data.draw(st.booleans()):
+        container[key] = data.draw(values)
     else:
-        del place[last]
+        del container[key]
     assert is_readable(document) == VALIDATOR.is_valid(document)
 
 

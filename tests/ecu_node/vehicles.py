@@ -1,7 +1,7 @@
 """Small vehicles for the node's tests: layouts and DBCs made to measure, parameters, and frames with cantools."""
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -101,6 +101,13 @@ def parameters_for(database: VehicleDatabase, **faults: tuple[float, float]) -> 
 def as_document(parameters: VehicleParameters) -> dict[str, Any]:
     """Parameters as the JSON document they are written as."""
     return dict(msgspec.to_builtins(parameters))
+
+
+def places(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Every container of a JSON document with each of its keys."""
+    for key in range(len(value)) if isinstance(value, list) else list(value) if isinstance(value, dict) else ():
+        yield value, key
+        yield from places(value[key])
 
 
 def protected(database: VehicleDatabase, message: str, counter: int, **values: float) -> bytes:

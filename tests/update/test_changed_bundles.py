@@ -7,7 +7,6 @@ import json
 import lzma
 import os
 import shutil
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from ecu_node.core.status import UnfitError
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.update.client import update
+from tests.ecu_node.vehicles import places
 from tests.update.repo import Repo
 
 BUNDLES = int(os.environ.get("HV_BUNDLES", "300"))
@@ -47,13 +47,6 @@ def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
     at, length = draw(st.integers(0, len(content) - 1)), draw(st.sampled_from((0, 1, 2, 16, 200, len(content))))
     piece = content[at : at + length]
     return content[:at] + draw(st.binary(max_size=16) | st.just(2 * piece)) + content[at + length :]
-
-
-def places(value: Any) -> Iterator[tuple[Any, Any]]:
-    """Every container of a JSON document with each of its keys."""
-    for key in range(len(value)) if isinstance(value, list) else list(value) if isinstance(value, dict) else ():
-        yield value, key
-        yield from places(value[key])
 
 
 @st.composite

@@ -23,11 +23,6 @@ class LoggedFrame(NamedTuple):
     data: str
 
 
-def ip_link(*arguments: str) -> None:
-    """Change an interface with ip(8); needs root."""
-    run_tool("ip", "link", *arguments)
-
-
 def run_tool(*command: str) -> None:
     """Run a program that must succeed."""
     subprocess.run(command, check=True, timeout=LONGEST_WAIT_S)
@@ -35,9 +30,8 @@ def run_tool(*command: str) -> None:
 
 def bring_up(channel: str) -> None:
     """Bring an interface up as tools/with_vcan does."""
-    ip_link("set", channel, "mtu", "72")
-    ip_link("set", channel, "txqueuelen", "1000")
-    ip_link("set", channel, "up")
+    for words in (("mtu", "72"), ("txqueuelen", "1000"), ("up",)):
+        run_tool("ip", "link", "set", channel, *words)
 
 
 def frames_of(log: Path) -> list[LoggedFrame]:

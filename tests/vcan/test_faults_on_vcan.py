@@ -18,7 +18,6 @@ from tests.vcan.processes import (
     bring_up,
     data_of,
     frames_of,
-    ip_link,
     play,
     playing,
     run_tool,
@@ -51,7 +50,7 @@ def bus_is_back() -> Iterator[None]:
     """Restore vcan0 for the next test."""
     yield
     if not Path(f"/sys/class/net/{CHANNEL}").exists():
-        ip_link("add", CHANNEL, "type", "vcan")
+        run_tool("ip", "link", "add", CHANNEL, "type", "vcan")
     bring_up(CHANNEL)
 
 
@@ -63,11 +62,11 @@ def test_node_corrects_again_after_its_bus_failed(tmp_path: Path, drive: Path, s
             play(drive)
             before.wait_for(BATTERY_CORRECTED, INSTANTS)
         if how == "deleted":
-            ip_link("del", CHANNEL)
+            run_tool("ip", "link", "del", CHANNEL)
             node.wait_for("the bus failed")
-            ip_link("add", CHANNEL, "type", "vcan")
+            run_tool("ip", "link", "add", CHANNEL, "type", "vcan")
         else:
-            ip_link("set", CHANNEL, "down")
+            run_tool("ip", "link", "set", CHANNEL, "down")
             node.wait_for("the bus failed")
         bring_up(CHANNEL)
         node.wait_for("the bus is open again")

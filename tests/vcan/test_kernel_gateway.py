@@ -28,7 +28,6 @@ from tests.vcan.processes import (
     Recording,
     bring_up,
     generate,
-    ip_link,
     playing,
     run_tool,
     running_recording,
@@ -128,10 +127,10 @@ def test_removed_kernel_rules_are_restored(start_gateway: StartNode) -> None:
         run_tool("cangw", "-A", *mine)
         node.wait_for(f"vcan0 and vcan1: {RULES} rules of the kernel were not as they must be; they are now")
         assert len(rules()) == len(before) + 1, "a rule that somebody else has set stays"
-        ip_link("del", OTHER_CHANNEL)
+        run_tool("ip", "link", "del", OTHER_CHANNEL)
         node.wait_for("the kernel carries no frames: ")
         assert rules() == [], "neither way is open"
-        ip_link("add", OTHER_CHANNEL, "type", "vcan")
+        run_tool("ip", "link", "add", OTHER_CHANNEL, "type", "vcan")
         bring_up(OTHER_CHANNEL)
         wait_until(lambda: rules() == before, "the rules to be there again")
         assert node.stop() == 0
@@ -182,9 +181,9 @@ def test_internal_error_leaves_the_kernel_rules_in_place() -> None:
 
 
 def test_rules_for_a_vanished_interface_are_refused_in_one_line() -> None:
-    ip_link("add", "vcan9", "type", "vcan")
+    run_tool("ip", "link", "add", "vcan9", "type", "vcan")
     with KernelRoutes((CHANNEL, "vcan9"), {(BATTERY, False)}, fd=False, say=print) as routes:
-        ip_link("delete", "vcan9")
+        run_tool("ip", "link", "delete", "vcan9")
         with pytest.raises(BusError, match=r"^vcan0 and vcan9: the kernel refuses a rule of can-gw: no interface"):
             routes.set()
 
