@@ -101,9 +101,7 @@ def test_check_warns_of_unapplied_faults_fd_and_narrow_signals(make_database: Ma
 
 
 @pytest.mark.parametrize(("load", "expected_a"), [("[unmeasured_load]\nmean_a = 6.1\nsd_a = 1.0\n", 6.1), ("", 0.0)])
-def test_parameter_template_takes_the_expected_sum_from_the_unmeasured_load_of_the_layout(
-    make_database: MakeDatabase, load: str, expected_a: float
-) -> None:
+def test_template_expects_the_unmeasured_load(make_database: MakeDatabase, load: str, expected_a: float) -> None:
     database = make_database(f"{SMALL_LAYOUT}{load}")
     document = json.loads(template_text(database, "v1", datetime(2026, 6, 1, 12, 0, tzinfo=UTC)))
     assert document["junction_residual"]["expected_a"] == expected_a
@@ -122,9 +120,7 @@ ERRORS = [
 
 
 @pytest.mark.parametrize(("error", "code", "text"), ERRORS)
-def test_program_prints_each_error_as_one_line_and_returns_its_exit_code(
-    error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_error_is_one_line(error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert end_of("prog", error, debug=False) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(text)

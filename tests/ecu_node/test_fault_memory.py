@@ -157,7 +157,7 @@ DAMAGE = [
 
 
 @pytest.mark.parametrize(("old", "new", "why"), DAMAGE)
-def test_node_passes_values_through_if_it_cannot_read_the_fault_memory_until_it_is_cleared(
+def test_unreadable_fault_memory_lets_values_pass_through(
     vehicle: Vehicle, old: str, new: str | None, why: str
 ) -> None:
     """The damaged file stays as it is until then; bus sleep changes nothing."""

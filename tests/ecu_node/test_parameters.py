@@ -177,7 +177,7 @@ BEYOND_LIMITS = [
 
 
 @pytest.mark.parametrize(("change", "words"), BEYOND_LIMITS)
-def test_parameters_beyond_the_limits_of_drift_offset_sum_or_delay_are_unfit(
+def test_parameters_beyond_limits_are_unfit(
     database: VehicleDatabase, change: dict[str, Any], words: str | None
 ) -> None:
     expected = {key: value for key, value in change.items() if key == "expected_a"}

@@ -102,9 +102,7 @@ ERRORS = {"openat": "ENOSPC", "write": "ENOSPC", "fsync": "EIO", "rename": "EIO"
 
 
 @pytest.mark.parametrize("command", ["update"], indirect=True)
-def test_failed_disk_write_is_reported_and_keeps_the_state_unless_already_replaced(
-    command: Callable[[Path], list[str]], state: Path, tmp_path: Path
-) -> None:
+def test_failed_write_keeps_old_or_new_state(command: Callable[[Path], list[str]], state: Path, tmp_path: Path) -> None:
     work, log = tmp_path / "work", tmp_path / "log"
     calls = calls_of(command(started(state, work)), work, FILES, log)
     before, after = timeless(state), timeless(work)

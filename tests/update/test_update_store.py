@@ -42,9 +42,7 @@ def ended(state: Path, other: VehicleParameters, database: VehicleDatabase, monk
 
 
 @pytest.mark.parametrize("damage", [without, cut, a_folder])
-def test_running_node_keeps_its_parameters_while_the_state_is_damaged(
-    damage: Callable[[Path], None], state: Path, database: VehicleDatabase
-) -> None:
+def test_damaged_state_keeps_parameters(damage: Callable[[Path], None], state: Path, database: VehicleDatabase) -> None:
     """A running node keeps the set in force; a node that starts with a damaged state passes values through."""
     running, path = Running(state, database), state / "state.json"
     whole = path.read_bytes()

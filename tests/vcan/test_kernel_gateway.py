@@ -188,9 +188,7 @@ def test_rules_for_a_vanished_interface_are_refused_in_one_line() -> None:
             routes.set()
 
 
-def test_branch_frames_of_another_node_are_logged_and_dropped(
-    drive: Path, start_gateway: StartNode, here: Recording, there: Recording
-) -> None:
+def test_foreign_frames_are_dropped(drive: Path, start_gateway: StartNode, here: Recording, there: Recording) -> None:
     command = ["cangen", OTHER_CHANNEL, "-I", f"{BATTERY:X}", "-D", FOREIGN, "-L", "8", "-g", "1"]
     with start_gateway() as node:
         with subprocess.Popen(command) as foreigner:
