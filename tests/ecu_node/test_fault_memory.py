@@ -157,9 +157,7 @@ DAMAGE = [
 
 
 @pytest.mark.parametrize(("old", "new", "why"), DAMAGE)
-def test_unreadable_fault_memory_lets_values_pass_through(
-    vehicle: Vehicle, old: str, new: str | None, why: str
-) -> None:
+def test_unreadable_fault_memory_lets_values_through(vehicle: Vehicle, old: str, new: str | None, why: str) -> None:
     """The damaged file stays as it is until then; bus sleep changes nothing."""
     vehicle.latch(Reason.BRANCH_STALE, "motor")
     content = vehicle.file.read_text()

@@ -243,9 +243,7 @@ JUMPS = [
 
 
 @pytest.mark.parametrize(("jump_a", "since_s", "period_s", "looks"), JUMPS)
-def test_jump_counts_if_it_lasts_and_is_large(
-    jump_a: float, since_s: float, period_s: float, looks: int | None
-) -> None:
+def test_jump_counts_if_large_and_lasting(jump_a: float, since_s: float, period_s: float, looks: int | None) -> None:
     junction = Watched(corrected_sd_a=1.0)
 
     def shown_a(now_s: float) -> dict[str, float]:

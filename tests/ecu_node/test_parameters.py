@@ -177,9 +177,7 @@ BEYOND_LIMITS = [
 
 
 @pytest.mark.parametrize(("change", "words"), BEYOND_LIMITS)
-def test_parameters_beyond_limits_are_unfit(
-    database: VehicleDatabase, change: dict[str, Any], words: str | None
-) -> None:
+def test_values_beyond_limits_are_unfit(database: VehicleDatabase, change: dict[str, Any], words: str | None) -> None:
     expected = {key: value for key, value in change.items() if key == "expected_a"}
     residual = JunctionResidual(measured_a=1.0, corrected_a=0.1, **expected)
     branches = {"battery": replace(SOUND, **{key: change[key] for key in change.keys() - expected})}
