@@ -649,11 +649,11 @@ def test_alive_counter_of_the_status_starts_at_0_and_wraps_at_its_width(make_dat
 # Frames that are lost, repeated or damaged, in both modes
 
 
+COUNTERS = [((0, 1, 3, 4, 7), None, "gaps 2"), ((0, 1, 1, 2), 2, "repeated 1"), ((0, 1, 9, 10), 2, "jumped 1")]
+
+
 @pytest.mark.parametrize("mode", Mode)
-@pytest.mark.parametrize(
-    ("sent", "unused", "counted"),
-    [((0, 1, 3, 4, 7), None, "gaps 2"), ((0, 1, 1, 2), 2, "repeated 1"), ((0, 1, 9, 10), 2, "jumped 1")],
-)
+@pytest.mark.parametrize(("sent", "unused", "counted"), COUNTERS)
 def test_frame_with_repeated_or_jumped_counter_is_not_used(
     database: VehicleDatabase, mode: Mode, sent: tuple[int, ...], unused: int | None, counted: str
 ) -> None:

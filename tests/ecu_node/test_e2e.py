@@ -197,9 +197,10 @@ def test_repeats_gaps_and_jumps_are_detected_across_counter_overflow(protection:
     assert found == [ok, Check.REPEATED, ok, Check.LOST, ok, jump, ok, ok]
 
 
-@pytest.mark.parametrize(
-    ("kind", "counter"), [("P04", 0x0100), ("P04", 0x0101), ("P07", 0x0101), ("P07", 0x010001), ("P07", 0x01000000)]
-)
+COUNTERS = [("P04", 0x0100), ("P04", 0x0101), ("P07", 0x0101), ("P07", 0x010001), ("P07", 0x01000000)]
+
+
+@pytest.mark.parametrize(("kind", "counter"), COUNTERS)
 def test_every_byte_of_a_multi_byte_counter_is_compared(protection: Protection, counter: int) -> None:
     check = Receiver(protection).check
     assert {check(frame) for frame in stream(protection, 13, first=-12)} == {Check.OK}, "the next counter is 1"

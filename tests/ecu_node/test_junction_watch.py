@@ -17,6 +17,7 @@ from ecu_node.parameters import JunctionResidual
 PLACE = BitPlace(first=0, end=2, order="little", shift=0, length=16, signed=True)
 PERIOD_S = 1 / 32
 Verdict = tuple[Reason, tuple[str, ...]] | None
+BATTERY_WRONG, HEATER_STUCK = (Reason.SUM_IMPLAUSIBLE, ("battery",)), (Reason.BRANCH_STUCK, ("heater",))
 
 
 def codes(scale: Fraction, *named: int) -> Codes:
@@ -166,8 +167,8 @@ def test_sums_of_right_sensors_give_no_verdict() -> None:
 
 
 GAIN_ERRORS = [
-    (0.0, 10.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
-    (0.0, 10.0, 100.0, (Reason.SUM_IMPLAUSIBLE, ("battery",))),
+    (0.0, 10.0, 0.0, BATTERY_WRONG),
+    (0.0, 10.0, 100.0, BATTERY_WRONG),
     (0.0, 0.0, 0.0, (Reason.SUM_IMPLAUSIBLE, ("battery", "motor"))),
     (0.1, 10.0, 0.0, None),
 ]
@@ -216,7 +217,7 @@ def test_stuck_branch_is_found_beside_a_gain_error_and_a_steady_one_is_not(drift
     assert junction.watch.verdict == verdict
 
 
-@pytest.mark.parametrize(("still_a", "verdict"), [(2.0, None), (3.0, (Reason.BRANCH_STUCK, ("heater",)))])
+@pytest.mark.parametrize(("still_a", "verdict"), [(2.0, None), (3.0, HEATER_STUCK)])
 def test_constant_current_is_stuck_unless_small(still_a: float, verdict: Verdict) -> None:
     """The sum varies by what no gain error explains; the motor is first heard after half a second.
 
@@ -250,13 +251,11 @@ def test_jump_counts_if_large_and_lasting(jump_a: float, since_s: float, period_
         return {"battery": 50.0 + jump_a * (now_s >= since_s), "motor": -45.0, "heater": -5.0}
 
     junction.run(2.0, shown_a, period_s=period_s)
-    assert junction.watch.verdict == (None if looks is None else (Reason.SUM_IMPLAUSIBLE, ("battery",)))
+    assert junction.watch.verdict == (None if looks is None else BATTERY_WRONG)
     assert looks is None or junction.now_s == since_s + (looks - 1) * period_s
 
 
-@pytest.mark.parametrize(
-    ("still_a", "verdict"), [(10.5, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (10.6, (Reason.BRANCH_STUCK, ("heater",)))]
-)
+@pytest.mark.parametrize(("still_a", "verdict"), [(10.5, BATTERY_WRONG), (10.6, HEATER_STUCK)])
 def test_still_branch_with_more_than_half_of_the_sum_is_stuck(still_a: float, verdict: Verdict) -> None:
     """The sum has jumped once it is 21 A."""
     junction = Watched(corrected_sd_a=1.0)
@@ -264,9 +263,7 @@ def test_still_branch_with_more_than_half_of_the_sum_is_stuck(still_a: float, ve
     assert junction.watch.verdict == verdict
 
 
-@pytest.mark.parametrize(
-    ("rises", "verdict"), [(2, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (3, (Reason.BRANCH_STUCK, ("heater",)))]
-)
+@pytest.mark.parametrize(("rises", "verdict"), [(2, BATTERY_WRONG), (3, HEATER_STUCK)])
 def test_still_branch_is_stuck_if_another_jumps_in_several_steps(rises: int, verdict: Verdict) -> None:
     """The battery rises by 24 A in frames one after the other."""
 
@@ -279,9 +276,7 @@ def test_still_branch_is_stuck_if_another_jumps_in_several_steps(rises: int, ver
     assert junction.watch.verdict == verdict
 
 
-@pytest.mark.parametrize(
-    ("rises", "verdict"), [(3, (Reason.SUM_IMPLAUSIBLE, ("battery",))), (4, (Reason.BRANCH_STUCK, ("heater",)))]
-)
+@pytest.mark.parametrize(("rises", "verdict"), [(3, BATTERY_WRONG), (4, HEATER_STUCK)])
 def test_still_branch_is_stuck_if_another_moves_as_the_sum_does_in_several_steps(rises: int, verdict: Verdict) -> None:
     """The battery rises by 1 A, which makes the sum wrong, and then by 4 A each time: half of 8 A, a third of 12 A."""
 

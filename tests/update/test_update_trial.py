@@ -95,9 +95,10 @@ def test_right_set_comes_in_force_after_its_trial_and_not_before(new: Path, car:
     assert abs(drive.corrector.watch.sums.corrected_a) < 0.1
 
 
-@pytest.mark.parametrize(
-    ("drift", "offset_a"), [(-DRIFT, -OFFSET_A), (0.0, -OFFSET_A), (3.0 * DRIFT, OFFSET_A), (DRIFT, 10.0)]
-)
+WRONG = [(-DRIFT, -OFFSET_A), (0.0, -OFFSET_A), (3.0 * DRIFT, OFFSET_A), (DRIFT, 10.0)]
+
+
+@pytest.mark.parametrize(("drift", "offset_a"), WRONG)
 @pytest.mark.parametrize("left_a", [0.5, 20.0], ids=["small remaining sum", "large remaining sum"])
 def test_wrong_set_fails_its_trial(
     new: Path, car: VehicleDatabase, drift: float, offset_a: float, left_a: float
