@@ -168,9 +168,9 @@ def test_trial_time_counts_only_in_valid_watch_states_while_current_flows(new: P
     put_on_trial(new, right(own))
     drive, no_trial_yet = Drive(new, own), (State.PASSING_THROUGH, Reason.ON_TRIAL)
     phases = ((1, True, no_trial_yet), (2, False, no_trial_yet), (2, True, CORRECTING))
-    for drive.contactor, drive.moving, told in phases:
+    for drive.contactor, drive.moving, expected in phases:
         drive.go_on(1.1 * TRIAL_S)
-        assert drive.told == told
+        assert drive.told == expected
 
 
 def test_revocation_takes_effect_at_once_in_a_running_node(new: Path, car: VehicleDatabase) -> None:

@@ -193,8 +193,8 @@ def test_foreign_frames_are_dropped(drive: Path, start_gateway: StartNode, here:
     with start_gateway() as node:
         with subprocess.Popen(command) as foreigner:
             with playing(drive) as player:
-                told = State.CORRECTING, Reason.FOREIGN_FRAMES
-                wait_until(lambda: state_of(there.data_of(STATUS)[-1]) == told, "the foreign frames to be told")
+                state = State.CORRECTING, Reason.FOREIGN_FRAMES
+                wait_until(lambda: state_of(there.data_of(STATUS)[-1]) == state, "the state FOREIGN_FRAMES")
                 assert player.wait(LONGEST_WAIT_S) == 0
             foreigner.terminate()
         here.wait_for(BATTERY, INSTANTS)
