@@ -338,12 +338,12 @@ def require_columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> No
 def _seconds(frame: pd.DataFrame, where: str) -> Array:
     """Return the instants of a frame, rising from 0; DriveError if its index is no such time. [s]"""
     index = frame.index
-    if isinstance(index, pd.RangeIndex) or not (
+    if (isinstance(index, pd.RangeIndex) and index.step == 1) or not (
         isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex)) or pd.api.types.is_any_real_numeric_dtype(index)
     ):
         what = "counts rows" if isinstance(index, pd.RangeIndex) else f"is of {index.dtype}"
         raise DriveError(
-            f"{where}: its index {what}; expected the time: seconds, or a DatetimeIndex; use frame.set_index(...)"
+            f"{where}: its index {what}; expected the time: floating-point seconds, or a DatetimeIndex; use set_index"
         )
     if len(index) < 2:
         raise DriveError(f"{where}: {len(index)} rows; leave the frame out")

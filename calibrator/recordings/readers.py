@@ -407,7 +407,7 @@ class TableSource(SignalSource):
 
     def recording(self, vehicle: str, name: str) -> Recording:  # noqa: D102 (as above)
         for column in self.branch_columns():
-            if complaint := self.table.no_numbers(column):
+            if complaint := self.table.no_numbers(column, or_words=False):
                 raise LogError(f"{self.where}: {complaint[0]}", complaint[1])
         return super().recording(vehicle, name)
 

@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -110,6 +110,8 @@ class Table:
     texts : dict of str to str
         For columns that are not read, as they have no number, or numbers that cannot be read such as ``20.9-``, by
         header: the first such cell and where it stands, for messages.
+    words : collection of str
+        Those of them in which no cell is like a number.
     found : str
         What was detected about the file, in words, such as ``decimal ',', utf-8-sig; time 'Zeit' in s``.
     disordered, clock_steps, without_time : int
@@ -123,6 +125,7 @@ class Table:
     units: dict[str, str]
     bad: dict[str, Mask] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
+    words: Collection[str] = ()
     found: str = ""
     disordered: int = 0
     clock_steps: int = 0
@@ -161,10 +164,13 @@ class Table:
             raise LogError(f"{self.path}: {why}")
         return header
 
-    def no_numbers(self, name: str) -> tuple[str, ...]:
-        """Return the complaint about a column that holds no numbers, and what to do; empty for all other columns."""
+    def no_numbers(self, name: str, *, or_words: bool = True) -> tuple[str, ...]:
+        """Return the complaint about a column that is not read, and what to do; empty for all other columns.
+
+        Without ``or_words`` it is empty for :attr:`words`, too.
+        """
         header = None if self.header(name) is not None else self._same(name, self.texts)
-        if header is None:
+        if header is None or (header in self.words and not or_words):
             return ()
         return f"column {header!r}: {self.texts[header]}", "write numbers, and the unit in the header"
 
@@ -334,7 +340,7 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
     known &= np.abs(time_s - np.median(time_s[known])) < 1e-9 * LATEST_TIME_STAMP_NS
     order = repaired_time(np.rint(1e9 * (time_s[known] - time_s[known][0])).astype(np.int64))
     rows = np.flatnonzero(known)[order.order]
-    columns, bad, texts = {}, {}, {}
+    columns, bad, texts, words = {}, {}, {}, list[str]()
     for name in frame.columns.difference(names, sort=False):
         value, is_bad = _numbers(frame[name])
         bad_rows, numbers = np.flatnonzero(is_bad), int(np.isfinite(value).sum())
@@ -347,6 +353,7 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
                 bad[name] = is_bad[rows]
         else:
             row = int([*unread, *bad_rows][0])
+            words += [] if unread.size else [name]
             which = f"{len(bad_rows):,} of its {len(frame):,} cells" if numbers else "its cells"
             line = f"line {frame.attrs['line'] + row}" if "line" in frame.attrs else f"row {row + 1}"
             texts[name] = f"{which} are no numbers, such as {str(frame[name].iloc[row])!r} in {line}"
@@ -362,6 +369,7 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
         units={name: unit for name, unit in units.items() if name in columns},
         bad=bad,
         texts=texts,
+        words=words,
         found=f"{found}{about}{coarse}",
         disordered=order.disordered,
         clock_steps=order.clock_steps,

@@ -124,8 +124,8 @@ def test_charge_that_only_a_second_opposite_offset_could_explain_corrects_nothin
     """A slip of the sign, kWh for Ah, or none at all."""
     frame = recording(offset_a=(5.0, 0.0, 0.0)).add([30.0, -30.0, 0.0])
     true_ah = float((frame["battery"] - 5.0).mean()) * SECONDS / 3600.0
-    known = {"trusted": ["motor"], "load": (0.0, 0.1), "charge_ah": {"battery": (factor * true_ah, 0.01)}}
-    calibrator = JunctionCalibrator(**known).fit(frame, JUNCTION)
+    charge_ah = {"battery": (factor * true_ah, 0.01)}
+    calibrator = JunctionCalibrator(trusted=["motor"], load=(0.0, 0.1), charge_ah=charge_ah).fit(frame, JUNCTION)
     noticed = [text for text in calibrator.notices_ if "check value and sign of charge_ah" in text]
     assert len(noticed) == (factor != 1.0)
     assert calibrator.parameters_["corrected"].any() == (factor == 1.0)

@@ -301,7 +301,7 @@ def of_all(change: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     (changed(V2=lambda each: each.iloc[:1]), r"V2, frame 1: 1 rows; leave the frame out"),
     (changed(V2=lambda each: each.assign(motor=1e-3 * each["motor"])), r"V2: the largest motor .*perhaps it is in kA"),
     (of_all(lambda each: each.set_index(60.0 * each.index)), r"V1, frame 1: rows are 60 s apart, expected 5 s at mo"),
-    (of_all(lambda each: each.set_index(1000 * np.arange(len(each)))), r"frame 1: its index is whole numbers, 1000 apa"),
+    (of_all(lambda each: each.set_index(1000 * np.arange(len(each)))), r"V1, frame 1: its index is whole numbers, 100"),
     (of_all(lambda each: each[["battery", "motor"]]), r"inputs none: expected one or more"),
 ])  # fmt: skip
 def test_unusable_data_frames_are_refused_in_one_line(given: Callable[[], Frames], message: str) -> None:
