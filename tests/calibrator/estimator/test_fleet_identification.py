@@ -1,15 +1,12 @@
 """``calibrator identify``: the filter bank chosen for known vehicles follows them; models of single vehicles."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from typer.testing import CliRunner, Result
 
-from calibrator.cli import app
 from calibrator.drive import Array, Channel, Drive, DriveFile, Equipment, Samples
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
@@ -21,6 +18,7 @@ from calibrator.summaries.filter_bank import FilterBank, read_bank
 from calibrator.summaries.summariser import summarise_samples
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import read_layout
+from tests.calibrator.command_here import reported
 from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.estimator.simulated_drives import coloured, samples_of
 
@@ -155,17 +153,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run_identify(store: Path, *options: object) -> Result:
-    """The command in this process, which need not import everything again."""
-    arguments = ["identify", str(store), "--layout", str(LAYOUT), "--workers", "1", *map(str, options)]
-    return CliRunner().invoke(app, arguments)
-
-
 def test_identify_writes_the_bank_and_names_the_worst_fitted_vehicle(store: Path, tmp_path: Path) -> None:
     bank = tmp_path / "new" / "bank.json"
-    run = run_identify(store, "--out", bank, "--json")
-    assert run.exit_code == 0, run.output
-    figures = json.loads(run.stdout)
+    figures = reported("identify", store, "--layout", LAYOUT, "--workers", 1, "--out", bank)
     worst = figures["branches"]["motor"]["worst_vehicle"]
     assert figures["snr_db"][worst]["motor"] == min(each["motor"] for each in figures["snr_db"].values())
     assert figures["branches"]["motor"]["median_db"] > 30.0

@@ -10,15 +10,7 @@ from scipy.special import logsumexp
 from calibrator.drive import Array
 from calibrator.estimator import posterior
 from calibrator.estimator.evidence import EvidenceRows
-from calibrator.estimator.prior import (
-    GRID,
-    LOAD_DENSITY,
-    TAIL_DENSITY,
-    Prior,
-    Slab,
-    first_prior,
-    known_prior,
-)
+from calibrator.estimator.prior import GRID, LOAD_DENSITY, TAIL_DENSITY, Prior, Slab, first_prior, known_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import (

@@ -9,19 +9,8 @@ import numpy as np
 import pytest
 
 from calibrator.errors import FleetError
+from calibrator.estimator import readings
 from calibrator.estimator.evidence import EvidenceRows
-from calibrator.estimator.readings import (
-    BenchReading,
-    BenchTable,
-    bench_readings,
-    current_flows,
-    flow_findings,
-    flows_in_fleet,
-    merge_readings,
-    read_bench_table,
-    untrusted_vehicles,
-    window_readings,
-)
 from calibrator.summaries.vehicle_summary import VehicleSummary, ZeroCurrent
 from ecu_node.layout import UnmeasuredLoad
 
@@ -30,16 +19,16 @@ HEADER = "vehicle,branch,drift,drift_sd,offset_a,offset_sd_a"
 NAN = np.nan
 
 
-def read(folder: Path, *lines: str, trusted: tuple[str, ...] = ()) -> BenchTable:
+def read(folder: Path, *lines: str, trusted: tuple[str, ...] = ()) -> readings.BenchTable:
     path = folder / "bench.csv"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8-sig")
     problems = {"V1": "", "V2": "", "copy": "same recording as V1"}
-    return read_bench_table(path, BRANCHES, problems, trusted=trusted, full_scale_a=FULL_SCALE_A)
+    return readings.read_bench_table(path, BRANCHES, problems, trusted=trusted, full_scale_a=FULL_SCALE_A)
 
 
-def bench_of(drift: float, drift_sd: float, offset_a: float, offset_sd_a: float, *sensor: str) -> BenchTable:
+def bench_of(drift: float, drift_sd: float, offset_a: float, offset_sd_a: float, *sensor: str) -> readings.BenchTable:
     vehicle, branch = sensor or ("V1", "battery")
-    return {(vehicle, branch): BenchReading(drift, drift_sd, offset_a, offset_sd_a)}
+    return {(vehicle, branch): readings.BenchReading(drift, drift_sd, offset_a, offset_sd_a)}
 
 
 def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> EvidenceRows:
@@ -55,7 +44,7 @@ def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> Ev
 
 def test_table_of_readings_may_have_any_column_order_and_empty_cells(tmp_path: Path) -> None:
     bench = read(tmp_path, HEADER, "V2, motor, 0.02, 0.001, , ", "", "V1,battery,,,-1.5,0.2")
-    (drift, offset_a), (drift_sd, offset_sd_a) = bench_readings(bench, VEHICLES, BRANCHES)
+    (drift, offset_a), (drift_sd, offset_sd_a) = readings.bench_readings(bench, VEHICLES, BRANCHES)
     np.testing.assert_array_equal(drift, [[NAN, NAN], [NAN, 0.02]])
     np.testing.assert_array_equal(drift_sd, [[NAN, NAN], [NAN, 0.001]])
     np.testing.assert_array_equal(offset_a, [[-1.5, NAN], [NAN, NAN]])
@@ -105,10 +94,10 @@ def test_bench_and_window_readings_are_averaged_or_both_dropped_if_contradictory
         **bench_of(0.02, 0.001, NAN, NAN, "V3", "motor"),
         **bench_of(0.02, 0.001, NAN, NAN, "gone", "motor"),
     }
-    readings, notices = merge_readings(vehicles, bench, BRANCHES)
-    assert readings[:, 1, 0, 0] == pytest.approx([5.0, 0.1 / np.sqrt(2.0)])
-    assert np.isnan(readings[:, 1, 1, 0]).all()
-    assert (readings[0, 0, 1, 0], readings[0, 0, 2, 1]) == pytest.approx((0.03, 0.02))
+    merged, notices = readings.merge_readings(vehicles, bench, BRANCHES)
+    assert merged[:, 1, 0, 0] == pytest.approx([5.0, 0.1 / np.sqrt(2.0)])
+    assert np.isnan(merged[:, 1, 1, 0]).all()
+    assert (merged[0, 0, 1, 0], merged[0, 0, 2, 1]) == pytest.approx((0.03, 0.02))
     assert notices[0].startswith("vehicle V2: its battery sensor was read as -5.0 A on the bench, and showed +5.0 A")
     assert notices[1] == "bench readings of vehicles that are left out are not used: gone"
 
@@ -121,10 +110,13 @@ def with_windows(*shown_a: tuple[float, float]) -> list[VehicleSummary]:
 
 def test_window_in_which_a_current_flows_between_two_sensors_is_not_used() -> None:
     vehicles = with_windows((0.84, -0.85), (0.84, 0.85), (0.2, -0.2), (5.0, -4.5), (NAN, NAN))
-    assert current_flows(vehicles).tolist() == [True, False, False, False, False]
-    assert np.isnan(window_readings(vehicles)[0, 1]).all(axis=1).tolist() == [True, False, False, False, True]
-    assert [[each.cause for each in flow_findings(vehicle)] for vehicle in vehicles] == [["window"], [], [], [], []]
-    assert flow_findings(vehicles[0])[0].text.startswith("two sensors show the same current with opposite signs while")
+    assert readings.current_flows(vehicles).tolist() == [True, False, False, False, False]
+    assert np.isnan(readings.window_readings(vehicles)[0, 1]).all(axis=1).tolist() == [True, False, False, False, True]
+    causes = [[each.cause for each in readings.flow_findings(vehicle)] for vehicle in vehicles]
+    assert causes == [["window"], [], [], [], []]
+    assert readings.flow_findings(vehicles[0])[0].text.startswith(
+        "two sensors show the same current with opposite signs while"
+    )
 
 
 @pytest.mark.parametrize(("shown_a", "flows"), [
@@ -137,19 +129,19 @@ def test_windows_of_a_fleet_are_not_used_if_the_same_small_current_flows_in_most
     shown_a: list[tuple[float, float]], flows: bool
 ) -> None:
     vehicles = with_windows(*shown_a)
-    assert flows_in_fleet(vehicles) == flows
-    assert np.isnan(merge_readings(vehicles, {}, BRANCHES, windows=False)[0]).all()
+    assert readings.flows_in_fleet(vehicles) == flows
+    assert np.isnan(readings.merge_readings(vehicles, {}, BRANCHES, windows=False)[0]).all()
 
 
 @pytest.mark.parametrize("others_a", [0.0, 5.0, -12.0])
 def test_trusted_vehicle_violating_the_junction_law_is_found(others_a: float) -> None:
     names = (*BRANCHES, "auxiliary")
     rows = rows_of(0.05, (0.0, 0.0, 3.0, -9.0, others_a))
-    found = untrusted_vehicles(rows, np.arange(5) < 4, names, full_scale_a=FULL_SCALE_A)
+    found = readings.untrusted_vehicles(rows, np.arange(5) < 4, names, full_scale_a=FULL_SCALE_A)
     assert list(found) == [0, 3]
     assert re.match(r"the gains of its sensors auxiliary and battery differ by \+5\.0%", found[0])
     assert found[3] == "its currents sum to -9.0 A on average, which no load without a sensor explains"
     load = UnmeasuredLoad(mean_a=3.0, sd_a=0.1)
-    declared = untrusted_vehicles(rows, np.arange(5) < 3, names, full_scale_a=FULL_SCALE_A, load=load)
+    declared = readings.untrusted_vehicles(rows, np.arange(5) < 3, names, full_scale_a=FULL_SCALE_A, load=load)
     assert list(declared) == [0, 1]
     assert "which the declared load of 3 A does not explain" in declared[1]

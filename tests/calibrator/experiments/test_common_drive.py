@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.experiments.common_drive import (
-    CommonCase,
-    builtin_common_drive,
-    common_trial,
-)
+from calibrator.experiments.common_drive import CommonCase, builtin_common_drive, common_trial
 from calibrator.experiments.figures import figure_rows, judge
 from calibrator.experiments.methods import BASELINES, CEILING, PERFECT, POSTERIOR, THRESHOLD, TREE, MethodRow
 from calibrator.experiments.recorded_trips import RecordedCase, recorded_trial

@@ -11,9 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
-from calibrator.cli import app
 from calibrator.errors import FleetError
 from calibrator.experiments.common_drive import CommonCase
 from calibrator.experiments.experiments import ALL, EXPERIMENTS, Experiment, ExperimentResult, Setting, fleet_for
@@ -23,6 +21,7 @@ from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
 from calibrator.experiments.runner import run_experiment
 from calibrator.experiments.trial import CommonEvidence, ComparedMethod, Estimate, Trial
 from calibrator.faults import Faults
+from tests.calibrator.command_here import refused, succeeded
 from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.experiments.small_trials import small_fleet, smooth_drive
 
@@ -182,8 +181,8 @@ def test_quick_experiment_has_few_settings_and_small_fleets() -> None:
 def test_option_only_selects_settings_by_a_part_of_their_name_and_refuses_an_unknown_one() -> None:
     kept = EXPERIMENTS["attacks"].only("cubic").small().settings
     assert [(each.series, each.x) for each in kept] == [("cubic 5-20 %", 2.0), ("cubic 5-20 %", 3.0)]
-    ran = CliRunner().invoke(app, ["experiment", "asymmetry", "--only", "0.3"])
-    assert "asymmetry: no setting has '0.3' in its name; there are 0, 0.2, 0.4, 0.5" in str(ran.exception)
+    said = refused("experiment", "asymmetry", "--only", "0.3")
+    assert "asymmetry: no setting has '0.3' in its name; there are 0, 0.2, 0.4, 0.5" in said
 
 
 def test_number_of_vehicles_without_a_drive_length_is_refused_for_recorded_trips() -> None:
@@ -192,12 +191,9 @@ def test_number_of_vehicles_without_a_drive_length_is_refused_for_recorded_trips
 
 
 def test_experiment_command_writes_json_page_and_picture_or_lists_all_experiments(tmp_path: Path) -> None:
-    out = ("--out", str(tmp_path / "results"))
-    ran = CliRunner().invoke(app, ["experiment", "snr", "--quick", "--repetitions", "1", "--workers", "1", *out])
-    assert ran.exit_code == 0, ran.output
+    succeeded("experiment", "snr", "--quick", "--repetitions", 1, "--workers", 1, "--out", tmp_path / "results")
     assert {path.name for path in (tmp_path / "results").iterdir()} == {"snr.json", "snr.md", "snr.png"}
-    listed = CliRunner().invoke(app, ["experiment"]).stdout.splitlines()
-    assert [line.split()[0] for line in listed] == list(EXPERIMENTS)
+    assert [line.split()[0] for line in succeeded("experiment").splitlines()] == list(EXPERIMENTS)
 
 
 # Methods of one's own beside the built-in ones, or alone

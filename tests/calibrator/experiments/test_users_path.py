@@ -5,9 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
-from calibrator.cli import app
 from calibrator.errors import FleetError
 from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import POSTERIOR
@@ -16,6 +14,7 @@ from calibrator.faults import Faults
 from calibrator.score import recovered
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
+from tests.calibrator.command_here import succeeded
 from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.experiments.small_trials import small_fleet, write_store
 
@@ -39,14 +38,10 @@ def test_trips_are_reduced_to_channels_common_to_all(tmp_path: Path) -> None:
 
 def calibrated(store: Path, out: Path) -> pd.DataFrame:
     """Result of the commands that users run, by vehicle and branch."""
-    layout = ("--layout", str(LAYOUT), "--workers", "1")
-    drawn = ("--vehicles", str(VEHICLES), "--drives", str(store), "--unseen-minutes", "0.1", "--balanced")
-    for command in (
-        ("simulate", *layout, *drawn, "--out", str(out / "fleet")),
-        ("calibrate", str(out / "fleet"), *layout, "--out", str(out / "result")),
-    ):
-        ran = CliRunner().invoke(app, command)
-        assert ran.exit_code == 0, ran.output
+    layout = ("--layout", LAYOUT, "--workers", 1)
+    drawn = ("--vehicles", VEHICLES, "--drives", store, "--unseen-minutes", 0.1, "--balanced")
+    succeeded("simulate", *layout, *drawn, "--out", out / "fleet")
+    succeeded("calibrate", out / "fleet", *layout, "--out", out / "result")
     rows = pd.read_parquet(out / "result" / "results.parquet")
     return rows[rows["branch"].notna()].pivot_table(index="vehicle", columns="branch", aggfunc="first", sort=True)
 

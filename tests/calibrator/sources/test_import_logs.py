@@ -4,8 +4,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from calibrator.processes.run_many import Workers
 from calibrator.sources.import_logs import ImportReport, import_logs
 from ecu_node.database import VehicleDatabase
@@ -24,11 +22,6 @@ def test_import_adds_only_logs_that_the_store_lacks(
     assert (len(first.drives), first.already_there) == (1, ())
     assert ([drive.vehicle for drive in both.drives], both.already_there) == (["V002"], ("V001/drive",))
     assert f"1 drive written to {tmp_path}, 1 already there, 0 left out" in both.as_text()
-
-
-@pytest.fixture(scope="module")
-def report(two_vehicles: Path, tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) -> ImportReport:
-    return imported([two_vehicles / "logs"], tmp_path_factory.mktemp("store"), database)
 
 
 def test_damaged_drive_in_the_store_is_reported_and_not_imported_again(
@@ -56,17 +49,12 @@ def test_leftover_file_of_a_killed_import_is_removed(
     assert {path.name for path in folder.iterdir()} == {"drive.parquet", other.name}
 
 
-def write_endless_log(path: Path) -> None:
-    """A log of blank lines, small as a file, that takes minutes to read."""
-    path.parent.mkdir(parents=True)
-    path.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
-
-
 def test_slow_log_is_left_out_and_others_are_imported(
     two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
 ) -> None:
     endless = tmp_path / "logs" / "V000" / "endless.log.gz"
-    write_endless_log(endless)
+    endless.parent.mkdir(parents=True)
+    endless.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)  # blank lines: a small file, minutes to read
     logs = [endless, two_vehicles / "logs"]
     report = import_logs(logs, database, tmp_path / "store", workers=Workers(), limit_s=10.0)
     assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
