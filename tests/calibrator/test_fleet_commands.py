@@ -186,9 +186,7 @@ def test_asymmetric_fleet_with_delays_and_load_is_recovered_without_harm(
     assert figures["harmed_rate"] == 0.0
 
 
-def test_parameter_files_state_the_delay_of_the_motor_within_5_ms(
-    delayed_fleet: Path, parameters: list[VehicleParameters]
-) -> None:
+def test_delay_of_the_motor_is_stated_within_5_ms(delayed_fleet: Path, parameters: list[VehicleParameters]) -> None:
     truth = read_truth(delayed_fleet / "truth.json").vehicles
     for item in parameters:
         delays = {name: branch.delay_s for name, branch in item.branches.items()}

@@ -63,9 +63,7 @@ def test_faults_of_a_fleet_recorded_as_tables_are_found(result: Path) -> None:
         assert rows.drift[vehicle, "motor"] == pytest.approx(gain, abs=0.01)
 
 
-def test_tables_give_the_same_result_directly_and_by_way_of_import_and_summarise(
-    place: Path, result: Path, tmp_path: Path
-) -> None:
+def test_tables_give_the_same_result_directly_and_by_summaries(place: Path, result: Path, tmp_path: Path) -> None:
     run(place, "import", place / "logs", "--out", tmp_path / "drives")
     run(place, "summarise", tmp_path / "drives", "--out", tmp_path / "summaries")
     run(place, "calibrate", tmp_path / "summaries", "--out", tmp_path / "result")

@@ -122,9 +122,7 @@ def test_doctor_finds_each_injected_mistake_and_no_other(
 
 
 @pytest.mark.parametrize("trip", ["TripA07", "TripA24"])
-def test_doctor_finds_no_error_in_i3_trips_and_names_an_inverted_motor(
-    trip: str, i3_store: Path, tmp_path: Path
-) -> None:
+def test_doctor_finds_no_error_in_i3_trips_and_an_inverted_motor(trip: str, i3_store: Path, tmp_path: Path) -> None:
     """The motor current of these trips is minus the sum of the others, so the junction sum is exactly 0.
 
     Which sign is wrong, that of battery or motor, follows from the voltage.

@@ -25,9 +25,7 @@ def test_gain_ratio_of_the_battery_to_each_charging_station_is_found(stations: J
     assert not any(each.parameters.findings for each in stations.vehicles_.values()), "a ramp is no fault of a sensor"
 
 
-def test_two_charging_stations_both_trusted_that_differ_are_reported_as_a_contradiction(
-    i3_charges: Path, tmp_path: Path
-) -> None:
+def test_two_trusted_charging_stations_that_differ_are_a_contradiction(i3_charges: Path, tmp_path: Path) -> None:
     """The meters of the two differ by 2.4 %; nothing is corrected."""
     done = command(
         "calibrate", i3_charges / "car", "--layout", i3_charges / "layout.toml",
@@ -38,9 +36,7 @@ def test_two_charging_stations_both_trusted_that_differ_are_reported_as_a_contra
     assert not pd.read_parquet(tmp_path / "r" / "results.parquet").applied.any()
 
 
-def test_offset_of_a_station_is_known_only_if_the_load_of_the_car_is_declared(
-    i3_charges: Path, stations: JunctionCalibrator
-) -> None:
+def test_offset_of_a_station_is_known_only_with_a_declared_load(i3_charges: Path, stations: JunctionCalibrator) -> None:
     """Between plug and battery the car draws 0.7 to 0.9 A that no branch measures; once declared, no offset is left."""
     knowing = JunctionCalibrator(meter="charger", trusted=["battery"], load=(0.8, 0.1))
     open_, declared = stations.parameters_, knowing.fit(i3_charges / "car", i3_charges / "layout.toml").parameters_

@@ -102,9 +102,7 @@ def chosen(drives: str, layout: Layout) -> TripSource:
     return choose_trips(drives, layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
 
 
-def test_drives_without_good_samples_are_left_out_and_named_in_a_notice(
-    database: VehicleDatabase, tmp_path: Path
-) -> None:
+def test_drives_without_good_samples_are_left_out_and_named(database: VehicleDatabase, tmp_path: Path) -> None:
     for name, good in (("fine", True), ("stuck", False)):
         branches = {
             branch: Channel(time_s=np.arange(100) * 0.1, value=np.ones(100), good=np.full(100, usable))
@@ -147,9 +145,7 @@ def free_parameters(faults: Faults) -> Array:
 
 
 @pytest.mark.parametrize(("branches", "sparsity", "count"), [(3, 60.0, 4), (2, 60.0, 2), (5, 20.0, 12)])
-def test_number_of_nonzero_fault_parameters_follows_from_the_sparsity_level(
-    branches: int, sparsity: float, count: int
-) -> None:
+def test_number_of_fault_parameters_follows_from_the_sparsity_level(branches: int, sparsity: float, count: int) -> None:
     faults = draw(branches=branches, sparsity=sparsity)
     assert np.all(np.count_nonzero(free_parameters(faults), axis=1) == count)
 

@@ -95,9 +95,7 @@ def test_recording_that_is_given_in_two_formats_is_reported(log: Path, layout: P
 
 
 @pytest.mark.parametrize(("declared_a", "reported"), [(2.5, False), (1.5, False), (0.5, True)])
-def test_mean_of_the_sum_is_reported_unless_the_declared_load_explains_it(
-    declared_a: float, reported: bool, log: Path, layout: Path
-) -> None:
+def test_mean_of_sum_is_reported_unless_declared(declared_a: float, reported: bool, log: Path, layout: Path) -> None:
     with layout.open("a") as file:
         file.write(f"\n[unmeasured_load]\nmean_a = {declared_a}\nsd_a = 0.5\n")
     found = examined(layout, log).findings("mean")
@@ -214,9 +212,7 @@ def test_unrelated_currents_are_reported_as_an_error_of_the_sum(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(("factor", "wrong"), [(1.0, []), (1000.0, [("unit", "U [V]")]), (0.01, [("unit", "U [V]")])])
-def test_wrong_unit_of_a_voltage_is_not_blamed_on_the_power(
-    factor: float, wrong: list[tuple[str, str]], tmp_path: Path
-) -> None:
+def test_wrong_voltage_unit_is_not_blamed_on_power(factor: float, wrong: list[tuple[str, str]], tmp_path: Path) -> None:
     current = 40.0 * RNG.normal(size=300)
     volts = 400.0 - 0.1 * current
     branches = branch("battery", signal="I") + branch("motor", power="P [W]", voltage="U [V]")
@@ -375,9 +371,7 @@ def exchange(layout: Path, one: str, other: str) -> None:
     layout.write_text(mark.replace("signal = @", f"signal = {second[1]}"))
 
 
-def test_branches_of_opposite_signs_with_exchanged_signals_give_an_error(
-    log: Path, layout: Path, tmp_path: Path
-) -> None:
+def test_branches_of_opposite_sign_with_exchanged_signals_are_an_error(log: Path, layout: Path, tmp_path: Path) -> None:
     exchange(layout, "battery", "motor")
     doctor = examined(layout, log)
     assert doctor.errors == [("exchanged", "battery")]

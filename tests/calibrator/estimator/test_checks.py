@@ -77,9 +77,7 @@ def checked(summaries: Sequence[DriveSummary], K: int) -> list[tuple[SensorFindi
 @pytest.mark.parametrize("K", [2, 3])
 @pytest.mark.parametrize("branch", [0, 1])
 @pytest.mark.parametrize("cause", CAUSES)
-def test_misfit_of_one_sensor_is_found_with_its_cause_and_blames_no_other_sensor(
-    cause: str, branch: int, K: int
-) -> None:
+def test_misfit_of_one_sensor_is_found_with_its_cause_and_blames_no_other(cause: str, branch: int, K: int) -> None:
     found = checked(a_fleet(K, CAUSES[cause], branch), K)
     if (cause, branch, K) == ("clipped", 1, 3):
         cause, branch = "switching", -1  # the clipping level is visible in no single other current

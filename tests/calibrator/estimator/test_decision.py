@@ -190,9 +190,7 @@ def worse(deployed: Faults, faults: Faults) -> Mask:
 
 @pytest.mark.parametrize("magnitude", [(0.01, 0.05), (0.3, 0.6), pytest.param((0.05, 0.25), marks=pytest.mark.long)])
 @pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
-def test_nine_in_ten_vehicles_are_recovered_for_faults_of_any_size_and_none_is_harmed(
-    K: int, magnitude: tuple[float, float]
-) -> None:
+def test_nine_in_ten_are_recovered_for_any_fault_size_and_none_harmed(K: int, magnitude: tuple[float, float]) -> None:
     faults = random_faults(1, vehicles=40, branches=K, magnitude=magnitude)
     found, deployed = estimated(faults, seed=1)
     estimate = replace(no_faults(40, K), drift=found.drift, offset_a=found.offset_a)

@@ -130,7 +130,7 @@ def test_hardware_offset_between_any_two_branches_causes_no_wrong_correction(off
 
 @pytest.mark.long
 @pytest.mark.parametrize("moved", [True, False])
-def test_fleet_where_half_have_a_moved_current_and_an_offset_or_two_offsets_is_rarely_sure_and_wrong(
+def test_fleet_where_half_have_a_moved_current_and_offset_or_two_offsets_is_rarely_sure_and_wrong(
     moved: bool,
 ) -> None:
     """Pairs with the last branch show which is usual; not learnt from, 32 of 48 moved ones were sure and wrong."""
@@ -158,7 +158,7 @@ def test_fleet_where_half_have_a_moved_current_and_an_offset_or_two_offsets_is_r
     (-1.0, "1 A in branch battery goes with +1 A in branch motor"),
     (0.1, "1 A in branch motor goes with -10 A in branch battery"),
 ])  # fmt: skip
-def test_wrong_sign_or_unit_is_refused_in_most_vehicles_and_not_learnt_from_in_a_few(
+def test_wrong_sign_or_unit_of_most_is_refused_and_of_few_ignored(
     summaries: Summaries, factor: float, told: str
 ) -> None:
     def wrong(summary: DriveSummary) -> DriveSummary:
@@ -192,9 +192,7 @@ def test_offset_of_all_battery_sensors_gives_a_notice_and_corrections_harm_no_ve
     ("vehicles", "branch", "gain"),
     [(5, 0, 0.1), (12, 1, 0.02), *(pytest.param(8, *each, marks=pytest.mark.long) for each in ((1, -0.09), (0, 0.03)))],
 )
-def test_gain_error_shared_by_all_sensors_of_a_branch_gives_a_notice_and_is_not_corrected(
-    vehicles: int, branch: int, gain: float
-) -> None:
+def test_gain_error_shared_by_all_sensors_is_noticed_and_not_corrected(vehicles: int, branch: int, gain: float) -> None:
     batch = no_faults(vehicles, K)
     batch.drift[:, branch] = gain
     summaries = summaries_of(batch, Conditions(samples=900), seed=vehicles)
@@ -279,9 +277,7 @@ def test_vehicles_whose_battery_signal_is_late_are_not_corrected() -> None:
 
 
 @pytest.mark.parametrize(("drift", "suspected"), [(0.02, False), (-0.02, False), (0.06, True)])
-def test_vehicle_that_differs_by_no_more_than_sound_ones_do_has_no_hardware_fault(
-    drift: float, suspected: bool
-) -> None:
+def test_vehicle_that_differs_no_more_than_sound_ones_has_no_hardware_fault(drift: float, suspected: bool) -> None:
     fleet = no_faults(12, K)
     fleet.hardware_drift[3] = drift
     summaries = summaries_of(fleet, Conditions(samples=900, model_error_a=0.3), seed=7)
@@ -305,7 +301,7 @@ def test_two_variants_of_the_vehicle_give_a_notice_and_a_finding_per_vehicle(lar
     assert not found.corrected.any()
 
 
-def test_probability_integral_transform_of_the_truth_lies_in_0_to_1(
+def test_integral_transform_of_the_truth_is_0_to_1(
     truth: Faults, summaries: Summaries, reference: FleetReference
 ) -> None:
     for pit in estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
@@ -403,9 +399,7 @@ def test_trusted_vehicles_whose_currents_sum_to_what_others_do_give_no_notice_of
 
 
 @pytest.mark.parametrize(("trusted", "doubt"), [(None, True), (first(2, 4), True), (first(3, 4), False)])
-def test_reference_of_a_small_fleet_is_in_doubt_unless_three_vehicles_are_trusted(
-    trusted: Mask | None, doubt: bool
-) -> None:
+def test_reference_of_a_small_fleet_is_in_doubt_unless_three_are_trusted(trusted: Mask | None, doubt: bool) -> None:
     learnt = learned(drives("none")[:4], trusted=trusted)
     assert (learnt.vehicles, learnt.in_doubt) == (4, doubt)
     assert any("few for a fleet" in text for text in learnt.notices) == doubt

@@ -107,9 +107,7 @@ def model_of(database: VehicleDatabase, store: Path, *drives: Drive) -> VehicleM
     )
 
 
-def test_vehicle_without_dynamics_is_simulated_exactly_from_one_drive_or_two(
-    database: VehicleDatabase, tmp_path: Path
-) -> None:
+def test_vehicle_without_dynamics_is_simulated_exactly(database: VehicleDatabase, tmp_path: Path) -> None:
     one = model_of(database, tmp_path, drive("whole"))
     two = model_of(database, tmp_path, drive("a", 2000), drive("b", 1000, seed=1))
     assert two.drives == ("a", "b")

@@ -167,9 +167,7 @@ def test_nothing_is_corrected_without_a_trusted_sensor_and_gain_ratios_are_shown
     assert any("0.95" in notice and "battery / motor" in notice for notice in calibrator.notices_)
 
 
-def test_command_leaves_out_unusable_vehicles_and_calibrates_the_other_as_python_does(
-    motor_off: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_command_leaves_out_unusable_vehicles_and_agrees_with_python(motor_off: pd.DataFrame, tmp_path: Path) -> None:
     for name, frame in {"good": motor_off, "short": motor_off.iloc[:20], "empty": motor_off.iloc[:0]}.items():
         (tmp_path / "cars" / name).mkdir(parents=True)
         frame.rename_axis("time_s").to_csv(tmp_path / "cars" / name / "drive.csv")
@@ -255,7 +253,7 @@ BATTERY_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "dri
 
 
 @pytest.mark.parametrize("known", [{"trusted": ["battery"]}, {"readings": BATTERY_READ}])
-def test_notice_is_given_if_a_gain_error_of_the_only_known_sensor_would_explain_all_others(
+def test_notice_if_a_gain_error_of_the_only_known_sensor_would_explain_all_others(
     known: dict[str, Any],
 ) -> None:
     wrong = JunctionCalibrator(**known).fit(recording(gain=(0.05, 0.0, 0.0), seconds=1200.0), JUNCTION)

@@ -138,9 +138,7 @@ def test_constructor_only_stores_parameters_as_in_scikit_learn() -> None:
     assert repr(plain) in plain._repr_html_().replace("&#x27;", "'")
 
 
-def test_results_of_data_frames_without_a_layout_have_no_files_for_the_node(
-    fitted: FleetCalibrator, tmp_path: Path
-) -> None:
+def test_results_of_frames_without_a_layout_have_no_files_for_the_node(fitted: FleetCalibrator, tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"no parameter files for the node are written: .*Junction\.from_layout"):
         out = fitted.write(tmp_path / "result")
     assert len(read_results(out)) == 36
@@ -250,9 +248,7 @@ def test_readings_and_trust_contradicted_by_drives_give_notices() -> None:
 @pytest.mark.parametrize(
     ("column", "factor", "said"), [("battery", -1.0, "reads with the wrong sign"), ("motor", 0.0, "does not follow")]
 )
-def test_explain_says_which_signs_are_wrong_and_which_currents_are_unrelated(
-    column: str, factor: float, said: str
-) -> None:
+def test_explain_says_which_signs_are_wrong_and_currents_unrelated(column: str, factor: float, said: str) -> None:
     given = frames(6)
     given["V6"][column] = factor * given["V6"][column] + np.sin(given["V6"].index)
     found = FleetCalibrator().fit(Fleet.from_frames(given, JUNCTION))

@@ -125,7 +125,7 @@ def test_window_in_which_a_current_flows_between_two_sensors_is_not_used() -> No
     ([(0.1, -0.1)] * 4, False),
     ([(0.5, -0.5)] * 2, False),
 ])  # fmt: skip
-def test_windows_of_a_fleet_are_not_used_if_the_same_small_current_flows_in_most(
+def test_windows_are_not_used_if_the_same_current_flows_in_most(
     shown_a: list[tuple[float, float]], flows: bool
 ) -> None:
     vehicles = with_windows(*shown_a)

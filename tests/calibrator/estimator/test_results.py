@@ -54,9 +54,7 @@ def test_error_for_a_vehicle_that_the_result_lacks_gives_its_name(result: Path, 
         results.written_of(result, name)
 
 
-def test_params_command_writes_the_files_of_all_named_vehicles_or_none(
-    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_params_writes_files_of_all_or_none(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["params", str(result), "v1", "v2", "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.splitlines() == [str(tmp_path / "out" / f"{name}.json") for name in ("v1", "v2")]
     assert read_parameters(tmp_path / "out" / "v2.json").branches["motor"].offset_a == 1.0

@@ -73,9 +73,7 @@ def task(store: SummaryStore, database: VehicleDatabase) -> FleetTask:
     return learn_task(sample, {}, branches=BRANCHES, identity=identity, fleet_size=VEHICLES)[0]
 
 
-def test_learning_sample_is_limited_to_the_largest_number_of_blocks(
-    store: SummaryStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_learning_sample_is_limited_to_a_number_of_blocks(store: SummaryStore, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = CalibrationSettings()
     whole = read_sample(store, settings)
     monkeypatch.setattr(run, "MOST_BLOCKS", sum(len(item.summary.moments) for item in whole[:10]))
@@ -84,9 +82,7 @@ def test_learning_sample_is_limited_to_the_largest_number_of_blocks(
     assert read_sample(store, trusted)[-1].vehicle == whole[-1].vehicle
 
 
-def test_fleet_in_whose_windows_a_current_flows_is_calibrated_as_without_windows(
-    store: SummaryStore, task: FleetTask
-) -> None:
+def test_fleet_in_whose_windows_current_flows_is_calibrated_without_them(store: SummaryStore, task: FleetTask) -> None:
     seen = ZeroCurrent(offset_a=np.array([0.84, -0.84]), sd_a=np.full(2, 0.1))
     plain = read_sample(store, CalibrationSettings())
     flowing = [replace(each, zero_current=seen) for each in plain]
@@ -150,9 +146,7 @@ def test_results_with_one_and_with_two_workers_are_identical(
     assert contents(tmp_path / "two") == contents(result)
 
 
-def test_small_fleet_is_calibrated_without_worker_processes(
-    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_small_fleet_starts_no_processes(store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_many, "_outcomes", None)  # which starts processes
     succeeded(*words(store.url, tmp_path / "out", "--workers", 2))
 
@@ -205,9 +199,7 @@ def test_store_that_is_empty_ambiguous_or_not_named_is_refused(store: SummarySto
 # Second pass
 
 
-def test_parameters_of_a_vehicle_do_not_depend_on_others_in_its_bucket(
-    store: SummaryStore, task: FleetTask, tmp_path: Path
-) -> None:
+def test_parameters_do_not_depend_on_others_in_the_bucket(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
     bucket = fullest(store)
     records = store.read(bucket)
     together = texts(calibrate_bucket(bucket, store=store, task=task))
@@ -218,9 +210,7 @@ def test_parameters_of_a_vehicle_do_not_depend_on_others_in_its_bucket(
         assert found.decode().splitlines() == together[name].decode().splitlines()
 
 
-def test_vehicle_with_impossible_numbers_is_left_out_of_both_passes(
-    store: SummaryStore, task: FleetTask, tmp_path: Path
-) -> None:
+def test_vehicle_with_impossible_numbers_is_left_out(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
     expected = texts(calibrate_bucket(bucket, store=store, task=task))
@@ -323,9 +313,7 @@ def test_option_since_recalibrates_only_vehicles_that_a_changed_option_concerns(
         assert {name for name in old if old[name] != now[name]} == concerned
 
 
-def test_option_since_leaves_out_vehicles_removed_from_the_store_and_names_them(
-    store: SummaryStore, result: Path, tmp_path: Path
-) -> None:
+def test_option_since_names_vehicles_removed_from_the_store(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     """Also if it was the only one of its bucket."""
     shutil.copytree(store.url, tmp_path / "store")
     gone = {name for name in (f"V{j:03d}" for j in range(VEHICLES)) if store.bucket_of(name) == fullest(store)}

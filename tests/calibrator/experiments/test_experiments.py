@@ -73,9 +73,7 @@ def test_new_experiment_needs_one_table_row_and_is_checked_before_it_runs(fleet:
 @pytest.mark.parametrize(
     "name", ["delay", *(pytest.param(n, marks=pytest.mark.long) for n in EXPERIMENTS if n not in {"delay", "snr"})]
 )
-def test_each_experiment_runs_at_small_size_and_writes_json_page_and_picture(
-    name: str, fleet: RecordedFleet, tmp_path: Path
-) -> None:
+def test_each_experiment_runs_and_writes_json_page_and_picture(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
     row = EXPERIMENTS[name].small()
     result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")

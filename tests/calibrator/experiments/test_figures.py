@@ -78,9 +78,7 @@ def test_calibration_error_equals_the_excess_of_confidence_over_recovery() -> No
     [(0.1, 0.0, 1.0, 0.0), (0.1, 0.2, 0.5, 0.5), (0.1, -1.0, 0.5, 0.5)],
     ids=["true correction", "sound branch is corrected", "gain of zero"],
 )
-def test_vehicle_with_a_worsened_branch_is_harmed(
-    drift: float, harm_second: float, recovery_rate: float, harmed: float
-) -> None:
+def test_worse_branch_harms_the_vehicle(drift: float, harm_second: float, recovery_rate: float, harmed: float) -> None:
     figures = figures_of(judge(*two_vehicles(drift=drift, harm_second=harm_second)))
     assert (figures["recovery_rate"].value, figures["harmed"].value) == (recovery_rate, harmed)
     assert figures["deployed"].value == 1.0

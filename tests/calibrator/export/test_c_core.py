@@ -133,9 +133,7 @@ def test_exported_c_compiles_with_any_vehicle_name(make_database: MakeDatabase, 
 
 
 @pytest.mark.parametrize("place", ["7|64@0- (0.0001,0) [0|0]", "0|64@1+ (0.0001,0) [0|0]"])
-def test_signal_too_wide_to_be_corrected_is_refused_and_named(
-    make_database: MakeDatabase, tmp_path: Path, place: str
-) -> None:
+def test_signal_too_wide_for_correction_is_refused(make_database: MakeDatabase, tmp_path: Path, place: str) -> None:
     motor = ' SG_ Motor : 23|16@0- (-0.05,0) [-1600|1600] "A" Node\n'
     dbc = SMALL_DBC.replace(motor, "").replace("7|16@0- (0.1,0) [-3000|3000]", place)
     dbc = dbc.replace("Net: 2 Node\n", "Net: 4 Node\n" + motor).replace('VAL_ 256 Battery -32768 "SNA";\n', "")

@@ -43,9 +43,7 @@ def test_export_replaces_a_different_file_only_with_replace(form: str, params: P
     assert (out.read_bytes(), len(list(out.parent.iterdir()))) == (content, 1)
 
 
-def test_export_refuses_parameters_of_another_vehicle_or_layout(
-    params: Path, tmp_path: Path, make_database: MakeDatabase
-) -> None:
+def test_export_refuses_other_vehicles_and_layouts(params: Path, tmp_path: Path, make_database: MakeDatabase) -> None:
     more = ("--format", "c", "--output", tmp_path / "out")
     with pytest.raises(ParameterError, match=r"v1\.json: parameters are for vehicle 'v1', this is 'v7'"):
         raise refused(params, *more, "--vehicle", "v7")
@@ -54,9 +52,7 @@ def test_export_refuses_parameters_of_another_vehicle_or_layout(
     assert not (tmp_path / "out").exists()
 
 
-def test_export_to_c_gives_a_notice_about_e2e_profiles_that_the_c_core_lacks(
-    make_database: MakeDatabase, tmp_path: Path
-) -> None:
+def test_export_to_c_gives_a_notice_of_e2e_profiles_that_it_lacks(make_database: MakeDatabase, tmp_path: Path) -> None:
     layout = SMALL_LAYOUT + '\n[e2e]\nprofile = "P05"\noffset = 4\nmessages = ["Pair"]\n'
     database = make_database(layout)
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), tmp_path / "v1.json")

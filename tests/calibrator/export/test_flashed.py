@@ -62,9 +62,7 @@ def flashed(program: Path, out: Path, memory: Mapping[int, bytes]) -> Path:
     return out
 
 
-def test_hex_file_flashed_into_the_program_gives_the_right_correction(
-    vehicles: tuple[Path, Checked], tmp_path: Path
-) -> None:
+def test_hex_flashed_into_a_program_gives_the_right_correction(vehicles: tuple[Path, Checked], tmp_path: Path) -> None:
     program, checked = vehicles
     with pytest.raises(ValueError, match="C core"):
         check_frames(checked, program, Random(1), 1_000)
@@ -153,9 +151,7 @@ def test_program_without_a_matching_calibration_symbol_is_refused(
         find_image(program, make_database())
 
 
-def test_numbers_with_more_digits_than_calibration_tools_have_are_refused(
-    make_database: MakeDatabase, tmp_path: Path
-) -> None:
+def test_numbers_with_more_digits_than_tools_have_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
     dbc = Path(make_database().layout.dbc_path).read_text().replace("[-3000|3000]", "[-0.3|0.3]")
     database = make_database(dbc=dbc)
     checked = checked_with(database, parameters_for(database, battery=(0.051, 0.0)), tmp_path)

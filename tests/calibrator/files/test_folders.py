@@ -131,9 +131,7 @@ def test_unknown_kind_of_storage_is_refused() -> None:
         open_storage("nokind://x").names()
 
 
-def test_unreadable_inner_folder_is_reported_and_others_are_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreadable_inner_folder_is_reported_and_others_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("V1", "lost+found", "vehicle 2"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.log").touch()
@@ -166,9 +164,7 @@ def test_folder_on_a_file_system_without_locks_is_usable(tmp_path: Path, monkeyp
     (OSError(errno.ENOSPC, "No space left on device"), "No space left on device; make room, and run the same command"),
     (RuntimeError("Unable to locate credentials"), "Unable to locate credentials; check the credentials, "),
 ])  # fmt: skip
-def test_failure_of_a_storage_is_reported_with_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
-) -> None:
+def test_failure_of_storage_says_what_to_do(monkeypatch: pytest.MonkeyPatch, error: Exception, words: str) -> None:
     def failing(*_: object) -> None:
         raise error
 

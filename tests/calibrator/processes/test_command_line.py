@@ -51,9 +51,7 @@ def test_missing_package_or_ctrl_c_at_start_ends_with_one_line(code: str, exit_c
     ("99999999999999", "SOURCE_DATE_EPOCH is '99999999999999'; expected seconds since 1970, or leave it unset"),
     ("", "none: no such folder, store of drives or store of summaries"),
 ])  # fmt: skip
-def test_wrong_source_date_epoch_ends_with_one_line_and_an_empty_one_is_ignored(
-    tmp_path: Path, epoch: str, said: str
-) -> None:
+def test_wrong_source_date_epoch_ends_in_one_line_and_empty_is_ignored(tmp_path: Path, epoch: str, said: str) -> None:
     command = [sys.executable, "-m", "calibrator", "calibrate", "none", "--layout", str(LAYOUT), "--out", "x"]
     environment = {**os.environ, "SOURCE_DATE_EPOCH": epoch, "PYTHONPATH": str(ROOT)}
     run = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -62,7 +60,7 @@ def test_wrong_source_date_epoch_ends_with_one_line_and_an_empty_one_is_ignored(
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.0])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_or_sigterm_ends_reader_processes_too(
+def test_ctrl_c_and_sigterm_end_readers(
     how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path
 ) -> None:
     log, temporary = tmp_path / "V1" / "endless.log.gz", short_folder

@@ -53,9 +53,7 @@ def fleet_of(vehicles: int, folder: Path, database: VehicleDatabase) -> Path:
 
 
 @pytest.mark.long
-def test_log_exceeding_time_or_memory_limits_is_left_out_with_its_reason(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_log_exceeding_time_or_memory_limits_is_left_out_with_reason(tmp_path: Path, database: VehicleDatabase) -> None:
     logs = fleet_of(1, tmp_path, database)
     lines = b"(1.000000) can0 123#\n" * 900_000
     bombs = {"blank lines": b"\n" * (1 << 24), "one line": b"0" * (1 << 24), "frames": lines}
@@ -78,9 +76,7 @@ def test_log_exceeding_time_or_memory_limits_is_left_out_with_its_reason(
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["import", "summarise", "calibrate"])
-def test_command_rerun_after_a_kill_gives_the_identical_result(
-    tmp_path: Path, database: VehicleDatabase, command: str
-) -> None:
+def test_rerun_after_a_kill_gives_the_identical_result(tmp_path: Path, database: VehicleDatabase, command: str) -> None:
     if command == "calibrate":
         given = tmp_path / "summaries"
         make_store(given, vehicles=500)
@@ -110,9 +106,7 @@ def test_command_rerun_after_a_kill_gives_the_identical_result(
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["import", "summarise"])
-def test_results_are_identical_after_loss_of_a_worker_and_the_scheduler(
-    tmp_path: Path, database: VehicleDatabase, command: str
-) -> None:
+def test_results_are_identical_after_loss_of_scheduler(tmp_path: Path, database: VehicleDatabase, command: str) -> None:
     logs = fleet_of(24, tmp_path, database)
     with started(command, logs, tmp_path / "here", "--workers", 1) as here:
         here.communicate()

@@ -190,9 +190,7 @@ def test_drives_in_object_storage_equal_those_in_a_folder(logs: Path, tmp_path: 
 
 
 @pytest.mark.long
-def test_cluster_and_object_storage_give_the_same_results_as_local_files(
-    logs: Path, tmp_path: Path, s3: dict[str, str]
-) -> None:
+def test_cluster_and_object_storage_give_the_results_of_files(logs: Path, tmp_path: Path, s3: dict[str, str]) -> None:
     layout = ("--layout", LAYOUT)
     for processes in (1, 2):
         command("summarise", logs, *layout, "--out", tmp_path / f"s{processes}", "--workers", processes)

@@ -363,9 +363,7 @@ def test_branches_given_by_the_user_keep_their_sign_and_need_no_confirmation(tab
     ("other.log --log car.dbc", "the database comes first"),
     ("car.dbc --out there.toml", "exists, and is not overwritten"),
 ])  # fmt: skip
-def test_layout_init_refuses_unfit_files_with_one_line(
-    line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unfit_files_are_refused(line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     database_file(tmp_path, PACK, INVERTER)
     database_file(tmp_path, PACK, PACK.replace("1 PackStatus", "9 Twin"), name="two.dbc")
     (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n")

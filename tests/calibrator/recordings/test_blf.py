@@ -161,9 +161,7 @@ def test_damaged_container_is_reported_with_the_number_of_frames_before_it(wrong
 
 
 @pytest.mark.parametrize("batch_bytes", [1, 100, 1 << 21])
-def test_frames_do_not_depend_on_how_many_containers_are_parsed_together(
-    batch_bytes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_do_not_depend_on_how_containers_are_batched(batch_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blf, "BATCH_BYTES", batch_bytes)
     messages = [can.Message(timestamp=START + k, arbitration_id=k, data=bytes([k])) for k in range(100)]
     assert len(assert_the_same(written(messages, container_bytes=150))) == 100

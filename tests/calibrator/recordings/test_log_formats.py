@@ -200,9 +200,7 @@ def test_truncated_gzip_is_reported_with_line_and_number_of_readable_frames(tmp_
     assert len(lines) - _READ_BYTES // min(map(len, lines)) <= line <= len(lines)
 
 
-def test_reading_mf4_without_asammdf_is_refused_and_names_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mf4_without_asammdf_is_refused_with_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     path = tmp_path / "drive.mf4"
     path.write_bytes(b"MDF")

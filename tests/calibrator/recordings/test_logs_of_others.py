@@ -167,9 +167,7 @@ def test_logs_written_by_other_programs_give_the_right_currents(tmp_path: Path, 
     require_currents(before(tmp_path / name, layout))
 
 
-def test_logs_in_a_folder_are_read_as_one_recording_and_notes_beside_them_are_ignored(
-    tmp_path: Path, layout: Path
-) -> None:
+def test_logs_in_a_folder_are_read_as_one_recording_and_notes_are_ignored(tmp_path: Path, layout: Path) -> None:
     (tmp_path / "logs").mkdir()
     for name in ("1.csv", "2.csv"):
         LOGS["SavvyCAN"][1](tmp_path / "logs" / name)
@@ -283,9 +281,7 @@ def test_branch_can_be_computed_by_a_formula(tmp_path: Path, layout: Path) -> No
         (('dbc = "car.dbc"', 'dbc = "x.kcd"'), "x.kcd: cannot read the DBC: No such file"),
     ],
 )  # fmt: skip
-def test_wrong_layout_is_refused_with_one_line(
-    tmp_path: Path, layout: Path, change: tuple[str, str], words: str
-) -> None:
+def test_wrong_layout_is_refused_in_one_line(tmp_path: Path, layout: Path, change: tuple[str, str], words: str) -> None:
     assert change[0] in LAYOUT
     layout.write_text(LAYOUT.replace(*change))
     write_with_python_can(tmp_path / "x.log")
@@ -331,9 +327,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("name", DAMAGED)
-def test_damaged_log_gives_one_error_line_or_a_notice_of_the_lines_left_out(
-    tmp_path: Path, layout: Path, name: str, damage: str
-) -> None:
+def test_damaged_log_gives_one_error_line_or_a_notice(tmp_path: Path, layout: Path, name: str, damage: str) -> None:
     log = tmp_path / name
     LOGS[DAMAGED[name]][1](log)
     log.write_bytes(DAMAGES[damage](log.read_bytes()))
@@ -357,7 +351,7 @@ def test_damaged_log_gives_one_error_line_or_a_notice_of_the_lines_left_out(
     ("SavvyCAN", b"00000100,false", b"90000000000100,false"),
     ("PEAK TRC 1.3", b"00000200", b"9000000200"),
 ])  # fmt: skip
-def test_single_damaged_line_is_left_out_and_counted(
+def test_damaged_line_is_skipped_and_counted(
     tmp_path: Path, layout: Path, program: str, old: bytes, new: bytes
 ) -> None:
     name, write = LOGS[program]
@@ -385,7 +379,7 @@ def test_damaged_database_is_refused_with_one_line(tmp_path: Path, layout: Path,
     (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
     (LAYOUT.replace("car.dbc", "float.dbc"), "branch battery: Pack.Current is a floating-point number"),
 ])  # fmt: skip
-def test_node_refuses_layouts_of_several_or_no_dbc_or_with_a_computed_or_floating_point_branch(
+def test_node_refuses_layouts_of_several_or_no_dbc_or_a_computed_or_floating_point_branch(
     layout: Path, text: str, words: str
 ) -> None:
     layout.with_name("float.dbc").write_text(f"{DBC}SIG_VALTYPE_ 256 Current : 1;\n")

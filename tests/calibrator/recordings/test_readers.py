@@ -126,7 +126,7 @@ def test_frames_of_e2e_profile_7_with_a_counter_of_4_bytes_are_written_and_check
 
 
 @pytest.mark.parametrize(("value", "expected"), [(np.nan, "SNA"), (1e6, 650.0), (-1e6, -650.0)])
-def test_missing_values_are_written_as_sna_and_large_ones_saturate(
+def test_missing_values_become_sna_and_large_saturate(
     database: VehicleDatabase, value: float, expected: object
 ) -> None:
     series = encode_message(database, "HV_Motor", np.zeros(1), {"MotorCurrent": np.array([value])})

@@ -90,7 +90,7 @@ def test_replay_command_sends_a_log_and_counts_frames(log: Path, capsys: pytest.
     assert capsys.readouterr().out.startswith("60 frames in ")
 
 
-def test_ctrl_c_reports_how_many_frames_were_sent(
+def test_ctrl_c_reports_progress(
     log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def send(self: VirtualBus, msg: can.Message, timeout: float | None = None) -> None:

@@ -315,9 +315,7 @@ def test_branch_of_a_table_is_a_column_or_a_quotient_of_columns(tmp_path: Path, 
         ("time,I,J\n0,True,2\n1,False,3\n", "I,J", "branch I: I is in 'on/off'; expected A, mA, kA"),
     ],
 )  # fmt: skip
-def test_unusable_table_or_wrong_branches_are_refused_with_one_line(
-    tmp_path: Path, text: str, branches: str, words: str
-) -> None:
+def test_unusable_table_or_wrong_branches_are_refused(tmp_path: Path, text: str, branches: str, words: str) -> None:
     (tmp_path / "x.csv").write_text(text)
     assert words in refused("kirchhoff", tmp_path / "x.csv", "--branches", branches)
 

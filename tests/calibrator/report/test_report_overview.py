@@ -48,9 +48,7 @@ def test_overview_counts_vehicles_and_sensors_and_takes_medians(result: Path) ->
     assert found["duration_h"]["median"] == 0.5
 
 
-def test_workshop_list_is_ordered_hardware_then_sensors_then_shared_causes(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_workshop_list_is_ordered_hardware_sensors_shared_causes(tmp_path: Path, database: VehicleDatabase) -> None:
     vehicles = six_vehicles(database)
     load = SensorFinding(branch="battery", cause="load", probability=0.99, text="5 A without a sensor.")
     inverted = SensorFinding(branch="motor", cause="inverted", probability=0.9, text="its sign is turned.")
@@ -75,9 +73,7 @@ def test_next_steps_name_action_and_vehicles(result: Path) -> None:
     assert left_out == f"Find out why log of {EVIL} could not be used; most often: cannot be read: {EVIL}."
 
 
-def test_next_steps_combine_vehicles_that_the_same_measurement_would_decide(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_next_steps_combine_vehicles_that_one_measurement_decides(tmp_path: Path, database: VehicleDatabase) -> None:
     held = sensor(0.0, 8.0, held_back="harm limit")
     window = "a zero-current window (contactors open) would decide: the motor sensor then shows +{} A or +0 A"
     needs = {"V1": window.format(7), "V2": window.format(3), "V3": window.format(7)}

@@ -71,9 +71,7 @@ def test_report_page_shows_its_numbers_without_javascript(result: Path) -> None:
     assert "1 because it is beyond the limits of the layout" in text
 
 
-def test_page_of_a_very_large_fleet_lists_only_part_of_its_vehicles_and_says_so(
-    result: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_page_of_a_very_large_fleet_lists_only_part_and_says_so(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_module, "MOST_SENSORS", 11)
     page, report = report_page(result)
     assert len(columns_of(page)["vehicle"]) == 5

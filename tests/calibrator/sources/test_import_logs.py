@@ -14,9 +14,7 @@ def imported(logs: list[Path], store: Path, database: VehicleDatabase) -> Import
     return import_logs(logs, database, store, workers=Workers())
 
 
-def test_import_adds_only_logs_that_the_store_lacks(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_import_adds_only_logs_the_store_lacks(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     first = imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     both = imported([two_vehicles], tmp_path, database)  # beside the logs it has unseen drives
     assert (len(first.drives), first.already_there) == (1, ())
@@ -24,9 +22,7 @@ def test_import_adds_only_logs_that_the_store_lacks(
     assert f"1 drive written to {tmp_path}, 1 already there, 0 left out" in both.as_text()
 
 
-def test_damaged_drive_in_the_store_is_reported_and_not_imported_again(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_damaged_drive_of_the_store_is_reported(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     imported([two_vehicles / "logs" / "V001"], tmp_path, database)
     (tmp_path / "drives" / "V001" / "drive.parquet").write_bytes(b"cut")
     report = imported([two_vehicles / "logs" / "V001"], tmp_path, database)
@@ -35,9 +31,7 @@ def test_damaged_drive_in_the_store_is_reported_and_not_imported_again(
     assert "remove it and import it again" in report.left_out["V001/drive"]
 
 
-def test_leftover_file_of_a_killed_import_is_removed(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_leftover_of_a_killed_import_is_removed(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     folder = tmp_path / "drives" / "V001"
     folder.mkdir(parents=True)
     left, other = folder / ".drive.parquet.x1y2", folder / ".drive.parquet.new"
@@ -49,7 +43,7 @@ def test_leftover_file_of_a_killed_import_is_removed(
     assert {path.name for path in folder.iterdir()} == {"drive.parquet", other.name}
 
 
-def test_slow_log_is_left_out_and_others_are_imported(
+def test_slow_log_is_left_out_and_others_are_read(
     two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
 ) -> None:
     endless = tmp_path / "logs" / "V000" / "endless.log.gz"
@@ -62,9 +56,7 @@ def test_slow_log_is_left_out_and_others_are_imported(
     assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 10 s and was ended; ")
 
 
-def test_drive_that_cannot_be_written_stops_the_import(
-    two_vehicles: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_unwritable_drive_stops_the_import(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     """Otherwise all further drives would be left out one by one, with exit code 0."""
     command = [sys.executable, "-m", "calibrator", "import", str(two_vehicles / "logs"), "--layout", str(LAYOUT)]
     limited = ["prlimit", "--fsize=1000", *command, "--out", str(tmp_path)]

@@ -123,8 +123,6 @@ def test_branches_of_a_vehicle_are_those_of_its_first_readable_drive(store: Path
     (["battery", "battery"], "branch battery is asked for twice; name each branch once"),
     (["pack", "battery"], "no branch 'pack'; known are battery, motor"),
 ])  # fmt: skip
-def test_repeated_or_unknown_branches_are_refused(
-    store: Path, database: VehicleDatabase, branches: list[str], words: str
-) -> None:
+def test_wrong_branches_are_refused(store: Path, database: VehicleDatabase, branches: list[str], words: str) -> None:
     with pytest.raises((FleetError, LayoutError), match=words):
         probe_equipment(find_fleet(store), database, branches)

@@ -144,9 +144,7 @@ def test_reason_of_a_vehicle_names_its_drives_that_cannot_be_read(fleet: SmallFl
     assert re.search("s of usable data in 1 drive; at least 120 s are needed; b: .*b.parquet: not a drive", why)
 
 
-def test_summarise_fails_as_long_as_the_store_has_no_usable_vehicle(
-    fleet: SmallFleet, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_summarise_fails_while_no_vehicle_is_usable(fleet: SmallFleet, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["summarise", str(fleet.drives), "--layout", str(LAYOUT), "--out", str(fleet.out)]
     fleet.write("V1", samples=601)
     assert run_command(arguments) == 1

@@ -66,9 +66,7 @@ def test_summary_files_are_readable_by_duckdb(store: SummaryStore) -> None:
     assert seconds == pytest.approx(VEHICLES * 1800.0)
 
 
-def test_records_stay_files_of_their_own_until_compacted_and_none_counts_twice_after_a_kill(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
+def test_records_stay_files_until_compacted_and_none_counts_twice(tmp_path: Path, database: VehicleDatabase) -> None:
     store = small_store(tmp_path / "store", database, random_faults(4))
     bucket = store.bucket_of("V001")
     before = {path.name: path.read_bytes() for path in (tmp_path / "store" / "buckets").iterdir()}
@@ -129,9 +127,7 @@ def test_failed_drive_does_not_invalidate_other_records_of_its_vehicle() -> None
 
 
 @pytest.mark.parametrize("damage", [b"", b"PAR1", b"x" * 5000])
-def test_damaged_file_of_a_bucket_is_refused_and_named(
-    tmp_path: Path, database: VehicleDatabase, damage: bytes
-) -> None:
+def test_damaged_file_of_bucket_is_refused_and_named(tmp_path: Path, database: VehicleDatabase, damage: bytes) -> None:
     store = small_store(tmp_path, database, no_faults(2, 2))
     path = next((tmp_path / "buckets").iterdir())
     path.write_bytes(damage)

@@ -57,9 +57,7 @@ def test_error_of_a_command_is_printed_on_one_line_and_sets_the_exit_code(
 @pytest.mark.parametrize(
     "arguments", [["--debug", "fail", "user"], ["fail", "--debug", "user"], ["fail", "user", "--debug"]]
 )
-def test_debug_option_shows_the_traceback_at_any_position(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_debug_shows_the_traceback_at_any_position(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(app, "prog", arguments) == 1
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "Traceback (most recent call last):"
@@ -100,9 +98,7 @@ def number_options(command: Any, *words: str) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("given", ["few", "nan", "inf"])
-def test_every_number_option_refuses_words_nan_and_inf_and_names_its_bounds(
-    given: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_number_options_refuse_words_nan_and_inf_with_bounds(given: str, capsys: pytest.CaptureFixture[str]) -> None:
     options = [*number_options(get_command(calibrator_app))]
     assert len(options) > 20
     for words in options:
@@ -110,9 +106,7 @@ def test_every_number_option_refuses_words_nan_and_inf_and_names_its_bounds(
         assert re.search(f"'{words[-1]}': {given}: expected a (whole )?number from .* to", capsys.readouterr().err)
 
 
-def test_ctrl_c_ends_a_tool_with_one_line_and_exit_code_130(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ctrl_c_ends_a_tool_with_code_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     tool = command_app()
 
     @tool.command()
