@@ -32,9 +32,9 @@ def currents(time_s: Array) -> dict[str, Array]:
     return {"battery": 2.5 - motor - auxiliary - dcdc, "motor": motor, "auxiliary": auxiliary, "dcdc": dcdc}
 
 
-def true_drive(*, delay_s: Mapping[str, float] | None = None, seed: int = 1) -> Drive:
+def true_drive(*, delay_s: Mapping[str, float] | None = None) -> Drive:
     """The drive as sensors with 0.2 A of noise show it, some of them late."""
-    noise = np.random.default_rng(seed)
+    noise = np.random.default_rng(1)
     branches = {}
     for name, period_s in PERIOD_S.items():
         time_s = np.arange(0.0, DURATION_S, period_s)

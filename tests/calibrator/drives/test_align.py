@@ -34,8 +34,8 @@ def drive_of(branches: dict[str, Channel], inputs: dict[str, Channel] | None = N
     return Drive(vehicle="V1", name="d", branches=branches, inputs=inputs or {})
 
 
-def aligned(layout: Layout, branches: dict[str, Channel], inputs: dict[str, Channel] | None = None) -> Samples:
-    return align(drive_of(branches, inputs), layout, tuple(branches), inputs=tuple(inputs or {}))
+def aligned(layout: Layout, branches: dict[str, Channel]) -> Samples:
+    return align(drive_of(branches), layout, tuple(branches), inputs=())
 
 
 def test_linear_signal_is_interpolated_exactly(layout: Layout) -> None:

@@ -9,11 +9,11 @@ from calibrator.drive import Array
 from calibrator.estimator import learning
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces
 from calibrator.estimator.learning import learn_fault_models
-from calibrator.estimator.posterior import FaultModel, Spread, explain, weigh
+from calibrator.estimator.posterior import FaultModel, explain, weigh
 from calibrator.estimator.prior import GRID, Prior, first_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
-from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
+from tests.calibrator.estimator.simulated_rows import Errors, model_of_equals, random_faults, rows_of
 
 
 def moved(rows: EvidenceRows, by: Array) -> EvidenceRows:
@@ -229,7 +229,7 @@ def test_single_fault_does_not_determine_the_prior_of_fault_sizes() -> None:
 def test_single_vehicle_is_judged_by_the_initial_prior_and_not_by_one_learnt_from_itself() -> None:
     errors = Errors(slope=0.1, ratio=0.03, intercept=0.05, junction=0.03)
     rows = rows_of(random_faults(3, vehicles=1, branches=2), seed=3, errors=errors)
-    draws, guess = explain(rows, law_of(2), feed=0), first_prior(2)
+    draws, guess = explain(rows, model_of_equals(2), feed=0), first_prior(2)
 
     def numbers(prior: Prior) -> Array:
         tally = np.zeros(prior.counts.shape)
@@ -278,14 +278,6 @@ def test_shared_gain_error_is_attributed_to_one_of_three_branches_but_not_of_two
         assert causes.get((K + branch,), 0.0) > 0.99
 
 
-def law_of(K: int, prior: Prior | None = None) -> FaultModel:
-    """FaultModel of vehicles that are alike but for their faults."""
-    spread = Spread(
-        mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(2 * K + 1)
-    )
-    return FaultModel(spread=spread, priors=((1.0, prior or first_prior(K)),))
-
-
 def test_unexplained_vehicle_gets_wider_uncertainty_and_others_do_not() -> None:
     K = 2
     rows = rows_of(random_faults(15, vehicles=6, branches=K), seed=15)
@@ -295,7 +287,7 @@ def test_unexplained_vehicle_gets_wider_uncertainty_and_others_do_not() -> None:
     read = rows.covariance.copy()
     read[2, [3, 4, 8, 9], [3, 4, 8, 9]] = 1e-6  # ... while readings say that all sensors are right
     rows = replace(rows, covariance=read)
-    plain, odd = (explain(each, law_of(K), feed=0) for each in (rows, moved(rows, by)))
+    plain, odd = (explain(each, model_of_equals(K), feed=0) for each in (rows, moved(rows, by)))
     wide = [np.sqrt((draws.fits.root[2, : draws.fits.number[2]] ** 2).max()) for draws in (plain, odd)]
     assert wide[1] > 3.0 * wide[0]
     for j in (0, 1, 3, 4, 5):

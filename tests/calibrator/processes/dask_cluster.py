@@ -13,23 +13,22 @@ ROOT = Path(__file__).parents[3]
 
 
 class DaskCluster:
-    """Start the cluster, at once or when it is told to; a context manager that kills it.
+    """Start the cluster; a context manager that kills it.
 
     ``environment`` is added to that of the processes.
     """
 
-    def __init__(self, folder: Path, environment: Mapping[str, str] | None = None, *, at_once: bool = True) -> None:
+    def __init__(self, folder: Path, environment: Mapping[str, str] | None = None) -> None:
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         self._environment = {**os.environ, "OMP_NUM_THREADS": "1", **(environment or {}), "PYTHONPATH": path}
-        self._folder, self._stack, self._at_once = folder, ExitStack(), at_once
+        self._folder, self._stack = folder, ExitStack()
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.address = f"tcp://127.0.0.1:{self.port}"
 
     def __enter__(self) -> "DaskCluster":
-        if self._at_once:
-            self.start()
+        self.start()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -29,11 +29,11 @@ def ideal_currents(samples: int = 400) -> Array:
     return np.column_stack([battery, -battery - auxiliary, auxiliary])
 
 
-def fleet(vehicles: int, *, symmetric: bool = True) -> Faults:
-    return random_faults(2, vehicles=vehicles, branches=3, full_scale_a=FULL_SCALE_A, symmetric=symmetric)
+def fleet(vehicles: int) -> Faults:
+    return random_faults(2, vehicles=vehicles, branches=3, full_scale_a=FULL_SCALE_A, symmetric=True)
 
 
-def simulated(faults: Faults, noise_a: float = 0.0) -> Array:
+def simulated(faults: Faults, noise_a: float) -> Array:
     a, b = slopes_and_intercepts(faults)
     clean = a[:, None, :] * ideal_currents() + b[:, None, :]
     return np.asarray(clean + noise_a * np.random.default_rng(3).normal(size=clean.shape))

@@ -47,12 +47,12 @@ def an_object(kind: int, body: bytes, *, version: int = 1, flags: int = 2, time:
     return struct.pack("<4sHHLL", b"LOBJ", 16 + len(head), version, size, kind) + head + body
 
 
-def classic(identifier: int, data: bytes, *, channel: int = 1, flags: int = 0) -> bytes:
-    return struct.pack("<HBBL8s", channel, flags, len(data), identifier, data)
+def classic(identifier: int, data: bytes) -> bytes:
+    return struct.pack("<HBBL8s", 1, 0, len(data), identifier, data)
 
 
-def fd_64(data: bytes, *, code: int, valid: int, extension_at: int = 0) -> bytes:
-    head = struct.pack("<BBBBLLLLLLLHBBL", 1, code, valid, 0, 0x123, 0, 0x1000, 0, 0, 0, 0, 0, 0, extension_at, 0)
+def fd_64(data: bytes, *, code: int, valid: int) -> bytes:
+    head = struct.pack("<BBBBLLLLLLLHBBL", 1, code, valid, 0, 0x123, 0, 0x1000, 0, 0, 0, 0, 0, 0, 0, 0)
     return head + data
 
 

@@ -27,9 +27,9 @@ EQUIPMENT = Equipment(
 CONDITIONS = Conditions(model_error_a=0.5)
 
 
-def random_faults(vehicles: int, seed: int = 0) -> Faults:
+def random_faults(vehicles: int) -> Faults:
     """One fault in most vehicles; every third has none."""
-    drawn = simulated_rows.random_faults(seed, vehicles=vehicles, branches=len(BRANCHES), full_scale_a=400.0)
+    drawn = simulated_rows.random_faults(0, vehicles=vehicles, branches=len(BRANCHES), full_scale_a=400.0)
     faulty = np.arange(vehicles) % 3 != 0
     return Faults(
         hardware_drift=drawn.hardware_drift * faulty,
@@ -62,15 +62,13 @@ def identity_of(database: VehicleDatabase, vehicles: int) -> StoreIdentity:
     return store_identity(EQUIPMENT, database, vehicles=vehicles, fleet="small", bank=bank)
 
 
-def small_store(
-    storage: Storage | Path, database: VehicleDatabase, faults: Faults, *, seed: int = 1, first: int = 0
-) -> SummaryStore:
+def small_store(storage: Storage | Path, database: VehicleDatabase, faults: Faults) -> SummaryStore:
     """A store of vehicles V000 and so on, one drive each."""
     place = open_storage(storage) if isinstance(storage, Path) else storage
     store = SummaryStore(storage=place, identity=identity_of(database, len(faults)))
     write_identity(place, store.identity)
-    names = [f"V{first + j:03d}" for j in range(len(faults))]
-    summaries = dict(zip(names, summaries_of(faults, CONDITIONS, seed=seed), strict=True))
+    names = [f"V{j:03d}" for j in range(len(faults))]
+    summaries = dict(zip(names, summaries_of(faults, CONDITIONS, seed=1), strict=True))
     for bucket, inside in store.by_bucket(names).items():
         store.append(bucket, [record_of(name, summaries[name]) for name in inside])
     return store

@@ -9,7 +9,7 @@ import pytest
 from calibrator.drive import Array, Channel, Drive, Samples
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank, low_passes
-from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, FitSums, add_up
+from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, add_up
 from calibrator.summaries.summariser import find_spikes, summarise_samples
 from calibrator.summaries.vehicle_summary import zero_current_offsets
 from ecu_node.database import read_database
@@ -19,17 +19,11 @@ from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, co
 SAMPLES = 1800
 
 
-def coloured_drive(seed: int = 0, K: int = 3) -> Samples:
+def coloured_drive() -> Samples:
     """Currents that change slowly against the sampling, balanced, with noise."""
-    rng = np.random.default_rng(seed)
-    i = 60.0 * coloured(rng, SAMPLES, K, 0.995) @ (np.eye(K) - 1.0 / K)
+    rng = np.random.default_rng(0)
+    i = 60.0 * coloured(rng, SAMPLES, 3, 0.995) @ (np.eye(3) - 1.0 / 3.0)
     return samples_of(rng.normal(size=(SAMPLES, 2)), i + rng.normal(0.0, 0.4, i.shape))
-
-
-def fit_of(*drives: Samples, temperatures_c: list[Array] | None = None) -> FitSums:
-    fit = summarise_samples(list(drives), period_s=PERIOD_S, temperatures_c=temperatures_c).fit
-    assert fit is not None
-    return fit
 
 
 def a_drive(seed: int, samples: int = 300, noise_a: float = 0.3) -> Samples:
@@ -127,7 +121,8 @@ def test_a_drive_without_enough_valid_samples_is_refused_with_the_reason() -> No
 
 def test_samples_are_summed_by_the_level_of_their_current() -> None:
     drive = coloured_drive()
-    levels = fit_of(drive).levels
+    fit = summarise_samples([drive], period_s=PERIOD_S).fit
+    assert fit is not None
     columns = np.column_stack([drive.inputs, drive.currents_a, np.ones(SAMPLES)])
     for k in range(3):
         x = drive.currents_a[:, k]
@@ -135,8 +130,8 @@ def test_samples_are_summed_by_the_level_of_their_current() -> None:
         level = np.where(x > 0.0, np.searchsorted(LEVEL_EDGES_A, x, "right"), np.searchsorted(LEVEL_EDGES_A, x, "left"))
         for number in range(len(LEVEL_EDGES_A) + 1):
             there = level == number
-            np.testing.assert_allclose(levels[k, number, :-1], columns[there].sum(axis=0), atol=1e-8)
-            np.testing.assert_allclose(levels[k, number, -1], np.sum(x[there] ** 2), atol=1e-8)
+            np.testing.assert_allclose(fit.levels[k, number, :-1], columns[there].sum(axis=0), atol=1e-8)
+            np.testing.assert_allclose(fit.levels[k, number, -1], np.sum(x[there] ** 2), atol=1e-8)
 
 
 def test_spikes_are_labelled_by_branch_and_sign_and_left_out() -> None:
