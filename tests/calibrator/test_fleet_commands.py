@@ -196,13 +196,6 @@ def test_delay_of_the_motor_is_stated_within_5_ms(delayed_fleet: Path, parameter
         assert abs(found - actual) < DELAY_TOLERANCE_S
 
 
-def test_parameter_files_apply_only_corrections_below_the_harm_limit(parameters: list[VehicleParameters]) -> None:
-    for item in parameters:
-        for branch in item.branches.values():
-            assert branch.harm_probability is not None
-            assert not branch.apply or branch.harm_probability < 0.001
-
-
 def test_unmeasured_load_is_estimated_from_the_fleet_and_reported(delayed_fleet: Path, delayed_result: Path) -> None:
     run = read_run(delayed_result)
     truth = [vehicle.unmeasured_a for vehicle in read_truth(delayed_fleet / "truth.json").vehicles.values()]

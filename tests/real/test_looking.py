@@ -11,16 +11,6 @@ from tests.calibrator.doctor.artificial_logs import examined
 from tests.real.conftest import ROOT
 
 
-@pytest.mark.parametrize(
-    ("name", "mean_a"), [("circontrol/2019_Circontrol_midpoint", 2.6), ("efacec/2019_efacaec_mida", -1.0)]
-)
-def test_kirchhoff_sum_of_car_and_station_is_their_difference(name: str, mean_a: float, i3_charges: Path) -> None:
-    found = reported("kirchhoff", i3_charges / "car" / f"{name}.csv.gz", "--layout", i3_charges / "layout.toml")
-    assert found["before"]["sum"]["mean_a"] == pytest.approx(mean_a, abs=0.3)
-    assert found["expected"]["parts_a"]["quantisation"] == pytest.approx(0.1 * 2**0.5 / 12**0.5, rel=0.01)
-    assert found["expected"]["in_band"]["before"] < 0.3
-
-
 def test_doctor_reports_constant_currents_of_a_charge_but_no_error(i3_charges: Path) -> None:
     doctor = examined(i3_charges / "layout.toml", i3_charges / "car" / "efacec" / "2019_efacaec_mida.csv.gz")
     assert doctor.errors == []

@@ -28,9 +28,6 @@ from calibrator.faults import Faults, measured_currents, true_currents
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-NOT_MODELLED = {"contactor_state", "junction_box_temperature"}
-"""Inputs that the built-in vehicle does not have; its logs hold "not available" for them."""
-
 
 def recorded(level: float, rise: float = 0.0) -> GroundTruth:
     """A minute at 10 Hz that starts and ends at a standstill."""
@@ -83,13 +80,6 @@ def test_no_piece_of_a_recording_is_in_both_the_calibration_and_the_unseen_trip_
         assert levels(few.trip(k, "unseen")) <= {2.0, 3.0}
     single = RecordedTrips(seed=0, recorded=[recorded(0.0, rise=1.0)], vehicles=3, unseen_s=10.0)
     assert levels(single.trip(0, "calibration")).isdisjoint(levels(single.trip(0, "unseen")))
-
-
-def test_builtin_trip_obeys_the_junction_law_and_has_all_channels(database: VehicleDatabase) -> None:
-    trip = builtin_trip(np.random.default_rng(7), duration_s=300.0, name="trip")
-    np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
-    assert set(trip.currents_a) == set(database.layout.branch_names)
-    assert set(trip.inputs) == {item.name for item in database.layout.input} - NOT_MODELLED
 
 
 def test_builtin_trip_without_fastsim_is_refused_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,15 +38,6 @@ def aligned(layout: Layout, branches: dict[str, Channel]) -> Samples:
     return align(drive_of(branches), layout, tuple(branches), inputs=())
 
 
-def test_linear_signal_is_interpolated_exactly(layout: Layout) -> None:
-    samples = aligned(layout, {"battery": ramp(0.013, 5.0, 0.02), "dcdc": ramp(0.031, 5.0, 0.1, -2.0)})
-    assert samples.valid.all()
-    np.testing.assert_allclose(samples.currents_a[:, 0], samples.time_s, atol=1e-12)
-    np.testing.assert_allclose(samples.currents_a[:, 1], -2.0 * samples.time_s, atol=1e-12)
-    assert samples.time_s[0] == pytest.approx(0.1)
-    assert samples.time_s[-1] == pytest.approx(4.9)
-
-
 @given(st.lists(st.floats(0.0, 30.0), min_size=2, max_size=60), st.floats(0.05, 3.0))
 def test_samples_are_not_extrapolated_and_not_valid_across_long_gaps(times: list[float], limit_s: float) -> None:
     known_s = np.array(sorted(times))

@@ -40,19 +40,6 @@ def supports(fits: posterior.Fits, vehicle: int) -> list[tuple[int, ...]]:
     return [tuple(np.flatnonzero(row).tolist()) for row in fits.support[vehicle, : fits.number[vehicle]]]
 
 
-def random_parameters(seed: int, shape: tuple[int, ...], K: int) -> Array:
-    return np.random.default_rng(seed).uniform(-0.3, 0.3, (*shape, 3 * K + 1))
-
-
-@BRANCHES
-def test_row_residuals_equal_those_of_the_equations(K: int) -> None:
-    rows = rows_of(random_faults(K, vehicles=8, branches=K, sparsity=50.0), seed=K, errors=READ)
-    theta = random_parameters(K, (8, 5), K)
-    left = posterior.row_residuals(plain_evidence(rows), theta)
-    for j in range(len(rows)):
-        np.testing.assert_allclose(left[j], plain_residual(rows.take(slice(j, j + 1)), theta[j]), atol=1e-13)
-
-
 def test_fits_of_two_branches_equal_separate_fits_of_all_supports() -> None:
     rows = rows_of(random_faults(4, vehicles=8, branches=2, sparsity=60.0), seed=4, errors=READ)
     fits, log_prior = fitted(plain_evidence(rows)), first_prior(2).log_supports

@@ -67,17 +67,6 @@ def test_sum_shows_the_offset_before_and_not_after_correction(log: Path) -> None
     assert found["left_out"] == ["auxiliary", "dcdc", "motor_rear"]
 
 
-def test_rmse_maximum_and_mean_follow_their_definitions(tmp_path: Path) -> None:
-    run = figures(*table(tmp_path, battery=MOTOR_A + 3.0, motor=-MOTOR_A))
-    found = run["before"]
-    battery = MOTOR_A + 3.0
-    wanted = {"rmse_a": np.sqrt(np.mean(battery**2)), "max_a": np.abs(battery).max(), "mean_a": battery.mean()}
-    assert {key: found["battery"][key] for key in wanted} == pytest.approx(wanted, abs=1e-3)
-    total = found["sum"]
-    assert total["rmse_a"] ** 2 == pytest.approx(total["mean_a"] ** 2 + total["sd_a"] ** 2)
-    assert total["rmse_percent"] == pytest.approx(100.0 * total["rmse_a"] / run["full_scale_a"])
-
-
 def test_rows_with_missing_numbers_are_counted_and_not_used(tmp_path: Path) -> None:
     battery = MOTOR_A + 12.0
     battery[100:110] = np.nan

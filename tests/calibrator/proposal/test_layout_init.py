@@ -266,16 +266,6 @@ def test_multiplexed_battery_current_is_found(tmp_path: Path) -> None:
     assert layout.find_branch("battery").timeout_s == 0.5  # every 100 ms: every other frame
 
 
-def test_guessed_branches_of_a_tesla_equal_those_of_the_layout_written_by_hand(
-    shared_data: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "Model3CAN.dbc").symlink_to(shared_data / "tesla_model3" / "Model3CAN.dbc")
-    guessed = found(tmp_path / "Model3CAN.dbc", "--log", shared_data / "tesla_model3" / "drive.log.gz")
-    for one, other in zip(guessed.branch, read_layout(DBC / "tesla_model3.toml").branch, strict=True):
-        assert (one.name, one.sign, one.source, one.voltage) == (other.name, other.sign, other.source, other.voltage)
-    assert guessed.path.read_text().count("\n# confirm:") == len(guessed.branch) * 2 + len(guessed.input) + 1
-
-
 I3 = """BO_ 274 Battery112: 8 BMS
  SG_ Battery_Current : 0|16@1+ (0.1,-819.2) [0|819] "Amps" INV
  SG_ Battery_Volts : 16|16@1+ (0.1,0) [0|500] "Volts" INV

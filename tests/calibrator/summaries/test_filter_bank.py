@@ -34,14 +34,6 @@ def test_columns_are_the_inputs_and_each_input_filtered_by_each_pole() -> None:
     np.testing.assert_array_equal(columns[~used], 0.0)
 
 
-def test_bank_without_poles_returns_the_inputs_unchanged() -> None:
-    u = inputs_of(2)
-    bank = filter_bank.FilterBank(input_names=NAMES, period_s=PERIOD_S)
-    columns, used = bank.run(u, np.ones(SAMPLES, bool))
-    assert used.all()
-    np.testing.assert_array_equal(columns, u)
-
-
 def test_error_of_the_initial_state_has_decayed_when_samples_are_used() -> None:
     u, bank = inputs_of(4, 2 * SAMPLES), bank_of(POLES[1:3])
     known, _ = bank.run(u, np.ones(2 * SAMPLES, bool))

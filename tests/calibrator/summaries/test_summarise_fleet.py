@@ -100,24 +100,6 @@ def test_drive_is_read_once_and_again_only_if_it_was_changed(fleet: SmallFleet) 
     assert fleet.total("V1").total[1, 1] == pytest.approx(2.25 * before[1, 1], rel=1e-6)
 
 
-def test_vehicle_with_a_bad_drive_is_left_out_and_tried_again(fleet: SmallFleet) -> None:
-    for vehicle in ("V1", "V2"):
-        fleet.write(vehicle)
-    path = fleet.file("V1/a")
-    whole = path.read_bytes()
-    path.write_bytes(whole[:1000])
-    left_out = fleet.add().left_out
-    assert list(left_out) == ["V1"]
-    assert "not a drive" in left_out["V1"]
-    store = fleet.open()
-    assert fleet.add().left_out == left_out
-    assert len(store.files(store.bucket_of("V1"))) == 1, "what is known is not noted again"
-    path.write_bytes(whole)
-    again = fleet.add()
-    assert (again.vehicles, again.left_out) == (1, {})
-    assert fleet.kept() == {"V1": [("a",)], "V2": [("a",)]}
-
-
 def test_drive_that_cannot_be_read_is_left_out_alone_and_tried_again(fleet: SmallFleet) -> None:
     for name in "abcd":
         fleet.write("V1", name)
