@@ -37,10 +37,8 @@ def test_compiled_code_is_cached_if_the_folder_is_writable(tmp_path: Path, writa
         "print(is_compiled('test_compiled'), largest(np.array([1.0, 3.0, 2.0])), is_compiled('test_compiled'))"
     )
     variables = {**os.environ, "CALIBRATOR_CACHE": str(cache)}
-    assert (
-        subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, env=variables, text=True)
-        == f"False 6.0 {writable}\n"
-    )
+    printed = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, env=variables, text=True)
+    assert printed == f"False 6.0 {writable}\n"
     assert any(cache.rglob("*.nbc")) == writable
 
 

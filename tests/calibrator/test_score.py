@@ -58,9 +58,8 @@ def test_one_worsened_branch_counts_as_harm_and_no_or_perfect_correction_does_no
     moments = {"mean_a": MEAN_A, "mean_square_a2": MEAN_SQUARE_A2}
     for harmless in (truth, sensor_faults(*np.zeros((2, 50, 2)))):
         assert not harmed(harmless, truth, **moments).any()
-    truth, estimate = (
-        sensor_faults(drift, np.zeros((2, 2))) for drift in ([[0.1, 0.0]] * 2, [[0.1, 0.001], [0.19, 0]])
-    )
+    none = np.zeros((2, 2))
+    truth, estimate = (sensor_faults(drift, none) for drift in ([[0.1, 0.0]] * 2, [[0.1, 0.001], [0.19, 0]]))
     assert harmed(estimate, truth, **moments).tolist() == [True, False]
 
 

@@ -78,9 +78,8 @@ def write_layout(
     layout = (DBC / "hv_powertrain.toml").read_text()
     layout = layout.replace("full_scale_a = 400.0", f"full_scale_a = {full_scale_a}")
     for name in inverted:
-        layout, count = re.subn(
-            rf'(name = "{name}".*\nsignal = .*\nsign = )(-?1)', lambda m: m[1] + str(-int(m[2])), layout
-        )
+        sign = rf'(name = "{name}".*\nsignal = .*\nsign = )(-?1)'
+        layout, count = re.subn(sign, lambda match: match[1] + str(-int(match[2])), layout)
         assert count == 1
     (folder / "layout.toml").write_text(layout)
     return folder / "layout.toml"

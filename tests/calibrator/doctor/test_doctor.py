@@ -318,9 +318,8 @@ def test_log_without_any_branch_gives_an_error_that_names_the_identifiers_in_it(
 def test_branch_missing_in_some_logs_gives_a_warning(log: Path, layout: Path, tmp_path: Path) -> None:
     without = [line for line in log.read_text().splitlines() if "can0 120#" not in line]
     (tmp_path / "other.log").write_text("\n".join(without))
-    (lacks,) = [
-        item for item in examined(layout, log, tmp_path / "other.log").findings("not in log") if item.subject == "motor"
-    ]
+    found = examined(layout, log, tmp_path / "other.log").findings("not in log")
+    (lacks,) = [item for item in found if item.subject == "motor"]
     assert (lacks.severity, lacks.number) == ("warning", 1)
     assert lacks.text.startswith("1 of 2 logs have it; the others are not in the sum")
 

@@ -42,10 +42,9 @@ def aligned(layout: Layout, branches: dict[str, Channel]) -> Samples:
 def test_samples_are_not_extrapolated_and_not_valid_across_long_gaps(times: list[float], limit_s: float) -> None:
     known_s = np.array(sorted(times))
     value = np.sin(known_s)
+    channels = {"x": channel(known_s, value)}
     try:
-        time_s, values, reasons = align_channels(
-            {"x": channel(known_s, value)}, {"x": limit_s}, period_s=PERIOD_S, where="test"
-        )
+        time_s, values, reasons = align_channels(channels, {"x": limit_s}, period_s=PERIOD_S, where="test")
     except DriveError:
         assert np.floor(known_s[-1] / PERIOD_S + 1e-3) < np.ceil(known_s[0] / PERIOD_S - 1e-3)
         return

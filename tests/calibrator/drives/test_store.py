@@ -20,9 +20,8 @@ def layout(database: VehicleDatabase) -> Layout:
 
 
 def some_drive(vehicle: str = "V1", name: str = "monday") -> Drive:
-    channel = Channel(
-        time_s=np.array([0.0, 0.1, 0.3]), value=np.array([1.5, np.nan, -2.0]), good=np.array([True, False, True])
-    )
+    value = np.array([1.5, np.nan, -2.0])
+    channel = Channel(time_s=np.array([0.0, 0.1, 0.3]), value=value, good=np.isfinite(value))
     empty = Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
     return Drive(vehicle=vehicle, name=name, branches={"battery": channel, "motor": empty}, inputs={"voltage": channel})
 

@@ -85,9 +85,8 @@ def samples_of(inputs: Array, currents_a: Array) -> Samples:
 def summaries_of(faults: Faults, conditions: Conditions | None = None, *, seed: int = 0) -> Sequence[DriveSummary]:
     """One drive of each vehicle of a fleet, summarised."""
     rng, conditions = np.random.default_rng(seed), conditions or Conditions()
-    return [
-        summarise_samples([drive_of(rng, faults.take(j), conditions)], period_s=PERIOD_S) for j in range(len(faults))
-    ]
+    drives = [drive_of(rng, faults.take(j), conditions) for j in range(len(faults))]
+    return [summarise_samples([drive], period_s=PERIOD_S) for drive in drives]
 
 
 def no_faults(vehicles: int, branches: int) -> Faults:

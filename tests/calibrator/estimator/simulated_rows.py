@@ -159,9 +159,8 @@ def plain_residual(rows: EvidenceRows, theta: Array) -> Array:
     turned = np.sum((np.exp(log_g) - ratio) * measured[1:], axis=1, keepdims=True)
     junction = (c - turned) / gain[:, :1] + (ratio_error @ (measured[1:] / np.exp(log_a[1:])))[:, None]
     junction -= omega.sum(axis=1, keepdims=True) + load
-    return np.column_stack(
-        [slope_error, ratio_error, gain_read - log_gain, intercept, junction, offset_read - omega * gain]
-    )
+    errors = [slope_error, ratio_error, gain_read - log_gain, intercept, junction, offset_read - omega * gain]
+    return np.column_stack(errors)
 
 
 def all_supports(branches: int) -> Iterator[tuple[int, ...]]:

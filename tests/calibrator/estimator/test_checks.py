@@ -59,9 +59,8 @@ def a_drive(seed: int, faults: Faults, bend: Bend | None, branch: int = 0, load_
 def a_fleet(K: int, bend: Bend | None = None, branch: int = 0, load_a: Array | float = 0.0) -> list[DriveSummary]:
     """Nine vehicles with gain errors and offsets, of which one has a bent sensor or a load without a sensor."""
     faults = random_faults(K, vehicles=9, branches=K, full_scale_a=FULL_SCALE_A)
-    drives = [
-        a_drive(10 + j, faults.take(j), *((bend, branch, load_a) if j == BAD else (None,))) for j in range(len(faults))
-    ]
+    bad = (bend, branch, load_a)
+    drives = [a_drive(10 + j, faults.take(j), *(bad if j == BAD else (None,))) for j in range(len(faults))]
     return [summarise_samples([drive], period_s=PERIOD_S, temperatures_c=[WARM_C]) for drive in drives]
 
 

@@ -249,9 +249,8 @@ def test_vehicle_of_which_no_row_is_known_has_a_confidence_of_0() -> None:
     assert found.confidence[1] == 0.0
 
 
-NARROW, WIDE = (
-    replace(first_prior(3), offset=Slab(low=low, high=high, tail=1e-3)) for low, high in ((0.005, 0.2), (0.05, 0.6))
-)
+SLABS = (Slab(low=low, high=high, tail=1e-3) for low, high in ((0.005, 0.2), (0.05, 0.6)))
+NARROW, WIDE = (replace(first_prior(3), offset=slab) for slab in SLABS)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.12])

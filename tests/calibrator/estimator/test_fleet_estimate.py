@@ -33,11 +33,12 @@ from tests.calibrator.estimator.simulated_rows import random_faults
 
 SCALE_A, VEHICLES, K, NAN = 400.0, 24, 2, np.nan
 NAMES = ("battery", "motor")
+THREE = (*NAMES, "auxiliary")
 Summaries = Sequence[DriveSummary]
 
 
-def learned(summaries: Summaries, **known: Any) -> FleetReference:
-    return learn_fleet(summaries, full_scale_a=SCALE_A, branches=NAMES, **known)
+def learned(summaries: Summaries, branches: Sequence[str] = NAMES, **known: Any) -> FleetReference:
+    return learn_fleet(summaries, full_scale_a=SCALE_A, branches=branches, **known)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def test_low_gain_of_the_largest_branch_is_recovered_and_its_dead_sensor_is_foun
         each[: len(low)] = 0.0
     faults.drift[: len(low), 0], faults.drift[: len(low), 1] = low, 0.15
     summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=3)
-    reference = learn_fleet(summaries, full_scale_a=SCALE_A, branches=(*NAMES, "auxiliaries"))
+    reference = learned(summaries, THREE)
     assert reference.order[0] == 0
     found = estimate_vehicles(summaries, reference)
     np.testing.assert_allclose(found.drift[:3, 0], low[:3], atol=0.01)
@@ -117,9 +118,7 @@ def test_hardware_offset_between_any_two_branches_causes_no_wrong_correction(off
             faults.hardware_offset_a[j, [p, r]] = moved_a, -moved_a
             faults.offset_a[j, p] = offset_a * rng.choice([-1.0, 1.0])
         summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=seed)
-        found = estimate_vehicles(
-            summaries, learn_fleet(summaries, full_scale_a=SCALE_A, branches=(*NAMES, "auxiliaries"))
-        )
+        found = estimate_vehicles(summaries, learned(summaries, THREE))
         error_a = np.abs(found.offset_a - faults.offset_a)[: len(pairs)]
         assert not (found.corrected[: len(pairs)] & (error_a > np.abs(faults.offset_a[: len(pairs)]))).any()
         if not offset_a:
@@ -147,8 +146,7 @@ def test_fleet_where_half_have_a_moved_current_and_offset_or_two_offsets_is_rare
             else:
                 faults.offset_a[j, r] = moved_a
         summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=seed)
-        reference = learn_fleet(summaries, full_scale_a=SCALE_A, branches=(*NAMES, "auxiliaries"))
-        found = estimate_vehicles(summaries, reference)
+        found = estimate_vehicles(summaries, learned(summaries, THREE))
         wrong = (np.abs(found.offset_a - faults.offset_a) > 0.1 * np.abs(faults.offset_a).max()).any(axis=1)
         sure_and_wrong += int((wrong & (found.confidence > 0.95))[:count].sum())
     assert sure_and_wrong <= 1
@@ -210,12 +208,12 @@ def test_small_gain_error_that_all_sensors_of_a_branch_share_is_told() -> None:
 
 def test_gain_errors_that_two_of_three_branches_share_are_given_to_no_pair() -> None:
     """A factor on all currents is invisible, so each pair explains the gain ratios as well as any other."""
-    batch, names = no_faults(12, 3), [*NAMES, "auxiliary"]
+    batch = no_faults(12, 3)
     batch.drift[:, 1:] = 0.03, -0.04
     summaries = summaries_of(batch, Conditions(samples=900), seed=3)
-    learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=names)
+    learnt = learned(summaries, THREE)
     (notice,) = (each for each in learnt.notices if "a batch of sensors shares" in each)
-    assert set(notice.rpartition("in branch ")[2].split(" or ")) == set(names)
+    assert set(notice.rpartition("in branch ")[2].split(" or ")) == set(THREE)
     found = estimate_vehicles(summaries, learnt)
     assert not found.corrected.any()
     assert found.confidence.max() < 0.6
@@ -230,7 +228,7 @@ def test_branches_in_parallel_that_share_a_current_differently_in_each_vehicle_a
         currents_a += 0.3 * rng.normal(size=currents_a.shape)
         drive = replace(drive, branch_names=("one", "other", "motor"), currents_a=currents_a)
         summaries.append(summarise_samples([drive], period_s=PERIOD_S))
-    learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=["one", "other", "motor"])
+    learnt = learned(summaries, ["one", "other", "motor"])
     assert not estimate_vehicles(summaries, learnt).corrected.any()
 
 
@@ -244,9 +242,7 @@ def test_vehicles_with_a_branch_that_others_lack_are_not_corrected() -> None:
         currents_a += 0.3 * rng.normal(size=currents_a.shape)
         drive = replace(drive, branch_names=("battery", "front", "rear"), currents_a=currents_a)
         summaries.append(summarise_samples([drive], period_s=PERIOD_S))
-    found = estimate_vehicles(
-        summaries, learn_fleet(summaries, full_scale_a=SCALE_A, branches=["battery", "front", "rear"])
-    )
+    found = estimate_vehicles(summaries, learned(summaries, ["battery", "front", "rear"]))
     assert not found.corrected.any()
     assert any(each.cause == "sum" for mine in found.findings for each in mine)
 
@@ -322,7 +318,7 @@ def test_branch_with_constant_values_leads_to_no_correction(step_a: float) -> No
         summaries.append(summarise_samples([still], period_s=PERIOD_S))
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=[*NAMES, "still"])
+        learnt = learned(summaries, [*NAMES, "still"])
     found = estimate_vehicles(summaries, learnt)
     assert not found.identifiable[:, 2].any()
     assert not found.corrected.any()

@@ -102,9 +102,8 @@ def drive(
 def model_of(database: VehicleDatabase, store: Path, *drives: Drive) -> VehicleModel:
     places = [(item, write_drive(store, item, database.layout)) for item in drives]
     entries = [DriveFile(vehicle=item.vehicle, name=item.name, place=place) for item, place in places]
-    return read_vehicle_model(
-        entries, Equipment(branches=BRANCHES, inputs=INPUTS, fleet_inputs=INPUTS, notices=()), database
-    )
+    equipment = Equipment(branches=BRANCHES, inputs=INPUTS, fleet_inputs=INPUTS, notices=())
+    return read_vehicle_model(entries, equipment, database)
 
 
 def test_vehicle_without_dynamics_is_simulated_exactly(database: VehicleDatabase, tmp_path: Path) -> None:
@@ -142,12 +141,10 @@ def test_junction_residual_from_moments_equals_that_of_the_samples() -> None:
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("identify") / "store"
+    folder, layout = tmp_path_factory.mktemp("identify") / "store", read_layout(LAYOUT)
     for j in range(5):
         lag_s = SLUGGISH_S if f"V{j}" == SLUGGISH else MOTOR_S
-        write_drive(
-            folder, drive("drive", 1800, vehicle=f"V{j}", lag_s=lag_s, noise_a=0.02, seed=j), read_layout(LAYOUT)
-        )
+        write_drive(folder, drive("drive", 1800, vehicle=f"V{j}", lag_s=lag_s, noise_a=0.02, seed=j), layout)
     return folder
 
 

@@ -186,9 +186,8 @@ def test_command_leaves_out_unusable_vehicles_and_agrees_with_python(motor_off: 
 
 
 def test_offset_that_either_of_two_sensors_may_have_gives_two_explanations() -> None:
-    calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(
-        recording(offset_a=(0.0, 6.0, 0.0)), JUNCTION
-    )
+    frame = recording(offset_a=(0.0, 6.0, 0.0))
+    calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(frame, JUNCTION)
     first, second = calibrator.vehicles_["vehicle"].parameters.explanations[:2]
     assert {*first.offset_a, *second.offset_a} == {"motor", "heater"}
     assert first.probability + second.probability > 0.9

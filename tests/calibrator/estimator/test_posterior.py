@@ -57,9 +57,8 @@ def test_fits_of_two_branches_equal_separate_fits_of_all_supports() -> None:
             if log_evidence + prior[on] < max(score.values()) - 8.0:
                 continue  # has next to no weight, and need not be at its optimum
             assert fits.log_evidence[j, q] == pytest.approx(log_evidence, abs=0.01)
-            np.testing.assert_allclose(
-                fits.theta[j, q], theta, atol=2e-3 * np.sqrt(covariance.max(initial=1e-6)) + 1e-7
-            )
+            atol = 2e-3 * np.sqrt(covariance.max(initial=1e-6)) + 1e-7
+            np.testing.assert_allclose(fits.theta[j, q], theta, atol=atol)
             np.testing.assert_allclose((fits.root[j, q] @ fits.root[j, q].T)[np.ix_(on, on)], covariance, rtol=0.02)
         missed = [value for on, value in score.items() if on not in found]
         assert np.exp(np.array(missed) - max(score.values())).sum() < 1e-3
@@ -124,10 +123,9 @@ def paper_prior(K: int, *totals: int) -> Prior:
 
 def drawn(rows: EvidenceRows, prior: Prior, shared: Array | None = None) -> posterior.Draws:
     evidence = plain_evidence(rows, shared=shared)
-    log_load = float(np.log(prior.load_share + prior.group_share.sum()))
-    return posterior.draw_explanations(
-        posterior.fit_explanations(evidence, prior.log_supports + 1.0, log_load + 2.0), evidence
-    )
+    log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
+    fits = posterior.fit_explanations(evidence, prior.log_supports + 1.0, log_load)
+    return posterior.draw_explanations(fits, evidence)
 
 
 def log_prior(prior: Prior, theta: Array, on: tuple[int, ...]) -> Array:

@@ -79,9 +79,8 @@ def test_rounding_of_a_small_current_is_not_taken_for_a_gain_error() -> None:
     for number in range(8):
         drive, rng = frame(number, minutes=15.0), np.random.default_rng(100 + number)
         wanted = np.interp(drive.index, np.arange(0.0, 901.0, 30.0), rng.uniform(0.0, 14.0, 31))
-        given[f"V{number}"] = drive.assign(
-            battery=drive["battery"] + wanted, heater=-2.0 * np.round(wanted / 2.0), wanted=wanted
-        )
+        rounded = -2.0 * np.round(wanted / 2.0)
+        given[f"V{number}"] = drive.assign(battery=drive["battery"] + wanted, heater=rounded, wanted=wanted)
     junction = Junction(branches=["battery", "motor", "heater"], full_scale_a=400.0)
     fitted = FleetCalibrator().fit(Fleet.from_frames(given, junction))
     assert not fitted.parameters_["corrected"].any()
@@ -174,9 +173,8 @@ def test_python_interface_writes_the_same_result_as_the_command(
 
 def test_data_frames_with_a_layout_give_parameter_files_for_the_node(tmp_path: Path) -> None:
     trips = [builtin_trip(np.random.default_rng(seed), duration_s=240.0, name="trip") for seed in range(3)]
-    given = {
-        f"V{n}": pd.DataFrame({**trip.currents_a, **trip.inputs}, index=trip.time_s) for n, trip in enumerate(trips)
-    }
+    tables = [pd.DataFrame({**trip.currents_a, **trip.inputs}, index=trip.time_s) for trip in trips]
+    given = {f"V{number}": table for number, table in enumerate(tables)}
     junction = Junction.from_layout(LAYOUT, branches=list(trips[0].currents_a))
     found = FleetCalibrator().fit(Fleet.from_frames(given, junction))
     out = found.write(tmp_path / "result")

@@ -34,9 +34,8 @@ def bench_of(drift: float, drift_sd: float, offset_a: float, offset_sd_a: float,
 def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> EvidenceRows:
     """Vehicles of three branches; the second gain ratio of the first is off, and junction constants are."""
     N, K = len(constant_a), 3
-    rows = EvidenceRows(
-        values=np.zeros((N, 5 * K)), covariance=np.tile(1e-6 * np.eye(5 * K), (N, 1, 1)), means=np.zeros((N, 2, K))
-    )
+    covariance = np.tile(1e-6 * np.eye(5 * K), (N, 1, 1))
+    rows = EvidenceRows(values=np.zeros((N, 5 * K)), covariance=covariance, means=np.zeros((N, 2, K)))
     rows.relative[0, K + 1] = relative
     rows.constant[:, K] = np.array(constant_a) / FULL_SCALE_A
     return rows
@@ -114,9 +113,8 @@ def test_window_in_which_a_current_flows_between_two_sensors_is_not_used() -> No
     assert np.isnan(readings.window_readings(vehicles)[0, 1]).all(axis=1).tolist() == [True, False, False, False, True]
     causes = [[each.cause for each in readings.flow_findings(vehicle)] for vehicle in vehicles]
     assert causes == [["window"], [], [], [], []]
-    assert readings.flow_findings(vehicles[0])[0].text.startswith(
-        "two sensors show the same current with opposite signs while"
-    )
+    (finding,) = readings.flow_findings(vehicles[0])
+    assert finding.text.startswith("two sensors show the same current with opposite signs while")
 
 
 @pytest.mark.parametrize(("shown_a", "flows"), [

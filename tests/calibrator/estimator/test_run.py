@@ -285,9 +285,7 @@ def test_option_since_recalibrates_changed_vehicles_and_detects_moved_sensors(
     said = succeeded(*words(grown.url, tmp_path / "out", "--since", result))
     old, now = contents(result / "params"), contents(tmp_path / "out" / "params")
     assert [name for name in old if old[name] != now[name]] == ["V009.json"]
-    (battery,) = [
-        row for row in read_results(tmp_path / "out") if (row["vehicle"], row["branch"]) == ("V009", "battery")
-    ]
+    (battery,) = [r for r in read_results(tmp_path / "out") if (r["vehicle"], r["branch"]) == ("V009", "battery")]
     assert f"V009: {moved}" in said if moved else "moved since" not in said
     assert (b'"d1"' in now["V009.json"]) == (moved is None)
     assert abs(battery["drift"] - faults.drift[0, 0]) <= 4.0 * battery["drift_sd"]

@@ -111,9 +111,8 @@ def test_cdfx_follows_the_order_of_the_dtd_and_holds_the_values_of_the_parameter
     assert [tree.findtext(tag) for tag in ("SHORT-NAME", "CATEGORY", "*/DATA-FILE")] == ["v1", "NO_VCD", "v1.json"]
     instances = {item.findtext("SHORT-NAME", ""): item for item in document.iter("SW-INSTANCE")}
     words = {"true": "1", "false": "0"}
-    found = {
-        name: float(instances[name].findtext(".//V") or words[instances[name].findtext(".//VT", "")]) for name in VALUES
-    }
+    texts = {name: (instances[name].findtext(".//V"), instances[name].findtext(".//VT", "")) for name in VALUES}
+    found = {name: float(number or words[word]) for name, (number, word) in texts.items()}
     assert found == pytest.approx(VALUES, abs=1e-12)
     assert instances["HV.battery.offset"].findtext(".//UNIT-DISPLAY-NAME") == "A"
     declared = {item.findtext("SW-FEATURE-REF") for item in document.iter("SW-CS-COLLECTION")}

@@ -21,7 +21,7 @@ from calibrator.errors import ExportError
 from calibrator.export.core import Checked, find_image, image_bytes, intel_hex, read_checked
 from ecu_node.parameters import write_parameters
 from tests.calibrator.export.c_core import check_frames
-from tests.calibrator.export.exports import checked_with, export, needs, refused
+from tests.calibrator.export.exports import export, needs, refused
 from tests.ecu_node.vehicles import MakeDatabase, parameters_for
 
 pytestmark = needs("gcc")
@@ -41,10 +41,8 @@ def vehicles(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Checked]:
 def written(vehicles: tuple[Path, Checked], form: str, out: Path) -> Path:
     """The vehicle's file in a format, from the command line."""
     program, checked = vehicles
-    more = ("--elf", program) if form in {"hex", "a2l"} else ()
-    run = export(
-        program.with_name("v1.json"), "--format", form, "--output", out, *more, layout=checked.database.layout.path
-    )
+    more, layout = ("--elf", program) if form in {"hex", "a2l"} else (), checked.database.layout.path
+    run = export(program.with_name("v1.json"), "--format", form, "--output", out, *more, layout=layout)
     assert run.exit_code == 0, run.output
     return out
 
@@ -154,8 +152,6 @@ def test_program_without_a_matching_calibration_symbol_is_refused(
 def test_numbers_with_more_digits_than_tools_have_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
     dbc = Path(make_database().layout.dbc_path).read_text().replace("[-3000|3000]", "[-0.3|0.3]")
     database = make_database(dbc=dbc)
-    checked = checked_with(database, parameters_for(database, battery=(0.051, 0.0)), tmp_path)
+    write_parameters(parameters_for(database, battery=(0.051, 0.0)), tmp_path / "v1.json")
     with pytest.raises(ExportError, match=r"branch battery: gain has more digits than .* --format hex"):
-        raise refused(
-            tmp_path / "v1.json", "--format", "dcm", "--output", tmp_path / "x", layout=checked.database.layout.path
-        )
+        raise refused(tmp_path / "v1.json", "--format", "dcm", "--output", tmp_path / "x", layout=database.layout.path)

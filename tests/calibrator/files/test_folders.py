@@ -144,10 +144,8 @@ def test_unreadable_inner_folder_is_reported_and_others_found(tmp_path: Path, mo
 
     monkeypatch.setattr(Storage, "contents", denied)
     problems: list[str] = []
-    assert [folder.url for folder, _ in walk(open_storage(tmp_path), problems)] == [
-        str(tmp_path / "V1"),
-        str(tmp_path / "vehicle 2"),
-    ]
+    found = [Path(folder.url).name for folder, _ in walk(open_storage(tmp_path), problems)]
+    assert found == ["V1", "vehicle 2"]
     assert problems == ["lost+found: cannot read it: Permission denied"]
 
 

@@ -81,9 +81,8 @@ def test_rows_with_missing_numbers_are_counted_and_not_used(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("digits", [0, 1, 2])
 def test_sum_due_to_quantisation_alone_lies_in_the_expected_band(digits: int, tmp_path: Path) -> None:
-    expected = figures(*table(tmp_path, digits, battery=MOTOR_A, motor=-0.4 * MOTOR_A, heater=-0.6 * MOTOR_A))[
-        "expected"
-    ]
+    currents_a = {"battery": MOTOR_A, "motor": -0.4 * MOTOR_A, "heater": -0.6 * MOTOR_A}
+    expected = figures(*table(tmp_path, digits, **currents_a))["expected"]
     assert expected["parts_a"]["quantisation"] == pytest.approx(10.0**-digits / 2.0)
     assert expected["in_band"]["before"] > 0.97
 

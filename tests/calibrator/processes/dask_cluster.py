@@ -43,9 +43,8 @@ class DaskCluster:
         options = ["--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard", "--no-jupyter"]
         self.scheduler = self._run("scheduler", *options)
         before = self._joined()
-        self.workers = [
-            self._run("worker", self.address, "--nthreads", "1", "--no-nanny", "--no-dashboard") for _ in range(2)
-        ]
+        options = [self.address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+        self.workers = [self._run("worker", *options) for _ in range(2)]
         until = time.monotonic() + 60.0
         while self._joined() < before + 2 and time.monotonic() < until:
             time.sleep(0.05)

@@ -31,7 +31,7 @@ sys.meta_path.insert(0, Finder())
 run()
 """
 IMPORTING = (
-    "from calibrator.processes.interrupts import importing\nwith importing(): os.kill(os.getpid(), signal.SIGINT)"
+    "from calibrator.processes import interrupts\nwith interrupts.importing(): os.kill(os.getpid(), signal.SIGINT)"
 )
 
 

@@ -39,9 +39,8 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
 
 
 def test_failing_or_crashing_items_do_not_affect_others_on_dask(tmp_path: Path, where: Workers) -> None:
-    require_failing_items_affect_no_others(
-        where, tmp_path, knows_signals=False
-    )  # a worker of Dask may not know the signal
+    # a worker of Dask may not know the signal
+    require_failing_items_affect_no_others(where, tmp_path, knows_signals=False)
 
 
 def test_error_of_an_item_is_not_taken_for_a_lost_scheduler(where: Workers, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -171,10 +171,9 @@ def test_logs_in_a_folder_are_read_as_one_recording_and_notes_are_ignored(tmp_pa
     (tmp_path / "logs").mkdir()
     for name in ("1.csv", "2.csv"):
         LOGS["SavvyCAN"][1](tmp_path / "logs" / name)
+    notes = "2026-11-03 12:00 two laps\n2026-11-03 12:40 heater on, 3 of 3\nbattery 80 %\n"
     for name in ("0.txt", "notes.txt"):
-        (tmp_path / "logs" / name).write_text(
-            "2026-11-03 12:00 two laps\n2026-11-03 12:40 heater on, 3 of 3\nbattery 80 %\n"
-        )
+        (tmp_path / "logs" / name).write_text(notes)
     found = before(tmp_path / "logs", layout)
     assert found["sum"]["mean_a"] == pytest.approx(2.2, abs=2e-3)
     jumps = "jumps of the clock, or pauses of more than 10 min, which became gaps of 60 s: 1"

@@ -37,9 +37,8 @@ def csv(table: pd.DataFrame, **options: Any) -> Callable[[Path], None]:
 def decoded_mf4(path: Path) -> None:
     """Channels in two groups with rates of their own, as a logger decodes them."""
     mdf = MDF()
-    mdf.append(
-        [Signal(BATTERY_A, TIME_S, name="Ibat", unit="A"), Signal(0.9 * BATTERY_A, TIME_S, name="Imot", unit="A")]
-    )
+    both = {"Ibat": BATTERY_A, "Imot": 0.9 * BATTERY_A}
+    mdf.append([Signal(values, TIME_S, name=name, unit="A") for name, values in both.items()])
     half = slice(None, None, 2)
     mdf.append([Signal(80.0 * BATTERY_A[half], TIME_S[half], name="Iheat", unit="mA")])
     mdf.save(path.with_suffix(".mf4"), overwrite=True)
@@ -199,9 +198,8 @@ def test_times_without_fractions_of_a_second_are_spread_and_reported(tmp_path: P
     ("step", "rows", "seconds"), [(1, 100, 99), (10, 100, 990), (10, 7000, 69.99), (500, 9, 4), (10**5, 9, 0.8)]
 )
 def test_time_unit_of_whole_numbers_is_inferred(tmp_path: Path, step: int, rows: int, seconds: float) -> None:
-    csv(pd.DataFrame({"time": step * np.arange(rows), "a": np.arange(rows) % 7, "b": 1, "note": "ok"}))(
-        tmp_path / "x.csv"
-    )
+    counts = np.arange(rows)
+    csv(pd.DataFrame({"time": step * counts, "a": counts % 7, "b": 1, "note": "ok"}))(tmp_path / "x.csv")
     table = read_table(tmp_path / "x.csv")
     assert table.time_s[-1] == pytest.approx(seconds)
     assert set(table.columns) == {"a", "b"}

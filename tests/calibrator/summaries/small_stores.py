@@ -21,9 +21,8 @@ from tests.calibrator.estimator import simulated_rows
 from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, summaries_of
 
 BRANCHES = ("battery", "motor")
-EQUIPMENT = Equipment(
-    branches=BRANCHES, inputs=("speed",), fleet_inputs=("speed", "torque", "voltage"), notices=("a notice",)
-)
+INPUTS = ("speed", "torque", "voltage")
+EQUIPMENT = Equipment(branches=BRANCHES, inputs=("speed",), fleet_inputs=INPUTS, notices=("a notice",))
 CONDITIONS = Conditions(model_error_a=0.5)
 
 

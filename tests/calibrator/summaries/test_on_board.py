@@ -63,9 +63,8 @@ def recorded_drive(seed: int = 1) -> Drive:
         "junction_box_temperature": beside_battery(np.round(20.0 + 0.01 * battery.time_s)),
         "voltage": beside_battery(350.0 - 0.05 * current(battery.time_s)),
     }
-    return Drive(
-        vehicle="V1", name="drive", branches={"battery": battery, "motor": motor, "auxiliary": auxiliary}, inputs=inputs
-    )
+    branches = {"battery": battery, "motor": motor, "auxiliary": auxiliary}
+    return Drive(vehicle="V1", name="drive", branches=branches, inputs=inputs)
 
 
 def stored(place: Path) -> VehicleSummary:

@@ -58,12 +58,8 @@ def test_summaries_are_read_back_as_written(store: SummaryStore) -> None:
 
 
 def test_summary_files_are_readable_by_duckdb(store: SummaryStore) -> None:
-    files = f"{store.url}/buckets/*.parquet"
-    count, seconds = duckdb.execute(
-        f"SELECT count(DISTINCT vehicle), sum(duration_s) FROM read_parquet('{files}')"
-    ).fetchall()[0]
-    assert count == VEHICLES
-    assert seconds == pytest.approx(VEHICLES * 1800.0)
+    query = f"SELECT count(DISTINCT vehicle), sum(duration_s) FROM read_parquet('{store.url}/buckets/*.parquet')"
+    assert duckdb.execute(query).fetchall() == [(VEHICLES, pytest.approx(VEHICLES * 1800.0))]
 
 
 def test_records_stay_files_until_compacted_and_none_counts_twice(tmp_path: Path, database: VehicleDatabase) -> None:
