@@ -153,8 +153,6 @@ def test_score_refuses_the_truth_of_other_vehicles_or_branches(
 
 # A fleet with delays, and a load that no sensor measures
 
-DELAY_TOLERANCE_S = 0.005
-
 
 @pytest.fixture(scope="session")
 def delayed_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -193,7 +191,7 @@ def test_delay_of_the_motor_is_stated_within_5_ms(delayed_fleet: Path, parameter
         assert all(delay is not None for delay in delays.values())
         found = (delays["motor"] or 0.0) - (delays["battery"] or 0.0)
         actual = truth[item.vehicle].delay_s["motor"] - truth[item.vehicle].delay_s["battery"]
-        assert abs(found - actual) < DELAY_TOLERANCE_S
+        assert abs(found - actual) < 0.005
 
 
 def test_unmeasured_load_is_estimated_from_the_fleet_and_reported(delayed_fleet: Path, delayed_result: Path) -> None:

@@ -31,10 +31,6 @@ def confident(confidence: Array, recovered: Array | Mask) -> Values:
     return judge(replace(estimate, confidence=confidence), trial)
 
 
-def unseen_of(truth: Faults) -> UnseenDrive:
-    return UnseenDrive.of_linear_sensors(SWINGING_A.mean(axis=0), np.mean(SWINGING_A**2, axis=0), truth)
-
-
 def one_of(*, drift: Array, truth: Array) -> tuple[Estimate, Trial]:
     """An estimate of drifts alone, shape (N, K), all of which are corrected, and its trial."""
     zero = np.zeros(truth.shape)
@@ -43,7 +39,7 @@ def one_of(*, drift: Array, truth: Array) -> tuple[Estimate, Trial]:
         smallest_fault=0.05,
         full_scale_a=400.0,
         truth=faults,
-        unseen=unseen_of(faults),
+        unseen=UnseenDrive.of_linear_sensors(SWINGING_A.mean(axis=0), np.mean(SWINGING_A**2, axis=0), faults),
         record=lambda: pytest.fail("not needed"),
         collect=lambda: pytest.fail("not needed"),
     )

@@ -19,11 +19,6 @@ from calibrator.experiments.pages import draw_result
 BIASES = ("0", "0.2", "0.4", "0.5")
 
 
-def shown_as(result: ExperimentResult, name: str) -> ExperimentResult:
-    """The same figures, drawn as another experiment."""
-    return replace(result, experiment=EXPERIMENTS[name])
-
-
 @pytest.fixture(scope="module")
 def equal() -> ExperimentResult:
     """Recovery rates of 0 and 1, the same for all series and both methods, of 30 vehicles each.
@@ -65,7 +60,7 @@ def test_error_bars_are_the_95_percent_intervals(equal: ExperimentResult) -> Non
 
 
 def test_legend_covers_no_data_and_names_each_method_once(equal: ExperimentResult) -> None:
-    for result in (equal, shown_as(equal, "sparsity")):
+    for result in (equal, replace(equal, experiment=EXPERIMENTS["sparsity"])):
         figure = drawn(result)
         (legend,) = figure.legends
         assert not any(legend.get_window_extent().overlaps(axes.get_window_extent()) for axes in figure.axes)

@@ -59,12 +59,8 @@ def fd_64(data: bytes, *, code: int, valid: int) -> bytes:
 SOUND = an_object(CLASSIC, classic(0x10, b"x"))
 
 
-def by_python_can(content: bytes) -> Frames:
-    return frames_of(list(can.BLFReader(io.BytesIO(content))))
-
-
 def assert_the_same(content: bytes) -> Frames:
-    ours, theirs = blf_frames(io.BytesIO(content), "x.blf"), by_python_can(content)
+    ours, theirs = blf_frames(io.BytesIO(content), "x.blf"), frames_of(list(can.BLFReader(io.BytesIO(content))))
     width = theirs.data.shape[1]
     np.testing.assert_array_equal(ours.key, theirs.key)
     np.testing.assert_array_equal(ours.length, theirs.length)

@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from msgspec.structs import replace
 
@@ -24,25 +23,10 @@ from tests.calibrator.report.results_at_hand import EVIL, sensor, six_vehicles, 
 NO_HARDWARE = {"hardware_drift": 0.0, "hardware_offset_a": {}}
 
 
-def facts_of(page: str) -> dict[str, Any]:
-    found = re.search(r'id="facts">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
-    return dict(json.loads(found[1]))
-
-
-def packed(page: str, name: str) -> bytes:
+def packed(page: str, name: str) -> Any:
     """Data of the page that a browser unpacks."""
-    found = re.search(f'id="{name}-data">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
-    return gzip.decompress(base64.b64decode(found[1]))
-
-
-def columns_of(page: str) -> dict[str, np.ndarray[Any, Any]]:
-    """Columns of the vehicles that are listed, by name; NaN where not known."""
-    return {
-        name: np.array([np.nan if each is None else each for each in values])
-        for name, values in json.loads(packed(page, "columns")).items()
-    }
+    (found,) = re.findall(f'id="{name}-data">(.*?)</script>', page, re.DOTALL)
+    return json.loads(gzip.decompress(base64.b64decode(found)))
 
 
 def visible(page: str) -> str:
@@ -51,14 +35,10 @@ def visible(page: str) -> str:
     return " ".join(html.unescape(shown).split())
 
 
-def test_names_and_reasons_are_escaped_in_the_page(result: Path) -> None:
+def test_page_escapes_names_and_reasons_and_refers_to_no_external_resource(result: Path) -> None:
     page, _ = report_page(result)
     assert EVIL not in page
     assert page.count("&lt;script&gt;document.title") == 5  # the notice, what was left out, why, and both in the step
-
-
-def test_report_page_refers_to_no_external_resource(result: Path) -> None:
-    page, _ = report_page(result)
     assert not re.search(r'(src|href)="(?!#|data:)', page)
     assert "default-src 'none'" in page
 
@@ -74,7 +54,7 @@ def test_report_page_shows_its_numbers_without_javascript(result: Path) -> None:
 def test_page_of_a_very_large_fleet_lists_only_part_and_says_so(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_module, "MOST_SENSORS", 11)
     page, report = report_page(result)
-    assert len(columns_of(page)["vehicle"]) == 5
+    assert len(packed(page, "columns")["vehicle"]) == 5
     assert report["overview"]["vehicles"] == 6
     assert "5 of 6 vehicles are listed" in visible(page)
 
@@ -89,9 +69,9 @@ def test_page_of_a_vehicle_is_about_this_vehicle_alone(result: Path) -> None:
     assert "8.00 A Kirchhoff sum on the bus, as nothing is corrected" in text
     assert "V4: a zero-current window (contactors open) would decide." in text
     assert "V1" not in text
-    facts = facts_of(page)
-    assert facts["alone"]
-    (own,) = json.loads(packed(page, "details"))
+    (facts,) = re.findall(r'id="facts">(.*?)</script>', page, re.DOTALL)
+    assert json.loads(facts)["alone"]
+    (own,) = packed(page, "details")
     first, second = own["explanations"]
     assert first == {"probability": 0.6, "drift": {}, "offset_a": {"battery": 8.0}, **NO_HARDWARE}
     wanted = {"probability": 0.4, "drift": {"motor": -0.03}, "offset_a": {}}
@@ -114,7 +94,7 @@ def test_findings_appear_in_the_workshop_list_and_with_the_vehicle(tmp_path: Pat
         text = visible(page)
         assert "V5 motor inverted 99.3 % motor: its sign is turned." in text
         assert "V5 the vehicle load 90.0 % 5 A flow where <no> sensor is." in text
-        found = [each for row in json.loads(packed(page, "details")) for each in row["findings"]]
+        found = [each for row in packed(page, "details") for each in row["findings"]]
         assert ("motor", "inverted", 0.993) in [(each["branch"], each["cause"], each["probability"]) for each in found]
     assert "Workshop list" not in visible(report_page(result, "V1")[0])
 
