@@ -11,16 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrator.artificial import trips
 from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.random_fleet import FaultSettings, Purpose, random_stream
-from calibrator.artificial.trips import (
-    GroundTruth,
-    RecordedTrips,
-    TripSource,
-    choose_trips,
-    cut_and_rejoin,
-    ground_truth_from_drive,
-)
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
@@ -29,20 +22,20 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
 
-def recorded(level: float, rise: float = 0.0) -> GroundTruth:
+def recorded(level: float, rise: float = 0.0) -> trips.GroundTruth:
     """A minute at 10 Hz that starts and ends at a standstill."""
     speed = np.where((np.arange(600) + 5) % 60 < 10, 0.0, 30.0)
     battery, auxiliary = level + rise * np.arange(600.0), np.full(600, -2.0)
     currents = {"battery": battery, "motor": -battery - auxiliary, "auxiliary": auxiliary}
-    return GroundTruth(name=f"trip{level:g}", period_s=0.1, currents_a=currents, inputs={"speed": speed})
+    return trips.GroundTruth(name=f"trip{level:g}", period_s=0.1, currents_a=currents, inputs={"speed": speed})
 
 
-def levels(trip: GroundTruth) -> set[float]:
+def levels(trip: trips.GroundTruth) -> set[float]:
     return set(trip.currents_a["battery"].tolist())
 
 
 def test_rejoined_trip_has_jumps_only_at_standstills() -> None:
-    joined = cut_and_rejoin(np.random.default_rng(0), [recorded(0.0, rise=1.0)], duration_s=50.0, name="new")
+    joined = trips.cut_and_rejoin(np.random.default_rng(0), [recorded(0.0, rise=1.0)], duration_s=50.0, name="new")
     assert len(joined) >= 500
     jumps = np.flatnonzero(np.abs(np.diff(joined.currents_a["battery"])) > 1.0)
     assert jumps.size > 0
@@ -58,27 +51,27 @@ def test_recorded_drive_becomes_a_trip_over_the_span_common_to_all_channels() ->
     some, none = np.arange(100) != 50, np.zeros(100, bool)
     branches = {"battery": channel(0.0, some)}
     drive = Drive(vehicle="V", name="d", branches=branches, inputs={"speed": channel(0.5, some)})
-    made = ground_truth_from_drive(drive, 0.1)
+    made = trips.ground_truth_from_drive(drive, 0.1)
     assert made is not None
     np.testing.assert_allclose(made.currents_a["battery"], 2.0 * (0.5 + made.time_s))
     assert len(made) == pytest.approx(94, abs=1)
     without_good = Drive(vehicle="V", name="d", branches=branches, inputs={"speed": channel(0.5, none)})
-    assert ground_truth_from_drive(without_good, 0.1) is None
+    assert trips.ground_truth_from_drive(without_good, 0.1) is None
 
 
 def test_no_piece_of_a_recording_is_in_both_the_calibration_and_the_unseen_trip_of_a_vehicle() -> None:
-    trips = [recorded(float(k)) for k in range(4)]
-    enough = RecordedTrips(seed=0, recorded=trips, vehicles=4, unseen_s=30.0)
+    four = [recorded(float(k)) for k in range(4)]
+    enough = trips.RecordedTrips(seed=0, recorded=four, vehicles=4, unseen_s=30.0)
     for k in range(4):
         assert levels(enough.trip(k, "calibration")) == {float(k)}
         unseen = enough.trip(k, "unseen")
         assert len(unseen) == 300
         assert float(k) not in levels(unseen)
-    few = RecordedTrips(seed=0, recorded=trips, vehicles=9, unseen_s=30.0)
+    few = trips.RecordedTrips(seed=0, recorded=four, vehicles=9, unseen_s=30.0)
     for k in range(9):
         assert levels(few.trip(k, "calibration")) <= {0.0, 1.0}
         assert levels(few.trip(k, "unseen")) <= {2.0, 3.0}
-    single = RecordedTrips(seed=0, recorded=[recorded(0.0, rise=1.0)], vehicles=3, unseen_s=10.0)
+    single = trips.RecordedTrips(seed=0, recorded=[recorded(0.0, rise=1.0)], vehicles=3, unseen_s=10.0)
     assert levels(single.trip(0, "calibration")).isdisjoint(levels(single.trip(0, "unseen")))
 
 
@@ -88,8 +81,8 @@ def test_builtin_trip_without_fastsim_is_refused_with_the_extra_to_install(monke
         builtin_trip(np.random.default_rng(0), duration_s=60.0, name="trip")
 
 
-def chosen(drives: str, layout: Layout) -> TripSource:
-    return choose_trips(drives, layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
+def chosen(drives: str, layout: Layout) -> trips.TripSource:
+    return trips.choose_trips(drives, layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
 
 
 def test_drives_without_good_samples_are_left_out_and_named(database: VehicleDatabase, tmp_path: Path) -> None:

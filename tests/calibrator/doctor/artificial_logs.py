@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -101,6 +101,9 @@ class DoctorRun:
     def errors(self) -> list[tuple[str, str]]:
         """Kind and subject of each error."""
         return [(item.code, item.subject) for item in self.findings() if item.severity == "error"]
+
+
+Examine = Callable[[Drive], DoctorRun]
 
 
 def examined(layout: Path, *logs: Path) -> DoctorRun:

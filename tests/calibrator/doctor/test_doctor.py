@@ -13,14 +13,7 @@ import pytest
 from calibrator.drive import Array, Channel, Drive
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator, succeeded
-from tests.calibrator.doctor.artificial_logs import (
-    DoctorRun,
-    examined,
-    true_drive,
-    with_branch,
-    write_layout,
-    write_log,
-)
+from tests.calibrator.doctor.artificial_logs import Examine, examined, true_drive, with_branch, write_layout, write_log
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +27,9 @@ def layout(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def examine(tmp_path: Path, layout: Path, database: VehicleDatabase) -> Callable[[Drive], DoctorRun]:
+def examine(tmp_path: Path, layout: Path, database: VehicleDatabase) -> Examine:
     """Examine the log of a drive."""
     return lambda drive: examined(layout, write_log(tmp_path, drive, database))
-
-
-Examine = Callable[[Drive], DoctorRun]
 
 
 def cut(drive: Drive, seconds: float) -> Drive:

@@ -13,13 +13,7 @@ import pytest
 
 from calibrator.drive import Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.fleet_estimate import (
-    FleetEstimate,
-    FleetReference,
-    _says_zero,
-    estimate_vehicles,
-    learn_fleet,
-)
+from calibrator.estimator import fleet_estimate
 from calibrator.estimator.fleet_task import _distrust
 from calibrator.estimator.prior import known_prior
 from calibrator.estimator.vehicle_parameters import deciding_evidence
@@ -37,8 +31,8 @@ THREE = (*NAMES, "auxiliary")
 Summaries = Sequence[DriveSummary]
 
 
-def learned(summaries: Summaries, branches: Sequence[str] = NAMES, **known: Any) -> FleetReference:
-    return learn_fleet(summaries, full_scale_a=SCALE_A, branches=branches, **known)
+def learned(summaries: Summaries, branches: Sequence[str] = NAMES, **known: Any) -> fleet_estimate.FleetReference:
+    return fleet_estimate.learn_fleet(summaries, full_scale_a=SCALE_A, branches=branches, **known)
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +46,16 @@ def summaries(truth: Faults) -> Summaries:
 
 
 @pytest.fixture(scope="module")
-def reference(summaries: Summaries) -> FleetReference:
+def reference(summaries: Summaries) -> fleet_estimate.FleetReference:
     return learned(summaries)
 
 
 def test_faults_beyond_the_limits_are_estimated_but_not_corrected(
-    summaries: Summaries, reference: FleetReference
+    summaries: Summaries, reference: fleet_estimate.FleetReference
 ) -> None:
-    free, limited = (estimate_vehicles(summaries, reference, limits=limits) for limits in (None, (0.1, 1e3)))
+    free, limited = (
+        fleet_estimate.estimate_vehicles(summaries, reference, limits=limits) for limits in (None, (0.1, 1e3))
+    )
     beyond = free.corrected & (np.abs(free.drift) > 0.1)
     assert beyond.any()
     assert (limited.held_back[beyond] == "beyond the limits").all()
@@ -76,7 +72,7 @@ def test_low_gain_of_the_largest_branch_is_recovered_and_its_dead_sensor_is_foun
     summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=3)
     reference = learned(summaries, THREE)
     assert reference.order[0] == 0
-    found = estimate_vehicles(summaries, reference)
+    found = fleet_estimate.estimate_vehicles(summaries, reference)
     np.testing.assert_allclose(found.drift[:3, 0], low[:3], atol=0.01)
     np.testing.assert_allclose(found.drift[:3, 1], 0.15, atol=0.01)
     assert (found.confidence[3:5] < 0.5).all()
@@ -90,7 +86,7 @@ def test_load_of_one_vehicle_that_may_be_an_offset_leaves_it_open_unless_that_wa
     faults.offset_a[1, 1] = 10.0  # of the feeding branch; where it was read as none, it is a load
     readings[:, 1, 1, 1] = (0.0, 0.1) if is_read else NAN
     summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=3)
-    found = estimate_vehicles(summaries, learned(summaries, readings=readings), readings=readings)
+    found = fleet_estimate.estimate_vehicles(summaries, learned(summaries, readings=readings), readings=readings)
     (finding,) = found.findings[1]
     assert finding.cause == "load"
     assert finding.text.endswith("or an offset of the motor sensor") is not is_read
@@ -118,7 +114,7 @@ def test_hardware_offset_between_any_two_branches_causes_no_wrong_correction(off
             faults.hardware_offset_a[j, [p, r]] = moved_a, -moved_a
             faults.offset_a[j, p] = offset_a * rng.choice([-1.0, 1.0])
         summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=seed)
-        found = estimate_vehicles(summaries, learned(summaries, THREE))
+        found = fleet_estimate.estimate_vehicles(summaries, learned(summaries, THREE))
         error_a = np.abs(found.offset_a - faults.offset_a)[: len(pairs)]
         assert not (found.corrected[: len(pairs)] & (error_a > np.abs(faults.offset_a[: len(pairs)]))).any()
         if not offset_a:
@@ -146,7 +142,7 @@ def test_fleet_where_half_have_a_moved_current_and_offset_or_two_offsets_is_rare
             else:
                 faults.offset_a[j, r] = moved_a
         summaries = summaries_of(faults, Conditions(model_error_a=0.3), seed=seed)
-        found = estimate_vehicles(summaries, learned(summaries, THREE))
+        found = fleet_estimate.estimate_vehicles(summaries, learned(summaries, THREE))
         wrong = (np.abs(found.offset_a - faults.offset_a) > 0.1 * np.abs(faults.offset_a).max()).any(axis=1)
         sure_and_wrong += int((wrong & (found.confidence > 0.95))[:count].sum())
     assert sure_and_wrong <= 1
@@ -179,7 +175,7 @@ def test_offset_of_all_battery_sensors_gives_a_notice_and_corrections_harm_no_ve
     summaries = summaries_of(batch, Conditions(model_error_a=0.3), seed=4)
     learnt = learned(summaries)
     assert any("sum to +12" in notice for notice in learnt.notices)
-    found = estimate_vehicles(summaries, learnt)
+    found = fleet_estimate.estimate_vehicles(summaries, learnt)
     drift, offset_a = (np.where(found.corrected, each, 0.0) for each in (found.drift, found.offset_a))
     mean_a = np.array([summary.mean_a for summary in summaries])
     applied = replace(batch, drift=drift, offset_a=offset_a)
@@ -196,7 +192,7 @@ def test_gain_error_shared_by_all_sensors_is_noticed_and_not_corrected(vehicles:
     summaries = summaries_of(batch, Conditions(samples=900), seed=vehicles)
     learnt = learned(summaries)
     assert any("a gain error that a batch of sensors shares" in notice for notice in learnt.notices)
-    assert not estimate_vehicles(summaries, learnt).corrected.any()
+    assert not fleet_estimate.estimate_vehicles(summaries, learnt).corrected.any()
 
 
 def test_small_gain_error_that_all_sensors_of_a_branch_share_is_told() -> None:
@@ -214,35 +210,30 @@ def test_gain_errors_that_two_of_three_branches_share_are_given_to_no_pair() -> 
     learnt = learned(summaries, THREE)
     (notice,) = (each for each in learnt.notices if "a batch of sensors shares" in each)
     assert set(notice.rpartition("in branch ")[2].split(" or ")) == set(THREE)
-    found = estimate_vehicles(summaries, learnt)
+    found = fleet_estimate.estimate_vehicles(summaries, learnt)
     assert not found.corrected.any()
     assert found.confidence.max() < 0.6
 
 
+def divided(rng: np.random.Generator, into: list[list[float]]) -> DriveSummary:
+    """Summary of a drive with three sensors, each of which sees these shares of the currents of battery and motor."""
+    drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=900, model_error_a=0.3, noise_a=0.0))
+    currents_a = drive.currents_a @ np.array(into)
+    currents_a += 0.3 * rng.normal(size=currents_a.shape)
+    return summarise_samples([replace(drive, branch_names=THREE, currents_a=currents_a)], period_s=PERIOD_S)
+
+
 def test_branches_in_parallel_that_share_a_current_differently_in_each_vehicle_are_not_corrected() -> None:
-    rng, summaries = np.random.default_rng(11), []
-    for share in 0.5 + 0.015 * rng.normal(size=20):
-        drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=900, model_error_a=0.3, noise_a=0.0))
-        battery_a, motor_a = drive.currents_a.T
-        currents_a = np.column_stack([share * battery_a, (1.0 - share) * battery_a, motor_a])
-        currents_a += 0.3 * rng.normal(size=currents_a.shape)
-        drive = replace(drive, branch_names=("one", "other", "motor"), currents_a=currents_a)
-        summaries.append(summarise_samples([drive], period_s=PERIOD_S))
-    learnt = learned(summaries, ["one", "other", "motor"])
-    assert not estimate_vehicles(summaries, learnt).corrected.any()
+    rng = np.random.default_rng(11)
+    shares = 0.5 + 0.015 * rng.normal(size=20)
+    summaries = [divided(rng, [[share, 1.0 - share, 0.0], [0.0, 0.0, 1.0]]) for share in shares]
+    assert not fleet_estimate.estimate_vehicles(summaries, learned(summaries, THREE)).corrected.any()
 
 
 def test_vehicles_with_a_branch_that_others_lack_are_not_corrected() -> None:
-    rng, summaries = np.random.default_rng(5), []
-    for j in range(14):
-        drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=900, model_error_a=0.3, noise_a=0.0))
-        battery_a, motor_a = drive.currents_a.T
-        front = 0.4 * (j % 5 not in {0, 2})
-        currents_a = np.column_stack([battery_a, front * motor_a, (1.0 - front) * motor_a])
-        currents_a += 0.3 * rng.normal(size=currents_a.shape)
-        drive = replace(drive, branch_names=("battery", "front", "rear"), currents_a=currents_a)
-        summaries.append(summarise_samples([drive], period_s=PERIOD_S))
-    found = estimate_vehicles(summaries, learned(summaries, ["battery", "front", "rear"]))
+    rng, fronts = np.random.default_rng(5), [0.4 * (j % 5 not in {0, 2}) for j in range(14)]
+    summaries = [divided(rng, [[1.0, 0.0, 0.0], [0.0, front, 1.0 - front]]) for front in fronts]
+    found = fleet_estimate.estimate_vehicles(summaries, learned(summaries, THREE))
     assert not found.corrected.any()
     assert any(each.cause == "sum" for mine in found.findings for each in mine)
 
@@ -277,7 +268,7 @@ def test_vehicle_that_differs_no_more_than_sound_ones_has_no_hardware_fault(drif
     fleet = no_faults(12, K)
     fleet.hardware_drift[3] = drift
     summaries = summaries_of(fleet, Conditions(samples=900, model_error_a=0.3), seed=7)
-    found = estimate_vehicles(summaries, learned(summaries))
+    found = fleet_estimate.estimate_vehicles(summaries, learned(summaries))
     assert (found.hardware_probability > 0.5).tolist() == [suspected and j == 3 for j in range(12)]
     assert found.hardware_drift[3] == pytest.approx(drift, abs=0.005)
     assert not found.corrected.any()
@@ -289,7 +280,7 @@ def test_two_variants_of_the_vehicle_give_a_notice_and_a_finding_per_vehicle(lar
     fleet.hardware_drift[6:] = larger
     summaries = summaries_of(fleet, Conditions(samples=900, model_error_a=0.3), seed=6)
     learnt = learned(summaries)
-    found = estimate_vehicles(summaries, learnt)
+    found = fleet_estimate.estimate_vehicles(summaries, learnt)
     said = [{each.text.partition(" by")[0] for each in mine if each.cause == "variant"} for mine in found.findings]
     assert any("two variants of the vehicle?" in notice for notice in learnt.notices) == bool(larger)
     expected = [{"all its currents are smaller"}] * 6 + [{"all its currents are larger"}] * 6
@@ -298,9 +289,9 @@ def test_two_variants_of_the_vehicle_give_a_notice_and_a_finding_per_vehicle(lar
 
 
 def test_integral_transform_of_the_truth_is_0_to_1(
-    truth: Faults, summaries: Summaries, reference: FleetReference
+    truth: Faults, summaries: Summaries, reference: fleet_estimate.FleetReference
 ) -> None:
-    for pit in estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
+    for pit in fleet_estimate.estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
         assert pit.shape == (VEHICLES, K)
         assert ((pit >= 0.0) & (pit <= 1.0 + 1e-9)).all()
         assert 0.3 < pit.mean() < 0.7
@@ -319,7 +310,7 @@ def test_branch_with_constant_values_leads_to_no_correction(step_a: float) -> No
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         learnt = learned(summaries, [*NAMES, "still"])
-    found = estimate_vehicles(summaries, learnt)
+    found = fleet_estimate.estimate_vehicles(summaries, learnt)
     assert not found.identifiable[:, 2].any()
     assert not found.corrected.any()
 
@@ -343,10 +334,10 @@ def drives(fault: str, load_a: float = 0.0) -> Summaries:
     return summaries_of(fleet, Conditions(samples=1200, model_error_a=0.5, unmeasured_a=load_a), seed=1)
 
 
-def trusting(summaries: Summaries, trusted: Mask) -> tuple[FleetReference, FleetEstimate]:
+def trusting(summaries: Summaries, trusted: Mask) -> tuple[fleet_estimate.FleetReference, fleet_estimate.FleetEstimate]:
     reference, carrying = learned(summaries, trusted=trusted), trusted.copy()
     carrying[list(reference.distrusted)] = False
-    return reference, estimate_vehicles(summaries, reference, trusted=carrying)
+    return reference, fleet_estimate.estimate_vehicles(summaries, reference, trusted=carrying)
 
 
 def first(count: int, of: int = 16) -> Mask:
@@ -366,7 +357,7 @@ def test_wrong_zero_of_all_trusted_vehicles_turns_no_other_vehicle(load_a: float
     """Where the load is declared, the sum of the others is as right as where it is zero and there is none."""
     trusted, load = first(3), UnmeasuredLoad(mean_a=load_a, sd_a=0.1) if load_a else None
     reference = learned(drives("zero", load_a), trusted=trusted, load=load)
-    found = estimate_vehicles(drives("zero", load_a), reference, trusted=trusted)
+    found = fleet_estimate.estimate_vehicles(drives("zero", load_a), reference, trusted=trusted)
     assert "the zero of the trusted ones is not believed" in reference.notices[0]
     assert np.abs(found.offset_a[3:]).max() < 0.3
     assert found.drift[5, 1] == pytest.approx(0.1, abs=0.01)
@@ -385,7 +376,7 @@ def test_wrong_zero_of_all_trusted_vehicles_turns_no_other_vehicle(load_a: float
 def test_zero_of_trusted_vehicles_is_left_where_the_others_sum_to_the_load_and_they_do_not_by_chance(
     trusted_a: float, others_a: float, load: UnmeasuredLoad | None, says: bool
 ) -> None:
-    assert _says_zero(trusted_a, others_a, SCALE_A, load, count=3, branches=3) == says
+    assert fleet_estimate._says_zero(trusted_a, others_a, SCALE_A, load, count=3, branches=3) == says
 
 
 @pytest.mark.parametrize("load_a", [0.0, 3.0])
@@ -423,7 +414,7 @@ def test_load_is_estimated_from_the_fleet_or_taken_as_declared() -> None:
     declared = learned(summaries, load=load)
     assert declared.expected_a == pytest.approx(3.0)
     assert not declared.notices
-    assert not estimate_vehicles(summaries, declared).corrected.any()
+    assert not fleet_estimate.estimate_vehicles(summaries, declared).corrected.any()
 
 
 def test_declared_load_that_the_currents_of_most_vehicles_deny_corrects_nothing() -> None:

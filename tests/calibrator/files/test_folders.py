@@ -8,20 +8,14 @@ import fsspec
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.files.folders import (
-    require_new_folder,
-    require_possible_file,
-    require_possible_folder,
-    whole_folder,
-    write_files,
-)
+from calibrator.files import folders
 from calibrator.files.storage import Storage, StorageError, open_storage, walk
 from ecu_node.errors import UserError
 
 
 def test_folder_appears_only_when_it_is_complete(tmp_path: Path) -> None:
     out = tmp_path / "a" / "out"
-    with whole_folder(out) as partial:
+    with folders.whole_folder(out) as partial:
         (partial / "x").write_text("1")
         assert not out.exists()
     assert [path.name for path in out.iterdir()] == ["x"]
@@ -31,14 +25,14 @@ def test_folder_appears_only_when_it_is_complete(tmp_path: Path) -> None:
 def test_folder_that_is_not_empty_is_refused_and_unchanged(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("1")
-    with pytest.raises(FleetError, match="exists and is not empty"), whole_folder(tmp_path / "out"):
+    with pytest.raises(FleetError, match="exists and is not empty"), folders.whole_folder(tmp_path / "out"):
         pass
     assert (tmp_path / "out" / "mine").read_text() == "1"
 
 
 def test_full_disk_is_reported_and_no_partial_folder_remains(tmp_path: Path) -> None:
     message = rf"^{tmp_path}/out: cannot write it: No space left on device; make room, or choose another --out"
-    with pytest.raises(FleetError, match=message), whole_folder(tmp_path / "out"):
+    with pytest.raises(FleetError, match=message), folders.whole_folder(tmp_path / "out"):
         raise OSError(errno.ENOSPC, "Error writing bytes to file. Detail: [errno 28] No space left on device")
     assert list(tmp_path.iterdir()) == []
 
@@ -49,12 +43,12 @@ def test_partial_folder_of_a_killed_process_is_removed(tmp_path: Path, name: str
     gone.wait()
     (tmp_path / f".{name}.partial-{gone.pid}").mkdir()
     (tmp_path / f".{name}.partial-1").mkdir()
-    with whole_folder(tmp_path / name):
+    with folders.whole_folder(tmp_path / name):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == [f".{name}.partial-1", name]
 
 
-@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
+@pytest.mark.parametrize("require", [folders.require_new_folder, folders.require_possible_folder])
 @pytest.mark.parametrize("name", ["x", "x/y/z"])
 def test_folder_in_an_unwritable_file_system_is_refused(require: Callable[[Path], None], name: str) -> None:
     # Permissions do not stop root, so only an attempt shows it.
@@ -62,7 +56,9 @@ def test_folder_in_an_unwritable_file_system_is_refused(require: Callable[[Path]
         require(Path("/proc") / name)
 
 
-@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder, require_possible_file])
+@pytest.mark.parametrize(
+    "require", [folders.require_new_folder, folders.require_possible_folder, folders.require_possible_file]
+)
 def test_url_is_refused_where_only_a_path_can_be_written(require: Callable[[Path], None]) -> None:
     """Otherwise a local folder ``s3:`` would be made."""
     with pytest.raises(FleetError, match=r"^s3:/bucket/result: is a URL; name a folder of this machine"):
@@ -75,14 +71,14 @@ def test_symbolic_link_is_not_replaced_by_a_folder(tmp_path: Path) -> None:
     (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
     for name in ("out", "dangling"):
         with pytest.raises(FleetError, match=f"{name}: is a link"):
-            require_new_folder(tmp_path / name)
-    require_possible_folder(tmp_path / "out")
+            folders.require_new_folder(tmp_path / name)
+    folders.require_possible_folder(tmp_path / "out")
     with pytest.raises(FleetError, match="choose another"):
-        require_possible_folder(tmp_path / "dangling")
+        folders.require_possible_folder(tmp_path / "dangling")
 
 
 def fill_while_the_place_is_taken(out: Path) -> None:
-    with whole_folder(out) as folder:
+    with folders.whole_folder(out) as folder:
         (folder / "result").write_text("hours of work")
         out.mkdir()
         (out / "in the way").write_text("")
@@ -98,21 +94,21 @@ def test_result_is_kept_if_it_cannot_be_moved_to_its_place(tmp_path: Path) -> No
 def test_mount_point_is_refused_as_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "is_mount", lambda _: True)
     with pytest.raises(FleetError, match="a disk is mounted there"):
-        require_new_folder(tmp_path)
+        folders.require_new_folder(tmp_path)
 
 
 def test_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "old").write_bytes(b"old")
     (tmp_path / "folder").mkdir()
     with pytest.raises(UserError, match=f"^{tmp_path}/folder: cannot be written: Is a directory$"):
-        write_files({tmp_path / "folder": b""})
+        folders.write_files({tmp_path / "folder": b""})
 
     def full(handle: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("ecu_node.documents.os.fsync", full)
     with pytest.raises(UserError, match=f"^{tmp_path}/old: cannot be written: No space left on device$"):
-        write_files({tmp_path / "old": b"new"})
+        folders.write_files({tmp_path / "old": b"new"})
     assert sorted(tmp_path.iterdir()) == [tmp_path / "folder", tmp_path / "old"]
     assert (tmp_path / "old").read_bytes() == b"old"
 
