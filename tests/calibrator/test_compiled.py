@@ -33,9 +33,8 @@ def largest(values: Array) -> float:
 def test_compiled_code_is_cached_if_the_folder_is_writable(tmp_path: Path, writable: bool) -> None:
     (tmp_path / "file").touch()
     cache = tmp_path / "cache" if writable else tmp_path / "file" / "cache"
-    program = "from tests.calibrator.test_compiled import is_compiled, largest, np; " + (
-        "print(is_compiled('test_compiled'), largest(np.array([1.0, 3.0, 2.0])), is_compiled('test_compiled'))"
-    )
+    found = "is_compiled('test_compiled'), largest(np.array([1.0, 3.0, 2.0])), is_compiled('test_compiled')"
+    program = f"from tests.calibrator.test_compiled import is_compiled, largest, np; print({found})"
     variables = {**os.environ, "CALIBRATOR_CACHE": str(cache)}
     printed = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, env=variables, text=True)
     assert printed == f"False 6.0 {writable}\n"

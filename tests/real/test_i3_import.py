@@ -51,17 +51,14 @@ def trips(i3_store: Path) -> RecordedFleet:
 LONG = pytest.mark.long
 
 
-@pytest.mark.parametrize(
-    ("vehicles", "case", "least"),
-    [
-        (6, RecordedCase(branches=2, sparsity=80.0, balanced=True, world=""), 0.5),
-        pytest.param(12, RecordedCase(branches=2, sparsity=80.0, balanced=True, world=""), 0.8, marks=LONG),
-        pytest.param(6, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5, marks=LONG),
-        (12, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5),
-        pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=True, world=""), 0.01, marks=LONG),
-        pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=False, world=""), 0.01, marks=LONG),
-    ],
-)
+@pytest.mark.parametrize(("vehicles", "case", "least"), [
+    (6, RecordedCase(branches=2, sparsity=80.0, balanced=True, world=""), 0.5),
+    pytest.param(12, RecordedCase(branches=2, sparsity=80.0, balanced=True, world=""), 0.8, marks=LONG),
+    pytest.param(6, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5, marks=LONG),
+    (12, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5),
+    pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=True, world=""), 0.01, marks=LONG),
+    pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=False, world=""), 0.01, marks=LONG),
+])  # fmt: skip
 def test_enough_vehicles_with_faulty_sensors_are_corrected_and_none_is_harmed(
     trips: RecordedFleet, vehicles: int | None, case: RecordedCase, least: float
 ) -> None:

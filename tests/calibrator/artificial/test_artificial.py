@@ -16,9 +16,8 @@ from ecu_node.database import VehicleDatabase
 
 TIME_S = np.arange(600) * 0.1
 BATTERY_A = 50.0 * np.sin(TIME_S / 3.0)
-TRIP = GroundTruth(
-    name="t", period_s=0.1, currents_a={"battery": BATTERY_A, "motor": -BATTERY_A}, inputs={"speed": np.full(600, 50.0)}
-)
+CURRENTS_A = {"battery": BATTERY_A, "motor": -BATTERY_A}
+TRIP = GroundTruth(name="t", period_s=0.1, currents_a=CURRENTS_A, inputs={"speed": np.full(600, 50.0)})
 FAULTS = Faults(
     hardware_drift=np.array(0.0),
     hardware_offset_a=np.zeros(2),

@@ -78,6 +78,16 @@ def test_harm_probability_equals_that_of_simulated_currents() -> None:
     assert 0.0 < worse.mean() < 1.0
 
 
+def test_harm_on_two_drives_is_at_most_the_sum_of_both_and_0_without_a_correction() -> None:
+    found, estimate = points(TWO_EXPLANATIONS, sd=0.05), np.array([0.12, 0.0, 0.0, 0.0])
+    one, other = (np.array([[0.1, -0.1]]), np.full((1, K), 0.05)), (np.zeros((1, K)), np.full((1, K), 1e-4))
+    apart = [harm_probability(found, estimate, *drive)[0] for drive in (one, other)]
+    for drives in ((one, other), (other, one)):
+        both = harm_probability(found, estimate, *map(np.concatenate, zip(*drives, strict=True)))
+        assert max(apart) <= both[0] <= min(sum(apart), 1.0)
+        assert both[1] == 0.0
+
+
 def explained(
     truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0, probability: float = 1.0
 ) -> tuple[FaultModel, Draws, Array]:

@@ -53,9 +53,8 @@ def reference(summaries: Summaries) -> fleet_estimate.FleetReference:
 def test_faults_beyond_the_limits_are_estimated_but_not_corrected(
     summaries: Summaries, reference: fleet_estimate.FleetReference
 ) -> None:
-    free, limited = (
-        fleet_estimate.estimate_vehicles(summaries, reference, limits=limits) for limits in (None, (0.1, 1e3))
-    )
+    both = (None, (0.1, 1e3))
+    free, limited = (fleet_estimate.estimate_vehicles(summaries, reference, limits=limits) for limits in both)
     beyond = free.corrected & (np.abs(free.drift) > 0.1)
     assert beyond.any()
     assert (limited.held_back[beyond] == "beyond the limits").all()

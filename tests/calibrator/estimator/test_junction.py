@@ -81,11 +81,8 @@ def test_corrections_of_random_junctions_raise_no_error_by_more_than_0_05_percen
     # of two branches the declared load leaves one offset; of three the gain alone is corrected
     ({"offset_a": (0.0, 4.0, 0.0), "load_a": 3.0}, {"trusted": ["battery", "heater"], "load": (3.0, 0.2)}, {"motor"}),
     ({"gain": (0.0, 0.1, 0.0), "offset_a": (0.0, 0.0, 6.0)}, {"trusted": ["battery"], "load": (0.0, 0.1)}, {"motor"}),
-    (
-        {"gain": (0.4, 0.0, 0.0), "offset_a": (3.0, 0.0, 0.0), "load_a": 30.0},
-        {"trusted": ["motor", "heater"], "load": (30.0, 0.1)},
-        {"battery"},
-    ),
+    ({"gain": (0.4, 0.0, 0.0), "offset_a": (3.0, 0.0, 0.0), "load_a": 30.0},
+     {"trusted": ["motor", "heater"], "load": (30.0, 0.1)}, {"battery"}),
     ({}, {"trusted": ["battery"], "load": (0.0, 0.1)}, set()),
 ])  # fmt: skip
 def test_faults_are_estimated_within_3_sd_and_only_sure_branches_are_corrected(
@@ -341,14 +338,9 @@ def test_errors_of_estimated_gains_match_their_standard_deviations() -> None:
     (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
     (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
     (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
-    *(
-        (
-            lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
-            {"charge_ah": {"battery": (1.0, 0.1)}},
-            "have no samples of it",
-        )
-        for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)
-    ),
+    *((lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
+       {"charge_ah": {"battery": (1.0, 0.1)}}, "have no samples of it")
+      for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)),
 ])  # fmt: skip
 def test_junction_calibrator_refuses_wrong_arguments_and_data_with_one_line(
     motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str

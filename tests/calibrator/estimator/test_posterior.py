@@ -83,9 +83,8 @@ def test_residuals_are_zero_for_true_faults_beside_shared_errors(K: int, of_sens
     theta = parameters_of(own, group)
     theta[:, 2 * K : 3 * K] = own.offset_a / (1.0 + both.drift)
     rows = rows_of(both, errors=READ, noise=0.0, load=0.0 if of_sensor else group)
-    left = posterior.row_residuals(
-        plain_evidence(rows, centre=model_of_equals(K, shared).spread.mean, shared=shared), theta[:, None]
-    )[:, 0]
+    evidence = plain_evidence(rows, centre=model_of_equals(K, shared).spread.mean, shared=shared)
+    left = posterior.row_residuals(evidence, theta[:, None])[:, 0]
     np.testing.assert_allclose(left[rows.known], 0.0, atol=1e-12)
 
 

@@ -61,6 +61,7 @@ def test_sum_shows_the_offset_before_and_not_after_correction(log: Path) -> None
     found = figures(log, "--layout", LAYOUT)
     assert found["before"]["sum"]["rmse_a"] == pytest.approx(12.0, abs=0.02)
     assert found["before"]["sum"]["rmse_percent"] == pytest.approx(3.0, abs=0.005)
+    assert found["before"]["battery"]["mean_a"] == pytest.approx(12.0 + 100.0 * np.sin(TIME_S).mean(), abs=0.5)
     assert found["after"]["sum"]["max_a"] < 0.03
     assert found["change"]["battery"]["mean_a"] == pytest.approx(-12.0, abs=0.02)
     assert found["change"]["motor"]["max_a"] < 0.03

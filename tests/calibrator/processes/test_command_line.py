@@ -30,9 +30,7 @@ class Finder:
 sys.meta_path.insert(0, Finder())
 run()
 """
-IMPORTING = (
-    "from calibrator.processes import interrupts\nwith interrupts.importing(): os.kill(os.getpid(), signal.SIGINT)"
-)
+IMPORTING = "from calibrator.processes.interrupts import *\nwith importing(): os.kill(os.getpid(), signal.SIGINT)"
 
 
 @pytest.mark.parametrize(("code", "exit_code", "said"), [
@@ -66,10 +64,8 @@ def test_ctrl_c_and_sigterm_end_readers(
     log, temporary = tmp_path / "V1" / "endless.log.gz", short_folder
     log.parent.mkdir()
     log.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
-    command = [
-        *(sys.executable, "-m", "calibrator", "import", str(log.parent), "--workers", "1"),
-        *("--layout", str(LAYOUT), "--out", str(tmp_path / "store")),
-    ]
+    command = [sys.executable, "-m", "calibrator", "import", str(log.parent), "--workers", "1"]
+    command += ["--layout", str(LAYOUT), "--out", str(tmp_path / "store")]
     environment = {**os.environ, "TMPDIR": str(temporary)}
     environment.pop("COVERAGE_PROCESS_CONFIG", None)  # tracing holds up the end until threads miss their workers
     options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True, "env": environment}

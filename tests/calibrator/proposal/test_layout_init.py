@@ -91,35 +91,22 @@ def test_battery_current_is_found_under_usual_names_and_units(kind: str, tmp_pat
     assert [b.source for b in layout.branch] == [f"Status1.{name}", PACK_AND_MOTOR["motor"][0]]
 
 
-LEFT_OUT = {
-    "12 V beside it": (
-        'BO_ 1 BAT11: 8 EMS\n SG_ BAT_SNSR_I : 0|16@1+ (0.01,-327) [-327|328] "A" INV\n'
-        ' SG_ BAT_SNSR_V : 16|14@1+ (0.001,6) [6|18] "V" INV\n',
-        "BAT_SNSR_V beside it is at most 18 V: not at the junction",
-    ),
-    "nothing of a high voltage": (
-        'BO_ 1 Mgmt: 8 EMS\n SG_ BSBattCurrent : 0|14@1+ (0.0625,-512) [0|0] "Amps" INV\n',
-        "nothing says that it is of a high-voltage battery",
-    ),
-    "a limit": (
-        'BO_ 1 Pack: 8 BMS\n SG_ PackMaxCurrent : 0|16@1- (0.1,0) [-500|500] "A" INV\n',
-        "'max': a limit, demand, estimate or part of one",
-    ),
-    "in a message of limits": (
-        'BO_ 1 BMS_Limits: 8 BMS\n SG_ Discharge_Current : 0|16@1+ (0.1,0) [0|0] "A" INV\n',
-        "its message has 'limits': no measured flow",
-    ),
-    "of nowhere": (
-        'BO_ 1 Shunt: 8 EMS\n SG_ Current : 0|32@1- (1,0) [0|0] "mA" INV\n',
-        "neither name, comment nor sender says where it flows",
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", LEFT_OUT)
-def test_reason_is_given_why_a_current_is_not_taken_as_that_of_the_pack(kind: str, tmp_path: Path) -> None:
-    message, why = LEFT_OUT[kind]
-    path = database_file(tmp_path, message, INVERTER)
+@pytest.mark.parametrize(("message", "signals", "why"), [
+    ("BAT11: 8 EMS", ('BAT_SNSR_I : 0|16@1+ (0.01,-327) [-327|328] "A"', 'BAT_SNSR_V : 16|14@1+ (0.001,6) [6|18] "V"'),
+     "BAT_SNSR_V beside it is at most 18 V: not at the junction"),
+    ("Mgmt: 8 EMS", ('BSBattCurrent : 0|14@1+ (0.0625,-512) [0|0] "Amps"',),
+     "nothing says that it is of a high-voltage battery"),
+    ("Pack: 8 BMS", ('PackMaxCurrent : 0|16@1- (0.1,0) [-500|500] "A"',),
+     "'max': a limit, demand, estimate or part of one"),
+    ("BMS_Limits: 8 BMS", ('Discharge_Current : 0|16@1+ (0.1,0) [0|0] "A"',),
+     "its message has 'limits': no measured flow"),
+    ("Shunt: 8 EMS", ('Current : 0|32@1- (1,0) [0|0] "mA"',), "neither name, comment nor sender says where it flows"),
+])  # fmt: skip
+def test_reason_is_given_why_a_current_is_not_taken_as_that_of_the_pack(
+    message: str, signals: tuple[str, ...], why: str, tmp_path: Path
+) -> None:
+    lines = "".join(f" SG_ {signal} INV\n" for signal in signals)
+    path = database_file(tmp_path, f"BO_ 1 {message}\n{lines}", INVERTER)
     run = calibrator("layout", "init", path, "--out", tmp_path / "car.toml")
     assert run.returncode == 1
     assert not (tmp_path / "car.toml").exists()
@@ -129,19 +116,15 @@ def test_reason_is_given_why_a_current_is_not_taken_as_that_of_the_pack(kind: st
 
 
 def test_charger_is_proposed_without_a_log_only_if_the_dbc_has_no_motor(tmp_path: Path) -> None:
-    charger = (
-        'BO_ 5 Chg: 8 OBC\n SG_ CHG_Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS\n'
-        ' SG_ CHG_Volts : 16|16@1+ (0.1,0) [0|1] "Volts" BMS\n'
-    )
+    amps, volts = 'Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS', 'Volts : 16|16@1+ (0.1,0) [0|1] "Volts" BMS'
+    charger = f"BO_ 5 Chg: 8 OBC\n SG_ CHG_{amps}\n SG_ CHG_{volts}\n"
     assert found(database_file(tmp_path, PACK, charger)).find_branch("charger").source == "Chg.CHG_Amps"
     assert signed(found(database_file(tmp_path, PACK, charger, INVERTER))) == PACK_AND_MOTOR
 
 
 def test_motor_current_is_computed_from_torque_and_speed_if_not_measured(tmp_path: Path) -> None:
-    motor = (
-        'BO_ 2 x1DA: 8 INV\n SG_ MG_EffectiveTorque : 0|11@1- (0.5,0) [-274|274] "Nm" BMS\n'
-        ' SG_ MG_OutputRevolution : 16|15@1- (1,0) [-16382|16382] "rpm" BMS\n'
-    )
+    torque, speed = '0|11@1- (0.5,0) [-274|274] "Nm" BMS', '16|15@1- (1,0) [-16382|16382] "rpm" BMS'
+    motor = f"BO_ 2 x1DA: 8 INV\n SG_ MG_EffectiveTorque : {torque}\n SG_ MG_OutputRevolution : {speed}\n"
     branch = found(database_file(tmp_path, PACK, motor)).find_branch("motor")
     assert (branch.formula, branch.uncertainty) == ("torque * motor_speed * 0.10472 / voltage", 0.1)
 
@@ -346,7 +329,6 @@ def test_branches_given_by_the_user_keep_their_sign_and_need_no_confirmation(tab
 
 
 @pytest.mark.parametrize(("line", "said"), [
-    ("none.dbc", "no such file"),
     ("car.dbc --log other.log", "none of its identifiers is in"),
     ("car.dbc --log other.csv", "none of its columns is in"),
     ("two.dbc --log two.csv", "column 'PackCurrent' could be PackStatus.PackCurrent and Twin.PackCurr"),

@@ -64,10 +64,8 @@ def test_every_log_format_is_read_completely_compressed_or_not(tmp_path: Path, s
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".csv"])
 def test_frames_of_can_fd_are_read_with_all_their_bytes(tmp_path: Path, suffix: str) -> None:
-    messages = [
-        can.Message(timestamp=1.7e9 + k, arbitration_id=0x123, is_extended_id=False, is_fd=True, data=bytes(range(n)))
-        for k, n in enumerate((3, 8, 12, 64))
-    ]
+    fd: dict[str, Any] = {"arbitration_id": 0x123, "is_extended_id": False, "is_fd": True}
+    messages = [can.Message(timestamp=1.7e9 + n, data=bytes(range(n)), **fd) for n in (3, 8, 12, 64)]
     frames = read_frames(write_log(tmp_path / f"fd{suffix}", messages))
     assert contents(frames) == expected_contents(messages)
     assert frames.data.shape == (4, 64)

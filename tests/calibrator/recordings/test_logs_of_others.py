@@ -265,21 +265,18 @@ def test_branch_can_be_computed_by_a_formula(tmp_path: Path, layout: Path) -> No
     assert (branch.computed, branch.uncertainty) == (True, 0.05)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (("signal = \"Motor.Current\"", 'formula = "torque / 2"'), "motor: torque is no [[input]] or [[derived]]"),
-        (("signal = \"Motor.Current\"", 'formula = "f(1)"'), "motor: formula 'f(1)': 'f(1)' is not allowed"),
-        (("sign = -1", 'sign = -1\nformula = "1"'), "'power' and 'voltage', or 'formula'"),
-        (("sign = -1", "sign = -1\nuncertainty = 0.1"), "motor: 'uncertainty' is that of a 'formula'"),
-        (("sign = -1", 'sign = -1\nunit = "km"'), "branch motor: signal Current is in 'km'; expected A, mA, kA"),
-        (("Motor.Current", "aux:Motor.Current"), "no [[bus]] is named 'aux'; known are none"),
-        (("full_scale_a", f"{BUSES}\nfull_scale_a"), "unknown key 'full_scale_a'"),
-        (('sign = -1', f'sign = -1\n{BUSES}'), "give either 'dbc', or [[bus]] with a 'dbc' each"),
-        (('dbc = "car.dbc"', ''), "no 'dbc', so that it fits tables only; give the DBC of the frames"),
-        (('dbc = "car.dbc"', 'dbc = "x.kcd"'), "x.kcd: cannot read the DBC: No such file"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("change", "words"), [
+    (("signal = \"Motor.Current\"", 'formula = "torque / 2"'), "motor: torque is no [[input]] or [[derived]]"),
+    (("signal = \"Motor.Current\"", 'formula = "f(1)"'), "motor: formula 'f(1)': 'f(1)' is not allowed"),
+    (("sign = -1", 'sign = -1\nformula = "1"'), "'power' and 'voltage', or 'formula'"),
+    (("sign = -1", "sign = -1\nuncertainty = 0.1"), "motor: 'uncertainty' is that of a 'formula'"),
+    (("sign = -1", 'sign = -1\nunit = "km"'), "branch motor: signal Current is in 'km'; expected A, mA, kA"),
+    (("Motor.Current", "aux:Motor.Current"), "no [[bus]] is named 'aux'; known are none"),
+    (("full_scale_a", f"{BUSES}\nfull_scale_a"), "unknown key 'full_scale_a'"),
+    (('sign = -1', f'sign = -1\n{BUSES}'), "give either 'dbc', or [[bus]] with a 'dbc' each"),
+    (('dbc = "car.dbc"', ''), "no 'dbc', so that it fits tables only; give the DBC of the frames"),
+    (('dbc = "car.dbc"', 'dbc = "x.kcd"'), "x.kcd: cannot read the DBC: No such file"),
+])  # fmt: skip
 def test_wrong_layout_is_refused_in_one_line(tmp_path: Path, layout: Path, change: tuple[str, str], words: str) -> None:
     assert change[0] in LAYOUT
     layout.write_text(LAYOUT.replace(*change))
@@ -293,20 +290,17 @@ def nameless_archive(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"a.log", b"\0.log"))
 
 
-@pytest.mark.parametrize(
-    ("name", "write", "words"),
-    [
-        ("x.log", lines("  can0  {id}   [8]  {data}"), "without times; record it with 'candump -L' or 'candump -ta'"),
-        ("x.csv", lines("{us},{id8},true,Rx,0,8,{cells}", GVRET.replace("LEN", "L")), "without the column 'LEN'"),
-        ("x.csv", lines("{us},{id8},true,Rx,0,8,ZZ", GVRET), "line 2 is damaged, and 80 of 80 lines are"),
-        ("x.zip", lambda path: path.write_bytes(b"PK nothing"), "x.zip: not a readable archive: File is not a zip"),
-        ("x.zip", nameless_archive, "x.zip: no logs in it; expected .log, .asc"),
-        ("x.zip", lambda path: zipfile.ZipFile(path, "w").close(), "x.zip: no logs in it; expected .log, .asc"),
-        ("x.log", lines("{n} {id} {data}"), "line 1 is damaged"),
-        ("x.log", lines("({epoch:.6f}) can0 100#{digits}"), "usable frames of battery only; a sum needs two branches"),
-        ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "write", "words"), [
+    ("x.log", lines("  can0  {id}   [8]  {data}"), "without times; record it with 'candump -L' or 'candump -ta'"),
+    ("x.csv", lines("{us},{id8},true,Rx,0,8,{cells}", GVRET.replace("LEN", "L")), "without the column 'LEN'"),
+    ("x.csv", lines("{us},{id8},true,Rx,0,8,ZZ", GVRET), "line 2 is damaged, and 80 of 80 lines are"),
+    ("x.zip", lambda path: path.write_bytes(b"PK nothing"), "x.zip: not a readable archive: File is not a zip"),
+    ("x.zip", nameless_archive, "x.zip: no logs in it; expected .log, .asc"),
+    ("x.zip", lambda path: zipfile.ZipFile(path, "w").close(), "x.zip: no logs in it; expected .log, .asc"),
+    ("x.log", lines("{n} {id} {data}"), "line 1 is damaged"),
+    ("x.log", lines("({epoch:.6f}) can0 100#{digits}"), "usable frames of battery only; a sum needs two branches"),
+    ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
+])  # fmt: skip
 def test_unusable_log_is_refused_with_one_line(
     tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str
 ) -> None:

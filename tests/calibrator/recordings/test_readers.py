@@ -136,9 +136,8 @@ def test_missing_values_become_sna_and_large_saturate(
 
 
 def test_writing_a_floating_point_signal_is_refused() -> None:
-    database = big_endian_database(
-        BIG_ENDIAN_DBC.replace("M: 8", "M: 16").replace("40|9@1-", "64|32@1-") + "SIG_VALTYPE_ 100 C : 1;\n"
-    )
+    dbc = BIG_ENDIAN_DBC.replace("M: 8", "M: 16").replace("40|9@1-", "64|32@1-")
+    database = big_endian_database(f"{dbc}SIG_VALTYPE_ 100 C : 1;\n")
     with pytest.raises(DatabaseError, match=r"^signal C is a float; only whole-numbered signals can be written"):
         encode_message(database, "M", np.zeros(1), {"C": np.array([1.5])})
     assert len(encode_message(database, "M", np.zeros(1), {"B": np.array([1.0])}).data) == 1

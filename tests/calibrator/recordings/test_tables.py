@@ -157,16 +157,10 @@ def test_rows_without_time_or_with_too_many_cells_are_left_out_and_counted(tmp_p
     assert "2 damaged lines or frames left out" in found["notices"]
 
 
-@pytest.mark.parametrize(
-    "index",
-    [
-        pd.Index([*range(50), *range(60, ROWS + 10)]),
-        dates(),
-        dates().set_names("time"),
-        pd.MultiIndex.from_arrays([["V1"] * ROWS, TIME_S], names=["vehicle", "time"]),
-    ],
-    ids=["row numbers", "index without a name", "index named like a column", "index of vehicle and time"],
-)
+@pytest.mark.parametrize("index", [
+    pd.Index([*range(50), *range(60, ROWS + 10)]), dates(), dates().set_names("time"),
+    pd.MultiIndex.from_arrays([["V1"] * ROWS, TIME_S], names=["vehicle", "time"]),
+])  # fmt: skip
 def test_column_of_times_takes_precedence_over_the_index(tmp_path: Path, index: pd.Index) -> None:
     frame().set_axis(index).to_parquet(tmp_path / "x.parquet")
     table = read_table(tmp_path / "x.parquet")
@@ -225,15 +219,12 @@ def powers() -> pd.DataFrame:
 
 def write_layout_with_dbc(folder: Path, battery: str, motor: str) -> Path:
     """A layout of two currents of the messages Bms (-90 to 90 A) and Inv (mA)."""
-    (folder / "car.dbc").write_text(
-        f'VERSION ""\nBU_: C\nBO_ 1 Bms: 8 C\n SG_ {battery} : 0|16@1- (0.1,0) [-90|90] "A" C\n'
-        f'BO_ 2 Inv: 8 C\n SG_ {motor} : 0|16@1- (1,0) [0|0] "mA" C\n'
-    )
-    (folder / "car.toml").write_text(
-        'schema = 1\nname = "car"\ndbc = "car.dbc"\nfull_scale_a = 100\nbranch = [\n'
-        f'{{ name = "battery", signal = "Bms.{battery}", sign = 1 }}, '
-        f'{{ name = "motor", signal = "Inv.{motor}", sign = -1 }}]\n'
-    )
+    bms, inv = f'{battery} : 0|16@1- (0.1,0) [-90|90] "A" C', f'{motor} : 0|16@1- (1,0) [0|0] "mA" C'
+    (folder / "car.dbc").write_text(f'VERSION ""\nBU_: C\nBO_ 1 Bms: 8 C\n SG_ {bms}\nBO_ 2 Inv: 8 C\n SG_ {inv}\n')
+    sources = {"battery": (f"Bms.{battery}", 1), "motor": (f"Inv.{motor}", -1)}
+    branches = [f'{{ name = "{name}", signal = "{x}", sign = {sign} }}' for name, (x, sign) in sources.items()]
+    head = 'schema = 1\nname = "car"\ndbc = "car.dbc"\nfull_scale_a = 100\n'
+    (folder / "car.toml").write_text(f"{head}branch = [{', '.join(branches)}]\n")
     return folder / "car.toml"
 
 
@@ -295,24 +286,21 @@ def test_branch_of_a_table_is_a_column_or_a_quotient_of_columns(tmp_path: Path, 
         require_sum(before(tmp_path / "x.csv", *branches))
 
 
-@pytest.mark.parametrize(
-    ("text", "branches", "words"),
-    [
-        ("", BRANCHES, "x.csv: the file is empty; a header and rows of numbers are expected"),
-        ("time;a;b\n", BRANCHES, "x.csv: no row of numbers below the header"),
-        ("0,1,2\n1,2,3\n2,3,4\n", BRANCHES, "x.csv: no header: line 1 has numbers; write the names of the columns"),
-        ("hello\nworld\n", BRANCHES, "x.csv: no table: the first line is 'hello'; columns between commas"),
-        ("time,a\n0,1\n", "a=a,b=b", "x.csv: 1 rows of values; a header and at least two rows are expected"),
-        ("a,b\n3,1\n2,2\n3,1\n", "a,b", "x.csv: no column is the time: none has it in its name and increases"),
-        ("time,a\n0,1x\n1,2y\n", "a,b", "x.csv: no column of numbers beside the time"),
-        ("time,Ibat,Imot\n0,1 A,2\n1,2 A,3\n", "Ibat,Imot", "column 'Ibat': its cells are no numbers, such as '1 A' i"),
-        ("time;I;J\n0.1;20,930;2\n0.2;-22,360;3\n", "I,J", "column 'I': its cells are no numbers, such as '20,930' in"),
-        ("time;I;J\n0,1;1.234;2\n0,2;2.345;3\n", "I,J", "x.csv: column 'I': '1.234' may be 1234 or 1,234; write it wi"),
-        ("time,I [A],I (mA)\n0,1,2\n1,2,3\n", "I,Imot", "'I' stands for 'I [A]', 'I (mA)'; write it in full"),
-        ("time,I [V],J\n0,1,2\n1,2,3\n", "I,J", "branch I: I is in 'V'; expected A, mA, kA"),
-        ("time,I,J\n0,True,2\n1,False,3\n", "I,J", "branch I: I is in 'on/off'; expected A, mA, kA"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "branches", "words"), [
+    ("", BRANCHES, "x.csv: the file is empty; a header and rows of numbers are expected"),
+    ("time;a;b\n", BRANCHES, "x.csv: no row of numbers below the header"),
+    ("0,1,2\n1,2,3\n2,3,4\n", BRANCHES, "x.csv: no header: line 1 has numbers; write the names of the columns"),
+    ("hello\nworld\n", BRANCHES, "x.csv: no table: the first line is 'hello'; columns between commas"),
+    ("time,a\n0,1\n", "a=a,b=b", "x.csv: 1 rows of values; a header and at least two rows are expected"),
+    ("a,b\n3,1\n2,2\n3,1\n", "a,b", "x.csv: no column is the time: none has it in its name and increases"),
+    ("time,a\n0,1x\n1,2y\n", "a,b", "x.csv: no column of numbers beside the time"),
+    ("time,Ibat,Imot\n0,1 A,2\n1,2 A,3\n", "Ibat,Imot", "column 'Ibat': its cells are no numbers, such as '1 A' i"),
+    ("time;I;J\n0.1;20,930;2\n0.2;-22,360;3\n", "I,J", "column 'I': its cells are no numbers, such as '20,930' in"),
+    ("time;I;J\n0,1;1.234;2\n0,2;2.345;3\n", "I,J", "x.csv: column 'I': '1.234' may be 1234 or 1,234; write it wi"),
+    ("time,I [A],I (mA)\n0,1,2\n1,2,3\n", "I,Imot", "'I' stands for 'I [A]', 'I (mA)'; write it in full"),
+    ("time,I [V],J\n0,1,2\n1,2,3\n", "I,J", "branch I: I is in 'V'; expected A, mA, kA"),
+    ("time,I,J\n0,True,2\n1,False,3\n", "I,J", "branch I: I is in 'on/off'; expected A, mA, kA"),
+])  # fmt: skip
 def test_unusable_table_or_wrong_branches_are_refused(tmp_path: Path, text: str, branches: str, words: str) -> None:
     (tmp_path / "x.csv").write_text(text)
     assert words in refused("kirchhoff", tmp_path / "x.csv", "--branches", branches)
