@@ -78,6 +78,13 @@ def test_harm_probability_equals_that_of_simulated_currents() -> None:
     assert 0.0 < worse.mean() < 1.0
 
 
+def test_confidence_adds_up_explanations_within_tolerance() -> None:
+    found = points([(0.4, [0.2, 0, 0, 0]), (0.3, [0, 0.1, 0, 0]), (0.3, [0, 0.1004, 0, 0])], sd=1e-6)
+    estimate, confidence = best_estimate(found, LEAST)
+    assert estimate[1] == pytest.approx(0.1, abs=1e-3)
+    assert confidence == pytest.approx(0.6)
+
+
 def test_harm_on_two_drives_is_at_most_the_sum_of_both_and_0_without_a_correction() -> None:
     found, estimate = points(TWO_EXPLANATIONS, sd=0.05), np.array([0.12, 0.0, 0.0, 0.0])
     one, other = (np.array([[0.1, -0.1]]), np.full((1, K), 0.05)), (np.zeros((1, K)), np.full((1, K), 1e-4))

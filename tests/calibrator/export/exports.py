@@ -1,16 +1,15 @@
 """Parameter files to export, and the command line."""
 
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
-from calibrator.cli import app
 from calibrator.export.core import Checked, read_checked
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import UserError
 from ecu_node.parameters import VehicleParameters, write_parameters
+from tests.calibrator import command_here
 from tests.ecu_node.vehicles import LAYOUT
 
 __all__ = ["checked_with", "export", "needs", "refused"]
@@ -28,12 +27,9 @@ def checked_with(database: VehicleDatabase, parameters: VehicleParameters, folde
     return read_checked(folder / "v1.json", database, None)
 
 
-def export(*arguments: object, layout: Path = LAYOUT) -> Result:
-    return CliRunner().invoke(app, ["export", *map(str, arguments), "--layout", str(layout)])
+def export(*arguments: object, layout: Path = LAYOUT) -> "subprocess.CompletedProcess[str]":
+    return command_here.calibrator("export", *arguments, "--layout", layout)
 
 
-def refused(*arguments: object, layout: Path = LAYOUT) -> UserError:
-    error = export(*arguments, layout=layout).exception
-    assert isinstance(error, UserError)
-    assert "\n" not in str(error)
-    return error
+def refused(*arguments: object, layout: Path = LAYOUT) -> str:
+    return command_here.refused("export", *arguments, "--layout", layout)

@@ -13,7 +13,6 @@ from calibrator.errors import ExportError
 from calibrator.export.core import Checked
 from calibrator.export.tool_formats import cdfx_text, dcm_text
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import ParameterError
 from ecu_node.parameters import BranchParameters, write_parameters
 from tests.calibrator.export.exports import checked_with, export, refused
 from tests.ecu_node.vehicles import SMALL_LAYOUT, MakeDatabase, parameters_for
@@ -33,22 +32,20 @@ def test_export_replaces_a_different_file_only_with_replace(form: str, params: P
     arguments = (params, "--format", form, "--output", out)
     for _ in range(2):  # the same again is no error
         run = export(*arguments)
-        assert (run.exit_code, run.stderr, run.stdout) == (0, "", f"{out}\n")
+        assert (run.returncode, run.stderr, run.stdout) == (0, "", f"{out}\n")
     content = out.read_bytes()
     out.write_text("mine")
-    with pytest.raises(ExportError, match="exists; choose another --out, or replace it with --replace"):
-        raise refused(*arguments)
+    assert "exists; choose another --out, or replace it with --replace" in refused(*arguments)
     assert out.read_text() == "mine"
-    assert export(*arguments, "--replace").exit_code == 0
+    assert export(*arguments, "--replace").returncode == 0
     assert (out.read_bytes(), len(list(out.parent.iterdir()))) == (content, 1)
 
 
 def test_export_refuses_other_vehicles_and_layouts(params: Path, tmp_path: Path, make_database: MakeDatabase) -> None:
     more = ("--format", "c", "--output", tmp_path / "out")
-    with pytest.raises(ParameterError, match=r"v1\.json: parameters are for vehicle 'v1', this is 'v7'"):
-        raise refused(params, *more, "--vehicle", "v7")
-    with pytest.raises(ParameterError, match=r"made with layout hv_powertrain\.toml .*, this is .*small"):
-        raise refused(params, *more, layout=make_database().layout.path)
+    assert "v1.json: parameters are for vehicle 'v1', this is 'v7'" in refused(params, *more, "--vehicle", "v7")
+    said = refused(params, *more, layout=make_database().layout.path)
+    assert re.search(r"made with layout hv_powertrain\.toml .*, this is .*small", said)
     assert not (tmp_path / "out").exists()
 
 

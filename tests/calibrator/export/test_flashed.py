@@ -4,6 +4,7 @@ A program that was linked with another calibration gives the same bits as the no
 it, or the values of DCM or CDFX at the addresses of the A2L.
 """
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from fractions import Fraction
@@ -43,7 +44,7 @@ def written(vehicles: tuple[Path, Checked], form: str, out: Path) -> Path:
     program, checked = vehicles
     more, layout = ("--elf", program) if form in {"hex", "a2l"} else (), checked.database.layout.path
     run = export(program.with_name("v1.json"), "--format", form, "--output", out, *more, layout=layout)
-    assert run.exit_code == 0, run.output
+    assert run.returncode == 0, run.stderr
     return out
 
 
@@ -153,5 +154,5 @@ def test_numbers_with_more_digits_than_tools_have_are_refused(make_database: Mak
     dbc = Path(make_database().layout.dbc_path).read_text().replace("[-3000|3000]", "[-0.3|0.3]")
     database = make_database(dbc=dbc)
     write_parameters(parameters_for(database, battery=(0.051, 0.0)), tmp_path / "v1.json")
-    with pytest.raises(ExportError, match=r"branch battery: gain has more digits than .* --format hex"):
-        raise refused(tmp_path / "v1.json", "--format", "dcm", "--output", tmp_path / "x", layout=database.layout.path)
+    said = refused(tmp_path / "v1.json", "--format", "dcm", "--output", tmp_path / "x", layout=database.layout.path)
+    assert re.search("branch battery: gain has more digits than .* --format hex", said)
