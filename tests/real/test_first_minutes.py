@@ -10,12 +10,9 @@ from typing import Any
 
 import pytest
 
-from calibrator.drives.store import iterate_drives
-from calibrator.files.layout_files import vehicle_database
 from tests.calibrator.command_here import calibrator as calibrator_here
 from tests.calibrator.doctor.artificial_logs import examined
-from tests.calibrator.drive_logs import write_drive_log
-from tests.real.conftest import LAYOUT, ROOT
+from tests.real.conftest import ROOT
 
 Change = Callable[[str], str]
 
@@ -117,19 +114,3 @@ def test_doctor_finds_each_injected_mistake_and_no_other(
     found = examined(tmp_path / "layout.toml", tesla / "drive.log.gz").findings()
     grave = [item for item in found if item.severity == "error" or item.code == "exchanged"]
     assert sorted((item.severity, item.code, item.subject) for item in grave or found) == findings
-
-
-@pytest.mark.parametrize("trip", ["TripA07", "TripA24"])
-def test_doctor_finds_no_error_in_i3_trips_and_an_inverted_motor(trip: str, i3_store: Path, tmp_path: Path) -> None:
-    """The motor current of these trips is minus the sum of the others, so the junction sum is exactly 0.
-
-    Which sign is wrong, that of battery or motor, follows from the voltage.
-    """
-    database = vehicle_database(LAYOUT)
-    drive = next(d for d in iterate_drives(i3_store, database.layout) if d.name == trip)
-    write_drive_log(tmp_path / "trip.log.gz", drive, database)
-    assert examined(LAYOUT, tmp_path / "trip.log.gz").errors == []
-    text = LAYOUT.read_text().replace('dbc = "hv', f'dbc = "{ROOT}/dbc/hv')
-    changed = re.sub(r'("HV_Motor.MotorCurrent"\nsign = )-1', r"\g<1>1", text)
-    (tmp_path / "wrong.toml").write_text(changed)
-    assert examined(tmp_path / "wrong.toml", tmp_path / "trip.log.gz").errors == [("sign", "motor")]

@@ -3,27 +3,14 @@
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from calibrator import JunctionCalibrator, read_log
-from tests.calibrator.command_here import calibrator as command
 
 
 @pytest.fixture(scope="module")
 def stations(i3_charges: Path) -> JunctionCalibrator:
     return JunctionCalibrator(meter="charger", trusted=["battery"]).fit(i3_charges / "car", i3_charges / "layout.toml")
-
-
-def test_two_trusted_charging_stations_that_differ_are_a_contradiction(i3_charges: Path, tmp_path: Path) -> None:
-    """The meters of the two differ by 2.4 %; nothing is corrected."""
-    done = command(
-        "calibrate", i3_charges / "car", "--layout", i3_charges / "layout.toml",
-        "--meter", "charger", "--trusted", "charger", "--out", tmp_path / "r",
-    )  # fmt: skip
-    assert done.returncode == 0
-    assert "what is known contradicts itself" in done.stdout
-    assert not pd.read_parquet(tmp_path / "r" / "results.parquet").applied.any()
 
 
 def test_offset_of_a_station_is_known_only_with_a_declared_load(i3_charges: Path, stations: JunctionCalibrator) -> None:

@@ -75,6 +75,14 @@ def test_no_piece_of_a_recording_is_in_both_the_calibration_and_the_unseen_trip_
     assert levels(single.trip(0, "calibration")).isdisjoint(levels(single.trip(0, "unseen")))
 
 
+def test_builtin_trip_obeys_the_junction_law_and_has_all_channels(database: VehicleDatabase) -> None:
+    trip = builtin_trip(np.random.default_rng(7), duration_s=300.0, name="trip")
+    np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
+    assert set(trip.currents_a) == set(database.layout.branch_names)
+    not_modelled = {"contactor_state", "junction_box_temperature"}  # logs hold "not available" for them
+    assert set(trip.inputs) == {item.name for item in database.layout.input} - not_modelled
+
+
 def test_builtin_trip_without_fastsim_is_refused_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fastsim", None)  # makes its import fail
     with pytest.raises(FleetError, match=r"need fastsim; .*: pip install 'hv-current-correction\[demo\]'$"):

@@ -122,6 +122,13 @@ def test_doubtful_gain_ratios_reveal_no_shared_gain_error() -> None:
     np.testing.assert_allclose(models[0].spread.mean[rows.places.ratios], [0.05, 0.0], atol=0.002)
 
 
+def test_prior_is_learnt_from_sensors_that_read_only_a_tenth_of_the_current() -> None:
+    """As where half of the vehicles report a branch in another unit."""
+    faults = no_faults(12, 3)
+    faults.drift[:5, 2] = -0.9
+    assert learned(rows_of(faults, seed=10)).prior.gain.high > 0.8
+
+
 def test_load_in_a_single_vehicle_does_not_make_loads_probable() -> None:
     """What it shows may also be an offset of the feeding sensor; the other vehicles have neither."""
     faults = no_faults(8, 2)

@@ -12,7 +12,7 @@ from calibrator.drive import Array
 from calibrator.estimator.evidence import evidence_names
 from calibrator.estimator.fleet_estimate import FleetEstimate, reported_evidence
 from calibrator.estimator.posterior import Spread
-from calibrator.estimator.vehicle_parameters import deciding_evidence, impossible
+from calibrator.estimator.vehicle_parameters import deciding_evidence
 from calibrator.estimator.vehicle_report import explained
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, SensorFinding
@@ -161,8 +161,3 @@ def test_reported_evidence_without_noise_equals_that_of_the_true_faults() -> Non
     np.testing.assert_allclose(value[names.index("offset read motor")], faults.offset_a[:, 1] * scale)
     np.testing.assert_allclose(sd[names.index("slope motor")], 0.002 * value[names.index("slope motor")])
     np.testing.assert_allclose(sd[names.index("offset read battery")], 0.001 * scale)
-
-
-def test_gain_error_above_100_percent_is_refused_as_impossible() -> None:
-    assert impossible(estimate(of(1.0, drift=(0.9, 0))), 0, NAMES) == ""
-    assert "its motor sensor reads 2.2 times the current" in impossible(estimate(of(1.0, drift=(0, 1.2))), 0, NAMES)

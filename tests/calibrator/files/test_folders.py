@@ -13,15 +13,6 @@ from calibrator.files.storage import Storage, StorageError, open_storage, walk
 from ecu_node.errors import UserError
 
 
-def test_folder_appears_only_when_it_is_complete(tmp_path: Path) -> None:
-    out = tmp_path / "a" / "out"
-    with folders.whole_folder(out) as partial:
-        (partial / "x").write_text("1")
-        assert not out.exists()
-    assert [path.name for path in out.iterdir()] == ["x"]
-    assert [path.name for path in out.parent.iterdir()] == ["out"]
-
-
 def test_folder_that_is_not_empty_is_refused_and_unchanged(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("1")

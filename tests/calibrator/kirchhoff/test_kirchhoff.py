@@ -94,7 +94,7 @@ def test_sensor_noise_widens_the_expected_band(noise_a: float, tmp_path: Path) -
     battery, motor = MOTOR_A + noise_a * rng.normal(size=1200), -MOTOR_A
     expected = figures(*table(tmp_path, battery=battery, motor=motor))["expected"]
     assert expected["parts_a"]["noise"] == pytest.approx(noise_a, rel=0.15)
-    far = figures(*table(tmp_path, battery=battery + 10.0 * noise_a, motor=motor))["expected"]
+    far = figures(*table(tmp_path, battery=battery + 4.0 * noise_a, motor=motor))["expected"]
     assert expected["in_band"]["before"] > 0.9
     assert far["in_band"]["before"] < 0.5
 
