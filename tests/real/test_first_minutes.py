@@ -1,68 +1,34 @@
 """The first minutes of somebody with a DBC and a log: a recorded Tesla Model 3, and faults put into the recording."""
 
-import json
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.calibrator.command_here import calibrator as calibrator_here
+from tests.calibrator.command_here import calibrator, refused, reported, succeeded
 from tests.calibrator.doctor.artificial_logs import examined
-from tests.real.conftest import ROOT
 
 Change = Callable[[str], str]
 
 
-def calibrator(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    """Run a command in a folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        return calibrator_here(*arguments)
-
-
-def test_documented_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> None:
+def test_documented_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The commands are those of docs/first_minutes.md."""
-    made = calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "my_car.toml"])
+    monkeypatch.chdir(tesla)
+    made = calibrator("layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "my_car.toml")
     assert made.returncode == 0
     assert made.stdout.startswith("my_car.toml: branches battery, motor_rear, motor_front;")
     assert made.stderr.endswith("\nnext: calibrator doctor --layout my_car.toml --log drive.log.gz\n")
-    again = calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--out", "my_car.toml"])
-    assert again.returncode == 1
-    assert again.stderr.startswith("calibrator: my_car.toml: exists, and is not overwritten")
-    doctor = calibrator(tesla, *["doctor", "--layout", "my_car.toml", "--log", "drive.log.gz"])
-    assert doctor.returncode == 0, doctor.stdout
+    again = refused("layout", "init", "Model3CAN.dbc", "--out", "my_car.toml")
+    assert again.startswith("calibrator: my_car.toml: exists, and is not overwritten")
+    doctor = succeeded("doctor", "--layout", "my_car.toml", "--log", "drive.log.gz")
     ready = "ready for: kirchhoff, import, calibrate --trusted, ecu-node --gateway"  # too short for a fleet
-    assert ready in doctor.stdout.splitlines()
-    drawn = calibrator(tesla, *["kirchhoff", "drive.log.gz", "--layout", "my_car.toml", "--plot", "sum.html", "--json"])
-    assert drawn.returncode == 0, drawn.stderr
-    total = json.loads(drawn.stdout)["before"]["sum"]
+    assert ready in doctor.splitlines()
+    drawn = reported("kirchhoff", "drive.log.gz", "--layout", "my_car.toml", "--plot", "sum.html")
+    total = drawn["before"]["sum"]
     assert (round(total["mean_a"], 1), round(total["sd_a"], 1)) == (4.1, 1.2)
     assert (tesla / "sum.html").read_text().startswith("<html>")
-    imported = calibrator(tesla, *["import", "drive.log.gz", "--layout", "my_car.toml", "--out", "store"])
-    assert imported.returncode == 0, imported.stderr
-
-
-@pytest.mark.long
-def test_documented_node_commands_work_with_the_guessed_layout(tesla: Path) -> None:
-    """The commands of docs/first_minutes.md that need no bus; before them the load that it names."""
-    calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "one_car.toml"])
-    with (tesla / "one_car.toml").open("a") as file:
-        file.write("\n[unmeasured_load]\nmean_a = 4.1\nsd_a = 1.0\n")
-    section = (ROOT / "docs" / "first_minutes.md").read_text().partition("\n## With one car\n")[2]
-    typed = re.findall(r"(?m)^ecu-node (?:template|check) [^#\n]*", section.partition("\n## ")[0])
-    assert len(typed) == 2
-    environment = {"PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "HOME": str(tesla)}
-    for command in typed:
-        line = command.replace("my_car.toml", "one_car.toml")
-        process: dict[str, Any] = {"shell": True, "cwd": tesla, "env": environment}
-        done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60, **process)
-        assert (done.returncode, done.stderr) == (0, ""), command
-    assert done.stdout.startswith("vehicle V1, parameter set 1: fit\n")
-    assert json.loads((tesla / "V1.json").read_text())["junction_residual"]["expected_a"] == 4.1
+    succeeded("import", "drive.log.gz", "--layout", "my_car.toml", "--out", "store")
 
 
 def inverted(name: str) -> Change:
