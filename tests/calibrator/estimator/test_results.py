@@ -13,7 +13,7 @@ from calibrator.report.overview import overview_of
 from calibrator.summaries.identity import bucket_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, read_parameters
-from tests.calibrator.conftest import run_command
+from tests.calibrator.command_here import refused, succeeded
 from tests.calibrator.report.results_at_hand import RUN as AT_HAND
 from tests.calibrator.report.results_at_hand import six_vehicle_result
 from tests.ecu_node.vehicles import parameters_for
@@ -48,13 +48,12 @@ def test_error_for_a_vehicle_that_the_result_lacks_gives_its_name(result: Path, 
         results.written_of(result, name)
 
 
-def test_params_writes_files_of_all_or_none(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["params", str(result), "v1", "v2", "--out", str(tmp_path / "out")]) == 0
-    assert capsys.readouterr().out.splitlines() == [str(tmp_path / "out" / f"{name}.json") for name in ("v1", "v2")]
+def test_params_command_writes_the_files_of_all_named_vehicles_or_none(result: Path, tmp_path: Path) -> None:
+    written = succeeded("params", result, "v1", "v2", "--out", tmp_path / "out")
+    assert written.splitlines() == [str(tmp_path / "out" / f"{name}.json") for name in ("v1", "v2")]
     second = read_parameters(tmp_path / "out" / "v2.json")
     assert (second.vehicle, second.branches["motor"].offset_a) == ("v2", 1.0)
-    assert run_command(["params", str(result), "v1", "v9", "--out", str(tmp_path / "none")]) == 1
-    assert "no vehicle 'v9' in it" in capsys.readouterr().err
+    assert "no vehicle 'v9' in it" in refused("params", result, "v1", "v9", "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 

@@ -1,7 +1,6 @@
 """A node's own summary of a drive against that of its log, over a bus and through ``calibrator summarise``."""
 
 import argparse
-import json
 import time
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.parameters import BranchParameters
 from ecu_node.summary import decode_summary
-from tests.calibrator.conftest import run_command
+from tests.calibrator.command_here import reported, succeeded
 from tests.calibrator.drive_logs import write_drive_log
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
@@ -103,8 +102,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) 
     folder = tmp_path_factory.mktemp("on_board")
     log = folder / "logs" / "V1" / "drive.log.gz"
     write_drive_log(log, recorded_drive(), database)
-    arguments = ["summarise", str(folder / "logs"), "--layout", str(LAYOUT), "--out", str(folder / "of_log")]
-    assert run_command([*arguments, "--workers", "1"]) == 0
+    succeeded("summarise", folder / "logs", "--layout", LAYOUT, "--out", folder / "of_log", "--workers", 1)
     summary = node_on(folder / "vehicle", database, stored(folder / "of_log").delays.by_branch())
     with can.Bus(interface="virtual", channel="on_board", preserve_timestamps=True) as bus:
         replay(log, summary, bus)
@@ -123,8 +121,7 @@ def test_summary_made_on_board_equals_that_of_the_log(folder: Path, tmp_path: Pa
     of_log = stored(folder / "of_log")
     size = sum(path.stat().st_size for path in (folder / "vehicle" / "V1").iterdir())
     assert size < 20_000 * MINUTES / 60.0 + 5000  # besides the levels, which are there once per file
-    arguments = ["summarise", str(folder / "vehicle"), "--layout", str(LAYOUT), "--out", str(tmp_path)]
-    assert run_command(arguments) == 0
+    succeeded("summarise", folder / "vehicle", "--layout", LAYOUT, "--out", tmp_path)
     on_board = stored(tmp_path)
     full = of_log.summary.shortened(-(-len(of_log.summary.moments) // BATCH))
     size = np.sqrt(np.maximum(np.einsum("bii->bi", full.moments), 1e-9))
@@ -147,16 +144,14 @@ def test_summary_made_on_board_equals_that_of_the_log(folder: Path, tmp_path: Pa
         np.testing.assert_allclose(getattr(on_board.zero_current, name), reading, rtol=1e-6)
 
 
-def test_unusable_on_board_record_is_left_out(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_on_board_record_is_left_out(folder: Path, tmp_path: Path) -> None:
     (path,) = (folder / "vehicle" / "V1").iterdir()
     content = path.read_bytes()
     for vehicle, damaged in {"V1": content, "V2": content[:300], "V3": content, "V4": b"summary"}.items():
         (tmp_path / "vehicle" / vehicle).mkdir(parents=True)
         (tmp_path / "vehicle" / vehicle / "x.summary").write_bytes(damaged)
-    arguments = ["summarise", str(tmp_path / "vehicle"), "--layout", str(LAYOUT), "--out", str(tmp_path / "store")]
-    capsys.readouterr()
-    assert run_command([*arguments, "--json"]) == 0
-    left_out = json.loads(capsys.readouterr().out)["left_out"]
+    report = reported("summarise", tmp_path / "vehicle", "--layout", LAYOUT, "--out", tmp_path / "store")
+    left_out = report["left_out"]
     assert left_out.keys() == {"V2", "V3", "V4"}
     assert "damaged" in left_out["V2"]
     assert "a record of vehicle V1" in left_out["V3"]

@@ -19,7 +19,7 @@ from calibrator.summaries.record import Record, joined_records
 from calibrator.summaries.summarise_fleet import SummariseReport, add_drives, read_vehicle_summary
 from calibrator.summaries.summary_store import SummaryStore, open_store
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.conftest import run_command
+from tests.calibrator.command_here import calibrator, succeeded
 from tests.ecu_node.vehicles import LAYOUT
 
 EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("speed",), fleet_inputs=("speed",), notices=())
@@ -126,16 +126,15 @@ def test_reason_of_a_vehicle_names_its_drives_that_cannot_be_read(fleet: SmallFl
     assert re.search("s of usable data in 1 drive; at least 120 s are needed; b: .*b.parquet: not a drive", why)
 
 
-def test_summarise_fails_while_no_vehicle_is_usable(fleet: SmallFleet, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["summarise", str(fleet.drives), "--layout", str(LAYOUT), "--out", str(fleet.out)]
+def test_summarise_fails_as_long_as_the_store_has_no_usable_vehicle(fleet: SmallFleet) -> None:
+    arguments = ("summarise", fleet.drives, "--layout", LAYOUT, "--out", fleet.out)
     fleet.write("V1", samples=601)
-    assert run_command(arguments) == 1
-    said = capsys.readouterr()
-    assert "V1: 60" in said.out
-    assert "no vehicle could be summarised, for the reasons given above" in said.err
+    done = calibrator(*arguments)
+    assert (done.returncode, "V1: 60" in done.stdout) == (1, True)
+    assert "no vehicle could be summarised, for the reasons given above" in done.stderr
     fleet.write("V2")
     for _ in range(2):  # the second run adds nothing
-        assert run_command(arguments) == 0
+        succeeded(*arguments)
 
 
 def test_drives_of_other_branches_cannot_be_added(fleet: SmallFleet) -> None:
