@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from calibrator.drive import Array
 from calibrator.estimator import posterior
 from calibrator.estimator.evidence import EvidenceRows
-from calibrator.estimator.prior import GRID, LOAD_DENSITY, TAIL_DENSITY, Prior, Slab, first_prior, known_prior
+from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, first_prior, known_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import (
@@ -251,22 +251,6 @@ def test_moved_currents_are_as_many_as_are_kept_and_none_where_no_two_sensors_ha
 
 
 # Prior of the faults
-
-
-def mass(density: Array, low: float = 0.0, high: float = np.inf) -> float:
-    return float(np.trapezoid(np.where((low < GRID) & (high > GRID), density, 0.0), GRID))
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.05, 0.25), (0.004, 1.0), (0.1, 0.12)])
-@pytest.mark.parametrize("tail", [0.001, 0.1])
-def test_slab_is_uniform_between_its_bounds_and_has_its_tail_beyond(low: float, high: float, tail: float) -> None:
-    density = Slab(low=low, high=high, tail=tail).density
-    assert mass(density) == pytest.approx(1.0, abs=1e-9)
-    assert mass(density - tail * TAIL_DENSITY, 0.85 * low, 1.15 * high) == pytest.approx(1.0 - tail, abs=0.02)
-    middle = np.interp(np.linspace(1.1 * low, 0.9 * high, 9), GRID, density - tail * TAIL_DENSITY)
-    if low < 0.1:
-        np.testing.assert_allclose(middle, middle.mean(), rtol=0.06)
-    assert (density[(GRID > 0.002) & (GRID < 1.5)] > 0.0).all(), "no size is impossible"
 
 
 @BRANCHES
