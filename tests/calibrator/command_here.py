@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.calibrator.conftest import LAYOUT, run_command
+from calibrator.cli import run_calibrator
+from tests.calibrator.conftest import LAYOUT
 
 __all__ = ["calibrator", "made_once", "once", "refused", "reported", "succeeded"]
 
@@ -21,8 +22,9 @@ def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
     """Run a command; test_command_line.py tests how it starts and ends as a process."""
     output, errors = TextIOWrapper(BytesIO(), encoding="utf-8"), TextIOWrapper(BytesIO(), encoding="utf-8")
     line = [*map(str, arguments)]
-    with redirect_stdout(output), redirect_stderr(errors):
-        code = run_command(line)
+    with redirect_stdout(output), redirect_stderr(errors), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["calibrator", *line])
+        code = run_calibrator()
     return subprocess.CompletedProcess(line, code, said(output), said(errors))
 
 

@@ -4,15 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from calibrator.cli import run_calibrator
-
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 
 
 @pytest.fixture(scope="session")
 def two_vehicles(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fleet of two vehicles with a log each."""
-    from tests.calibrator.command_here import made_once  # noqa: PLC0415 (which runs commands by this module)
+    from tests.calibrator.command_here import made_once  # noqa: PLC0415 (which has the layout from here)
 
     options = ("--vehicles", 2, "--currents", 2, "--minutes", 2.5, "--unseen-minutes", 0.1, "--seed", 5)
     return made_once(tmp_path_factory, "two_vehicles", "simulate", *options)
@@ -23,9 +21,3 @@ def short_folder() -> Iterator[Path]:
     """A folder whose path is short, as the names of sockets must be."""
     with tempfile.TemporaryDirectory() as folder:
         yield Path(folder)
-
-
-def run_command(arguments: list[str]) -> int:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["calibrator", *arguments])
-        return run_calibrator()

@@ -29,7 +29,7 @@ from ecu_node.database import VehicleDatabase
 from tests.calibrator.command_here import calibrator, succeeded
 from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.estimator.simulated_drives import Conditions, summaries_of
-from tests.calibrator.summaries.small_stores import BRANCHES, random_faults, record_of, small_store
+from tests.calibrator.summaries.small_stores import BRANCHES, fullest, random_faults, record_of, small_store
 
 VEHICLES = 24
 ONE = Workers(processes=1)
@@ -120,10 +120,6 @@ def rewritten(store: SummaryStore, folder: Path, bucket: int, records: Mapping[s
     other = SummaryStore(storage=open_storage(Path(mkdtemp(dir=folder))), identity=store.identity)
     other.append(bucket, [record for items in records.values() for record in items])
     return other
-
-
-def fullest(store: SummaryStore) -> int:
-    return max(store.buckets(), key=lambda bucket: len(store.outlines(bucket)))
 
 
 # The result

@@ -71,3 +71,8 @@ def small_store(storage: Storage | Path, database: VehicleDatabase, faults: Faul
     for bucket, inside in store.by_bucket(names).items():
         store.append(bucket, [record_of(name, summaries[name]) for name in inside])
     return store
+
+
+def fullest(store: SummaryStore) -> int:
+    """Bucket with most vehicles."""
+    return max(store.buckets(), key=lambda bucket: len(store.outlines(bucket)))

@@ -34,18 +34,6 @@ def test_columns_are_the_inputs_and_each_input_filtered_by_each_pole() -> None:
     np.testing.assert_array_equal(columns[~used], 0.0)
 
 
-def test_error_of_the_initial_state_has_decayed_when_samples_are_used() -> None:
-    u, bank = inputs_of(4, 2 * SAMPLES), bank_of(POLES[1:3])
-    known, _ = bank.run(u, np.ones(2 * SAMPLES, bool))
-    started, used = bank.run(u[SAMPLES:], np.ones(SAMPLES, bool))
-    first = int(np.flatnonzero(used)[0])
-    error = np.abs(known[SAMPLES, len(NAMES) :] - np.tile(u[SAMPLES], 2))
-    left = np.abs(known[SAMPLES:] - started)[first, len(NAMES) :]
-    assert first == bank.settling
-    np.testing.assert_array_less(left, filter_bank.UNSETTLED * error)
-    assert left[-1] > 0.9 * filter_bank.UNSETTLED * error[-1]
-
-
 @pytest.mark.parametrize("is_long", [False, True])
 def test_short_gap_holds_the_inputs_and_a_long_gap_restarts_the_filters(is_long: bool) -> None:
     u, valid = inputs_of(5), np.ones(SAMPLES, bool)

@@ -21,7 +21,14 @@ from calibrator.summaries.record import MOST_BLOCKS, SCHEMA, Record, joined_reco
 from calibrator.summaries.summary_store import MOST_FILES, SummaryStore, compact_store, look_at_store
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, summaries_of
-from tests.calibrator.summaries.small_stores import CONDITIONS, identity_of, random_faults, record_of, small_store
+from tests.calibrator.summaries.small_stores import (
+    CONDITIONS,
+    fullest,
+    identity_of,
+    random_faults,
+    record_of,
+    small_store,
+)
 
 VEHICLES = 40
 
@@ -124,18 +131,12 @@ def test_damaged_file_of_bucket_is_refused_and_named(tmp_path: Path, database: V
         store.outlines(int(path.name[:5]))
 
 
-def spoil(store: SummaryStore, bucket: int, changes: Mapping[str, Any]) -> str:
-    """Change columns of the first vehicle of a bucket, as another tool would; returns its name."""
+def spoil(store: SummaryStore, bucket: int, changes: Mapping[str, Any]) -> None:
+    """Change columns of the first vehicle of a bucket, as another tool would."""
     path = Path(store.url) / "buckets" / store.files(bucket)[0]
     rows = pq.read_table(path).to_pylist()
-    name = str(rows[0]["vehicle"])
     rows[0] |= changes
     pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), path)
-    return name
-
-
-def fullest(store: SummaryStore) -> int:
-    return max(store.buckets(), key=lambda bucket: len(store.outlines(bucket)))
 
 
 @pytest.fixture
