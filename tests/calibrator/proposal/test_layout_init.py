@@ -329,6 +329,7 @@ def test_branches_given_by_the_user_keep_their_sign_and_need_no_confirmation(tab
 
 
 @pytest.mark.parametrize(("line", "said"), [
+    ("none.dbc", "no such file"),
     ("car.dbc --log other.log", "none of its identifiers is in"),
     ("car.dbc --log other.csv", "none of its columns is in"),
     ("two.dbc --log two.csv", "column 'PackCurrent' could be PackStatus.PackCurrent and Twin.PackCurr"),
