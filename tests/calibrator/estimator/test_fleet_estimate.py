@@ -244,7 +244,7 @@ def test_gain_error_that_two_of_three_sensors_share_in_some_vehicles_is_not_corr
     faults.drift[8, 0] = 0.1
     faults.hardware_drift[:] = 0.01 * rng.normal(size=18)
     summaries = summaries_of(faults, Conditions(samples=900, model_error_a=0.3), seed=1)
-    found = estimate_vehicles(summaries, learn_fleet(summaries, full_scale_a=SCALE_A, branches=[*NAMES, "auxiliary"]))
+    found = fleet_estimate.estimate_vehicles(summaries, learned(summaries, THREE))
     assert np.flatnonzero(found.corrected.any(axis=1)).tolist() == [8]
     named = [[each.branch for each in mine if each.cause == "shared"] for mine in found.findings]
     assert named == [["battery"]] * 7 + [[]] * 11
@@ -257,7 +257,7 @@ def test_vehicles_whose_battery_signal_is_late_are_not_corrected() -> None:
         drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=900, model_error_a=0.3))
         currents_a = np.column_stack([np.roll(drive.currents_a[:, 0], late), drive.currents_a[:, 1]])
         summaries.append(summarise_samples([replace(drive, currents_a=currents_a)], period_s=PERIOD_S))
-    found = estimate_vehicles(summaries, learned(summaries))
+    found = fleet_estimate.estimate_vehicles(summaries, learned(summaries))
     assert not found.corrected.any()
     assert all(any("is a signal late" in each.text for each in mine) for mine in found.findings)
 
@@ -420,8 +420,8 @@ def test_declared_load_that_the_currents_of_most_vehicles_deny_corrects_nothing(
     summaries = drives("drift")
     learnt = learned(summaries, load=UnmeasuredLoad(mean_a=4.0, sd_a=0.3))
     assert any("as if without a load, and one of 4 A is declared" in text for text in learnt.notices)
-    assert not estimate_vehicles(summaries, learnt).corrected.any()
-    assert estimate_vehicles(summaries, learned(summaries)).corrected.any()
+    assert not fleet_estimate.estimate_vehicles(summaries, learnt).corrected.any()
+    assert fleet_estimate.estimate_vehicles(summaries, learned(summaries)).corrected.any()
 
 
 def test_expected_share_of_faulty_vehicles_and_known_prior_replace_learnt_ones() -> None:
