@@ -67,9 +67,12 @@ VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
 """Least share of the fleet, half width of the hardware drift, and least number of vehicles of a variant. [1]"""
 ALIKE = 0.02
 """Distance up to which slopes of a vehicle count as alike, and as those of most: sound vehicles differ by less. [1]"""
-WORSE_SUM, WORSE_SUM_A, MOST_SUM_A = 1.5, 0.0025, 0.03
+WORSE_SUM, WORSE_SUM_A = 1.5, 0.0025
 """An estimate is wrong with which the sum of the currents scatters more by this factor [1] and by this share of full
-scale, or by the last share of it: loads without a sensor that switch are smaller."""
+scale."""
+MOST_SUM, MOST_SUM_A = 0.25, 0.03
+"""Currents do not cancel if their sum scatters by more than this share of what the largest of them does, and by this
+share of full scale: a heater without a sensor stays below."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,7 +193,7 @@ class FleetReference:
         if self.load is not None and self.load_denied:
             notices.append(
                 f"the currents of most vehicles sum to {self.sums_a[1]:+z.1f} A, as if without a load, and one of "
-                f"{self.load.mean_a:g} A is declared: nothing is corrected; check it, or read an offset"
+                f"{self.load.mean_a:g} A is declared: nothing new is corrected; check it, or read an offset"
             )
         elif self.in_doubt:
             notices.append(
@@ -405,9 +408,10 @@ def _says_zero(
 
 
 def _is_denied(load: UnmeasuredLoad, others_a: float, full_scale_a: float) -> bool:
-    """Return whether a declared load is clearly not zero, but what most vehicles sum to (NaN: not known) is."""
+    """Return whether most vehicles sum to zero (NaN: not known), and clearly not to the declared load."""
     least_a = LEAST_SHARED * full_scale_a
-    return abs(load.mean_a) > least_a + CONTRADICTION * load.sd_a and abs(others_a) < max(least_a, load.sd_a)
+    is_apart = abs(others_a - load.mean_a) > least_a + CONTRADICTION * load.sd_a
+    return is_apart and abs(others_a) < max(least_a, load.sd_a)
 
 
 def _carried_centre(rows: EvidenceRows, carriers: Mask, doubtful: Mask, *, zero: bool) -> Array:
@@ -521,10 +525,11 @@ def estimate_vehicles(
         summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=reference.branches
     )
     covariance_a2 = fleet.covariance[:, fleet.inputs : -1, fleet.inputs : -1]
-    growing = _growing_sums(covariance_a2, 1.0 + found.drift[:, order], scale_a)
+    sums = _sum_findings(covariance_a2, 1.0 + found.drift[:, order], scale_a)
     slopes = rows.relative[:, : len(order)] - reference.usual_slopes
-    hiding = _hiding_sensors(slopes, found.faulty[:, order], found.drift[:, order], reference.ordered)
-    unfit = [(*mine, *sums, *hides) for mine, sums, hides in zip(unfit, growing, hiding, strict=True)]
+    is_open = found.faulty[:, order] & ~rows.known[:, rows.places.gain_reads].any(axis=1, keepdims=True)
+    hidden = _hidden_findings(slopes, is_open, found.drift[:, order], reference.ordered)
+    unfit = [(*mine, *of_sum, *of_gain) for mine, of_sum, of_gain in zip(unfit, sums, hidden, strict=True)]
     drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
     has_own_load = np.array([each.weight @ (each.load != 0.0) > SUSPECTED for each in found.points])
     is_read = rows.known[:, rows.places.offset_reads][:, reference.feed]  # then the load is no offset
@@ -554,46 +559,49 @@ def estimate_vehicles(
     )
 
 
-def _growing_sums(covariance_a2: Array, gain: Array, full_scale_a: float) -> list[tuple[SensorFinding, ...]]:
-    """Find the vehicles whose currents would sum to more, or to much, if these gains were right: they are not.
+def _sum_findings(covariance_a2: Array, gain: Array, full_scale_a: float) -> list[tuple[SensorFinding, ...]]:
+    """Find the vehicles whose currents would sum to more if these gains were right, or do not cancel anyway.
 
     Gains of parallel branches, which the junction law does not tell apart, come from the fleet model alone.
     """
     before_a, after_a = (
-        np.sqrt(np.maximum(np.einsum("nkl,nk,nl->n", covariance_a2, weight, weight), 0.0)).tolist()
+        np.sqrt(np.maximum(np.einsum("nkl,nk,nl->n", covariance_a2, weight, weight), 0.0))
         for weight in (np.ones_like(gain), 1.0 / gain)
     )
+    largest_a = np.sqrt(np.diagonal(covariance_a2, axis1=1, axis2=2).max(axis=1))
+    grows = after_a > np.maximum(WORSE_SUM * before_a, before_a + WORSE_SUM_A * full_scale_a)
+    remains = after_a > np.maximum(MOST_SUM_A * full_scale_a, MOST_SUM * largest_a)
     found = list[tuple[SensorFinding, ...]]()
-    for before, after in zip(before_a, after_a, strict=True):
-        grows = after > max(WORSE_SUM * before, before + WORSE_SUM_A * full_scale_a)
-        sums = f"with these gains the currents would sum to {after:.1f} A RMS about their mean, "
-        if grows:
-            sums += f"not to {before:.1f} A: is it a variant of the vehicle?"
-        else:
-            sums += "whatever they are: is a signal late by more than half a second, or a branch missing?"
-        is_wrong = grows or after > MOST_SUM_A * full_scale_a
-        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=sums),) if is_wrong else ())
+    for j in range(len(gain)):
+        why = (
+            "a variant of the vehicle" if grows[j] else "a signal late by more than half a second, or a branch missing"
+        )
+        after, before = f"{after_a[j]:.1f} A RMS about their mean", f"{before_a[j]:.1f} A without"
+        text = f"with these gains the currents sum to {after}, to {before}: is it {why}?"
+        is_wrong = grows[j] or remains[j]
+        found.append((SensorFinding(branch=None, cause="sum", probability=1.0, text=text),) if is_wrong else ())
     return found
 
 
-def _hiding_sensors(
+def _hidden_findings(
     slopes: Array, faulty: Mask, drift: Array, branches: Sequence[str]
 ) -> list[tuple[SensorFinding, ...]]:
     """Find the vehicles in which the only faulty gain is that of the one sensor which shows what the fleet's do.
 
     The vehicle would draw more, and this sensor happen to hide it. That the others share a gain error, as sensors of
-    one control unit do, is as probable. ``slopes`` (N, K) are logarithms, relative to the fleet.
+    one control unit do, is as probable. ``slopes`` (N, K) are logarithms, relative to the fleet; in vehicles of
+    which a gain was read none is ``faulty`` here.
     """
     found = list[tuple[SensorFinding, ...]]()
     for own, is_faulty, gain_error in zip(slopes, faulty, drift, strict=True):
         named = np.flatnonzero(is_faulty & (np.abs(gain_error) > LEAST_HARDWARE))
         rest = np.delete(own, named)
-        hides = len(named) == 1 and len(rest) > 1 and abs(own[named[0]]) < ALIKE and np.ptp(rest) < ALIKE
-        if not hides:
+        more = float(rest.mean()) if len(rest) > 1 else 0.0
+        if len(named) != 1 or abs(own[named[0]]) >= min(ALIKE, abs(more)) or np.ptp(rest) >= ALIKE:
             found.append(())
             continue
-        text = f"either the vehicle draws {np.expm1(rest.mean()):+.1%} and one sensor hides it, or the others share it"
-        found.append((SensorFinding(branch=branches[named[0]], cause="shared", probability=0.5, text=text),))
+        text = f"either the vehicle draws {np.expm1(more):+.1%} and one sensor hides it, or the others share that error"
+        found.append((SensorFinding(branch=branches[named[0]], cause="hidden", probability=0.5, text=text),))
     return found
 
 

@@ -338,7 +338,7 @@ def require_columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> No
 def _seconds(frame: pd.DataFrame, where: str) -> Array:
     """Return the instants of a frame, rising from 0; DriveError if its index is no such time. [s]"""
     index = frame.index
-    if (isinstance(index, pd.RangeIndex) and index.step == 1) or not (
+    if (isinstance(index, pd.RangeIndex) and index.name is None) or not (
         isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex)) or pd.api.types.is_any_real_numeric_dtype(index)
     ):
         what = "counts rows" if isinstance(index, pd.RangeIndex) else f"is of {index.dtype}"

@@ -366,13 +366,15 @@ def estimate_junction(
     S, places, contradictions = system.sensors, system.places, system.contradictions()
     scale_known, posterior = any(p < S for p in system.known), _posterior(system)
     mean, sd, draws, weight = posterior.mean, posterior.sd, posterior.draws, posterior.weight
-    sum_a = system.laws[0].constant_a[0] - (0.0 if known.load is None else known.load.mean_a)
-    for name in known.charge_a:  # of one vehicle
-        own_a = float(mean[S + branches.index(name)]) * scale_a
+    for s in map(branches.index, known.charge_a):  # of one vehicle
+        others = [p for p in system.known if p >= S and p != S + s]
+        own_a = float(mean[S + s]) * scale_a
+        sum_a = system.laws[0].constant_a[0] - float(mean[others].sum()) * scale_a
         if abs(own_a) > CANCELLED * scale_a and abs(sum_a) < 0.5 * abs(own_a):
+            unknown = " and the load that no branch measures (--load)" if known.load is None else ""
             contradictions.append(
-                f"by the charge given for {name} its sensor has an offset of {own_a:+.1f} A, but all offsets sum to "
-                f"{sum_a:+.1f} A: check value and sign of --charge"
+                f"by the charge given for {branches[s]} its sensor has an offset of {own_a:+.1f} A, but what is not "
+                f"known of the offsets{unknown} sums to {sum_a:+.1f} A: check value and sign of --charge"
             )
     gain_fault = _fault_probability(mean[:S], sd[:S], OPEN_GAIN_SD, TRUSTED_DRIFT_SD)
     offset_fault = _fault_probability(mean[S : 2 * S], sd[S : 2 * S], OPEN_OFFSET_SD, TRUSTED_OFFSET_SD)

@@ -277,7 +277,7 @@ def deciding_evidence(
     if doubtful and not those("harm limit"):
         return (
             f"bench-checked vehicles would decide: the fleet's reference is in doubt for branch {', '.join(doubtful)}; "
-            f"name at least three with --trusted"
+            f"see the notices, or name at least three with --trusted"
         ), None
     text, rival = _rival(estimate.explanations[j], branches, held_back != "", full_scale_a)
     if text:

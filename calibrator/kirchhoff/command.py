@@ -83,7 +83,8 @@ def kirchhoff(
     source = open_recording(log, database)
     if isinstance(source, TableSource):
         for column in source.branch_columns():
-            source.table.column(column)  # a name that the table does not have is an error, not a branch to leave out
+            if not source.table.no_numbers(column):  # a name that the table does not have is an error, not a gap
+                source.table.column(column)
     recording = source.recording(database.layout.name, log.name.partition(".")[0])
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:

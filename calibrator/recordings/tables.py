@@ -352,7 +352,7 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
             if is_bad[rows].any():
                 bad[name] = is_bad[rows]
         else:
-            row = int([*unread, *bad_rows][0])
+            row = int((unread if unread.size else bad_rows)[0])
             words += [] if unread.size else [name]
             which = f"{len(bad_rows):,} of its {len(frame):,} cells" if numbers else "its cells"
             line = f"line {frame.attrs['line'] + row}" if "line" in frame.attrs else f"row {row + 1}"
@@ -525,9 +525,12 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
     body = [cell for row in rows[first:] for cell in row]
     commas = [cell for cell in body if _DECIMAL_COMMA.fullmatch(cell)]
     points = [cell for cell in body if "." in cell and _NUMBER.fullmatch(cell)]
-    if all(re.fullmatch(_THOUSANDS.format(","), cell) for cell in commas):
+    more_commas = len(commas) > len(points)
+    if all(re.fullmatch(_THOUSANDS.format(","), cell) for cell in commas) and (points or delimiter != ";"):
         decimal = "."
-    elif len(commas) > len(points) or all(re.fullmatch(_THOUSANDS.format(r"\."), cell) for cell in points):
+    elif more_commas or (
+        10 * len(commas) > len(points) and all(re.fullmatch(_THOUSANDS.format(r"\."), cell) for cell in points)
+    ):
         decimal = ","
     else:
         decimal = "."
@@ -563,7 +566,8 @@ def _without_thousands(path: Path, texts: pd.DataFrame, decimal: str) -> pd.Data
         has_both = text.str.fullmatch(rf"{whole}{point}\d*").fillna(value=False)
         if has_both.any() or (is_whole.any() and not (text.str.contains(comma) & ~is_whole).any()):
             separated[name] = text.where(is_whole | has_both)
-            proved |= bool(has_both.any() or text.str.fullmatch(r"[-+]?[1-9]\d{0,2}").any())
+            whole_ones = text[text.str.fullmatch(r"[-+]?[1-9]\d{0,2}").fillna(value=False)]
+            proved |= bool(has_both.any() or whole_ones.nunique() > 1)  # a single value may be a code for no value
     if separated and not proved and decimal == ",":
         name, text = next(iter(separated.items()))
         cell = text.dropna().iloc[0]

@@ -234,7 +234,7 @@ def test_vehicles_with_a_branch_that_others_lack_are_not_corrected() -> None:
     summaries = [divided(rng, [[1.0, 0.0, 0.0], [0.0, front, 1.0 - front]]) for front in fronts]
     found = fleet_estimate.estimate_vehicles(summaries, learned(summaries, THREE))
     assert not found.corrected.any()
-    assert any(each.cause == "sum" for mine in found.findings for each in mine)
+    assert any("a variant of the vehicle" in each.text for mine in found.findings for each in mine)
 
 
 def test_gain_error_that_two_of_three_sensors_share_in_some_vehicles_is_not_corrected_in_the_third() -> None:
@@ -246,7 +246,7 @@ def test_gain_error_that_two_of_three_sensors_share_in_some_vehicles_is_not_corr
     summaries = summaries_of(faults, Conditions(samples=900, model_error_a=0.3), seed=1)
     found = fleet_estimate.estimate_vehicles(summaries, learned(summaries, THREE))
     assert np.flatnonzero(found.corrected.any(axis=1)).tolist() == [8]
-    named = [[each.branch for each in mine if each.cause == "shared"] for mine in found.findings]
+    named = [[each.branch for each in mine if each.cause == "hidden"] for mine in found.findings]
     assert named == [["battery"]] * 7 + [[]] * 11
     assert found.confidence[:7].max() <= 0.5
 
@@ -259,7 +259,18 @@ def test_vehicles_whose_battery_signal_is_late_are_not_corrected() -> None:
         summaries.append(summarise_samples([replace(drive, currents_a=currents_a)], period_s=PERIOD_S))
     found = fleet_estimate.estimate_vehicles(summaries, learned(summaries))
     assert not found.corrected.any()
-    assert all(any("is a signal late" in each.text for each in mine) for mine in found.findings)
+    assert all(any("a signal late" in each.text for each in mine) for mine in found.findings)
+
+
+def test_switched_heater_without_a_sensor_is_no_late_signal() -> None:
+    rng, summaries = np.random.default_rng(6), []
+    for _ in range(12):
+        drive = drive_of(rng, no_faults(1, K).take(0), Conditions(samples=900, model_error_a=0.3))
+        heated_a = 25.0 * np.repeat(rng.integers(0, 2, 15), 60)
+        currents_a = drive.currents_a + np.column_stack([heated_a, np.zeros(900)])
+        summaries.append(summarise_samples([replace(drive, currents_a=currents_a)], period_s=PERIOD_S))
+    found = fleet_estimate.estimate_vehicles(summaries, learned(summaries))
+    assert not any(each.cause == "sum" for mine in found.findings for each in mine)
 
 
 @pytest.mark.parametrize(("drift", "suspected"), [(0.02, False), (-0.02, False), (0.06, True)])
@@ -422,6 +433,14 @@ def test_declared_load_that_the_currents_of_most_vehicles_deny_corrects_nothing(
     assert any("as if without a load, and one of 4 A is declared" in text for text in learnt.notices)
     assert not fleet_estimate.estimate_vehicles(summaries, learnt).corrected.any()
     assert fleet_estimate.estimate_vehicles(summaries, learned(summaries)).corrected.any()
+
+
+@pytest.mark.parametrize(("others_a", "load_a", "denied"), [(0.0, 4.0, True), (0.398, 0.5, False), (4.0, 4.0, False)])
+def test_declared_load_is_denied_by_a_sum_of_zero_that_is_far_from_it(
+    others_a: float, load_a: float, denied: bool
+) -> None:
+    load = UnmeasuredLoad(mean_a=load_a, sd_a=0.02)
+    assert fleet_estimate._is_denied(load, others_a, SCALE_A) == denied
 
 
 def test_expected_share_of_faulty_vehicles_and_known_prior_replace_learnt_ones() -> None:

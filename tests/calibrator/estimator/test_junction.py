@@ -128,6 +128,18 @@ def test_charge_that_only_a_second_opposite_offset_could_explain_corrects_nothin
     assert calibrator.parameters_["corrected"].any() == (factor == 1.0)
 
 
+@pytest.mark.parametrize(("offset_a", "load_a"), [((10.0, 0.0, -10.0), 0.0), ((-10.0, 0.0, 0.0), 16.0)])
+def test_charge_is_believed_beside_an_opposite_offset_that_was_read_or_a_large_load(
+    offset_a: tuple[float, float, float], load_a: float
+) -> None:
+    read = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["heater"], "offset_a": [offset_a[2]], "offset_sd_a": [0.1]})
+    frame = recording(offset_a=offset_a, load_a=load_a)
+    charge_ah = {"battery": (float((frame["battery"] - offset_a[0]).mean()) * SECONDS / 3600.0, 0.01)}
+    rows = found(frame, trusted=["motor"], load=(load_a, 1.0), charge_ah=charge_ah, readings=read)
+    assert rows.corrected["vehicle", "battery"]
+    assert rows.offset_a["vehicle", "battery"] == pytest.approx(offset_a[0], abs=0.5)
+
+
 def test_several_junctions_are_calibrated_independently() -> None:
     # more vehicles than are read together
     frames = {f"V{number}": recording(number, gain=(0.0, 0.05, 0.0), seconds=60.0) for number in range(6)}

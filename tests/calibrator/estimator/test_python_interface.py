@@ -271,6 +271,10 @@ def of_all(change: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     return lambda: {name: change(each) for name, each in frames().items()}
 
 
+def in_milliseconds(each: pd.DataFrame) -> pd.DataFrame:
+    return each.assign(ms=1000 * np.arange(len(each))).set_index("ms")
+
+
 @pytest.mark.parametrize(("given", "message"), [
     (dict, r"dict without vehicles: expected data frames by vehicle"),
     (lambda: frames(1), r"a single vehicle, V1: a fleet that is compared with itself needs 5 or more"),
@@ -291,11 +295,12 @@ def of_all(change: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
     (changed(V2=lambda each: each.iloc[::-1]), r"V2, frame 1: the time does not rise at row 1 \(299.0 "),
     (retimed(lambda time: time.where(time != 7.0, 6.0)), r"V2, frame 1: the time does not rise at row 7 \(6.0 -> "),
     (changed(V2=lambda each: each.reset_index(drop=True)), r"V2, frame 1: its index counts rows; expected the tim"),
+    (changed(V2=lambda each: each.reset_index(drop=True).iloc[::2]), r"V2, frame 1: its index counts rows"),
     (retimed(lambda time: time.astype(str)), r"V2, frame 1: its index is of .*; expected"),
     (changed(V2=lambda each: each.iloc[:1]), r"V2, frame 1: 1 rows; leave the frame out"),
     (changed(V2=lambda each: each.assign(motor=1e-3 * each["motor"])), r"V2: the largest motor .*perhaps it is in kA"),
     (of_all(lambda each: each.set_index(60.0 * each.index)), r"V1, frame 1: rows are 60 s apart, expected 5 s at mo"),
-    (of_all(lambda each: each.set_index(1000 * np.arange(len(each)))), r"V1, frame 1: its index is whole numbers, 100"),
+    (of_all(in_milliseconds), r"V1, frame 1: its index is whole numbers, 100"),
     (of_all(lambda each: each[["battery", "motor"]]), r"inputs none: expected one or more"),
 ])  # fmt: skip
 def test_unusable_data_frames_are_refused_in_one_line(given: Callable[[], Frames], message: str) -> None:

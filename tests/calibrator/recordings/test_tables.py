@@ -272,6 +272,16 @@ def test_branch_column_with_some_numbers_that_cannot_be_read_is_named_by_all_com
         assert "column 'Ibat [A]': 37 of its 100 cells are no numbers, such as '" in done.stdout + done.stderr
 
 
+def test_three_decimals_of_a_german_table_are_no_thousands(tmp_path: Path) -> None:
+    """Of a charge, whose currents are never below 1 A, with a code for "no value"."""
+    currents = [f"{86.0 + 0.1 * k:.3f}".replace(".", ",") for k in range(ROWS)]
+    rows = [f"{time};{a};-{a}" for time, a in zip(dates(), currents, strict=True)]
+    (tmp_path / "x.csv").write_text("\n".join(["time;Ibat;Imot", *rows[:-1], rows[-1].split(";")[0] + ";255;255"]))
+    found = before(tmp_path / "x.csv", "--branches", "Ibat,-Imot")["Ibat"]
+    assert found["max_a"] == pytest.approx(255.0)
+    assert found["mean_a"] < 100.0
+
+
 def test_one_damaged_number_is_left_out(tmp_path: Path) -> None:
     csv(frame(**{"Ibat [A]": ["1.2.3", *BATTERY_A[1:]]}))(tmp_path / "x.csv")
     require_sum(before(tmp_path / "x.csv", "--branches", BRANCHES))
