@@ -600,7 +600,8 @@ def _hidden_findings(
         if len(named) != 1 or abs(own[named[0]]) >= min(ALIKE, abs(more)) or np.ptp(rest) >= ALIKE:
             found.append(())
             continue
-        text = f"either the vehicle draws {np.expm1(more):+.1%} and one sensor hides it, or the others share that error"
+        either = f"either the vehicle draws {np.expm1(more):+.1%} and one sensor hides it, or the others share that"
+        text = f"{either} gain error; a bench check of any gain decides"
         found.append((SensorFinding(branch=branches[named[0]], cause="hidden", probability=0.5, text=text),))
     return found
 

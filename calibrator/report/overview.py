@@ -44,7 +44,7 @@ SIGMAS = 3.0
 QUANTILE = 0.999
 """Share of the fleet that one margin for all must cover; of fewer than a thousand vehicles it must cover all. [1]"""
 MOST_LARGE = 5
-FLEET_CAUSES = ("load", "batch", "variant", "sum", "hidden", "window")
+FLEET_CAUSES = ("load", "batch", "variant", "sum", "window")
 """Causes of findings that many vehicles share and a workshop cannot mend; they come last in its list."""
 
 
