@@ -83,6 +83,8 @@ class VehicleDatabase:
                 f"{' and '.join(buses)}; write '{buses[0]}:{bare}'"
             )
         bus, message = found[0]
+        if sum(item.name == bare for item in self.databases[bus].messages) > 1:
+            raise DatabaseError(f"{paths[bus]}: {bare!r} is the name of several messages{where}; rename all but one")
         key = message.frame_id, message.is_extended_frame
         same = [item.name for item in self.databases[bus].messages if (item.frame_id, item.is_extended_frame) == key]
         if len(same) > 1:

@@ -27,6 +27,7 @@ from ecu_node.layout import ProfileP01
 from ecu_node.summary import RANGE_SLACK
 
 __all__ = [
+    "LARGEST",
     "Decoded",
     "SignalRange",
     "bit_range",
@@ -39,6 +40,8 @@ __all__ = [
 
 Raw = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.float64]
 
+LARGEST = 1e60
+"""Largest magnitude that is a value, in any unit: sums of squares of larger ones overflow."""
 _WORD_BITS = 64
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 
@@ -107,7 +110,7 @@ def decode_signal(
         value = np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
     whole = known & complete
     named = whole & _is_one_of(signal, raw, _named_bad(signal) if no_value is None else no_value)
-    held = np.isfinite(value) & signal_range(signal).holds(value)
+    held = (np.abs(value) <= LARGEST) & signal_range(signal).holds(value)
     bad = {"too short": ~whole, "not available": named, "out of range": whole & ~named & ~held}
     return Decoded(value=value, present=present, bad=bad)
 

@@ -24,6 +24,7 @@ from calibrator.drive import Array, Mask
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.errors import LogError
 from calibrator.files.layout_files import check_formulas
+from calibrator.recordings.decode import LARGEST
 from calibrator.recordings.frame_arrays import LATEST_TIME_STAMP_NS, repaired_time
 from calibrator.recordings.log_files import (
     UNREADABLE,
@@ -51,7 +52,7 @@ _DELIMITERS = ("\t", ";", "|", ",", " ")
 _EMPTY = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "null", "none"))
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
-_SIGNS = {"\N{MINUS SIGN}(?=[\\d.,])": "-", "(?<=\\d)['\N{RIGHT SINGLE QUOTATION MARK}](?=\\d{3})": ""}
+_SIGNS = {"[\N{MINUS SIGN}\N{EN DASH}](?=[\\d.,])": "-", "(?<=\\d)['\N{RIGHT SINGLE QUOTATION MARK}](?=\\d{3})": ""}
 """Patterns in numbers of spreadsheets, and what to read in their place: a typographic minus, Swiss thousands."""
 _THOUSANDS = r"[-+]?[1-9]\d{{0,2}}({0}\d{{3}})+"
 """A whole number with separators of thousands, to be formatted with the separator."""
@@ -401,13 +402,13 @@ def _numbers(column: "pd.Series[float]") -> tuple[Array, Mask]:
     """Return the numbers of a column, NaN where a cell has none, and which cells hold something else than a number."""
     if pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
         value = column.to_numpy(np.float64, na_value=np.nan)
-        bad = np.isinf(value)
+        bad = np.abs(value) > LARGEST
     else:
         text = column.astype("string").str.strip()
         value = pd.to_numeric(text, errors="coerce").to_numpy(np.float64, na_value=np.nan)
         empty = text.isna() | text.str.lower().isin(_EMPTY)
-        bad = ~np.isfinite(value) & ~empty.to_numpy(np.bool_)
-    return np.where(np.isfinite(value), value, np.nan), bad
+        bad = ~(np.abs(value) <= LARGEST) & ~empty.to_numpy(np.bool_)
+    return np.where(np.abs(value) <= LARGEST, value, np.nan), bad
 
 
 # ---- time
@@ -421,8 +422,12 @@ def _time(path: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> tuple[li
             both, form = _dates(frame[first].astype("string") + " " + frame[second].astype("string"))
             if _increases(both):
                 return [first, second], both, f"time '{first}' and '{second}', a {form}"
+    falling = False
     for name in dict.fromkeys([*named, *frame.columns]):
+        if falling and name not in named:
+            break  # rows in descending order: no other column that happens to increase is the time
         time_s, unit = _seconds(frame[name], name, units.get(name, ""))
+        falling |= name in named and _increases(-time_s)
         if (name in named or unit.startswith(("date", "time of day")) or not _is_row_number(name)) and _increases(
             time_s
         ):

@@ -83,6 +83,7 @@ WRONG_DBCS = [
     (SMALL_DBC.replace('"W" Node', '"V" Node'), "branch heater: signal Power is in 'V'; expected W"),
     (SMALL_DBC + "BO_ 258 Old: 2 Node\n", "small.dbc: messages Net and Old have one identifier, 0x102; take out"),
     (SMALL_DBC + BEYOND_ENUM, r"cannot read it \(DBC: \"list index .*\"\), as if an attribute \(BA_\) had a value"),
+    (SMALL_DBC + "BO_ 258 Pair: 2 Node\n", "small.dbc: 'Pair' is the name of several messages.*; rename all but one"),
     ("this is no dbc", "small.dbc: not a CAN database"),
     ("", "small.dbc: the DBC has no message"),
 ]

@@ -90,6 +90,7 @@ TABLES: dict[str, tuple[str, Callable[[Path], object]]] = {
     "German whole thousands": ("x.csv", csv(whole_thousands("."), sep=";")),
     "Swiss thousands": ("x.csv", csv(thousands("{:,.3f}").map(lambda x: x.replace(",", "'")))),
     "typographic minus": ("x.csv", csv(frame().map(lambda x: str(x).replace("-", "\N{MINUS SIGN}")))),
+    "en dash": ("x.csv", csv(frame().map(lambda x: str(x).replace("-", "\N{EN DASH}")))),
     "line ends of an old Mac": ("x.csv", csv(long(), lineterminator="\r")),
     "BOM": ("x.csv", csv(frame(), encoding="utf-8-sig")),
     "archive": ("x.zip", zipped),
@@ -270,6 +271,17 @@ def test_branch_column_with_some_numbers_that_cannot_be_read_is_named_by_all_com
         done = calibrator(*command)
         assert done.returncode == 1
         assert "column 'Ibat [A]': 37 of its 100 cells are no numbers, such as '" in done.stdout + done.stderr
+
+
+def test_table_in_descending_order_is_refused_though_another_column_increases(tmp_path: Path) -> None:
+    csv(frame(range=TIME_S).iloc[::-1].assign(soc=TIME_S))(tmp_path / "x.csv")
+    said = refused("kirchhoff", tmp_path / "x.csv", "--branches", BRANCHES)
+    assert "the time does not increase in column 'time'; sort the rows by it" in said
+
+
+def test_huge_number_is_left_out(tmp_path: Path) -> None:
+    csv(frame(**{"Ibat [A]": [1e200, *BATTERY_A[1:]]}))(tmp_path / "x.csv")
+    require_sum(before(tmp_path / "x.csv", "--branches", BRANCHES))
 
 
 def test_three_decimals_of_a_german_table_are_no_thousands(tmp_path: Path) -> None:
