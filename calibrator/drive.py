@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "LARGEST",
     "Array",
     "Channel",
     "Complex",
@@ -30,6 +31,8 @@ Array = NDArray[np.floating[Any]]
 """Real numbers; always double precision in practice."""
 Mask = NDArray[np.bool_]
 Complex = NDArray[np.complex128]
+LARGEST = 1e60
+"""Largest magnitude that is a good value, in any unit: sums of squares of larger ones overflow."""
 
 
 @dataclass(frozen=True, kw_only=True)

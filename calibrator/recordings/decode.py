@@ -19,7 +19,7 @@ from fastcrc import crc8
 from numpy.typing import NDArray
 
 from calibrator.compiled import compiled
-from calibrator.drive import Array, Mask
+from calibrator.drive import LARGEST, Array, Mask
 from ecu_node.core.e2e import protection_of
 from ecu_node.database import VehicleDatabase, means_not_available
 from ecu_node.errors import DatabaseError
@@ -27,7 +27,6 @@ from ecu_node.layout import ProfileP01
 from ecu_node.summary import RANGE_SLACK
 
 __all__ = [
-    "LARGEST",
     "Decoded",
     "SignalRange",
     "bit_range",
@@ -40,8 +39,6 @@ __all__ = [
 
 Raw = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.float64]
 
-LARGEST = 1e60
-"""Largest magnitude that is a value, in any unit: sums of squares of larger ones overflow."""
 _WORD_BITS = 64
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 

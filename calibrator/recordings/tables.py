@@ -20,11 +20,10 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from calibrator.drive import Array, Mask
+from calibrator.drive import LARGEST, Array, Mask
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.errors import LogError
 from calibrator.files.layout_files import check_formulas
-from calibrator.recordings.decode import LARGEST
 from calibrator.recordings.frame_arrays import LATEST_TIME_STAMP_NS, repaired_time
 from calibrator.recordings.log_files import (
     UNREADABLE,

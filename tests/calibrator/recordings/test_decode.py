@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from calibrator.recordings.decode import LARGEST, decode_signal, p01_is_sound
+from calibrator.drive import LARGEST
+from calibrator.recordings.decode import decode_signal, p01_is_sound
 from ecu_node.database import means_not_available
 from ecu_node.errors import DatabaseError
 
