@@ -55,7 +55,7 @@ def test_constant_makes_92_percent_of_the_mean_square_of_the_tesla_sum(tesla: Pa
     assert "motor_front" not in before["alone"]  # it moves less than its steps
 
 
-def test_table_of_the_example_equals_kirchhoff_output_for_its_logs(i3_charges: Path, tmp_path: Path) -> None:
+def test_table_of_two_chargers_equals_kirchhoff_output_for_its_logs(i3_charges: Path, tmp_path: Path) -> None:
     """The command that the head of the table names gives its rows."""
     kept = pd.read_csv(ROOT / "examples" / "bmw_i3_two_chargers.csv", comment="#").groupby("station")
     for log in ("circontrol/2019_Circontrol_end.csv.gz", "efacec/2019_eacaec_enda.csv.gz"):

@@ -239,7 +239,7 @@ def test_damaged_bundle_or_state_is_refused(damage: Callable[[Path], None], repo
         one_line(found, "provision")
 
 
-def test_flipped_bit_in_the_state_is_detected(state: Path) -> None:
+def test_flipped_bit_in_state_json_is_refused_as_damage(state: Path) -> None:
     content = (state / "state.json").read_bytes()
     for place in range(0, len(content), 61):
         damaged = bytearray(content)

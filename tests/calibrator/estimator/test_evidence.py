@@ -41,7 +41,7 @@ def test_fleet_model_is_unbiased_even_if_all_faults_have_one_sign() -> None:
 
 
 @pytest.mark.parametrize("varying", [0, 3])
-def test_effect_of_an_input_is_learnt_from_vehicles_where_it_varies(varying: int) -> None:
+def test_effect_of_an_input_is_learnt_where_it_varies_and_is_0_if_it_never_does(varying: int) -> None:
     """Such as the vehicle's mass: where it is constant, its variance is rounding and must not be a divisor."""
     rng, summaries, told = np.random.default_rng(8), [], np.array([0.1, -0.1, 0.0])
     for j in range(12):

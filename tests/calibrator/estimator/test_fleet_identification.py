@@ -116,7 +116,9 @@ def test_vehicle_without_dynamics_is_simulated_exactly(database: VehicleDatabase
     assert len(one.held_out_inputs) == pytest.approx(600 + one.lead_in, abs=1)
 
 
-def test_parked_and_hardly_recorded_vehicles_are_refused(database: VehicleDatabase, tmp_path: Path) -> None:
+def test_error_for_a_vehicle_that_was_parked_or_has_less_than_60_s_of_data(
+    database: VehicleDatabase, tmp_path: Path
+) -> None:
     moving, still = drive("a"), channel(np.zeros(SAMPLES))
     parked = replace(moving, inputs={**moving.inputs, "torque": still, "heater_demand": still})
     with pytest.raises(DriveError, match="none of its inputs varies: was it parked"):

@@ -322,7 +322,7 @@ def test_learning_finds_intercept_errors_larger_than_stated() -> None:
     assert (wide.dispersion > 2.0 * plain.dispersion).all()
 
 
-def test_loads_that_differ_between_vehicles_are_not_sensor_offsets() -> None:
+def test_loads_that_differ_between_vehicles_are_learnt_as_spread_not_as_a_shared_offset() -> None:
     K, load = 2, np.random.default_rng(15).normal(0.0075, 0.0025, 30).clip(0.0)
     errors = Errors(intercept=0.0003, junction=0.0001)  # as on recorded trips
     model = learned(rows_of(random_faults(15, vehicles=30, branches=K), seed=15, errors=errors, load=load))

@@ -89,7 +89,7 @@ def test_sum_due_to_quantisation_alone_lies_in_the_expected_band(digits: int, tm
 
 
 @pytest.mark.parametrize("noise_a", [0.3, 1.0])
-def test_sensor_noise_widens_the_expected_band(noise_a: float, tmp_path: Path) -> None:
+def test_expected_band_covers_sensor_noise_but_not_ten_times_as_much(noise_a: float, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     battery, motor = MOTOR_A + noise_a * rng.normal(size=1200), -MOTOR_A
     expected = figures(*table(tmp_path, battery=battery, motor=motor))["expected"]
