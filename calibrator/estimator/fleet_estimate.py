@@ -154,7 +154,7 @@ class FleetReference:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether the fleet is no reference, being small or not as declared: only trusted vehicles may be corrected."""
+        """Whether the fleet is too small, or denies its declared load: only trusted vehicles may be corrected."""
         return not self.carried and (self.vehicles < FEWEST_VEHICLES or self.load_denied)
 
     @property
@@ -193,7 +193,7 @@ class FleetReference:
         if self.load is not None and self.load_denied:
             notices.append(
                 f"the currents of most vehicles sum to {self.sums_a[1]:+z.1f} A, as if without a load, and one of "
-                f"{self.load.mean_a:g} A is declared: nothing new is corrected; check it, or read an offset"
+                f"{self.load.mean_a:g} A is declared: nothing new is corrected; check that load, or read an offset"
             )
         elif self.in_doubt:
             notices.append(

@@ -529,12 +529,13 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
     body = [cell for row in rows[first:] for cell in row]
     commas = [cell for cell in body if _DECIMAL_COMMA.fullmatch(cell)]
     points = [cell for cell in body if "." in cell and _NUMBER.fullmatch(cell)]
-    more_commas = len(commas) > len(points)
-    if all(re.fullmatch(_THOUSANDS.format(","), cell) for cell in commas) and (points or delimiter != ";"):
+    only_thousands = [
+        all(re.fullmatch(_THOUSANDS.format(sign), cell) for cell in cells)
+        for sign, cells in ((",", commas), (r"\.", points))
+    ]
+    if only_thousands[0] and (points or delimiter != ";"):  # between semicolons, without points, a comma is decimal
         decimal = "."
-    elif more_commas or (
-        10 * len(commas) > len(points) and all(re.fullmatch(_THOUSANDS.format(r"\."), cell) for cell in points)
-    ):
+    elif len(commas) > len(points) or (only_thousands[1] and 10 * len(commas) > len(points)):  # fewer stand in notes
         decimal = ","
     else:
         decimal = "."

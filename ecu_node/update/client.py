@@ -221,7 +221,7 @@ def _verified_offer(state: VehicleState, source: str, now: datetime) -> _Offer:
             updater = Updater(name, "metadata", None, "targets", fetcher, _CONFIG, bootstrap=state.root.encode())
             try:
                 info = updater.get_targetinfo(target)
-            except exceptions.RepositoryError as error:  # of a bin that was never published TUF tells only by its text
+            except exceptions.RepositoryError as error:  # only its text tells a bin that was never published
                 if "delegated but is not part of snapshot" not in str(error):
                     raise
                 info = None
