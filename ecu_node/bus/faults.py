@@ -50,23 +50,15 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
             raise ValueError(f"unknown reason {self.reason!r}")
 
 
-def _file(folder: Path) -> Path:
-    """Return the path of the fault memory; raise UserError if there is no such folder."""
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such state folder; name the one of 'ecu-node run --state'")
-    return folder / _NAME
-
-
 def read_faults(folder: Path) -> list[Fault]:
-    """Return the entries of a state folder, the last one first; raise UserError if they cannot be read."""
-    path = _file(folder)
-    try:
-        return msgspec.json.decode(read_user_file(path, largest_bytes=_LARGEST_BYTES), type=list[Fault])
-    except FileNotFoundError:
-        return []
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise UserError(f"{path}: cannot read the fault memory: {why}; 'ecu-node clear' begins a new one") from None
+    """Return the entries of a state folder, the last one first.
+
+    Raises
+    ------
+    UserError
+        If the entries cannot be read, or the folder is none of a node.
+    """
+    return _read(_of_a_node(folder) / _NAME)
 
 
 def clear_faults(folder: Path) -> str:
@@ -75,18 +67,34 @@ def clear_faults(folder: Path) -> str:
     Raises
     ------
     UserError
-        If there is no such folder, or it is none of a node.
+        If the folder is none of a node.
     """
-    path = _file(folder)
-    if not (path.exists() or state_path(folder).exists()):
-        raise UserError(f"{folder}: neither a state nor faults there; name the folder of 'ecu-node run --state'")
+    path = _of_a_node(folder) / _NAME
     try:
-        count = len(read_faults(folder))
+        count = len(_read(path))
         found = f"{count} fault{'s' * (count > 1)} cleared" if count else "no faults"
     except UserError:
         found = "a fault memory that could not be read is cleared"
     path.unlink(missing_ok=True)
     return f"{folder}: {found}"
+
+
+def _of_a_node(folder: Path) -> Path:
+    """Return a folder that holds a state or faults; raise UserError if it holds neither."""
+    if not ((folder / _NAME).exists() or state_path(folder).exists()):
+        raise UserError(f"{folder}: neither a state nor faults there; name the folder of 'ecu-node run --state'")
+    return folder
+
+
+def _read(path: Path) -> list[Fault]:
+    """Return the entries of a file, none if there is no such file; raise UserError if they cannot be read."""
+    try:
+        return msgspec.json.decode(read_user_file(path, largest_bytes=_LARGEST_BYTES), type=list[Fault])
+    except FileNotFoundError:
+        return []
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"{path}: cannot read the fault memory: {why}; 'ecu-node clear' begins a new one") from None
 
 
 def faults_text(faults: list[Fault]) -> str:
@@ -127,7 +135,7 @@ class FaultMemory:
         self._written: Future[bool] | None = None
         """Result of the last write: whether the file now holds the faults; None before the first one."""
         try:
-            self._faults = read_faults(folder)
+            self._faults = _read(folder / _NAME)
         except UserError as error:
             say(f"{error}; until then measured values are passed through")
             reason, now = Reason.SUM_IMPLAUSIBLE.name, time_text(datetime.now(UTC))

@@ -262,7 +262,7 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
             f"{where} has {message.length} bytes in the DBC; CAN FD pads it, so that its CRC cannot be checked; "
             f"expected {', '.join(map(str, _FD_LENGTHS))}"
         )
-    how = _counter_crc8(entry, message, where) if isinstance(entry, CounterCrc8) else _autosar(entry, message)
+    how = _counter_crc8(entry, message, where) if isinstance(entry, CounterCrc8) else _autosar(entry, message, where)
     windows = (entry.init, entry.valid, entry.invalid)
     protection = Protection(max_step=entry.max_delta_counter, windows=windows, **how)
     if entry.max_delta_counter >= protection.modulus:
@@ -282,7 +282,7 @@ def _data_id(given: dict[str, int], message: Message, highest: int) -> int:
     return given.get(message.name, message.frame_id & highest)
 
 
-def _autosar(entry: AutosarProfile, message: Message) -> dict[str, Any]:
+def _autosar(entry: AutosarProfile, message: Message, where: str) -> dict[str, Any]:
     """Return the fields of a :class:`Protection` by a profile of AUTOSAR."""
     profile = _PROFILES[entry.profile]
     header_bits, options = profile.header_bits, dict[str, int]()
@@ -290,10 +290,15 @@ def _autosar(entry: AutosarProfile, message: Message) -> dict[str, Any]:
     if isinstance(entry, ProfileP02):
         identity, offset = bytes(entry.data_id_list[message.name]), 0
     else:
-        highest = 0xFFFFFFFF if entry.profile in {"P04", "P07"} else 0xFFFF
-        identity, offset = _data_id(entry.data_id, message, highest), entry.offset
         mode = _DATA_ID_MODES[getattr(entry, "data_id_mode", "both")]
-        header_bits += 4 * (mode == p01.E2E_P01_DATAID_NIBBLE)  # sent above the counter
+        is_nibble = mode == p01.E2E_P01_DATAID_NIBBLE
+        highest = 0xFFFFFFFF if entry.profile in {"P04", "P07"} else 0xFFF if is_nibble else 0xFFFF
+        identity, offset = _data_id(entry.data_id, message, highest), entry.offset
+        if is_nibble and identity > highest:
+            raise LayoutError(
+                f'{where}: data_id {identity} is above {highest}, the highest with data_id_mode = "nibble"'
+            )
+        header_bits += 4 * is_nibble  # sent above the counter
         options = {key: value for key, value in (("offset", offset), ("data_id_mode", mode)) if value}
     first, bits = offset + profile.counter_byte, profile.counter_bits
     return {

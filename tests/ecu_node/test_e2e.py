@@ -287,6 +287,10 @@ MISTAKES = [
     (autosar("P02", "data_id_list = {}"), ", data_id_list: Room has none"),
     (autosar("P05", 'crc = "C"'), ": unknown key 'crc'; allowed are profile, messages"),
     (autosar("P06", "data_id = { Room = 65536 }"), ", data_id, Room: "),
+    (
+        autosar("P01", 'data_id_mode = "nibble"\ndata_id = { Room = 4096 }'),
+        ": message Room: data_id 4096 is above 4095",
+    ),
     (autosar("P01", "max_delta_counter = 15"), ": message Room: max_delta_counter is 15"),
     (autosar("P06", "offset = 20"), ": message Room has 24 bytes, too few for the header of 25 bytes"),
     (OEM.replace('"Count"', '"Alive"'), ": message Room has no signal 'Alive'; it has Count, Sum"),

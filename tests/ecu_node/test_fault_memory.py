@@ -1,6 +1,7 @@
 """The fault memory: latched faults are stored, listed and cleared."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 
 from ecu_node.bus.faults import FaultMemory
 from ecu_node.core.status import Reason, State
+from ecu_node.update.state import state_path
 from tests.ecu_node.junctions import Junction, driving, three_branches
 from tests.ecu_node.processes import ecu_node, running
 from tests.ecu_node.vehicles import LAYOUT, AtOnce
@@ -19,6 +21,7 @@ class Vehicle:
     def __init__(self, folder: Path) -> None:
         self.state = folder / "state"
         self.state.mkdir()
+        state_path(self.state).touch()  # what it says does not matter here
         self.file = self.state / "faults.json"
         self.database = three_branches(folder)
         self.said: list[str] = []
@@ -118,7 +121,7 @@ def test_bus_sleep_releases_a_stale_branch_and_a_short_gap_does_not(vehicle: Veh
 
 
 def test_fault_that_cannot_be_stored_is_logged_once_and_stored_later(vehicle: Vehicle) -> None:
-    vehicle.state.rmdir()
+    shutil.rmtree(vehicle.state)
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.later(3.0)
     assert vehicle.latched() is Reason.SUM_IMPLAUSIBLE
