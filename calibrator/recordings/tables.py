@@ -358,8 +358,7 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
             line = f"line {frame.attrs['line'] + row}" if "line" in frame.attrs else f"row {row + 1}"
             texts[name] = f"{which} are no numbers, such as {str(frame[name].iloc[row])!r} in {line}"
     if not columns:
-        name = next(iter(frame.columns.difference(names, sort=False)), "")
-        shown = f"; '{name}' begins with {str(frame[name].iloc[0])!r}" if name else ""
+        shown = next((f"; '{name}': {text}" for name, text in texts.items()), "")
         raise LogError(f"{path}: no column of numbers beside the time{shown}")
     coarse = _coarse(order.time_s, columns)
     return Table(
