@@ -110,10 +110,11 @@ class UsualMisfits:
         Robust standard deviation over vehicles of the slopes over the fleet model [1], and median standard deviation of
         the currents about it [A].
     other : ndarray of int of shape (K,)
-        For each branch, the other one whose fleet model moves most besides.
+        For each branch k, the number of the other branch whose modelled current varies most apart from what that of k
+        explains.
     follows, follows_a : ndarray of shape (K,)
-        Median share of that branch's current that each sensor shows beside its own [1], and how far from it vehicles
-        usually are [A].
+        Share of the current of branch ``other`` that a sensor shows in addition to its own, as the median of the
+        vehicles [1], and how far from this vehicles usually are [A].
     spike_rate : float
         Share of samples that are spikes. [1]
     """
@@ -588,7 +589,7 @@ def find_misfits(
         By falling probability; causes are ``inverted``, ``dead``, ``follows``, ``clipped``, ``saturating``,
         ``quadratic``, ``cubic``, ``sign``, ``step``, ``ramp``, ``temperature``, ``spikes``, ``outliers``, ``noise`` and
         ``switching``.
-        No branch is named where the evidence does not tell the sensor, or the cause is no sensor.
+        No branch is named where the evidence does not tell which sensor it is, or the cause is not a sensor.
     """
     found: list[tuple[SensorFinding, ...]] = [()] * len(summaries)
     places = [j for j, summary in enumerate(summaries) if summary.fit is not None]

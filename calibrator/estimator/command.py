@@ -104,8 +104,8 @@ def calibrate(
 ) -> None:
     """Estimate the sensor faults of every vehicle and write its parameter file.
 
-    The default method, posterior, says how sure it is and corrects a branch only if that hardly harms. The published
-    method is kept as a reference.
+    The default method, posterior, says how sure it is and corrects a branch only if that is unlikely to make it worse.
+    The published method is kept as a reference.
     """
     with importing():
         from calibrator.estimator.results import left_out_of

@@ -3,8 +3,8 @@
 :func:`estimate_rows` does it for N vehicles: fault models of the fleet -> weighted draws -> one posterior per vehicle
 (:class:`FleetPoints`) -> :class:`RowsEstimate`.
 
-The estimate is the point that has most of the posterior within the tolerance of "recovered"; that share is the
-confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
+The estimate is the candidate that is most probably "recovered"; that probability is the confidence (M18). Correction
+with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
 
     alpha^2 E[i^2] + 2 alpha beta E[i] + beta^2  >  d^2 E[i^2] + 2 d o E[i] + o^2                               (M19)
 
@@ -104,7 +104,10 @@ class FleetPoints(Points):
 
 
 def group_centres(models: Sequence[FaultModel]) -> Array:
-    """Return what each group shares in the feeding branch, over full scale: of the model with most groups."""
+    """Return the constant of the feeding branch that each of g groups shares, over full scale, shape (g,).
+
+    Groups are those of the model that has most of them.
+    """
     return max((model.prior.group_centre for model in models), key=len)
 
 
@@ -149,14 +152,17 @@ def posterior_points(models: Sequence[tuple[FaultModel, Draws, Array]]) -> list[
 
 
 def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
-    """Find the point that has most of the posterior within its tolerance.
+    """Choose the estimate: the candidate that is most probably "recovered".
+
+    Candidates are the mean and the two heaviest points of each of the most probable explanations. Of nearly equal ones
+    that of the more probable explanation is taken.
 
     Parameters
     ----------
     points : Points
         Posterior of one vehicle.
     smallest : ndarray of shape (2,)
-        Least norms that the vectors of drifts and of offsets count with: the smallest faults of the fleet. [1]
+        The true vectors of drifts and of offsets count as at least so long: the smallest faults of the fleet. [1]
 
     Returns
     -------
@@ -191,7 +197,7 @@ def recovery_probability(points: Points, candidates: Array, smallest: Sequence[f
     candidates : ndarray of shape (C, 2K)
         Drifts [1] and offsets in fractions of full scale.
     smallest : sequence of float or ndarray of shape (2,)
-        Least norms that the vectors of drifts and of offsets count with. [1]
+        The true vectors of drifts and of offsets count as at least so long. [1]
 
     Returns
     -------
@@ -254,8 +260,8 @@ class SensorEstimate:
         Sensor faults and their standard deviations; in a fleet these are the distances from the estimate within which
         68 % of the posterior lies. [1], [A]
     hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
-        Drift and probability of a hardware fault (NaN for single junctions), to which a smaller drift than
-        :data:`LEAST_HARDWARE` does not count; probability that the estimate is recovered. [1]
+        Drift of a hardware fault; probability of a hardware fault, as which a drift up to :data:`LEAST_HARDWARE` alone
+        does not count (NaN for single junctions); probability that the estimate is recovered. [1]
     hardware_offset_a : ndarray of shape (N, K)
         Offsets of a hardware fault. [A]
     fault_probability, harm_probability : ndarray of shape (N, K)

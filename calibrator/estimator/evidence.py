@@ -158,7 +158,10 @@ class Blocks:
         return cls(count=count, vehicle=np.repeat(np.arange(len(count)), count))
 
     def total(self, values: Array) -> Array:
-        """Sum (B, ...) over the blocks of each vehicle to (N, ...); to the last bit, other vehicles have no effect."""
+        """Sum values (B, ...) over the blocks of each vehicle, to shape (N, ...).
+
+        The sum of a vehicle is the same to the bit, whichever other vehicles there are.
+        """
         first = np.cumsum(self.count) - self.count
         return np.asarray(np.add.reduceat(np.ascontiguousarray(values), first, axis=0))
 
@@ -393,10 +396,10 @@ def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
 
 
 def ratios_in_doubt(fleet: FleetMoments) -> Mask:
-    """Find gain ratios that slow changes of the currents show otherwise than fast ones, in the fleet as a whole.
+    """Find gain ratios that differ between slow and fast changes of the currents, in the fleet as a whole.
 
-    Gains are the same at any speed. Filters of signals, means over a second, held values and loads that follow the
-    speed are not: what they add to a ratio looks like a gain error that all vehicles share: (M8a) of docs/method.md.
+    A gain error is the same in both. The effect of filtered signals, means over a second, held values and loads that
+    follow the vehicle's speed is not, and looks like a gain error that all vehicles share: (M8a) of docs/method.md.
 
     Parameters
     ----------

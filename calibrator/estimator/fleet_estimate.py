@@ -109,11 +109,11 @@ class FleetReference:
     carried : bool
         Whether enough trusted vehicles carry the reference, so that the fleet may be small.
     sums_a : (float, float)
-        Sum of the currents of trusted vehicles that carry the reference, their median, and the sum on which most of the
+        Median junction sum of the trusted vehicles that carry the reference, and the junction sum on which most of the
         others agree; NaN if there are too few, or they do not agree. [A]
     zero_trusted : bool
-        Whether trusted vehicles, if there are any, say where zero is: not if only the currents of the others sum to the
-        load.
+        Whether the offsets of trusted vehicles are taken as zero, too. Not if their junction sum differs from that of
+        the others, and that of the others is the expected load.
     load_denied : bool
         Whether the currents of most vehicles sum to zero although a load is declared, and no offset was read.
     agreeing : tuple of float

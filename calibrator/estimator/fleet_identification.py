@@ -1,7 +1,8 @@
 """``calibrator identify``: the filter bank that a fleet's vehicles share, and how well it simulates each of them.
 
-A read-out is C, D and the offset of (2) in [1]_ by least squares on summaries. The columns of the bank depend on the
-inputs alone, so noise of the sensors leaves no bias. Fit and simulation of held-out blocks need second moments only.
+A read-out (C, D and the offset of equation (2) of [1]_) is fitted to summaries by least squares. The columns of the
+bank depend on the inputs alone, so noise of the sensors leaves no bias. Fit and simulation of held-out blocks need
+second moments only.
 
 Candidate banks are the plain inputs; low-passes whose time constants are spaced evenly in their logarithm; and poles of
 systems of several orders, identified from some vehicles together: as they are, or each replaced by several poles about

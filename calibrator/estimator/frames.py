@@ -63,20 +63,20 @@ OTHER_UNIT = 100.0
 
 
 def require(good: Any, what: str, given: Any, expected: str) -> None:
-    """Raise FleetError unless ``good``; ``what`` names the argument, and the message shows it if it is short."""
+    """Raise FleetError unless ``good``; the message begins with ``what`` and shows ``given`` if that is short."""
     if not good:
         shown = text if len(text := repr(given)) < 80 and "\n" not in text else f"of type {type(given).__name__}"
         raise FleetError(f"{what} {shown}: expected {expected}")
 
 
 def path_of(given: Any, what: str, expected: str = "the path of a layout (TOML)") -> Path:
-    """Return an argument that names a file or folder as a path; FleetError, naming ``what``, if it is none."""
+    """Return an argument that names a file or folder as a path; FleetError, naming ``what``, if it is no path."""
     require(isinstance(given, (str, os.PathLike)) and os.fspath(given), what, given, expected)
     return Path(given)
 
 
 def is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
-    """Check whether an argument is a number of this kind from ``low`` to ``high``; bool is none."""
+    """Check whether an argument is a number of this kind from ``low`` to ``high``; a bool is no number."""
     return isinstance(given, kind) and not isinstance(given, bool) and low <= float(given) <= high
 
 

@@ -6,11 +6,11 @@ No fleet is needed. Every vehicle gives K - 1 gain ratios and one constant of th
 
 with the offsets o and the load l that no branch measures. They are linearised in the unknowns (lambda, o, l), so
 recordings of one car that has another sensor ("meter") in one branch each time, as at different chargers, are one
-system of equations. The ratio of a branch whose current hardly varies is wrong by much, and c by that times the mean
-current; their covariance says so, for g and c themselves, not for logarithms. Ratios do not give the scale of the
-gains: it comes from sensors that are known. Offsets come from known sensors, zero-current windows, a declared load, or
-a charge balance. As no fleet shows what is usual, the gain of a sensor that is not known is open: its prior is a wide
-Gaussian. Its offset is absent (a narrow Gaussian: no zero is exact) or present, of any size; each choice is one
+system of equations. If the current of a branch hardly varies, its ratio may be far off, and c by as much times the mean
+current. The covariance says so, and is therefore that of g and c, not of logarithms. Ratios do not give the scale of
+the gains: it comes from sensors that are known. Offsets come from known sensors, zero-current windows, a declared load,
+or a charge balance. As no fleet shows what is usual, the gain of a sensor that is not known is open: its prior is a
+wide Gaussian. Its offset is absent (a narrow Gaussian: no zero is exact) or present, of any size; each choice is one
 explanation. What stays open is reported with its standard deviation, and is not corrected.
 """
 

@@ -61,7 +61,7 @@ JUMP = 0.02
 MOST_SHOWN = 5
 """Largest number of vehicles whose gain ratios are shown one by one."""
 WORSE, WORSE_A = 1.5, 1.0
-"""A correction is told that raises the RMS of the junction sum by more than this factor [1] and this current. [A]"""
+"""A correction is reported if it raises the RMS of the junction sum by more than this factor [1] and current. [A]"""
 MOST_READ_HERE = 5
 """Largest number of vehicles that are read in this process: other processes would take longer to start."""
 

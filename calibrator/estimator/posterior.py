@@ -148,7 +148,8 @@ class Fits(NamedTuple):
     number : ndarray of int of shape (N,)
         Number of explanations of each vehicle; entries beyond it in the other arrays are meaningless.
     support : ndarray of bool of shape (N, Q, P)
-        Which parameters are not zero; of a current that is moved between two branches one, in ``theta`` both.
+        Which parameters are not zero. If the hardware moves a current between two branches, that is one fault: only one
+        of its two hardware offsets is marked here, ``theta`` has both.
     hardware, sensor : ndarray of int of shape (N, Q)
         Numbers of hardware and sensor faults.
     theta : ndarray of shape (N, Q, P)
@@ -766,9 +767,9 @@ class FaultSizes(NamedTuple):
     weight : ndarray of shape (D,)
         Weights of the draws.
     first : ndarray of int
-        First draw of each vehicle.
+        Index of the first of the D draws of each vehicle that has any.
     log_density : ndarray of shape (G,)
-        Logarithm of the density of sizes that the weights are for.
+        Logarithm of the density of sizes in the prior by which the draws are weighted.
     """
 
     place: Integers

@@ -119,7 +119,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What the user chose: branches, held-out vehicles; for the posterior method also harm limit, trust, load, etc."""
     created: str
     details: dict[str, Any]
-    """What the method records of its run: reference and hyper-parameters of a fleet, gain ratios and constants of
+    """What the method records of its run: reference and hyperparameters of a fleet, gain ratios and constants of
     single junctions, or unity drive and simulation SNR of the published method."""
     vehicles: int
     buckets: int = 0
@@ -424,7 +424,7 @@ def read_run(result: Path) -> RunRecord:
 
 
 def deployed_rms_a(applied: Mask, *, measured_a: Array, corrected_a: Array) -> Array:
-    """Return the RMS of the Kirchhoff sum with what the node applies, shape (N,): as measured where it applies nothing.
+    """Return the RMS of the Kirchhoff sum with what the node applies, shape (N,); as measured if that is nothing. [A]
 
     Parameters
     ----------
