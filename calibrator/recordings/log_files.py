@@ -152,7 +152,7 @@ def is_candump(head: str, *, printed: bool = False) -> bool:
 
 
 def is_bus_log(path: Path) -> bool:
-    """Check whether an MDF 4 file holds frames: ASAM sets the name of their channel, and names are never compressed.
+    """Check whether an MDF 4 file holds frames: their channel has the name that ASAM sets, which is never compressed.
 
     An empty file counts as one that holds frames.
     """

@@ -108,10 +108,10 @@ class Table:
         Rows in which a column has a text or an infinite number instead of a number; columns without such rows are
         absent.
     texts : dict of str to str
-        For columns that are not read, as they have no number, or numbers that cannot be read such as ``20.9-``, by
-        header: the first such cell and where it stands, for messages.
+        By header of each column that is not read, as it has no number or one that cannot be read such as ``20.9-``: the
+        first such cell and where it stands, for messages.
     words : collection of str
-        Those of them in which no cell is like a number.
+        Headers in ``texts`` of columns in which no cell is like a number.
     found : str
         What was detected about the file, in words, such as ``decimal ',', utf-8-sig; time 'Zeit' in s``.
     disordered, clock_steps, without_time : int

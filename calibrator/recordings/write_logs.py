@@ -28,7 +28,7 @@ class FrameSeries:
     arbitration_id, extended : int, bool
         Identifier, and whether it has 29 bits.
     time_s : ndarray of shape (n,)
-        Instants of the frames. [s]
+        Instants of the frames, from any zero; they become the time stamps as they are. [s]
     data : ndarray of uint8 of shape (n, length)
         Payloads.
     """
