@@ -96,7 +96,7 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class Attack:
-    """A world, and which of N vehicles it affects how much.
+    """A world as drawn for N vehicles: which of them it affects, and how much.
 
     Attributes
     ----------

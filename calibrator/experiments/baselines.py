@@ -78,9 +78,10 @@ def lasso(trial: Trial) -> Faults:
 
 
 def fleet_median(trial: Trial) -> Faults:
-    """Return as sensor faults what is farther than :data:`BEYOND` robust standard deviations from the fleet's median.
+    """Return as sensor faults the slopes and intercepts that are far from the fleet's median, less that median.
 
-    Compared are each vehicle's slopes and intercepts, equation (15) of the paper, here over the fleet model.
+    Far is more than :data:`BEYOND` robust standard deviations. Slopes and intercepts are those of equation (15) of the
+    paper, here over the fleet model.
     """
     rows, order = _evidence_rows(trial)
 
@@ -94,7 +95,10 @@ def fleet_median(trial: Trial) -> Faults:
 
 
 def total_least_squares(trial: Trial) -> Faults:
-    """Return sensor faults by the direction in which currents vary least: it gives 1 / (1 + d), scaled to median 1."""
+    """Return sensor faults from the weighted sum of the currents that varies least.
+
+    Its weights, scaled to median 1, are taken as 1 / (1 + d); offsets are the smallest that make its mean 0.
+    """
     mean_a, covariance_a2 = _measured_moments(trial)
     w = np.linalg.eigh(covariance_a2)[1][:, :, 0]
     w = w / np.median(w, axis=1, keepdims=True)
@@ -105,7 +109,7 @@ def total_least_squares(trial: Trial) -> Faults:
 
 
 def reconciliation(trial: Trial) -> Faults:
-    """Return sensor faults by which measured currents follow from reconciled ones, the nearest that sum to zero.
+    """Return as sensor faults the lines of measured over reconciled currents, which are the nearest that sum to zero.
 
     All sensors count as equally accurate; a sum that their :data:`ACCURACY` explains gives no faults.
     """

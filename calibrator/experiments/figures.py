@@ -195,7 +195,7 @@ def tenths_of(values: Values) -> pd.DataFrame:
 
 
 def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
-    """Return the expected calibration error by tenths of the confidence, and that of exact ones by chance. [1]"""
+    """Return the expected calibration error by tenths of confidence, and what exact confidences give by chance. [1]"""
     vehicles, confidence = tenths["vehicles"].to_numpy(float), tenths["confidence"].to_numpy(float)
     error = vehicles * np.abs(confidence - tenths["recovered"].to_numpy(float))
     chance = np.sqrt(2.0 / np.pi * vehicles * confidence * (1.0 - confidence))

@@ -144,7 +144,7 @@ def require_estimate(method: str, estimate: Estimate, truth: Faults) -> Estimate
     ------
     FleetError
         If it is no :class:`Estimate`, its faults are no :class:`Faults`, an array has a wrong shape or type or values
-        that are not finite, a confidence is outside 0 to 1, the number that failed is none of 0 to N, or findings are
+        that are not finite, a confidence is outside 0 to 1, the number that failed is not 0 to N, or findings are
         given but not for exactly N vehicles.
     """
     if not isinstance(estimate, Estimate):

@@ -165,7 +165,7 @@ def _markdown(table: pd.DataFrame) -> str:
 
 
 def write_page(folder: Path, result: ExperimentResult) -> None:
-    """Write NAME.json, NAME.md and NAME.png into a folder, and beside the folder the heads of its pages, FOLDER.md."""
+    """Write NAME.json, NAME.md and NAME.png into a folder, and beside it FOLDER.md with the tables of all its pages."""
     name = result.experiment.name
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / f"{name}.json", f"{result.to_json()}\n".encode())
