@@ -48,9 +48,10 @@ class VehicleDatabase:
     """SHA-256 of the DBC file; see :attr:`.Layout.dbc_digest`."""
 
     def message(self, name: str, place: str = "") -> Message:
-        """Return the message of this name.
+        """Return the message ``Message`` or ``bus:Message``; ``place`` is where the layout names it, for errors.
 
-        DatabaseError (no such message) says where the layout names it: ``place``; LayoutError: there is no such bus.
+        DatabaseError if there is no such message, or the name or its identifier is not unique; LayoutError if there is
+        no such bus.
         """
         return self._found(name, place)[1]
 
@@ -97,7 +98,7 @@ class VehicleDatabase:
     def signal(self, name: str) -> tuple[Message, Signal]:
         """Return message and signal of ``Message.Signal``; raise :class:`DatabaseError` if the DBC lacks one of them.
 
-        LayoutError says that the name has another form, or a bus that the layout does not have.
+        LayoutError if the name has another form, or a bus that the layout does not have.
         Without a DBC the name is that of a column; its signal is then a float in the unit that the layout gives.
         """
         if not self.layout.dbc_files:

@@ -94,7 +94,7 @@ class Bus(_Table, frozen=True, kw_only=True):
 
 
 class Branch(_Table, frozen=True, kw_only=True):
-    """One HV current at the junction: a current, a power divided by a voltage, or computed by a formula [A]."""
+    """One HV current at the junction, given by a current signal, by a power and a voltage, or by a formula."""
 
     name: Name
     sign: Literal[1, -1]

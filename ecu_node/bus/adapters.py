@@ -1,8 +1,8 @@
 """Opens a bus of python-can; its settings come from the command line, then from python-can's own configuration.
 
-The latter is CAN_BITRATE and CAN_CONFIG of the environment, and can.conf: the section named like the channel, then
-[default]. Without a bit rate an adapter's driver would take 500 kbit/s, which disturbs a bus of another rate: that is
-refused.
+python-can's configuration is CAN_BITRATE and CAN_CONFIG of the environment, and can.conf: the section named like the
+channel, then [default]. An adapter's driver would take 500 kbit/s if no bit rate is given, which disturbs a bus of
+another rate: so a missing bit rate is an error.
 """
 
 import configparser

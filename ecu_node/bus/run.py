@@ -1,9 +1,9 @@
 """``ecu-node run``: parameters, core, buses and service put together; ``ecu-node check``: what a run would apply.
 
 Parts that have something to do besides the frames, such as the fault memory and the telemetry, have a method ``look``
-and are in the lists ``looks`` or ``records`` of :func:`run_node`. It is called every 20 ms, just after the junction was
-looked at; ``corrector.watch`` then has the currents of all branches: ``instant_s`` and ``currents_a`` (measured and
-corrected).
+and are in the lists ``looks`` or ``records`` of :func:`run_node`. ``look`` is called every 20 ms, just after the
+junction was looked at; ``corrector.watch`` then has the currents of all branches: ``instant_s`` and ``currents_a``
+(measured and corrected).
 """
 
 import argparse

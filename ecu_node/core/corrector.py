@@ -255,8 +255,8 @@ class Source:
         -------
         bytearray or None
             Payload to be sent on, protected with the counter that the frame came with; None if the frame carries a
-            branch and is corrupt, repeated, or its counter jumped: then it is not passed on. That too many frames of
-            the message fail their check holds nothing up: its receivers judge that for themselves.
+            branch and is corrupt, repeated, or its counter jumped: then it is not passed on. Intact frames are
+            passed on even if too many others of the message fail their check: its receivers judge that themselves.
         """
         ways = self.ways[len(payload)]
         if self._take(payload, now_s, ways) > _LAST_USABLE:

@@ -87,7 +87,7 @@ class Protection:
         return self.check(payload, self.identity)
 
     def is_intact(self, payload: bytearray) -> bool:
-        """Check whether a payload is long enough, its CRC right and its counter below ``modulus``; it alone counts."""
+        """Check whether a payload, by itself, is long enough, its CRC right and its counter below ``modulus``."""
         return len(payload) >= self.least_bytes and self.is_sound(payload) and self.counter_of(payload) < self.modulus
 
     def counter_of(self, payload: bytes | bytearray) -> int:

@@ -53,13 +53,13 @@ class HeardSignal:
         self._spoilt_s = -math.inf
 
     def follow(self, signal: PlacedSignal, frames: Frames) -> None:
-        """Read the signal from these frames, to which its message goes on adding."""
+        """Read the signal from ``frames``, to which each new frame of its message is added."""
         self.signal, self._frames = signal, frames
 
     def newest_first(self) -> Iterator[tuple[float, int]]:
         """Return pairs of time [s] and code of the remembered frames with the signal, the newest first.
 
-        No frame is read twice, over all calls.
+        Each frame is decoded only once, however often this is called.
         """
         if self._frames and self._frames[-1] is not self._read:
             new = list(takewhile(lambda frame: frame is not self._read, reversed(self._frames)))
