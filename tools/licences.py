@@ -12,7 +12,7 @@ READ = {"docutils": "BSD-2-Clause AND public domain", "fastsim": "Apache-2.0"}
 
 
 def licence_of(one: Distribution) -> str:
-    """Return the licence that the metadata state, in one line, a good one if there is one; empty if they state none."""
+    """Return the licence that the metadata state, in one line; of several a good one if any, empty without any."""
     name, found = one.metadata["Name"], one.metadata.get_all("License-Expression") or []
     classifiers = [text.rpartition(" :: ")[2] for text in one.metadata.get_all("Classifier") or [] if "License" in text]
     stated = [text for text in one.metadata.get_all("License") or [] if "\n" not in text and len(text) < 60]

@@ -58,7 +58,7 @@ class Vehicle:
     noise_a : float
         Standard deviation of the noise of each sensor sample. [A]
     delay_s : ndarray of shape (K,)
-        Delay of each sensor: what it shows now flowed so much earlier. [s]
+        Delay of each sensor: how long ago the current flowed that it shows. [s]
     unmeasured_a : float
         Load that no branch measures; the first branch, which feeds the others, carries it. [A]
     """

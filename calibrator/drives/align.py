@@ -44,7 +44,7 @@ _STALE, _NOT_GOOD = "stale", "not good"
 
 
 def at_pace(layout: Layout, drives: Sequence[Drive]) -> Layout:
-    """Return the layout; with the frame distance of the fastest branch as period, if its own is far shorter."""
+    """Return the layout, with the frame distance of the fastest branch as period if far longer, see :data:`SLOWER`."""
     channels = [channel for drive in drives for channel in drive.branches.values() if channel.good.sum() > 1]
     fastest_s = min((float(np.median(np.diff(each.time_s[each.good]))) for each in channels), default=0.0)
     if fastest_s < SLOWER * layout.period_s:

@@ -305,7 +305,7 @@ class Repository:
             return expiry_of(path.read_bytes())
 
     def sign(self, signers: Sequence[Signer]) -> Iterator[str]:
-        """Sign all staged metadata, a role per iteration; roles that lack signatures then are in :attr:`waiting`.
+        """Sign all staged metadata, one role per iteration; :attr:`waiting` then names those that lack signatures.
 
         Parameters
         ----------

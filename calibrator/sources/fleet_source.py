@@ -2,9 +2,9 @@
 
 A log belongs to the vehicle that its folder is named after, and its drive is named after the file without suffixes:
 ``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders and ``.zip`` archives are searched
-at any depth; an archive counts as a folder of its name. Logs that lie beside the folders of vehicles, vehicles with
-two folders of the same name, folders without logs beside them, and drives for which there are two files, are left out,
-and the report names them.
+at any depth; an archive counts as a folder of its name. Left out, and named in the report, are logs that lie beside
+the folders of vehicles, folders beside these that hold no logs, vehicles with two folders of the same name, and drives
+for which there are two files.
 """
 
 import re
@@ -116,7 +116,8 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     Parameters
     ----------
     arguments : iterable of str or Path
-        Files, or folders to search, of which ``drives`` or ``logs`` alone if it is in one; paths or URLs.
+        Files, or folders to search; paths or URLs. In a folder that has a folder ``drives``, or else ``logs``, only
+        this one is searched.
 
     Returns
     -------

@@ -47,7 +47,7 @@ def no_progress() -> AbstractContextManager[None]:
 
 
 def one_pass(number: int, total: int) -> AbstractContextManager[None]:
-    """Within the block every bar shows this number of its pass: ``2/3 calibrate``; none if total is 1."""
+    """Within the block every bar begins with the number of the pass, as ``2/3 calibrate``; not if total is 1."""
     return _within(_number, lambda: f"{number}/{total} " if total > 1 else "")
 
 

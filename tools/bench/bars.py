@@ -2,8 +2,8 @@
 
     python -m bench.bars        (in tools/, after experiments and benchmarks)
 
-Fails if a bar is missed that is not known to be, or farther than is known, or has no figure; or if figures are of more
-than one commit, or of changed files.
+Fails if a bar has no figure, or is missed by more than ``bars.toml`` says is known; or if figures are of more than one
+commit, or of changed files.
 """
 
 import json

@@ -40,7 +40,7 @@ IDLE = {
 
 
 def read(_: bytes, seconds: float) -> bytes:
-    """Stand for a worker that reads a vehicle's drives on a core of its own."""
+    """Wait as long as reading a vehicle's drives is taken to last, and return as many bytes as its record has."""
     time.sleep(seconds)
     return bytes(RECORD_BYTES)
 

@@ -41,7 +41,7 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def ready_times_s(page: Path) -> list[float]:
-    """Measure the time from opening the page in Chromium until table and first figures are ready, as it tells. [s]"""
+    """Open the page in Chromium some times; return how long each took until it reported table and figures ready. [s]"""
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
         raise SystemExit("bench: no chromium and chromedriver here (Debian: apt-get install chromium chromium-driver)")

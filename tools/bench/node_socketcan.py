@@ -192,7 +192,7 @@ def _pass_on(kind: str) -> None:
 
 
 def main(*, frames: int = 20_000, as_json: bool = False, peer: str = "") -> None:
-    """Measure and print one line per row, or JSON; with --peer be one of the other ways until it is ended."""
+    """Measure and print one line per row, or JSON; with --peer act as one of the other ways, until ended."""
     if peer:
         _pass_on(peer)
     found = rows(frames)
