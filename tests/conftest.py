@@ -1,8 +1,10 @@
-"""What all tests share: real data where it is, the rule for skipped tests, a guard against open buses, and Ctrl-C."""
+"""What all tests share: real data where it is, the rule for skipped tests, a guard against open buses, Ctrl-C, ids."""
 
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import is_dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 from weakref import WeakSet
@@ -23,6 +25,8 @@ ROOT = Path(__file__).parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
 WHEN_ASKED = [ROOT / "tests" / name for name in ("package", "vcan")]
 """Folders whose tests run only where they are named: they need a built wheel, or a kernel with SocketCAN."""
+LONGEST_ID = 60
+"""Most characters of a parameter that is shown in the name of a test."""
 NOTHING_MAY_BE_SKIPPED = os.environ.get("HV_REQUIRE_ALL") == "1"
 
 settings.register_profile("patient", deadline=None)  # a busy machine or a first compilation may be slow
@@ -86,6 +90,33 @@ def no_bus_left_open() -> Iterator[None]:
 def pytest_configure() -> None:
     """Let Ctrl-C end the tests and programs that they start: a shell lets jobs in the background ignore it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
+    """Show a parameter that is no text with its name, as ``load_a=3``: a report then says what its numbers are."""
+    text = None if isinstance(val, str) else _as_plain(val)
+    return f"{argname}={text}" if text is not None and len(text) <= LONGEST_ID else None
+
+
+def _as_plain(val: Any) -> str | None:
+    """Return numbers, texts, members of enumerations, and collections of these as text; None for anything else."""
+    if isinstance(val, Enum):
+        return val.name
+    if isinstance(val, float):
+        return f"{val:.6g}"
+    if val is None or isinstance(val, int | str):
+        return repr(val)
+    if is_dataclass(val) or hasattr(val, "__struct_fields__"):
+        return repr(val) if "<" not in repr(val) else None  # <...> holds an address, other in each process
+    if hasattr(val, "tolist"):
+        return _as_plain(val.tolist())
+    if isinstance(val, dict):
+        inner = [(str(key), _as_plain(item)) for key, item in val.items()]
+        return None if any(text is None for _, text in inner) else ", ".join(f"{key}: {text}" for key, text in inner)
+    if isinstance(val, list | tuple | set | frozenset) and all(text is not None for text in map(_as_plain, val)):
+        texts = filter(None, map(_as_plain, val))
+        return f"({', '.join(sorted(texts) if isinstance(val, set | frozenset) else texts)})"
+    return None
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
