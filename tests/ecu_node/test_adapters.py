@@ -149,7 +149,9 @@ def test_dry_run_prints_the_bus_that_would_be_opened(node: list[str], dry_run: D
     assert "no bitrate" in done.err
 
 
-@pytest.mark.parametrize("timing", [can.BitTiming(**CLASSIC_TIMING), can.BitTimingFd(**FD_TIMING)])
+@pytest.mark.parametrize(
+    "timing", [can.BitTiming(**CLASSIC_TIMING), can.BitTimingFd(**FD_TIMING)], ids=["classic", "FD"]
+)
 def test_bit_timing_is_printed_once(timing: can.BitTiming | can.BitTimingFd, tmp_path: Path, dry_run: DryRun) -> None:
     lines = [f"{name} = {value}" for name, value in timing.items()]
     (tmp_path / "can.conf").write_text("\n".join(["[PCAN_USBBUS1]", *lines]))

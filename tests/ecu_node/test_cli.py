@@ -187,7 +187,7 @@ MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--chan
 COMMANDS = [(check(Path("p")), ""), (["--help"], ""), (["--version"], "1"), (MONITOR, "1")]
 
 
-@pytest.mark.parametrize(("arguments", "unbuffered"), COMMANDS)
+@pytest.mark.parametrize(("arguments", "unbuffered"), COMMANDS, ids=["check", "--help", "--version", "monitor"])
 def test_unwritable_output_prints_one_line_and_exits_with_1(arguments: list[str], unbuffered: str) -> None:
     with Path("/dev/full").open("w") as full:
         done = program(*arguments, stdout=full.fileno(), PYTHONUNBUFFERED=unbuffered)
@@ -195,7 +195,7 @@ def test_unwritable_output_prints_one_line_and_exits_with_1(arguments: list[str]
     assert (done.returncode, done.stderr) == (1, line)
 
 
-@pytest.mark.parametrize("arguments", [check(Path("p")), ["--help"]])
+@pytest.mark.parametrize("arguments", [check(Path("p")), ["--help"]], ids=["check", "--help"])
 def test_closed_output_pipe_ends_a_command_silently_with_exit_code_1(arguments: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)

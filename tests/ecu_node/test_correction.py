@@ -126,7 +126,9 @@ LARGE = [
 ]
 
 
-@pytest.mark.parametrize(("source", "drift", "offset_a"), LARGE)
+@pytest.mark.parametrize(
+    ("source", "drift", "offset_a"), LARGE, ids=["signed", "unsigned", "offset in the DBC", "with a fault"]
+)
 def test_largest_sum_of_the_integer_plan_has_59_bits(source: Codes, drift: float, offset_a: float) -> None:
     plan = integer_plan(source, current(), sign=1, drift=drift, offset_a=offset_a)
     largest = max(abs(source.lowest), abs(source.highest)) * plan.gain + abs(plan.bias) + (1 << (plan.shift - 1))
@@ -218,6 +220,8 @@ LIMITS = [
 ]
 
 
-@pytest.mark.parametrize(("limits", "codes"), LIMITS)
+@pytest.mark.parametrize(
+    ("limits", "codes"), LIMITS, ids=["all doubles", "minimum = maximum", "minimum above maximum", "from 1.99 to 2.01"]
+)
 def test_dbc_limits_restrict_codes_only_if_minimum_is_below_maximum(limits: tuple[float, float], codes: range) -> None:
     assert whole_range(current(limits=limits)) == codes

@@ -302,7 +302,11 @@ EXPECTED = [
 ]
 
 
-@pytest.mark.parametrize(("offset_a", "sums", "reason"), EXPECTED)
+@pytest.mark.parametrize(
+    ("offset_a", "sums", "reason"),
+    EXPECTED,
+    ids=["1.5 A more", "0.5 A more", "3 A, seen by the calibrator", "sum of 0 A at a load of 3 A", "-3 A at that load"],
+)
 def test_junction_sum_is_judged_relative_to_the_expected_sum(
     database: VehicleDatabase, offset_a: float, sums: JunctionResidual, reason: Reason
 ) -> None:
@@ -387,7 +391,7 @@ def test_dbc_names_all_status_codes(database: VehicleDatabase, signal: str, code
     assert names == {code.value: code.name.replace("_", "") for code in codes}
 
 
-@pytest.mark.parametrize("offset", ["0", "-20"])
+@pytest.mark.parametrize("offset", ["0", "-20"], ids="offset in the DBC: {}".format)
 def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDatabase, offset: str) -> None:
     dbc = SMALL_DBC.replace("(0.01,0)", f"(0.01,{offset})").replace("(-0.05,0)", f"(-0.05,{offset})")
     database = make_database(dbc=dbc)
@@ -408,7 +412,9 @@ def test_power_branch_enters_the_sum_as_power_over_voltage(make_database: MakeDa
     assert corrector.branches[2].currents_at(0.9) is None, "nor one near zero"
 
 
-@pytest.mark.parametrize(("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")])
+@pytest.mark.parametrize(
+    ("scale", "unit"), [("1", "50W/bit"), ("50", "50W/bit")], ids=["in the unit alone", "also as factor"]
+)
 def test_scale_of_a_power_in_its_unit_is_applied_once(make_database: MakeDatabase, scale: str, unit: str) -> None:
     dbc = SMALL_DBC.replace('(1,0) [0|60000] "W"', f'({scale},0) [0|60000] "{unit}"')
     corrector = corrector_for(make_database(SMALL_LAYOUT, dbc), heater=(0.0, 0.0))

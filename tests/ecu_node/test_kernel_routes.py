@@ -5,7 +5,10 @@ import pytest
 from ecu_node.bus.kernel_routes import complement, kernel_routes
 
 
-@pytest.mark.parametrize("taken", [(), (0,), (0x7FF,), (0x110, 0x120, 0x130, 0x5F0), (0x110, 0x111), tuple(range(300))])
+@pytest.mark.parametrize(
+    "taken",
+    [(), (0,), (0x7FF,), (0x110, 0x120, 0x130, 0x5F0), (0x110, 0x111), pytest.param(tuple(range(300)), id="0 to 299")],
+)
 def test_kernel_rules_cover_each_untaken_11_bit_identifier_exactly_once(taken: tuple[int, ...]) -> None:
     pairs = list(complement(taken, 11))
     covered = [sum(identifier & mask == prefix for prefix, mask in pairs) for identifier in range(2048)]

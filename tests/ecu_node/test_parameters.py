@@ -4,7 +4,6 @@ import codecs
 import json
 import math
 from collections.abc import Callable
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +118,9 @@ FOREIGN = [
 ]
 
 
-@pytest.mark.parametrize(("branch", "change", "reason", "words"), FOREIGN)
+@pytest.mark.parametrize(
+    ("branch", "change", "reason", "words"), FOREIGN, ids=["vehicle", "layout", "DBC", "branch that the layout lacks"]
+)
 def test_parameters_of_another_vehicle_layout_or_dbc_are_unfit(
     database: VehicleDatabase, branch: str, change: dict[str, Any], reason: Reason, words: str
 ) -> None:
@@ -253,7 +254,9 @@ MALFORMED = [
 ]
 
 
-@pytest.mark.parametrize(("content", "words"), MALFORMED, ids=count())
+@pytest.mark.parametrize(
+    ("content", "words"), MALFORMED, ids=[words or "not a finite number" for _, words in MALFORMED]
+)
 def test_malformed_parameter_file_is_refused_in_one_line(
     database: VehicleDatabase, tmp_path: Path, content: bytes | Callable[[bytes], bytes], words: str
 ) -> None:

@@ -41,10 +41,11 @@ BYTES = [
     (SMALL_LAYOUT, "+", "-12.8", "255", 0.2),
     (SMALL_LAYOUT.replace(MOTOR_ENTRY, ""), "-", "0", "-128", 0.2),
 ]
+BYTE_SIGNALS = ["signed, drift -0.2", "unsigned, drift -0.2", "unsigned, drift 0.2", "signed, battery alone"]
 
 
 @pytest.mark.parametrize("mode", Mode)
-@pytest.mark.parametrize(("layout", "sign", "offset", "missing", "drift"), BYTES)
+@pytest.mark.parametrize(("layout", "sign", "offset", "missing", "drift"), BYTES, ids=BYTE_SIGNALS)
 def test_every_8_bit_code_matches_the_oracle_whatever_the_other_bits_are(
     make_database: MakeDatabase, mode: Mode, layout: str, sign: str, offset: str, missing: str, drift: float
 ) -> None:

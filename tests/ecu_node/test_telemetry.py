@@ -112,7 +112,11 @@ def test_telemetry_lines_lost_on_a_full_disk_are_counted_and_logged_once(make_ou
     assert outlet.said[1] == "--telemetry: lines are written again"
 
 
-@pytest.mark.parametrize("target", [".", "pipe", ("no-such-host.invalid", 5000), ("a" * 64, 5000)])
+@pytest.mark.parametrize(
+    "target",
+    [".", "pipe", ("no-such-host.invalid", 5000), ("a" * 64, 5000)],
+    ids=["folder", "pipe", "unknown host", "impossible host"],
+)
 def test_unusable_target_blocks_nothing(target: str | tuple[str, int], make_outlet: Any, tmp_path: Path) -> None:
     """A folder, a pipe without a reader, a host without an address, and one that no name server could know."""
     os.mkfifo(tmp_path / "pipe")

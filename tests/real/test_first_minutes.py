@@ -104,8 +104,8 @@ def tenfold_voltage(dbc: str) -> str:
     (str, with_unit("RearPower266", "W"), [("error", "unit", "motor_rear")]),
     (str, with_unit("SmoothBattCurrent132", "kA"), [("error", "unit", "battery")]),
     (str, with_unit("FrontPower2E5", "MW"), [("error", "unit", "motor_front")]),
-    (inverted("battery"), with_unit("RearPower266", "W"),
-     [("error", "sign", "battery"), ("error", "unit", "motor_rear")]),
+    pytest.param(inverted("battery"), with_unit("RearPower266", "W"),
+                 [("error", "sign", "battery"), ("error", "unit", "motor_rear")], id="sign and unit"),
     (str, tenfold_voltage, [("error", "unit", "ID132HVBattAmpVolt.BattVoltage132")]),
 ])  # fmt: skip
 def test_doctor_finds_each_injected_mistake_and_no_other(

@@ -61,6 +61,10 @@ LONG = pytest.mark.long
         pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=True, world=""), 0.01, marks=LONG),
         pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=False, world=""), 0.01, marks=LONG),
     ],
+    ids=[
+        *("6 vehicles, K=2, S=80", "12 vehicles, K=2, S=80", "6 vehicles, K=3, S=80", "12 vehicles, K=3, S=80"),
+        *("all vehicles, K=3, S=60, balanced", "all vehicles, K=3, S=60"),
+    ],
 )
 def test_enough_vehicles_with_faulty_sensors_are_corrected_and_none_is_harmed(
     trips: RecordedFleet, vehicles: int | None, case: RecordedCase, least: float

@@ -116,12 +116,12 @@ def without_some(channel: Channel) -> Channel:
 
 
 @pytest.mark.parametrize(("drive", "within_s"), [
-    (with_value("motor", lambda a: np.where(np.arange(len(a)) % 2500 < 5, 650.0, a)), 5e-3),  # wild samples
-    (changed("motor", lambda c: kept(c, np.floor(c.time_s / 20.0) % 3 != 0)), 1e-3),  # gaps
+    (with_value("motor", lambda a: np.where(np.arange(len(a)) % 2500 < 5, 650.0, a)), 5e-3),
+    (changed("motor", lambda c: kept(c, np.floor(c.time_s / 20.0) % 3 != 0)), 1e-3),
     (changed("motor", without_some), 1e-3),
     (changed("battery", lambda c: replace(c, value=c.value + 4.0 * (np.floor(c.time_s / 17.0) % 2))), 2e-3),
-    (with_value("motor", lambda a: np.where(a > 60.0, 1.15, 0.95) * (a - 60.0)), 3e-3),  # a gain for each sign
-])  # fmt: skip
+    (with_value("motor", lambda a: np.where(a > 60.0, 1.15, 0.95) * (a - 60.0)), 3e-3),
+], ids=["wild samples", "gaps", "bad samples", "offset that steps", "a gain for each sign"])  # fmt: skip
 def test_gaps_outliers_steps_and_sensor_faults_hardly_change_the_delay(drive: Drive, within_s: float) -> None:
     found = estimate_delays([drive], TWO, max_sd_s=0.02)
     assert found.known.all()
@@ -135,12 +135,13 @@ SHORT = made_up_drive(1, replace(PAIR, duration_s=30.0))
 @pytest.mark.parametrize("drive", [
     *(with_value(branch, lambda a: np.full(len(a), 12.0)) for branch in TWO),
     *(with_value(branch, lambda a: 12.0 + 0.4 * NOISE[: len(a)]) for branch in TWO),
-    with_value("motor", lambda a: -a),  # a wrong sign
+    with_value("motor", lambda a: -a),
     made_up_drive(1, replace(PAIR, size_a={"motor": 0.0})),
-    made_up_drive(1, replace(PAIR, delay_s={"motor": 0.8})),  # beyond the longest
+    made_up_drive(1, replace(PAIR, delay_s={"motor": 0.8})),
     NO_SAMPLES,
     SHORT,
-])  # fmt: skip
+], ids=["battery constant", "motor constant", "battery noise alone", "motor noise alone", "motor with a wrong sign",
+        "motor off", "delay beyond the longest", "no good samples", "short drive"])  # fmt: skip
 def test_delay_is_marked_as_not_known_if_the_drive_does_not_show_it(drive: Drive) -> None:
     found = estimate_delays([drive], TWO)
     assert found.known.tolist() == [True, False]

@@ -119,7 +119,7 @@ def errors_of(rows: evidence.EvidenceRows, faults: Faults) -> Array:
     simulated_drives.Conditions(noise_a=1.0, memory=0.8),
     pytest.param(simulated_drives.Conditions(), marks=pytest.mark.long),
     pytest.param(simulated_drives.Conditions(model_error_a=1.0), marks=pytest.mark.long),
-])  # fmt: skip
+], ids=["noise with a memory", "usual conditions", "errors of the model"])  # fmt: skip
 def test_errors_of_rows_are_as_stated(conditions: simulated_drives.Conditions, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evidence, "LEAST_SD", np.array([5e-5, 1e-5]))  # these sensors are exact
     faults = random_faults(1, vehicles=150, branches=K, sparsity=70.0, full_scale_a=FULL_SCALE_A)

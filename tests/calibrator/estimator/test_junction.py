@@ -76,7 +76,7 @@ def test_corrections_of_random_junctions_raise_no_error_by_more_than_0_05_percen
 
 @pytest.mark.parametrize(("fault", "known", "corrected"), [
     ({"gain": (0.0, 0.05, 0.0)}, {"trusted": ["battery"]}, {"motor"}),
-    ({"gain": (0.03, 0.05, 0.0)}, {"readings": MOTOR_READ}, {"battery", "motor"}),
+    pytest.param({"gain": (0.03, 0.05, 0.0)}, {"readings": MOTOR_READ}, {"battery", "motor"}, id="motor on a bench"),
     ({"offset_a": (0.0, 4.0, 0.0)}, {"trusted": ["battery"]}, set()),
     # of two branches the declared load leaves one offset; of three the gain alone is corrected
     ({"offset_a": (0.0, 4.0, 0.0), "load_a": 3.0}, {"trusted": ["battery", "heater"], "load": (3.0, 0.2)}, {"motor"}),
@@ -258,7 +258,9 @@ def test_sensors_of_one_car_at_several_meters_are_estimated_together() -> None:
 BATTERY_READ = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "drift": [0.0], "drift_sd": [0.002]})
 
 
-@pytest.mark.parametrize("known", [{"trusted": ["battery"]}, {"readings": BATTERY_READ}])
+@pytest.mark.parametrize(
+    "known", [{"trusted": ["battery"]}, {"readings": BATTERY_READ}], ids=["battery trusted", "battery read on a bench"]
+)
 def test_notice_if_a_gain_error_of_the_only_known_sensor_would_explain_all_others(
     known: dict[str, Any],
 ) -> None:

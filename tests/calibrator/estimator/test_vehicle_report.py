@@ -77,7 +77,8 @@ CHECK = "a check of the {} sensor against a reference would decide: its gain is 
 
 
 @pytest.mark.parametrize(("explanations", "held_back", "text"), [
-    ((of(0.6, offset_a=(40, 0)), of(0.4, offset_a=(0, 40))), ("", ""), WINDOW.format(40, 0)),
+    pytest.param((of(0.6, offset_a=(40, 0)), of(0.4, offset_a=(0, 40))), ("", ""), WINDOW.format(40, 0),
+                 id="offset of either sensor"),
     ((of(0.6, drift=(0.1, 0)), of(0.4, drift=(0, -0.2))), ("", ""), CHECK.format("motor", 0, -20)),
     ((of(0.5, drift=(0.1, 0)), of(0.5, drift=(0.1, 0))), ("", ""),
      "the explanations differ in the vehicle, not in its sensors: inspect the hardware"),

@@ -161,7 +161,7 @@ def test_rows_without_time_or_with_too_many_cells_are_left_out_and_counted(tmp_p
 @pytest.mark.parametrize("index", [
     pd.Index([*range(50), *range(60, ROWS + 10)]), dates(), dates().set_names("time"),
     pd.MultiIndex.from_arrays([["V1"] * ROWS, TIME_S], names=["vehicle", "time"]),
-])  # fmt: skip
+], ids=["row numbers with a gap", "dates", "dates named time", "vehicle and time"])  # fmt: skip
 def test_column_of_times_takes_precedence_over_the_index(tmp_path: Path, index: pd.Index) -> None:
     frame().set_axis(index).to_parquet(tmp_path / "x.parquet")
     table = read_table(tmp_path / "x.parquet")

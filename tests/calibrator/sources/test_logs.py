@@ -106,7 +106,7 @@ def store(database: VehicleDatabase, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(("branches", "beside"), [
     (None, []),
     (["battery", "motor"], ["branches recorded but not asked for, missing from the junction sum: auxiliary"]),
-])  # fmt: skip
+], ids=["all asked for", "auxiliary not asked for"])  # fmt: skip
 def test_branches_not_recorded_or_not_requested_are_named_in_notices(
     store: Path, database: VehicleDatabase, branches: list[str] | None, beside: list[str]
 ) -> None:

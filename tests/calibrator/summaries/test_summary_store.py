@@ -120,7 +120,7 @@ def test_failed_drive_does_not_invalidate_other_records_of_its_vehicle() -> None
     assert joined_records([bad, record_of("V1", summary_of(600))]).drives == ("d1",)
 
 
-@pytest.mark.parametrize("damage", [b"", b"PAR1", b"x" * 5000])
+@pytest.mark.parametrize("damage", [b"", b"PAR1", b"x" * 5000], ids=["empty", "first bytes alone", "other content"])
 def test_damaged_file_of_bucket_is_refused_and_named(tmp_path: Path, database: VehicleDatabase, damage: bytes) -> None:
     store = small_store(tmp_path, database, no_faults(2, 2))
     path = next((tmp_path / "buckets").iterdir())
@@ -145,7 +145,11 @@ def own_store(store: SummaryStore, tmp_path: Path) -> SummaryStore:
     return SummaryStore(storage=open_storage(tmp_path / "store"), identity=store.identity)
 
 
-@pytest.mark.parametrize("changes", [{"moments": [1.0] * 29}, {"noise_a2": []}, {"delay_reference": "bogus"}])
+@pytest.mark.parametrize(
+    "changes",
+    [{"moments": [1.0] * 29}, {"noise_a2": []}, {"delay_reference": "bogus"}],
+    ids=["other number of moments", "no noise", "unknown branch"],
+)
 def test_rows_with_columns_of_another_store_are_refused(own_store: SummaryStore, changes: dict[str, Any]) -> None:
     bucket = fullest(own_store)
     spoil(own_store, bucket, changes)
