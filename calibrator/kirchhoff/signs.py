@@ -84,7 +84,7 @@ def bands_of(recordings: Sequence[Sequence[Channel]]) -> Bands:
 def likely_multipliers(
     bands: Bands, price_besides: Callable[[Array], float], *, factors: Sequence[float] = FACTORS, sure: bool = True
 ) -> Array:
-    """Return the multipliers, shape (K,), of the least price: log (V / N) plus the price of other objections.
+    """Return the multipliers, shape (K,), whose price is least: log (V / N) plus the price of other objections.
 
     Parameters
     ----------

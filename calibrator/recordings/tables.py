@@ -326,7 +326,7 @@ def peak_of(value: Array) -> float:
 
 
 def likely_full_scale_a(peak_a: float) -> float:
-    """Guess the full scale of a junction: :data:`HEADROOM` times the peak current, rounded up to a round number. [A]"""
+    """Guess the full scale of a junction: :data:`HEADROOM` times the peak (not 0), rounded up to a round number. [A]"""
     least_a = HEADROOM * peak_a
     decade = 10.0 ** np.floor(np.log10(least_a))
     return float(next(step * decade for step in ROUND if step * decade >= least_a * (1.0 - 1e-9)))

@@ -202,7 +202,7 @@ def battery_margin(
     branch : str
         Branch of the battery.
     limit_a, voltage_v : float or None
-        Current limit; None: full scale. Voltage, only to be returned: with it A become kW. [A], [V]
+        Current limit, None: full scale [A]; voltage, which is only passed on, to show margins in kW [V].
 
     Returns
     -------
