@@ -194,14 +194,14 @@ def test_gain_error_shared_by_all_sensors_is_noticed_and_not_corrected(vehicles:
     assert not fleet_estimate.estimate_vehicles(summaries, learnt).corrected.any()
 
 
-def test_small_gain_error_that_all_sensors_of_a_branch_share_is_told() -> None:
+def test_small_gain_error_that_all_sensors_of_a_branch_share_is_reported() -> None:
     batch = no_faults(12, K)
     batch.drift[:, 1] = 0.006
     learnt = learned(summaries_of(batch, Conditions(samples=1800, noise_a=0.1), seed=2))
     assert any("by 0.6%: a gain error that a batch of sensors shares" in notice for notice in learnt.notices)
 
 
-def test_gain_errors_that_two_of_three_branches_share_are_given_to_no_pair() -> None:
+def test_gain_errors_that_two_of_three_branches_share_are_attributed_to_no_pair() -> None:
     """A factor on all currents is invisible, so each pair explains the gain ratios as well as any other."""
     batch = no_faults(12, 3)
     batch.drift[:, 1:] = 0.03, -0.04
@@ -298,7 +298,7 @@ def test_two_variants_of_the_vehicle_give_a_notice_and_a_finding_per_vehicle(lar
     assert not found.corrected.any()
 
 
-def test_integral_transform_of_the_truth_is_0_to_1(
+def test_probability_integral_transform_of_the_truth_is_between_0_and_1(
     truth: Faults, summaries: Summaries, reference: fleet_estimate.FleetReference
 ) -> None:
     for pit in fleet_estimate.estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
@@ -363,7 +363,7 @@ def test_trusted_vehicles_set_the_reference_of_a_fleet_with_a_shared_offset() ->
 
 
 @pytest.mark.parametrize("load_a", [0.0, 3.0])
-def test_wrong_zero_of_all_trusted_vehicles_turns_no_other_vehicle(load_a: float) -> None:
+def test_wrong_zero_of_all_trusted_vehicles_gives_the_others_no_offset(load_a: float) -> None:
     """Where the load is declared, the sum of the others is as right as where it is zero and there is none."""
     trusted, load = first(3), UnmeasuredLoad(mean_a=load_a, sd_a=0.1) if load_a else None
     reference = learned(drives("zero", load_a), trusted=trusted, load=load)
@@ -374,7 +374,7 @@ def test_wrong_zero_of_all_trusted_vehicles_turns_no_other_vehicle(load_a: float
     assert found.corrected[:, 1].tolist() == [j == 5 for j in range(16)]
 
 
-@pytest.mark.parametrize(("trusted_a", "others_a", "load", "says"), [
+@pytest.mark.parametrize(("trusted_a", "others_a", "load", "is_believed"), [
     (1.5, 0.1, None, False),
     (0.6, 0.1, None, True),  # as bench checks differ by chance
     (4.5, 3.0, None, True),  # beside a load that nobody declared
@@ -383,10 +383,10 @@ def test_wrong_zero_of_all_trusted_vehicles_turns_no_other_vehicle(load_a: float
     (0.0, 12.0, None, True),
     (NAN, NAN, None, True),
 ])  # fmt: skip
-def test_zero_of_trusted_vehicles_is_left_where_the_others_sum_to_the_load_and_they_do_not_by_chance(
-    trusted_a: float, others_a: float, load: UnmeasuredLoad | None, says: bool
+def test_zero_of_trusted_vehicles_is_not_believed_if_only_the_others_sum_to_the_load(
+    trusted_a: float, others_a: float, load: UnmeasuredLoad | None, is_believed: bool
 ) -> None:
-    assert fleet_estimate._says_zero(trusted_a, others_a, SCALE_A, load, count=3, branches=3) == says
+    assert fleet_estimate._says_zero(trusted_a, others_a, SCALE_A, load, count=3, branches=3) == is_believed
 
 
 @pytest.mark.parametrize("load_a", [0.0, 3.0])

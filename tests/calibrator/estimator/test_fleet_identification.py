@@ -116,7 +116,7 @@ def test_vehicle_without_dynamics_is_simulated_exactly(database: VehicleDatabase
     assert len(one.held_out_inputs) == pytest.approx(600 + one.lead_in, abs=1)
 
 
-def test_error_for_a_vehicle_that_was_parked_or_has_less_than_60_s_of_data(
+def test_vehicle_that_was_parked_or_has_less_than_60_s_of_data_is_refused(
     database: VehicleDatabase, tmp_path: Path
 ) -> None:
     moving, still = drive("a"), channel(np.zeros(SAMPLES))

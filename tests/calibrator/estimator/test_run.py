@@ -94,7 +94,9 @@ def test_fleet_in_whose_windows_current_flows_is_calibrated_without_them(store: 
 
 
 @pytest.mark.parametrize("shown_a", [0.84, 0.1])
-def test_vehicle_is_told_if_its_windows_are_not_used(store: SummaryStore, task: FleetTask, shown_a: float) -> None:
+def test_vehicle_has_a_finding_if_a_current_flows_in_its_windows(
+    store: SummaryStore, task: FleetTask, shown_a: float
+) -> None:
     seen = ZeroCurrent(offset_a=np.array([shown_a, -shown_a]), sd_a=np.full(2, 0.05))
     vehicle = replace(read_sample(store, CalibrationSettings())[0], zero_current=seen)
     found = task.calibrate([vehicle])[vehicle.vehicle]
