@@ -46,6 +46,9 @@ __all__ = ["SEEN", "JunctionKnowledge", "JunctionLaw", "estimate_junction", "nam
 
 LAW_GAIN_SD, LAW_OFFSET_SD = 0.002, 0.0005
 """Standard deviation that delays, noise and curvature of sensors add to a gain ratio, and to c over full scale. [1]"""
+LAW_MOVING_SD = 0.00003
+"""The same for the part of the junction sum, over full scale, that moves with a branch by chance, as where the delay of
+another, switched current is not quite right: gains of branches whose current moves little are known less well. [1]"""
 MOST_RATIO, SURE_SD = 3.0, 0.1
 """Gain ratio that no two sensors have, and standard deviation below which it is refused (times the ratio, if greater);
 else it counts with its deviation. [1]"""
@@ -119,7 +122,9 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
     constant_sd_a = float(np.hypot(np.sqrt(covariance[-1, -1]), LAW_OFFSET_SD * scale_a))
     unit = np.append(np.ones(K - 1), 1.0 / scale_a)
     # an error of a ratio turns the line about the mean current, and so moves the constant
-    jacobian = np.vstack([np.eye(K - 1), mean_a[others] / scale_a]) * LAW_GAIN_SD * _possible(ratio)
+    moved = np.maximum(np.sqrt(summary.variance_a2[others]) / scale_a, LAW_MOVING_SD)
+    error = np.hypot(LAW_GAIN_SD * _possible(ratio), LAW_MOVING_SD / moved)
+    jacobian = np.vstack([np.eye(K - 1), mean_a[others] / scale_a]) * error
     covariance = covariance * np.outer(unit, unit) + jacobian @ jacobian.T
     covariance[-1, -1] += LAW_OFFSET_SD**2
     return JunctionLaw(order, np.append(ratio, constant_a / scale_a), covariance, (constant_a, constant_sd_a))
@@ -394,8 +399,9 @@ def estimate_junction(
         harm[j] = harm_probability(points[j], estimate, *true, least=LAW_OFFSET_SD)
         harm_of_gain[j] = harm_probability(points[j], gain_only, *true, least=LAW_OFFSET_SD)
         confidence[j] = recovery_probability(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
-    # Where it is open which sensor has an offset, the gain alone may be corrected.
-    gain_alone = (harm >= harm_limit) & (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED)
+    # Where no offset is suspected, or it is open which sensor has it, the gain alone may be corrected.
+    gain_alone = (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED)
+    gain_alone &= (harm >= harm_limit) | (offset_fault[places] <= SUSPECTED)
     harm, faulty = np.where(gain_alone, harm_of_gain, harm), fault > SUSPECTED
     findings = _misfits([each.summary for each in vehicles], branches, scale_a)
     unfit = np.array([[bool(mine)] for mine in findings])

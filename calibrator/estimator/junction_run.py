@@ -28,6 +28,7 @@ from calibrator.estimator.settings import CalibrationSettings, RunIdentity
 from calibrator.estimator.vehicle_parameters import impossible, parameters_of
 from calibrator.estimator.vehicle_report import sensor_texts
 from calibrator.processes.run_many import Workers
+from calibrator.recordings.frame_arrays import CLOCK_GAP_S
 from calibrator.sources.fleet_source import load_drive, probe_equipment, read_vehicles
 from calibrator.summaries.moments import BLOCK_S
 from calibrator.summaries.summariser import summarise_samples
@@ -327,19 +328,27 @@ def _charges(
         )
     found, duration_s = {}, sum(drive.duration_s for drive in drives[0])
     for branch, (charge_ah, sd_ah) in settings.charge_ah.items():
-        measured_as = span_s = missing_s = 0.0
+        measured_as = span_s = missing_s = error_as = longest_s = 0.0
         for drive in drives[0]:
             channel = drive.branches[branch]
             time_s, value_a = channel.time_s[channel.good], channel.value[channel.good]
+            if len(time_s) < 2:
+                missing_s, longest_s = missing_s + drive.duration_s, np.inf
+                continue
             step_s = np.diff(time_s)
-            usual = step_s <= GAP_PERIODS * np.median(step_s) if step_s.size else step_s > 0.0
+            gap_s = np.append(step_s, drive.duration_s - step_s.sum())  # the last one: at both ends
+            gap_s = gap_s[gap_s > GAP_PERIODS * np.median(step_s)]
             measured_as += float(np.trapezoid(value_a, time_s))
             span_s += float(step_s.sum())
-            missing_s += drive.duration_s - float(step_s[usual].sum())
-        if missing_s > MOST_MISSING * duration_s:
+            missing_s += float(gap_s.sum())
+            error_as += float(gap_s.sum() * np.std(value_a))  # across a gap the current is a guess
+            longest_s = max(longest_s, float(gap_s.max(initial=0.0)))
+        if missing_s > MOST_MISSING * duration_s or round(longest_s) >= CLOCK_GAP_S:
             raise FleetError(
                 f"--charge {branch}: {missing_s:.0f} s of {duration_s:.0f} s have no samples of it, so its charge is "
-                f"not known; leave the option out"
+                f"not known (at most {MOST_MISSING:.0%} may be missing, and less than {CLOCK_GAP_S:g} s at once); "
+                f"leave the option out"
             )
-        found[branch] = measured_as / span_s, charge_ah * 3600.0 / span_s, sd_ah * 3600.0 / span_s
+        sd_as = float(np.hypot(3600.0 * sd_ah, error_as))
+        found[branch] = measured_as / span_s, charge_ah * 3600.0 / span_s, sd_as / span_s
     return found

@@ -107,6 +107,40 @@ def test_charge_balance_determines_an_offset(missing: float, gain: float) -> Non
     assert row.offset_sd_a < 0.5
 
 
+def test_charge_across_a_gap_is_known_as_far_as_the_current_varies() -> None:
+    """No sensor is wrong, and 10 s are missing in which 60 A more flow."""
+    frame = recording()
+    missing = (frame.index > 100.0) & (frame.index < 110.0)
+    frame.loc[missing, ["battery", "motor"]] += [60.0, -60.0]
+    charge_ah = float(frame["battery"].mean()) * SECONDS / 3600.0
+    row = found(frame[~missing], trusted=["motor"], charge_ah={"battery": (charge_ah, 0.001)}).loc["vehicle", "battery"]
+    assert abs(row.offset_a) < 2.0 * row.offset_sd_a
+    assert not row.corrected
+
+
+def test_gain_is_corrected_alone_where_no_offset_is_suspected() -> None:
+    """Of a heater whose offset, a mean of none and several, would add more error than its gain error has."""
+    frame = recording(gain=(0.0, 0.08, -0.03), heater_a=None)
+    frame["dcdc"] = -3.0 - np.sin(frame.index.to_numpy() / 7.0)
+    frame["battery"] -= frame["dcdc"]
+    read = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "drift": [0.0], "drift_sd": [0.002]})
+    read = read.assign(offset_a=0.0, offset_sd_a=0.05)
+    junction = Junction(branches=[*JUNCTION.branches, "dcdc"], full_scale_a=500.0)
+    parameters = JunctionCalibrator(readings=read, load=(0.0, 0.1)).fit(frame, junction).parameters_
+    row = parameters.set_index("branch").loc["heater"]
+    assert row.corrected
+    assert row.gain_error == pytest.approx(-0.03, abs=0.01)
+    assert row.offset_a == 0.0
+
+
+def test_gain_of_a_branch_that_moves_little_is_known_less_well() -> None:
+    """A sum that moves by 0.003 % of full scale with a current that moves by 0.15 % of it looks like 2 %."""
+    frame = recording()
+    frame["battery"] += 0.9 * frame["heater"]
+    frame["heater"] *= 0.1
+    assert found(frame, trusted=["battery"]).gain_error_sd["vehicle", "heater"] > 0.025
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_offset_reading_of_the_wrong_sign_is_noticed_by_the_junction_sum(sign: float) -> None:
     read = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "offset_a": [6.0 * sign], "offset_sd_a": [0.1]})
@@ -353,6 +387,8 @@ def test_errors_of_estimated_gains_match_their_standard_deviations() -> None:
     *((lambda frame, of=of: [frame, frame.assign(battery=frame["battery"].where(of(frame.index)))],
        {"charge_ah": {"battery": (1.0, 0.1)}}, "have no samples of it")
       for of in (lambda time_s: abs(time_s - 100.0) > 30.0, lambda time_s: time_s < 150.0)),
+    (lambda _: (long := recording(seconds=1500.0))[abs(long.index - 700.0) > 150.0],  # counts as a gap of 60 s
+     {"charge_ah": {"battery": (1.0, 0.1)}}, "less than 60 s at once"),
 ])  # fmt: skip
 def test_junction_calibrator_refuses_wrong_arguments_and_data_with_one_line(
     motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str
