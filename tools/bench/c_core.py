@@ -141,8 +141,12 @@ def fuzz(folder: Path, seconds: int) -> None:
     flags = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all", f"-I{CORE}")
     subprocess.run(["clang", *flags, *sources, "-o", folder / "fuzz"], check=True)
     (folder / "corpus").mkdir()
-    whole = b"".join(data[:64] for _, data in frames(vehicle().database, Random(5), 60) if data)
-    (folder / "corpus" / "one").write_bytes(whole)
+    database = vehicle().database
+    numbers = {key.identifier | key.extended << 31: number for number, key in enumerate(received(database))}
+    for seed in range(20):  # frames as c_core_fuzz.c takes them apart, so that it begins behind the checks
+        some = ((numbers[name], data[:64]) for name, data in frames(database, Random(seed), 40) if data is not None)
+        whole = b"".join(bytes([number, len(data)]) + data for number, data in some)
+        (folder / "corpus" / f"{seed}").write_bytes(whole)
     words = (f"-max_total_time={seconds}", "-max_len=4096", "-print_final_stats=1", "-verbosity=0", "corpus")
     subprocess.run([folder / "fuzz", *words], cwd=folder, check=True)
 

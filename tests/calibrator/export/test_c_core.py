@@ -88,7 +88,7 @@ def test_c_core_matches_the_node_for_random_vehicles_under_sanitizers(seed: int,
 
 @needs("clang")
 def test_fuzzing_of_the_c_core_finds_no_error(tmp_path: Path) -> None:
-    fuzz(tmp_path, 30)
+    fuzz(tmp_path, 12)
 
 
 @needs("gcc", "clang", "nm")
