@@ -221,8 +221,9 @@ def with_faults(**changed: Any) -> Change:
     return lambda estimate: replace(estimate, faults=replace(estimate.faults, **changed))
 
 
-def run(*methods: ComparedMethod) -> ExperimentResult:
-    return run_experiment(EXPERIMENTS["classifier"].small(), smooth_drive(), methods=methods, repetitions=1)
+def run(*methods: ComparedMethod, reading: str = "") -> ExperimentResult:
+    row = EXPERIMENTS["classifier"].only(reading).small()
+    return run_experiment(row, smooth_drive(), methods=methods, repetitions=1)
 
 
 def test_table_shows_own_methods_and_one_confidence_preferably_of_the_default_method() -> None:
@@ -254,7 +255,7 @@ class Spoiling(Own):
 
 
 def test_method_that_overwrites_its_trial_does_not_change_the_figures_of_others() -> None:
-    spoilt, clean = run(Spoiling(), PERFECT, POSTERIOR), run(Own(), PERFECT, POSTERIOR)
+    spoilt, clean = (run(method, PERFECT, POSTERIOR, reading="3 of 6") for method in (Spoiling(), Own()))
     pd.testing.assert_frame_equal(spoilt.figures, clean.figures)
 
 
