@@ -1,6 +1,6 @@
 """Start the calibrator as ``python -m calibrator`` or console command; say what to install if packages are missing.
 
-Slow modules are imported inside a function, so that Ctrl-C or a closed pipe is handled during imports as it is later.
+Slow modules are imported inside a function, so that Ctrl-C is handled during imports as it is later.
 """
 
 import signal
@@ -10,7 +10,7 @@ from importlib import import_module
 
 from calibrator.processes.interrupts import ending_at_sigterm, importing, interrupted_message
 from ecu_node.errors import UserError
-from ecu_node.program import INTERRUPTED, drop_output, flush_output, load_python_can, say_error
+from ecu_node.program import INTERRUPTED, flush_output, load_python_can, say_error
 
 __all__ = ["calibrator_program"]
 
@@ -28,9 +28,6 @@ def calibrator_program() -> None:
         code = INTERRUPTED
     except UserError as error:
         say_error(f"calibrator: {error}")
-        code = 1
-    except BrokenPipeError:
-        drop_output()
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # work is finished or rolled back; only threads are left to join
     if code == INTERRUPTED:

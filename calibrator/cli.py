@@ -24,6 +24,7 @@ from calibrator.sources.command import import_
 from calibrator.summaries.command import store_app, summarise
 from calibrator.terminal.command_line import command_app, example, run_app
 from ecu_node import __version__
+from ecu_node.program import write_output
 
 __all__ = ["app", "run_calibrator"]
 
@@ -98,7 +99,7 @@ def run_calibrator() -> int:
 
 def _version(wanted: bool) -> None:
     if wanted:
-        print(f"calibrator {__version__}")
+        write_output(f"calibrator {__version__}")
         raise typer.Exit
 
 

@@ -407,6 +407,8 @@ _CLEAR_SCREEN, _HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[2J", "\x1b[H", "\x1b[K",
 def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, as_json: bool) -> int:
     """Show what is on a bus until SIGINT, SIGTERM or SIGHUP: a live table in a terminal, else a block per second.
 
+    It also ends when nobody reads it any more.
+
     Parameters
     ----------
     layout : Path
@@ -439,9 +441,9 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
     opened = partial(open_bus, database, mode=Mode.OVERLAY, **bus)
     with ExitStack() as left_at_end:
         steady = left_at_end.enter_context(closing(SteadyBus(opened, counters, say)))
-        write_output(_CLEAR_SCREEN if is_live else "", end="")
+        is_read = write_output(_CLEAR_SCREEN if is_live else "", end="")
         monitor, view = BusMonitor(database, time.monotonic()), None
-        while view is None or (once_s is None and not stop()):
+        while view is None or (once_s is None and is_read and not stop()):
             _listen(steady, monitor, time.monotonic() + period_s, stop)
             view = monitor.look(time.monotonic()) | {"is_bus_open": steady.state != "gone"}
             steady.count_dropped()
@@ -450,11 +452,11 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
                 width, height = shutil.get_terminal_size()
                 # clear each line before writing it: after a full line the cursor stays on its last character
                 shown = [f"{_CLEAR_LINE}{line[:width]}\n" for line in lines[: height - 1]]
-                write_output("".join([_HOME, *shown, _CLEAR_BELOW]), end="")
+                is_read = write_output("".join([_HOME, *shown, _CLEAR_BELOW]), end="")
             elif as_json:
-                write_output(json.dumps(view, indent=2))
+                is_read = write_output(json.dumps(view, indent=2))
             else:
-                write_output("\n".join(lines) if once_s else "\n".join([*lines, ""]))
+                is_read = write_output("\n".join(lines) if once_s else "\n".join([*lines, ""]))
     if once_s is not None and not any(branch["is_seen"] for branch in view["branches"]):
         say_error(f"ecu-node: {where}: no branch of {layout} was seen; see that the bus is the right one")
         return 1

@@ -32,7 +32,7 @@ def write_result(document: Any, text: str, *, as_json: bool) -> None:
         write_output(text)
 
 
-def write_output(text: str, end: str = "\n") -> None:
+def write_output(text: str, end: str = "\n") -> bool:
     """Print a text, and make sure that it is written.
 
     Parameters
@@ -42,22 +42,27 @@ def write_output(text: str, end: str = "\n") -> None:
     end : str
         Text that is printed after it.
 
+    Returns
+    -------
+    bool
+        False if the reader of standard output has gone, as ``head`` does; all that is printed from then on is dropped.
+
     Raises
     ------
     UserError
         If it cannot be written, as on a full disk; the rest of it is dropped.
-    BrokenPipeError
-        If the reader of standard output has gone.
     """
     try:
         print(text, end=end, flush=True)
     except BrokenPipeError:
-        raise
+        drop_output()
+        return False
     except OSError as error:
         drop_output()
         raise UserError(
             f"standard output: cannot write the result: {error.strerror}; give it somewhere else to go"
         ) from None
+    return True
 
 
 def flush_output() -> None:
@@ -175,7 +180,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence[str]) -> int:
-    """Run a program; any error becomes one line on standard error, except for a closed output pipe, which is silent.
+    """Run a program; any error becomes one line on standard error; an output that nobody reads any more is none.
 
     Parameters
     ----------
@@ -201,9 +206,6 @@ def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence
                 return work(others)
             finally:
                 flush_output()
-    except BrokenPipeError:
-        drop_output()
-        return FAILED
     except Exception as error:  # noqa: BLE001 (each is reported, and ends the program)
         return end_of(name, error, debug=debug)
 

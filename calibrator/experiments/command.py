@@ -87,7 +87,9 @@ def experiment(
         result = replace(result, made=made)
         texts.append(result.to_json())
         if not json:
-            Console().print(result_table(result))
+            with (console := Console()).capture() as shown:
+                console.print(result_table(result))
+            write_output(shown.get(), end="")
         if out is not None:
             write_page(out, result)
     if json:

@@ -12,7 +12,7 @@ from typing import Any
 import typer
 
 from calibrator.errors import ContradictionError
-from ecu_node.program import DEBUG_HINT, FAILED, drop_output, end_of, flush_output, say_error, split_debug
+from ecu_node.program import DEBUG_HINT, FAILED, end_of, flush_output, say_error, split_debug
 
 __all__ = ["EXIT_CODES", "command_app", "example", "run_app", "run_tool"]
 
@@ -21,6 +21,7 @@ _PACKAGES = ("calibrator", "ecu_node", "tools")
 EXIT_CODES = (
     f"Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted, 143 ended by SIGTERM. {DEBUG_HINT}"
 )
+_HELP = ["-h", "--help"]
 INTERRUPTED = 130
 WRONG_USE = 2
 _UsageError: Any = typer.BadParameter.__base__
@@ -44,7 +45,7 @@ def command_app(**settings: Any) -> typer.Typer:
         "add_completion": False,
         "pretty_exceptions_enable": False,
         "rich_markup_mode": None,
-        "context_settings": {"help_option_names": ["-h", "--help"]},
+        "context_settings": {"help_option_names": _HELP},
     }
     return typer.Typer(**(shared | settings))
 
@@ -83,11 +84,6 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
     -------
     int
         Exit code, see :data:`EXIT_CODES`.
-
-    Raises
-    ------
-    BrokenPipeError
-        If the reader of standard output has left.
     """
     others, debug = split_debug(arguments)
     if "" in others:
@@ -105,11 +101,11 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
         if isinstance(end.code, str):
             say_error(f"{program}: {end.code}")
             return FAILED
-        return end.code or 0
+        # typer calls it a failure that nobody reads the help any more
+        is_unread_help = isinstance(end.__context__, BrokenPipeError) and not set(_HELP).isdisjoint(others)
+        return 0 if is_unread_help else end.code or 0
     except _UsageError as error:
         return _end_of_wrong_use(program, error)
-    except BrokenPipeError:
-        raise
     except Exception as error:  # noqa: BLE001 (each is reported, and ends the program)
         flush_output()  # if it was standard output that failed, this says so
         code = end_of(program, error, debug=debug, packages=_PACKAGES)
@@ -139,9 +135,6 @@ def run_tool(app: typer.Typer, program: str) -> None:
         flush_output()
     except KeyboardInterrupt:
         code = INTERRUPTED
-    except BrokenPipeError:
-        drop_output()
-        code = 1
     except Exception as error:  # noqa: BLE001 (standard output that cannot be written)
         code = end_of(program, error, debug=False, packages=_PACKAGES)
     if code == INTERRUPTED:

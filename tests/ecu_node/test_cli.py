@@ -195,13 +195,17 @@ def test_unwritable_output_prints_one_line_and_exits_with_1(arguments: list[str]
     assert (done.returncode, done.stderr) == (1, line)
 
 
-@pytest.mark.parametrize("arguments", [check(Path("p")), ["--help"]], ids=["check", "--help"])
-def test_closed_output_pipe_ends_a_command_silently_with_exit_code_1(arguments: list[str]) -> None:
+TEMPLATE = ["template", "--layout", str(LAYOUT), "--vehicle", "v1"]
+UNREAD = [(check(Path("p")), 1), (["--help"], 0), (TEMPLATE, 0), (MONITOR[:-2], 0)]
+
+
+@pytest.mark.parametrize(("arguments", "code"), UNREAD, ids=["check, not fit", "--help", "template", "monitor"])
+def test_closed_output_pipe_changes_no_exit_code_and_ends_the_monitor(arguments: list[str], code: int) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     done = program(*arguments, stdout=writing)
     os.close(writing)
-    assert (done.returncode, done.stderr) == (1, "")
+    assert (done.returncode, done.stderr) == (code, "")
 
 
 def test_names_that_the_terminal_cannot_show_are_escaped() -> None:
