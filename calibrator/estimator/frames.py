@@ -387,12 +387,16 @@ def _period_s(times: Mapping[str, Array], junction: Junction, *, coarsest_s: flo
     return max(round(usual_s, 6), FINEST_PERIOD_S) if layout is None else layout.period_s
 
 
-def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
-    """Return a column as floating-point numbers, NaN where a value is missing; DriveError if it holds no numbers."""
+def column_values(frame: pd.DataFrame, name: str, where: str, *, is_input: bool = False) -> Array:
+    """Return a column as floating-point numbers, NaN where a value is missing; DriveError if it holds no numbers.
+
+    An input may also be true and false, a current not.
+    """
     column = frame[name]
     if isinstance(column, pd.DataFrame):
         raise DriveError(f"{where}: column {name} is there twice")
-    if not pd.api.types.is_any_real_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
+    is_flag = is_input and pd.api.types.is_bool_dtype(column)
+    if not is_flag and not pd.api.types.is_any_real_numeric_dtype(column):
         raise DriveError(
             f"{where}: column {name} is of {column.dtype}; expected numbers, with NaN where a sample is bad: "
             f"pandas.to_numeric converts"
@@ -414,7 +418,7 @@ def _drives(
         pauses_s = np.maximum(np.diff(times[where]) - CLOCK_GAP_S, 0.0)
         time_s, channels = times[where] - np.append(0.0, np.cumsum(pauses_s)), dict[str, Channel]()
         for name in columns:
-            value = column_values(each.frame, name, where)
+            value = column_values(each.frame, name, where, is_input=name not in junction.branches)
             if not (good := np.isfinite(value)).any():
                 raise DriveError(f"{where}: column {name} has no number at all; leave the frame or the column out")
             channels[name] = Channel(time_s=time_s, value=value, good=good)

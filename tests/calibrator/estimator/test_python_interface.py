@@ -286,6 +286,7 @@ def in_milliseconds(each: pd.DataFrame) -> pd.DataFrame:
     (changed(V3=lambda each: each.drop(columns="heat")), r"vehicle V3, frame 1: no column heat; it has battery"),
     (changed(V3=lambda each: each.assign(wind=1.0)), r"V3, frame 1: column wind, which vehicle V1, frame 1 has n"),
     (changed(V2=lambda each: each.astype({"motor": str})), r"V2, frame 1: column motor is of .*expected numbers"),
+    (changed(V2=lambda each: each.astype({"motor": bool})), r"V2, frame 1: column motor is of bool; expected numbers"),
     (changed(V2=lambda each: each.assign(motor=np.nan)), r"V2, frame 1: column motor has no number at all"),
     (changed(V1=still, V2=still), r"branch motor never changes in most vehicles: stuck, or not connected"),
     (lambda: {1: frame(1), "1": frame(2)}, r"vehicle 1 is there twice; give all of its frames as one list"),
