@@ -78,6 +78,7 @@ MISTAKES = [
     ("calibrator import none LAYOUT --out x", 1, "none of the logs could be used, for the reasons given above"),
     # looking at a recording
     ("calibrator kirchhoff none.csv --branches battery=I,motor=J", 1, "none.csv: no such file"),
+    ("calibrator kirchhoff /dev/null --branches battery=I,motor=J", 1, "/dev/null: a pipe or device, which is not"),
     ("calibrator kirchhoff empty.csv --branches battery=I,motor=J", 1, "empty.csv: "),
     ("calibrator kirchhoff noise --branches battery=I,motor=J", 1, "noise: no table: only one line"),
     ("calibrator kirchhoff logs/v1/drive.log --branches battery=I,motor=J", 2, "a log of frames needs --layout"),
@@ -103,6 +104,7 @@ MISTAKES = [
     ("calibrator layout init car.dbc gvret.csv --out x", 2, "calibrator layout init car.dbc --log gvret.csv;"),
     ("calibrator layout init still.csv --out x.toml", 1, "still.csv"),
     ("calibrator doctor LAYOUT --log none.log", 1, "none.log: no such file"),
+    ("calibrator doctor LAYOUT --log /dev/null", 1, "; save what it gives to a file"),
     ("calibrator doctor LAYOUT --log empty", 1, "empty: not a known log format"),
     ("calibrator report folder", 1, "not a result of 'calibrator calibrate'"),
     ("calibrator report none", 1, "none"),

@@ -183,8 +183,10 @@ def _is_frame_header(line: str) -> bool:
 
 
 def exists(path: Path) -> bool:
-    """Check whether a file exists, alone or in an archive."""
+    """Check whether a file exists, alone or in an archive; LogError if it is a pipe or device."""
     archive = _archive(path)
+    if archive is None and path.exists() and not (path.is_file() or path.is_dir()):
+        raise LogError(f"{path}: a pipe or device, which is not read; save what it gives to a file")
     return path.is_file() if archive is None else path in files_in(archive)
 
 
