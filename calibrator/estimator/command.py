@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from calibrator.estimator.settings import Method
-from calibrator.files.folders import require_possible_file, require_possible_folder
+from calibrator.files.folders import require_possible_file, require_possible_folder, write_files
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import (
@@ -26,7 +26,6 @@ from calibrator.terminal.options import (
     number_option,
 )
 from calibrator.terminal.text import dumps, end_if_internal, print_report
-from ecu_node.documents import write_atomically
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.program import say_error, write_output
 
@@ -149,10 +148,8 @@ def params(
 
     texts = {vehicle: written_of(result, vehicle).text for vehicle in vehicles}
     require_possible_folder(out)
-    out.mkdir(parents=True, exist_ok=True)
     files = {vehicle: str(out / f"{vehicle}.json") for vehicle in texts}
-    for vehicle, text in texts.items():
-        write_atomically(Path(files[vehicle]), text)
+    write_files({Path(files[vehicle]): text for vehicle, text in texts.items()})
     write_output(dumps({"files": files}) if json else "\n".join(files.values()))
 
 
@@ -223,6 +220,5 @@ def identify(
 
     report = identify_fleet(fleet, vehicle_database(layout), workers=Workers(processes=workers))
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(out, report.bank.to_json())
+        write_files({out: report.bank.to_json()})
     print_report(report, json=json)

@@ -1,5 +1,6 @@
 """Result folders: written results are read back, and other folders are refused."""
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,17 @@ def test_params_command_writes_the_files_of_all_named_vehicles_or_none(result: P
     assert (second.vehicle, second.branches["motor"].offset_a) == ("v2", 1.0)
     assert "no vehicle 'v9' in it" in refused("params", result, "v1", "v9", "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()
+
+
+def test_params_command_names_the_file_that_a_full_disk_cannot_take(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("ecu_node.documents.os.fsync", full)
+    line = refused("params", result, "v1", "--out", tmp_path / "out")
+    assert f"{tmp_path}/out/v1.json: cannot be written: No space left on device; " in line
 
 
 def test_vehicle_with_invalid_parameters_is_left_out(tmp_path: Path, database: VehicleDatabase) -> None:

@@ -91,14 +91,14 @@ def test_mount_point_is_refused_as_a_new_folder(tmp_path: Path, monkeypatch: pyt
 def test_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "old").write_bytes(b"old")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(UserError, match=f"^{tmp_path}/folder: cannot be written: Is a directory$"):
+    with pytest.raises(UserError, match=f"^{tmp_path}/folder: cannot be written: Is a directory; "):
         folders.write_files({tmp_path / "folder": b""})
 
     def full(handle: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("ecu_node.documents.os.fsync", full)
-    with pytest.raises(UserError, match=f"^{tmp_path}/old: cannot be written: No space left on device$"):
+    with pytest.raises(UserError, match=f"^{tmp_path}/old: cannot be written: No space left on device; "):
         folders.write_files({tmp_path / "old": b"new"})
     assert sorted(tmp_path.iterdir()) == [tmp_path / "folder", tmp_path / "old"]
     assert (tmp_path / "old").read_bytes() == b"old"
