@@ -108,6 +108,7 @@ MISTAKES = [
     ("calibrator doctor LAYOUT --log empty", 1, "empty: not a known log format"),
     ("calibrator report folder", 1, "not a result of 'calibrator calibrate'"),
     ("calibrator report none", 1, "none"),
+    ("calibrator report v1.json", 1, "not a result of 'calibrator calibrate': Not a directory; name a folder that"),
     # one junction
     ("calibrator calibrate drive.csv CAR --out x --trusted gearbox", 1, "--trusted gearbox: no such branch"),
     ("calibrator calibrate drive.csv CAR --out x --trusted battery --expected-faults 0.2", 2, "is for a fleet"),

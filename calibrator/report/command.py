@@ -38,8 +38,10 @@ def report(
 ) -> None:
     """Show a result as one HTML page, of the fleet or of one vehicle; it needs no network."""
     with importing():
+        from calibrator.estimator.results import read_run
         from calibrator.report.page import report_page
 
+    read_run(result)  # if it is no result, this says so, and not that nothing can be written there
     target = out if out is not None else result / f"{vehicle or 'report'}.html"
     if target.suffix.lower() != ".html":
         raise typer.BadParameter(f"{target}: expected a file name that ends with .html", param_hint="--out")
