@@ -214,6 +214,8 @@ class Storage:
                 )
             elif what == "write":
                 remedy = "; choose another folder"
+            elif isinstance(error, PermissionError):
+                remedy = "; see that you may read it"
             raise StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}{remedy}") from None
 
 

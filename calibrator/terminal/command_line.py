@@ -156,5 +156,6 @@ def _end_of_wrong_use(program: str, error: Any) -> int:
         return WRONG_USE
     path = error.ctx.command_path if error.ctx is not None else program
     text = " ".join(error.format_message().split()).replace(": Value error, ", ": ").rstrip(".")
-    say_error(f"{path}: {text}; see '{path} --help'")
+    remedy = "see that you may read it" if text.endswith("is not readable") else f"see '{path} --help'"
+    say_error(f"{path}: {text}; {remedy}")
     return WRONG_USE

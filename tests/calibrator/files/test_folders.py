@@ -145,15 +145,18 @@ def test_folder_on_a_file_system_without_locks_is_usable(tmp_path: Path, monkeyp
         pass
 
 
-@pytest.mark.parametrize(("error", "words"), [
-    (OSError(errno.ENOSPC, "No space left on device"), "No space left on device; make room, and run the same command"),
-    (RuntimeError("Unable to locate credentials"), "Unable to locate credentials; check the credentials, "),
+@pytest.mark.parametrize(("place", "error", "words"), [
+    ("memory://x", OSError(errno.ENOSPC, "No space left on device"), "on device; make room, and run the same command"),
+    ("memory://x", RuntimeError("Unable to locate credentials"), "credentials; check the credentials, "),
+    ("/x", PermissionError(errno.EACCES, "Permission denied"), "denied; see that you may read it$"),
 ])  # fmt: skip
-def test_failure_of_storage_says_what_to_do(monkeypatch: pytest.MonkeyPatch, error: Exception, words: str) -> None:
+def test_failure_of_storage_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, place: str, error: Exception, words: str
+) -> None:
     def failing(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "open", failing)
-    expected = f"^memory://x/y: cannot read it: {words}"
-    with pytest.raises(StorageError, match=expected), open_storage("memory://x").opened("y"):
+    monkeypatch.setattr(type(fsspec.url_to_fs(place)[0]), "open", failing)
+    expected = f"^{place}/y: cannot read it: .*{words}"
+    with pytest.raises(StorageError, match=expected), open_storage(place).opened("y"):
         pass

@@ -49,6 +49,15 @@ def test_error_of_a_command_is_printed_on_one_line_and_sets_the_exit_code(
     assert line.lower().startswith(text.lower())
 
 
+def test_folder_that_may_not_be_read_is_named_with_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("os.access", lambda *_: False)  # also for root, who may read all
+    assert run_app(calibrator_app, "prog", ["report", "."]) == 2
+    line = "prog report: Invalid value for 'RESULT': path '.' is not readable; see that you may read it\n"
+    assert capsys.readouterr().err == line
+
+
 @pytest.mark.parametrize(
     "arguments", [["--debug", "fail", "user"], ["fail", "--debug", "user"], ["fail", "user", "--debug"]]
 )
