@@ -36,9 +36,10 @@ times full scale it is a warning, as loads without a sensor usually draw less. [
 LEAST_SUM_A, NO_SUM = 0.5, 0.3
 """A sum that varies by less than LEAST_SUM_A is right. Branches do not belong together if the mean square of their sum
 is more than NO_SUM times the sum of their mean squares. [A], [1]"""
-SAME, CLEAR = 1.2, 2.0
+SAME, CLEAR = 1.2, 1.4
 """The sign of a branch is unknown if with the other sign the sum varies less than SAME times as much. Two branches are
-surely exchanged if the sum varies more than CLEAR times as much as with each in the other's place. [1]"""
+surely exchanged if the sum varies more than CLEAR times as much as with each in the other's place: its variance is
+halved, as by the change of a sign. [1]"""
 STUCK_S, STUCK_RANGE = 10.0, (0.1, 0.9)
 """A current other than zero is stuck if it holds its exact value for so long; how much the others' sum varies meanwhile
 is taken between these quantiles. [s], [1]"""
@@ -91,8 +92,9 @@ def times(factor: float) -> str:
 def signs_and_units(junction: RecordedJunction) -> Findings:
     """Report branches with a wrong sign or unit."""
     multipliers, bands, layout = junction.multipliers, junction.bands, junction.database.layout
-    if _exchanged(junction):
-        return
+    exchanges = list(exchanged(junction))
+    if any(each.severity == "error" for each in exchanges) or (exchanges and np.all(multipliers == -1.0)):
+        return  # the signs follow from the exchange
     if np.all(multipliers == -1.0):
         text = "all signs are inverted: the battery's voltage falls while energy would flow into it"
         advice = "turn the sign of every [[branch]]: the current of a battery that is discharged is positive"
@@ -143,8 +145,12 @@ def _exchanged(junction: RecordedJunction) -> list[tuple[str, str]]:
     said: dict[str, list[set[str]]] = {}
     for branch in junction.database.layout.branch:
         if branch.name in junction.branches and not branch.computed:
+            own = branch.source.rpartition(".")[2]  # tells more than the message, which may carry several branches
             name, signal = words_of(branch.name), words_of(branch.source)
-            said[branch.name] = [places_of(words) | (set(POSITIONS) & set(words)) for words in (name, signal)]
+            places = places_of(name), places_of(words_of(own)) or places_of(signal)
+            said[branch.name] = [
+                at | (set(POSITIONS) & set(words)) for at, words in zip(places, (name, signal), strict=True)
+            ]
     return [
         (one, other)
         for one, other in combinations(said, 2)

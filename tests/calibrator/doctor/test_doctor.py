@@ -345,15 +345,32 @@ def test_short_log_is_reported_alike_by_doctor_kirchhoff_and_calibrate(
         assert f"need 120 s together, and these have {seconds:.1f} s" in waits["calibrate"]
 
 
-def test_branches_of_opposite_sign_with_exchanged_signals_are_an_error(log: Path, layout: Path, tmp_path: Path) -> None:
-    one, other = '"HV_Battery.BatteryCurrent"', '"HV_Motor.MotorCurrent"'
+def exchange(layout: Path, one: str, other: str) -> None:
+    """Have two branches read each other's signal."""
     layout.write_text(layout.read_text().replace(one, "@").replace(other, one).replace("@", other))
+
+
+@pytest.mark.parametrize("sender", ["HV", "BMS"])  # a BMS may also send what it does not measure
+def test_branches_of_opposite_sign_with_exchanged_signals_are_an_error(
+    sender: str, log: Path, layout: Path, tmp_path: Path
+) -> None:
+    for file in (layout, tmp_path / "hv_powertrain.dbc"):
+        file.write_text(file.read_text().replace("HV_", f"{sender}_"))
+    exchange(layout, f"{sender}_Battery.BatteryCurrent", f"{sender}_Motor.MotorCurrent")
     doctor = examined(layout, log)
     assert doctor.errors == [("exchanged", "battery")]
     (error,) = doctor.findings("exchanged")
-    assert "reads HV_Motor.MotorCurrent, and motor reads HV_Battery.BatteryCurrent" in error.text
+    assert f"reads {sender}_Motor.MotorCurrent, and motor reads {sender}_Battery.BatteryCurrent" in error.text
     assert error.number > 4.0
     assert 'exchange what [[branch]] "battery" and "motor" read' in error.advice
     code, said = calibrated(tmp_path, log, layout, "--trusted", "battery")
     assert code == 1
     assert "check sign and unit of branch" in said
+
+
+def test_exchanged_signals_of_one_sign_hide_no_wrong_sign_of_another_branch(log: Path, tmp_path: Path) -> None:
+    layout = write_layout(tmp_path, inverted=("motor",))
+    exchange(layout, "HV_Auxiliary.AuxiliaryCurrent", "HV_Dcdc.DcdcCurrent")
+    doctor = examined(layout, log)
+    assert doctor.errors == [("sign", "motor")]
+    assert [(item.severity, item.subject) for item in doctor.findings("exchanged")] == [("warning", "auxiliary")]
