@@ -62,6 +62,8 @@ class Comparison:
     ----------
     full_scale_a : float
         Full scale of the junction. [A]
+    parameters_of : str or None
+        Vehicle whose parameters made the corrected currents; None if these are from frames, or there are none.
     left_out : tuple of str
         Branches of the layout without usable values: not in the sum.
     uncorrected : tuple of str
@@ -89,6 +91,7 @@ class Comparison:
     """
 
     full_scale_a: float
+    parameters_of: str | None
     left_out: tuple[str, ...]
     uncorrected: tuple[str, ...]
     masked: Mapping[str, int]
@@ -137,6 +140,7 @@ class Comparison:
         texts = {
             f"no usable frames of {', '.join(self.left_out)}: left out of the sum": self.left_out,
             f"no correction of {', '.join(self.uncorrected)}: summed up as measured": self.uncorrected,
+            f"corrected with the parameters of {self.parameters_of}": self.parameters_of,  # a log says no vehicle
             "no corrected frames: only measured currents": "after" not in self.stages,
             f"{unused:,} of {len(self.valid):,} instants not used: {', '.join(reasons)}": unused,
         }
@@ -267,6 +271,7 @@ def compare_kirchhoff(
         frame[~valid] = np.nan
     return Comparison(
         full_scale_a=layout.full_scale_a,
+        parameters_of=parameters.vehicle if parameters is not None else None,
         left_out=tuple(name for name in layout.branch_names if name not in names),
         uncorrected=tuple(name for name in names if name not in after) if "after" in frames else (),
         masked={reason: int(mask.sum()) for reason, mask in reasons.items()},

@@ -167,6 +167,7 @@ def test_parameter_file_corrects_a_branch_only_if_it_is_marked_to_apply(log: Pat
     found = figures(log, "--layout", LAYOUT, "--parameters", file)
     assert found["after"]["sum"]["max_a"] < 0.05
     assert found["uncorrected"] == ["motor"]
+    assert "corrected with the parameters of V1" in found["notices"]
     passing = figures(log, "--layout", LAYOUT, "--parameters", parameters(tmp_path, offset_a=12.0, apply=False))
     assert passing["after"] == passing["before"]
     assert passing["uncorrected"] == ["battery", "motor"]
