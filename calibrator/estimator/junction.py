@@ -399,9 +399,9 @@ def estimate_junction(
         harm[j] = harm_probability(points[j], estimate, *true, least=LAW_OFFSET_SD)
         harm_of_gain[j] = harm_probability(points[j], gain_only, *true, least=LAW_OFFSET_SD)
         confidence[j] = recovery_probability(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
-    # Where no offset is suspected, or it is open which sensor has it, the gain alone may be corrected.
-    gain_alone = (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED)
-    gain_alone &= (harm >= harm_limit) | (offset_fault[places] <= SUSPECTED)
+    # Where no offset is suspected or read, or it is open which sensor has it, the gain alone may be corrected.
+    is_vague = (offset_fault[places] <= SUSPECTED) & (np.abs(offset) < SEEN * offset_sd)
+    gain_alone = (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED) & ((harm >= harm_limit) | is_vague)
     harm, faulty = np.where(gain_alone, harm_of_gain, harm), fault > SUSPECTED
     findings = _misfits([each.summary for each in vehicles], branches, scale_a)
     unfit = np.array([[bool(mine)] for mine in findings])

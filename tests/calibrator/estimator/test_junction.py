@@ -119,18 +119,19 @@ def test_charge_across_a_gap_is_known_as_far_as_the_current_varies() -> None:
 
 
 def test_gain_is_corrected_alone_where_no_offset_is_suspected() -> None:
-    """Of a heater whose offset, a mean of none and several, would add more error than its gain error has."""
-    frame = recording(gain=(0.0, 0.08, -0.03), heater_a=None)
+    """Of a heater whose offset, a mean of none and several, would add more error; one that was read is corrected."""
+    frame = recording(gain=(0.0, 0.08, -0.03), offset_a=(0.0, 0.8, 0.0))
     frame["dcdc"] = -3.0 - np.sin(frame.index.to_numpy() / 7.0)
     frame["battery"] -= frame["dcdc"]
-    read = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "drift": [0.0], "drift_sd": [0.002]})
-    read = read.assign(offset_a=0.0, offset_sd_a=0.05)
+    read = pd.DataFrame({"vehicle": "vehicle", "branch": ["battery", "motor"], "offset_a": [0.0, 0.8]})
+    read = read.assign(offset_sd_a=0.05, drift=[0.0, np.nan], drift_sd=[0.002, np.nan])
     junction = Junction(branches=[*JUNCTION.branches, "dcdc"], full_scale_a=500.0)
     parameters = JunctionCalibrator(readings=read, load=(0.0, 0.1)).fit(frame, junction).parameters_
-    row = parameters.set_index("branch").loc["heater"]
-    assert row.corrected
-    assert row.gain_error == pytest.approx(-0.03, abs=0.01)
-    assert row.offset_a == 0.0
+    rows = parameters.set_index("branch")
+    assert rows.corrected[["motor", "heater"]].all()
+    assert rows.gain_error["heater"] == pytest.approx(-0.03, abs=0.01)
+    assert rows.offset_a["heater"] == 0.0
+    assert rows.offset_a["motor"] == pytest.approx(0.8, abs=0.2)
 
 
 def test_gain_of_a_branch_that_moves_little_is_known_less_well() -> None:
