@@ -104,7 +104,8 @@ def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: fl
     if summary.variance_a2.max() < (STILL * scale_a) ** 2:  # ratios stay open, and the mean sum is the constant
         ratio: Array = np.ones(K - 1)
         constant_a = float(mean_a.sum())
-        covariance = np.diag(np.append(np.ones(K - 1), covariance[-1, -1]))
+        turns = np.vstack([np.eye(K - 1), mean_a[others]])
+        covariance = block_diag(np.zeros((K - 1, K - 1)), covariance[-1, -1]) + turns @ turns.T
     else:
         ratio, constant_a = -fit.estimate[0, :-1], float(fit.estimate[0, -1])
         sign = np.append(-np.ones(K - 1), 1.0)
@@ -353,7 +354,7 @@ def estimate_junction(
     -------
     estimate : FleetEstimate
         In the form of a fleet's; drifts and offsets are means of the posterior, also where no fault is suspected; an
-        offset is 0 where the gain alone is corrected.
+        offset is 0 where only the gain may be corrected.
     laws : list of N JunctionLaw
         The junction laws.
     deciding : list of N str
@@ -387,7 +388,7 @@ def estimate_junction(
     offset_fault = np.where(offset_read, offset_fault, posterior.offset_probability)
     fault = (1.0 - (1.0 - gain_fault) * (1.0 - offset_fault))[places]
     drift, offset, gain_sd, offset_sd = np.expm1(mean[places]), mean[S + places], sd[places], sd[S + places]
-    harm, harm_of_gain, confidence, points = np.zeros((N, K)), np.zeros((N, K)), np.zeros(N), []
+    harm, harm_of_gain, points = np.zeros((N, K)), np.zeros((N, K)), []
     for j, vehicle in enumerate(vehicles):
         faults = np.concatenate([np.expm1(draws[:, places[j]]), draws[:, S + places[j]]], axis=1)
         points.append(Points(faults, weight, posterior.explanation))
@@ -398,15 +399,22 @@ def estimate_junction(
         # Growth within the accuracy of the constant c is no harm: while offsets are open, a right gain can do that.
         harm[j] = harm_probability(points[j], estimate, *true, least=LAW_OFFSET_SD)
         harm_of_gain[j] = harm_probability(points[j], gain_only, *true, least=LAW_OFFSET_SD)
-        confidence[j] = recovery_probability(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
     # Where no offset is suspected or read, or it is open which sensor has it, the gain alone may be corrected.
     is_vague = (offset_fault[places] <= SUSPECTED) & (np.abs(offset) < SEEN * offset_sd)
     gain_alone = (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED) & ((harm >= harm_limit) | is_vague)
     harm, faulty = np.where(gain_alone, harm_of_gain, harm), fault > SUSPECTED
+    well_known = (gain_sd <= SOUND_GAIN_SD) & (offset_sd <= SOUND_OFFSET_SD)
+    offset_sd = np.where(gain_alone, np.hypot(offset_sd, offset), offset_sd)
+    offset = np.where(gain_alone, 0.0, offset)
+    confidence = np.array(
+        [
+            recovery_probability(each, np.append(*estimate)[None], (LEAST_FAULT, LEAST_FAULT))[0]
+            for each, *estimate in zip(points, drift, offset, strict=True)
+        ]
+    )
     findings = _misfits([each.summary for each in vehicles], branches, scale_a)
     unfit = np.array([[bool(mine)] for mine in findings])
     in_doubt = not scale_known or bool(contradictions) or bool(gain_sd.min() > KNOWN_GAIN_SD)
-    well_known = (gain_sd <= SOUND_GAIN_SD) & (offset_sd <= SOUND_OFFSET_SD)
     held_back, corrected, verdicts = decided(
         faulty,
         unfit=unfit,
@@ -416,12 +424,11 @@ def estimate_junction(
         beyond=(np.abs(drift) > layout.limits.drift) | (np.abs(offset * scale_a) > layout.offset_limit_a),
         sound=(~faulty & well_known).all(axis=1) & ~unfit[:, 0] & scale_known & (not contradictions),
     )
-    alone = gain_alone & corrected
     found = FleetEstimate(
         drift=drift,
-        offset_a=np.where(alone, 0.0, offset) * scale_a,
+        offset_a=offset * scale_a,
         drift_sd=gain_sd * (1.0 + drift),
-        offset_sd_a=np.where(alone, np.hypot(offset_sd, offset), offset_sd) * scale_a,
+        offset_sd_a=offset_sd * scale_a,
         hardware_drift=np.zeros(N),
         hardware_offset_a=np.zeros((N, K)),
         hardware_probability=np.full(N, np.nan),

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from calibrator.drive import Array, Drive, DriveFile, Equipment, FleetSource, Samples
+from calibrator.drive import Array, Drive, DriveFile, Equipment, FleetSource, Samples, good_samples
 from calibrator.drives.align import align, at_pace
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
@@ -328,27 +328,28 @@ def _charges(
         )
     found, duration_s = {}, sum(drive.duration_s for drive in drives[0])
     for branch, (charge_ah, sd_ah) in settings.charge_ah.items():
-        measured_as = span_s = missing_s = error_as = longest_s = 0.0
+        measured_as = missing_s = error_as2 = longest_s = 0.0
         for drive in drives[0]:
-            channel = drive.branches[branch]
-            time_s, value_a = channel.time_s[channel.good], channel.value[channel.good]
+            time_s, value_a = good_samples(drive.branches[branch])
             if len(time_s) < 2:
                 missing_s, longest_s = missing_s + drive.duration_s, np.inf
                 continue
             step_s = np.diff(time_s)
-            gap_s = np.append(step_s, drive.duration_s - step_s.sum())  # the last one: at both ends
-            gap_s = gap_s[gap_s > GAP_PERIODS * np.median(step_s)]
-            measured_as += float(np.trapezoid(value_a, time_s))
-            span_s += float(step_s.sum())
+            at_ends_s, is_gap = drive.duration_s - step_s.sum(), step_s > GAP_PERIODS * np.median(step_s)
+            gap_s = np.append(step_s[is_gap], at_ends_s)
+            measured_as += float(np.trapezoid(value_a, time_s)) * drive.duration_s / float(step_s.sum())
             missing_s += float(gap_s.sum())
-            error_as += float(gap_s.sum() * np.std(value_a))  # across a gap the current is a guess
-            longest_s = max(longest_s, float(gap_s.max(initial=0.0)))
-        if missing_s > MOST_MISSING * duration_s or round(longest_s) >= CLOCK_GAP_S:
+            longest_s = max(longest_s, float(gap_s.max()))
+            # in a gap the current may be any that it has elsewhere; gaps may all be where it is large
+            beside_a = np.append(value_a[:-1][is_gap], value_a[1:][is_gap])
+            unusual_a = float(beside_a.mean() - value_a.mean()) if is_gap.any() else 0.0
+            error_as2 += float(np.sum(gap_s**2) * np.var(value_a) + (gap_s.sum() * unusual_a) ** 2)
+        if missing_s > MOST_MISSING * duration_s or longest_s >= CLOCK_GAP_S - 0.5:
             raise FleetError(
                 f"--charge {branch}: {missing_s:.0f} s of {duration_s:.0f} s have no samples of it, so its charge is "
                 f"not known (at most {MOST_MISSING:.0%} may be missing, and less than {CLOCK_GAP_S:g} s at once); "
                 f"leave the option out"
             )
-        sd_as = float(np.hypot(3600.0 * sd_ah, error_as))
-        found[branch] = measured_as / span_s, charge_ah * 3600.0 / span_s, sd_as / span_s
+        sd_as = float(np.sqrt((3600.0 * sd_ah) ** 2 + error_as2))
+        found[branch] = measured_as / duration_s, charge_ah * 3600.0 / duration_s, sd_as / duration_s
     return found

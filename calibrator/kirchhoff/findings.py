@@ -145,11 +145,11 @@ def _exchanged(junction: RecordedJunction) -> list[tuple[str, str]]:
     said: dict[str, list[set[str]]] = {}
     for branch in junction.database.layout.branch:
         if branch.name in junction.branches and not branch.computed:
-            own = branch.source.rpartition(".")[2]  # tells more than the message, which may carry several branches
-            name, signal = words_of(branch.name), words_of(branch.source)
-            places = places_of(name), places_of(words_of(own)) or places_of(signal)
-            said[branch.name] = [
-                at | (set(POSITIONS) & set(words)) for at, words in zip(places, (name, signal), strict=True)
+            name, source, own = map(words_of, (branch.name, branch.source, branch.source.rpartition(".")[2]))
+            said[branch.name] = [  # the signal tells more than its message, which may carry several branches
+                places_of(name) | set(POSITIONS).intersection(name),
+                (places_of(own) or places_of(source))
+                | (set(POSITIONS).intersection(own) or set(POSITIONS).intersection(source)),
             ]
     return [
         (one, other)

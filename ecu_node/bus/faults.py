@@ -135,6 +135,8 @@ class FaultMemory:
         self._written: Future[bool] | None = None
         """Result of the last write: whether the file now holds the faults; None before the first one."""
         try:
+            if not folder.is_dir():  # such as one that is not mounted yet
+                raise UserError(f"{folder}: no such state folder")
             self._faults = _read(folder / _NAME)
         except UserError as error:
             say(f"{error}; until then measured values are passed through")

@@ -141,6 +141,13 @@ def test_vanished_state_folder_does_not_clear_a_latched_fault(vehicle: Vehicle) 
     assert vehicle.latched() is Reason.SUM_IMPLAUSIBLE
 
 
+def test_node_that_starts_without_its_state_folder_passes_values_through(vehicle: Vehicle) -> None:
+    """As where it is not mounted yet: what was active is not known."""
+    shutil.rmtree(vehicle.state)
+    vehicle.start()
+    assert vehicle.latched() is Reason.SUM_IMPLAUSIBLE
+
+
 def test_cleared_faults_do_not_return(vehicle: Vehicle) -> None:
     vehicle.latch(Reason.BRANCH_STALE, "motor")
     vehicle.latch(Reason.NONE)

@@ -107,15 +107,26 @@ def test_charge_balance_determines_an_offset(missing: float, gain: float) -> Non
     assert row.offset_sd_a < 0.5
 
 
-def test_charge_across_a_gap_is_known_as_far_as_the_current_varies() -> None:
-    """No sensor is wrong, and 10 s are missing in which 60 A more flow."""
-    frame = recording()
-    missing = (frame.index > 100.0) & (frame.index < 110.0)
+@pytest.mark.parametrize("first_s", [0.0, 100.0])
+def test_charge_across_a_gap_is_known_as_far_as_the_current_varies(first_s: float) -> None:
+    """No sensor is wrong, and 10 s are missing, at the start or where 60 A more flow."""
+    frame = recording(load_a=60.0)
+    missing = (frame.index >= first_s) & (frame.index < first_s + 10.0)
     frame.loc[missing, ["battery", "motor"]] += [60.0, -60.0]
     charge_ah = float(frame["battery"].mean()) * SECONDS / 3600.0
-    row = found(frame[~missing], trusted=["motor"], charge_ah={"battery": (charge_ah, 0.001)}).loc["vehicle", "battery"]
+    known = {"trusted": ["motor"], "charge_ah": {"battery": (charge_ah, 0.001)}}
+    row = found(frame.assign(battery=frame["battery"].mask(missing)), **known).loc["vehicle", "battery"]
     assert abs(row.offset_a) < 2.0 * row.offset_sd_a
     assert not row.corrected
+
+
+def test_charge_across_many_short_gaps_is_known_nearly_as_well() -> None:
+    frame = recording(offset_a=(5.0, 0.0, 0.0), load_a=30.0)
+    charge_ah = float((frame["battery"] - 5.0).mean()) * SECONDS / 3600.0
+    lost = np.isin(np.arange(len(frame)) % 100, range(4))
+    row = found(frame[~lost], trusted=["motor"], charge_ah={"battery": (charge_ah, 0.005)}).loc["vehicle", "battery"]
+    assert row.corrected
+    assert row.offset_a == pytest.approx(5.0, abs=0.5)
 
 
 def test_gain_is_corrected_alone_where_no_offset_is_suspected() -> None:
@@ -247,6 +258,16 @@ def test_car_at_rest_determines_an_offset_but_no_gain() -> None:
     rows = calibrator.parameters_.set_index("branch")
     assert rows.offset_a["motor"] == pytest.approx(5.0, abs=0.5)
     assert rows.gain_error_sd["motor"] > 0.1
+
+
+def test_offset_of_a_parked_car_is_found_at_coarse_resolution_if_all_gains_are_known() -> None:
+    """Currents of 5 A with an offset of 4 A, shown in steps of 0.1 A."""
+    step = 0.1 * (np.arange(1200) // 3 % 2)
+    frame = pd.DataFrame({"battery": 9.0 + step, "motor": 0.0, "heater": -5.0 - step}, index=0.1 * np.arange(1200))
+    read = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "drift": [0.0], "drift_sd": [0.002]})
+    row = found(frame, trusted=["motor", "heater"], readings=read, load=(0.0, 0.1)).loc["vehicle", "battery"]
+    assert row.offset_a == pytest.approx(4.0, abs=0.5)
+    assert row.corrected
 
 
 def bent(frame: pd.DataFrame, rms_a: float) -> None:
