@@ -66,7 +66,7 @@ MOST_OFFSETS, MARGIN = 3, 12.0
 """Most offsets of one explanation, and distance of its log weight below the best from which on it is left out."""
 DRAWS, FEWEST_DRAWS = 8192, 64
 """Draws in all, shared by weight of the explanations, and fewest of one: the usual harm limit of 0.001 is 8 draws."""
-CANCELLED = 0.02
+CANCELLED = 0.0025
 """Offset of a sensor by a declared charge, over full scale, from which on the sum of the currents must show it. [1]"""
 USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
 """Usual misfit, due to curvature of good sensors, and usual residual of the sum, due to noise and switched loads, over

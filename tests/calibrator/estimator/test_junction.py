@@ -162,11 +162,13 @@ def test_offset_reading_of_the_wrong_sign_is_noticed_by_the_junction_sum(sign: f
     assert all("; vehicle: RMS 6.0" in text for text in noticed)
 
 
-@pytest.mark.parametrize("factor", [1.0, -1.0, 0.36, 0.0])
-def test_charge_that_only_a_second_opposite_offset_could_explain_corrects_nothing(factor: float) -> None:
-    """A slip of the sign, kWh for Ah, or none at all."""
-    frame = recording(offset_a=(5.0, 0.0, 0.0)).add([30.0, -30.0, 0.0])
-    true_ah = float((frame["battery"] - 5.0).mean()) * SECONDS / 3600.0
+@pytest.mark.parametrize(("offset_a", "factor"), [(5.0, 1.0), (5.0, -1.0), (5.0, 0.36), (5.0, 0.0), (0.0, 1.1)])
+def test_charge_that_only_a_second_opposite_offset_could_explain_corrects_nothing(
+    offset_a: float, factor: float
+) -> None:
+    """A slip of the sign, kWh for Ah, none at all, or of a longer time than the recording."""
+    frame = recording(offset_a=(offset_a, 0.0, 0.0)).add([30.0, -30.0, 0.0])
+    true_ah = float((frame["battery"] - offset_a).mean()) * SECONDS / 3600.0
     charge_ah = {"battery": (factor * true_ah, 0.01)}
     calibrator = JunctionCalibrator(trusted=["motor"], load=(0.0, 0.1), charge_ah=charge_ah).fit(frame, JUNCTION)
     noticed = [text for text in calibrator.notices_ if "check value and sign of charge_ah" in text]
