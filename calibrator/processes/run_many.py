@@ -420,7 +420,7 @@ def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple
                     return
                 try:
                     if time.monotonic() - counted_s > COUNT_EVERY_S:
-                        workers, counted_s = max(len(client.nthreads()), 1), time.monotonic()
+                        workers, counted_s = max(_workers_of(client), 1), time.monotonic()
                         continue  # fill up the flight for this number of workers first
                     while unsent := list(islice(flight, len(futures), len(futures) + SENT_AT_ONCE)):
                         futures.extend(client.map(partial(_on_worker, job), unsent, pure=False))
@@ -459,16 +459,16 @@ def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
     try:
         _require_scheduler(address, patience_s)
         client = Client(address, timeout=patience_s, set_as_default=False)
+        try:
+            _wait_for_worker(client, address)
+        except BaseException:
+            client.close()
+            raise
     except (OSError, ValueError) as error:
         reason = str(error).partition("\n")[0]
         if lost:
             raise FleetError(f"{address}: the scheduler is gone; start it and its workers again{AGAIN}") from None
         raise FleetError(f"{address}: no Dask scheduler answers: {reason}; start one with 'dask scheduler'") from None
-    try:
-        _wait_for_worker(client, address)
-    except FleetError:
-        client.close()
-        raise
     return client
 
 
@@ -489,7 +489,7 @@ def _require_scheduler(address: str, patience_s: float) -> None:
 
 
 def _wait_for_worker(client: Any, address: str) -> None:
-    if not client.nthreads():
+    if not _workers_of(client):
         say_error(f"calibrator: {address}: the scheduler has no worker now; waiting {RETURN_S:g} s for one")
     try:
         client.wait_for_workers(1, timeout=RETURN_S)
@@ -534,3 +534,10 @@ def _silenced() -> Iterator[None]:
         gc.collect()  # asyncio logs unfinished tasks when they are collected: now, while silenced
         for logger, level in levels.items():
             logger.setLevel(level)
+
+
+def _workers_of(client: Any) -> int:
+    """Return the number of workers; raise OSError if the client has lost its scheduler."""
+    if client.scheduler is None:
+        raise OSError("the scheduler is gone")
+    return len(client.nthreads())

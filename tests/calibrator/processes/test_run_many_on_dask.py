@@ -26,7 +26,7 @@ from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.processes.dask_cluster import DaskCluster, gated, of_no_disk
 from tests.calibrator.processes.test_run_many import require_failing_items_affect_no_others
 
-pytest.importorskip("distributed")
+distributed = pytest.importorskip("distributed")
 PLAN = FleetPlan(vehicles=6, currents=2, sparsity=80.0, magnitude=(0.05, 0.25))
 
 
@@ -62,12 +62,17 @@ def test_error_of_an_item_is_not_taken_for_a_lost_scheduler(where: Workers, monk
 @pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning")  # distributed's, to a scheduler that was killed
 def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CONNECT_S", 2.0)
+    monkeypatch.setattr(module, "COUNT_EVERY_S", 0.01)  # so that workers are counted while there is no scheduler
     with DaskCluster(tmp_path) as cluster:
         results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
         assert [next(results), next(results)] == [0, 1]
         for process in (cluster.scheduler, *cluster.workers):
             process.send_signal(signal.SIGKILL)
             process.wait()
+        while any(
+            client.scheduler is not None for client in distributed.Client._instances
+        ):  # until the client has noticed it
+            time.sleep(0.05)
         cluster.start()
         (tmp_path / "go").touch()
         assert list(results) == list(range(2, 20))
