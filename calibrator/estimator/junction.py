@@ -34,7 +34,15 @@ from calibrator.estimator.decision import (
     harm_probability,
     recovery_probability,
 )
-from calibrator.estimator.evidence import MOST_NOISE, RIDGE, TINY, FleetMoments, junction_regression, stack_summaries
+from calibrator.estimator.evidence import (
+    MOST_NOISE,
+    RIDGE,
+    TINY,
+    FleetMoments,
+    junction_regression,
+    ratios_in_doubt,
+    stack_summaries,
+)
 from calibrator.estimator.readings import CONTRADICTION, TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.estimator.settings import SUSPECTED
 from calibrator.summaries.moments import DriveSummary
@@ -360,7 +368,7 @@ def estimate_junction(
     deciding : list of N str
         Sentence on what is still open and what would decide it, for each vehicle; empty if all is known.
     contradictions : list of str
-        Sentences on known values that the rest contradicts.
+        Sentences on known values that the rest contradicts, and on gain ratios that are none.
 
     Raises
     ------
@@ -382,6 +390,13 @@ def estimate_junction(
                 f"by the charge given for {branches[s]} its sensor has an offset of {own_a:+.1f} A, but what is not "
                 f"known of the offsets{unknown} sums to {sum_a:+.1f} A: check value and sign of --charge"
             )
+    for vehicle, law in zip(vehicles, system.laws, strict=True):
+        apart = ratios_in_doubt(stack_summaries([vehicle.summary], law.order))
+        contradictions += [
+            f"{vehicle.vehicle}: gains of {branches[k]} and {branches[law.order[0]]} differ between slow and fast "
+            f"changes of the currents: a signal is late, filtered, or a mean over time"
+            for k in np.array(law.order[1:])[apart].tolist()
+        ]
     gain_fault = _fault_probability(mean[:S], sd[:S], OPEN_GAIN_SD, TRUSTED_DRIFT_SD)
     offset_fault = _fault_probability(mean[S : 2 * S], sd[S : 2 * S], OPEN_OFFSET_SD, TRUSTED_OFFSET_SD)
     offset_read = [S + s in system.known for s in range(S)]

@@ -210,7 +210,7 @@ def calibrate_junctions(
             continue
         if contradictions:
             why = "; ".join(contradictions)
-            notices.append(f"what is known contradicts itself, so nothing is corrected: {why}")
+            notices.append(f"what is known contradicts itself or the recording, so nothing is corrected: {why}")
         for i, j in enumerate(group):
             name = vehicles[j].vehicle
             if why := impossible(found, i, branches):

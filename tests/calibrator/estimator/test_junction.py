@@ -145,6 +145,17 @@ def test_gain_is_corrected_alone_where_no_offset_is_suspected() -> None:
     assert rows.offset_a["motor"] == pytest.approx(0.8, abs=0.2)
 
 
+def test_nothing_is_corrected_where_one_branch_is_a_mean_over_the_distance_of_the_rows() -> None:
+    """As in rows of a second from a battery management system: gains differ between slow and fast changes."""
+    frame = recording(seconds=1800.0)
+    frame["battery"] = frame["battery"].rolling(10, min_periods=1).mean()
+    calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(frame.iloc[::10], JUNCTION)
+    assert any(
+        "gains of battery and motor differ between slow and fast changes" in text for text in calibrator.notices_
+    )
+    assert not calibrator.parameters_["corrected"].any()
+
+
 def test_gain_of_a_branch_that_moves_little_is_known_less_well() -> None:
     """A sum that moves by 0.003 % of full scale with a current that moves by 0.15 % of it looks like 2 %."""
     frame = recording()
