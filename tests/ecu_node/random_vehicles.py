@@ -293,10 +293,14 @@ def _autosar(rng: Random, draft: _Draft) -> dict[str, Any]:
         entry["data_id_list"] = {draft.name: [*rng.randbytes(16)]}
     else:
         entry["offset"] = rng.choice((0, 0, 0, rng.randrange(min(draft.size - (bits + 7) // 8, 61))))
+        if profile in {"P01", "P11"}:
+            modes = "both", "both", "nibble", *(("alternating", "low") * (profile == "P01"))
+            entry["data_id_mode"] = rng.choice(modes)
+        is_nibble = entry.get("data_id_mode") == "nibble"
+        bits += 4 * is_nibble
         if rng.random() < 0.5:
-            entry["data_id"] = {draft.name: rng.getrandbits(32 if profile in {"P04", "P07"} else 16)}
-    if profile in {"P01", "P11"}:
-        entry["data_id_mode"] = rng.choice(("both", "both", "nibble", *(("alternating", "low") * (profile == "P01"))))
-        bits += 4 * (entry["data_id_mode"] == "nibble")
+            entry["data_id"] = {
+                draft.name: rng.getrandbits(32 if profile in {"P04", "P07"} else 12 if is_nibble else 16)
+            }
     draft.header = [Signal("Header", 8 * entry.get("offset", 0), bits)]
     return entry
