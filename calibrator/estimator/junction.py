@@ -368,7 +368,7 @@ def estimate_junction(
     deciding : list of N str
         Sentence on what is still open and what would decide it, for each vehicle; empty if all is known.
     contradictions : list of str
-        Sentences on known values that the rest contradicts, and on gain ratios that are none.
+        Sentences on known values that the rest contradicts, and on gain ratios that differ at slow and fast changes.
 
     Raises
     ------
