@@ -12,6 +12,7 @@ import numpy as np
 from calibrator.doctor.facts import Facts
 from calibrator.drive import Drive, good_values
 from calibrator.drives.align import choose_inputs
+from calibrator.drives.computed_inputs import why_computed
 from calibrator.errors import LogError
 from calibrator.estimator.junction_run import summarise_junction
 from calibrator.findings import Finding, Findings, error, hint, warning, worst_first
@@ -153,6 +154,15 @@ def values(facts: Facts) -> Findings:
             yield warning("constant", row.name, text, advice, row.low)
 
 
+def computed_inputs(facts: Facts) -> Findings:
+    """Report inputs that carry the noise of a current sensor, and so its faults."""
+    for name, branch in facts.computed_inputs.items():
+        text = f"carries the noise of current sensors, as if computed from the current of {branch}"
+        yield warning(
+            "computed input", name, text, "a fleet is calibrated without it; name what the currents follow from"
+        )
+
+
 def impossible_voltage(facts: Facts) -> Findings:
     """Report a junction voltage that no vehicle has: the error of its unit shows in every power divided by it."""
     value_v = np.abs(good_values(facts.drives, VOLTAGE))
@@ -187,7 +197,8 @@ def full_scale(facts: Facts) -> Findings:
 
 
 CHECKS: Sequence[Callable[[Facts], Findings]] = (
-    logs_as_a_whole, counted_twice, absent, late, bad_frames, values, impossible_voltage, full_scale,
+    logs_as_a_whole, counted_twice, absent, late, bad_frames, values, computed_inputs, impossible_voltage,
+    full_scale,
 )  # fmt: skip
 
 
@@ -226,6 +237,8 @@ def _for_fleet(facts: Facts) -> str:
     if not layout.model_inputs:
         return "the layout has no model_inputs ([[input]], [[derived]])"
     kept, lacking = choose_inputs(layout, available)
+    if kept and not choose_inputs(layout, available - facts.computed_inputs.keys())[0]:
+        return f"model_inputs {why_computed(facts.computed_inputs)}"
     if not kept:
         names = ", ".join(sorted(layout.base_inputs(lacking) - available))
         return f"none of the model_inputs is recorded ({names})"

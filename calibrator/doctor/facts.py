@@ -1,6 +1,6 @@
 """Facts for the doctor's checks: what logs or tables contain of the branches and inputs of a layout."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import pandas as pd
 from cantools.database.can import Signal
 
 from calibrator.drive import Array, Channel, Drive, Mask
+from calibrator.drives.computed_inputs import computed_inputs, shared_noise
 from calibrator.errors import LogError
 from calibrator.kirchhoff.junction import RecordedJunction, look_at_junction
 from calibrator.kirchhoff.sums import with_voltages
@@ -79,6 +80,8 @@ class Facts:
         - ``low``, ``high``: least and greatest good value, a branch's with its current into the junction positive; NaN
           without any;
         - ``clipped``: number of good values at an end of the signal's range, :data:`FEWEST_CLIPPED` or more in a row.
+    computed_inputs : mapping of str to str
+        Inputs of models that are computed from a current sensor, and its branch.
     junction : RecordedJunction
         What the sum of the branches shows; its layout has a period that suits the logs, and voltages as more inputs.
     """
@@ -87,6 +90,7 @@ class Facts:
     logs: Sequence[ExaminedLog]
     drives: Sequence[Drive]
     channels: pd.DataFrame
+    computed_inputs: Mapping[str, str]
     junction: RecordedJunction
 
 
@@ -109,6 +113,7 @@ def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
         logs=logs,
         drives=drives,
         channels=pd.DataFrame(channels),
+        computed_inputs=computed_inputs([shared_noise(drive, sorted(needed), layout) for drive in drives]),
         junction=look_at_junction(drives, extended),
     )
 

@@ -18,12 +18,14 @@ import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive, Equipment, good_values
 from calibrator.drives.align import choose_inputs
+from calibrator.drives.computed_inputs import computed_inputs, shared_noise, why_computed
 from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.settings import FEWEST_VEHICLES
 from calibrator.files.layout_files import vehicle_database
 from calibrator.files.storage import open_storage
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S
+from calibrator.sources.fleet_source import PROBED_VEHICLES
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.record import Record
@@ -50,6 +52,10 @@ __all__ = [
 MOST_BRANCHES = 16
 MOST_MISSED, LEAST_AGE_S = 2.5, 0.5
 """Rows of a data frame that are farther apart than this many periods, and than this time, leave a gap. [1], [s]"""
+EXPECTED_INPUTS = (
+    "expected one or more different columns, other than the branches, that the currents depend on, such as speed, "
+    "torque, or the demands of heater and air conditioning"
+)
 FINEST_PERIOD_S = 0.1
 """Shortest time base of data frames without a layout: that of logs. [s]"""
 LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
@@ -219,7 +225,14 @@ def summarise_frames(
             f"branch {junction.branches[int(np.argmax(stuck))]} never changes in most vehicles: stuck, or not "
             f"connected; leave it out if the junction has none"
         )
-    equipment = Equipment(branches=tuple(junction.branches), inputs=chosen, fleet_inputs=chosen, notices=())
+    layout, first = database.layout, [mine[0] for mine in drives.values()]
+    recorded = sorted(layout.base_inputs(chosen))
+    computed = computed_inputs([shared_noise(drive, recorded, layout) for drive in first[:PROBED_VEHICLES]])
+    used, _ = choose_inputs(layout, {*columns} - computed.keys(), names=chosen)
+    if not used:
+        raise FleetError(f"inputs {why_computed(computed)}; {EXPECTED_INPUTS}")
+    notices = (f"inputs left out: {why_computed(computed)}",) if computed else ()
+    equipment = Equipment(branches=tuple(junction.branches), inputs=used, fleet_inputs=used, notices=notices)
     identity = store_identity(equipment, database, vehicles=len(drives), fleet="frames")
     store = SummaryStore(storage=open_storage(folder), identity=identity)
     write_identity(store.storage, identity)
@@ -315,10 +328,7 @@ def _chosen_inputs(
                 f"or name those to use with inputs=[...]"
             )
     if not chosen or len({*chosen, *branches}) < len(chosen) + len(branches):
-        raise FleetError(
-            f"inputs {few(chosen) or 'none'}: expected one or more different columns, other than the branches, that "
-            f"the currents depend on, such as speed, torque, or the demands of heater and air conditioning"
-        )
+        raise FleetError(f"inputs {few(chosen) or 'none'}: {EXPECTED_INPUTS}")
     return chosen, columns
 
 

@@ -15,10 +15,11 @@ from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from calibrator.drive import Drive, DriveFile, Equipment, FleetSource
 from calibrator.drives.align import choose_inputs
+from calibrator.drives.computed_inputs import SharedNoise, computed_inputs, shared_noise, why_computed
 from calibrator.drives.store import (
     DRIVES_FOLDER,
     is_drive_file,
@@ -36,6 +37,7 @@ from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import few, few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
+from ecu_node.layout import Layout
 from ecu_node.summary import SUFFIX
 
 __all__ = [
@@ -369,8 +371,8 @@ def probe_equipment(
     """Find out from some vehicles which branches and inputs the fleet has.
 
     The first readable drive of each of the first :data:`PROBED_VEHICLES` readable vehicles is read. The fleet has a
-    branch if more than half of these drives have it, and an input if at least one has it. A vehicle that lacks a chosen
-    branch is left out later.
+    branch if more than half of these drives have it, and an input if at least one has it, unless it is computed from a
+    current sensor. A vehicle that lacks a chosen branch is left out later.
 
     Parameters
     ----------
@@ -400,23 +402,23 @@ def probe_equipment(
         If a branch is named that the layout does not have.
     """
     layout = database.layout
-    names, errors = [_names_in(drive) for drive in drives], list[str]()
-    if not names:
-        vehicles = filter(None, fleet.vehicles.values())
-        with closing(try_many(partial(_names, database=database), vehicles, Workers(), limit_s=limit_s)) as read:
+    looks, errors = [_look_at(drive, layout, modelled=modelled) for drive in drives], list[str]()
+    if not looks:
+        vehicles, look = filter(None, fleet.vehicles.values()), partial(_look, database=database, modelled=modelled)
+        with closing(try_many(look, vehicles, Workers(), limit_s=limit_s)) as read:
             for _, outcome in read:
                 if isinstance(outcome, Failed):
                     errors.append(outcome.reason)
                 else:
-                    names.append(outcome)
-                if len(names) == PROBED_VEHICLES:
+                    looks.append(outcome)
+                if len(looks) == PROBED_VEHICLES:
                     break
-    if not names:
+    if not looks:
         raise FleetError(
             f"{fleet.place}: none of the first {len(errors)} vehicles can be read; the first says: {errors[0]}"
         )
-    seen = Counter(name for has, _ in names for name in has)
-    found = [name for name in layout.branch_names if 2 * seen[name] > len(names)]
+    seen = Counter(name for look in looks for name in look.branches)
+    found = [name for name in layout.branch_names if 2 * seen[name] > len(looks)]
     chosen = tuple(found if branches is None else branches)
     if branches is not None and len(branches) < 2:
         raise FleetError(
@@ -427,42 +429,65 @@ def probe_equipment(
         layout.find_branch(name)
     if twice := sorted({name for name in chosen if chosen.count(name) > 1}):
         raise FleetError(f"branch {', '.join(twice)} is asked for twice; name each branch once")
-    available = {name for _, inputs in names for name in inputs}
-    inputs, missing_inputs = choose_inputs(layout, available) if modelled else ((), ())
-    wanted = layout.fleet_inputs or layout.model_inputs
-    fleet_inputs = choose_inputs(layout, available, names=wanted)[0] if modelled else ()
     if len(chosen) < 2:
         raise FleetError(f"{fleet.place}: branches found: {', '.join(chosen) or 'none'}; a junction needs two or more")
-    if modelled and not inputs:
-        named = few(layout.model_inputs)
-        why = f"none of the model_inputs of {{}} was recorded: {named}" if named else "no model_inputs in {}"
-        raise FleetError(
-            f"{fleet.place}: {why.format(layout.path)}; a fleet is compared by inputs that its currents follow from, "
-            f"such as torque: name some there, see docs/layout.md; or name a branch whose sensor is right (--trusted)"
-        )
     texts = {
         "branches not recorded, taken as not fitted": [b for b in layout.branch_names if b not in {*found, *chosen}],
         "branches recorded but not asked for, missing from the junction sum": [b for b in found if b not in chosen],
-        "model inputs not recorded, left out": missing_inputs,
     }
-    notices = tuple(f"{text}: {', '.join(names)}" for text, names in texts.items() if names)
-    return Equipment(branches=chosen, inputs=inputs, fleet_inputs=fleet_inputs, notices=notices)
+    notices = [f"{text}: {', '.join(names)}" for text, names in texts.items() if names]
+    if not modelled:
+        return Equipment(branches=chosen, inputs=(), fleet_inputs=(), notices=tuple(notices))
+    return _with_inputs(chosen, looks, layout, fleet.place, notices)
 
 
-def _names(entries: Sequence[DriveFile], database: VehicleDatabase) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Read the names of the branches and inputs that the first readable drive has; UserError if none is readable."""
+def _with_inputs(
+    branches: tuple[str, ...], looks: "Sequence[_Look]", layout: Layout, place: str, notices: Sequence[str]
+) -> Equipment:
+    """Add the inputs that a fleet has, and notices on those that it lacks; FleetError if there is none."""
+    recorded = {name for look in looks for name in look.inputs}
+    computed = computed_inputs([look.noise for look in looks])
+    wanted = layout.fleet_inputs or layout.model_inputs
+    inputs, _ = choose_inputs(layout, recorded - computed.keys())
+    fleet_inputs, _ = choose_inputs(layout, recorded - computed.keys(), names=wanted)
+    _, missing = choose_inputs(layout, recorded)
+    if not inputs:
+        named = few(layout.model_inputs)
+        why = f"none of the model_inputs of {{}} was recorded: {named}" if named else "no model_inputs in {}"
+        if computed:
+            why = f"model_inputs of {{}}: {why_computed(computed)}"
+        raise FleetError(
+            f"{place}: {why.format(layout.path)}; a fleet is compared by inputs that its currents follow from, "
+            f"such as torque: name some there, see docs/layout.md; or name a branch whose sensor is right (--trusted)"
+        )
+    more = [f"model inputs not recorded, left out: {', '.join(missing)}"] if missing else []
+    more += [f"model inputs left out: {why_computed(computed)}"] if computed else []
+    return Equipment(branches=branches, inputs=inputs, fleet_inputs=fleet_inputs, notices=(*notices, *more))
+
+
+class _Look(NamedTuple):
+    """What a drive of a vehicle has: branches, recorded inputs, and noise that its model inputs share with sensors."""
+
+    branches: tuple[str, ...]
+    inputs: tuple[str, ...]
+    noise: Mapping[str, SharedNoise]
+
+
+def _look(entries: Sequence[DriveFile], database: VehicleDatabase, *, modelled: bool) -> _Look:
+    """Look at the first readable drive; UserError if none is readable."""
     problems = list[UserError]()
     for entry in entries:
         try:
             if not is_onboard(entry):
-                return _names_in(load_drive(entry, database))
+                return _look_at(load_drive(entry, database), database.layout, modelled=modelled)
             with local_copy(entry.place) as path:
                 record = read_onboard_record(path, database)
-            return tuple(record.branches), tuple(record.recorded)
+            return _Look(tuple(record.branches), tuple(record.recorded), {})
         except UserError as error:
             problems.append(error)
     raise problems[0]
 
 
-def _names_in(drive: Drive) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    return tuple(drive.branches), tuple(drive.inputs)
+def _look_at(drive: Drive, layout: Layout, *, modelled: bool) -> _Look:
+    wanted = layout.base_inputs({*layout.model_inputs, *layout.fleet_inputs}) if modelled else set()
+    return _Look(tuple(drive.branches), tuple(drive.inputs), shared_noise(drive, sorted(wanted), layout))

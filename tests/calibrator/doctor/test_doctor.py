@@ -75,6 +75,20 @@ def test_text_of_doctor_names_the_next_commands_and_its_tables_fit_80_columns(lo
     assert all(len(line) <= 80 for line in lines[1:14]), lines
 
 
+def test_inputs_that_are_computed_from_a_current_sensor_are_named(examine: Examine) -> None:
+    drive = true_drive()
+    shown = drive.branches["motor"]
+    torque = replace(shown, value=np.round(-shown.value * 0.76, 1))
+    others = {name: drive.inputs[name] for name in ("voltage", "speed")}
+    doctor = examine(replace(drive, inputs={**others, "torque": torque}))
+    (finding,) = doctor.findings("computed input")
+    assert (finding.subject, finding.severity) == ("torque", "warning")
+    assert finding.text.startswith("carries the noise of current sensors, as if computed from the current of motor")
+    assert doctor.report["not_ready"]["calibrate"].startswith(
+        "model_inputs torque (most like motor), computed from current sensors"
+    )
+
+
 def test_recording_that_is_given_in_two_formats_is_reported(log: Path, layout: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy.blf"  # which rounds times in another way
     with can.CanutilsLogReader(log) as frames, can.BLFWriter(copy) as writer:

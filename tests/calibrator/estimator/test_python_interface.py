@@ -25,6 +25,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UserError
 from tests.calibrator.command_here import succeeded
 from tests.calibrator.conftest import LAYOUT
+from tests.calibrator.drives.test_computed_inputs import trip
 from tests.calibrator.estimator.test_run import contents, failing_for
 from tests.calibrator.summaries.small_stores import random_faults, small_store
 
@@ -85,6 +86,27 @@ def test_rounding_of_a_small_current_is_not_taken_for_a_gain_error() -> None:
     fitted = FleetCalibrator().fit(Fleet.from_frames(given, junction))
     assert not fitted.parameters_["corrected"].any()
     assert not [notice for notice in fitted.notices_ if "junction law" in notice]
+
+
+def test_fault_of_a_sensor_from_which_an_input_is_computed_is_not_given_to_another_branch() -> None:
+    given = {}
+    for number in range(6):
+        drive, rng = trip(number).drop(columns="heater"), np.random.default_rng(number)
+        drive["battery"] = -drive["motor"]
+        power = -360.0 * drive["motor"] * (1.0 + rng.normal(0.0, 0.001))
+        drive["battery"] *= 1.10 if number == 3 else 1.0
+        drive += rng.normal(0.0, 0.3, drive.shape)
+        given[f"V{number}"] = drive.assign(pack_w=370.0 * drive["battery"], power=power)
+    with pytest.raises(FleetError, match=r"inputs pack_w \(most like battery\), computed from current sensors"):
+        Fleet.from_frames(given, JUNCTION, inputs=["pack_w"])
+    found = FleetCalibrator().fit(Fleet.from_frames(given, JUNCTION))
+    assert (
+        "inputs left out: pack_w (most like battery), computed from current sensors, whose noise and faults are in it"
+        in (found.notices_)
+    )
+    rows = found.parameters_.query("corrected")
+    assert rows[["vehicle", "branch"]].to_numpy().tolist() == [["V3", "battery"]]
+    assert rows["gain_error"].iloc[0] == pytest.approx(0.10, abs=0.005)
 
 
 def test_twelve_vehicles_are_calibrated_from_data_frames(fitted: FleetCalibrator, example: Any) -> None:

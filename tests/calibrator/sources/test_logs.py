@@ -1,6 +1,7 @@
 """Which log belongs to which vehicle, found without reading the logs; what branches a fleet has."""
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from calibrator.files.storage import open_storage
 from calibrator.sources.fleet_source import find_fleet, find_logs, probe_equipment
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
+from tests.calibrator.doctor.artificial_logs import true_drive
 
 
 def drives(found: FleetSource) -> list[str]:
@@ -126,3 +128,13 @@ def test_branches_of_a_vehicle_are_those_of_its_first_readable_drive(store: Path
 def test_wrong_branches_are_refused(store: Path, database: VehicleDatabase, branches: list[str], words: str) -> None:
     with pytest.raises((FleetError, LayoutError), match=words):
         probe_equipment(find_fleet(store), database, branches)
+
+
+def test_inputs_that_are_computed_from_a_current_sensor_are_not_used(tmp_path: Path, database: VehicleDatabase) -> None:
+    drive = true_drive()
+    torque = replace(drive.branches["motor"], value=-0.76 * drive.branches["motor"].value)
+    write_drive(tmp_path, replace(drive, inputs={**drive.inputs, "torque": torque}), database.layout)
+    found = probe_equipment(find_fleet(tmp_path), database, None)
+    notice = "torque (most like motor), computed from current sensors, whose noise and faults are in it"
+    assert f"model inputs left out: {notice}" in found.notices
+    assert found.inputs == ("heater_current", "aircon_current", "low_voltage_current")

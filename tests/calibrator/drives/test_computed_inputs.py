@@ -1,0 +1,97 @@
+"""Inputs that are computed from a current sensor are told from inputs of their own, by the noise that they carry."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from calibrator import Junction
+from calibrator.drive import Array, Channel, Drive
+from calibrator.drives.computed_inputs import computed_inputs, shared_noise, why_computed
+
+PERIOD_S = 0.1
+BRANCHES = ["battery", "motor", "heater"]
+Input = Callable[[pd.DataFrame, pd.DataFrame], Array]
+
+
+def trip(seed: int, minutes: float = 12.0) -> pd.DataFrame:
+    """True currents of a trip that is driven in town: power follows the pedal, the heater is switched. [A]"""
+    rng, count = np.random.default_rng(seed), round(60.0 * minutes / PERIOD_S)
+    pedal = np.repeat(rng.uniform(-0.6, 1.0, count // 50 + 1), 50)[:count]
+    motor = -90.0 * np.convolve(pedal, np.ones(20) / 20.0, "same")
+    heater = -10.0 * np.repeat(rng.choice([0.0, 0.4, 1.0], count // 300 + 1), 300)[:count]
+    return pd.DataFrame(
+        {"battery": -motor - heater, "motor": motor, "heater": heater}, index=PERIOD_S * np.arange(count)
+    )
+
+
+def drive_with(make: Input, seed: int, *, every: int = 1, battery_mean: int = 1) -> Drive:
+    """A drive with noisy sensors, one of them with a gain error, and an input that is made of it.
+
+    The input has every ``every``-th row; a ``battery_mean`` of rows makes the battery's sensor show their mean.
+    """
+    true = trip(seed, minutes=12.0 * battery_mean)
+    shown = true.assign(battery=true["battery"].rolling(battery_mean, min_periods=1).mean(), motor=1.08 * true["motor"])
+    shown = (shown + np.random.default_rng(seed + 100).normal(0.0, 0.3, true.shape)).iloc[::battery_mean]
+    time_s, value = shown.index.to_numpy(), np.asarray(make(shown, true.iloc[::battery_mean]), np.float64)
+
+    def channel(time_s: Array, value: Array) -> Channel:
+        return Channel(time_s=time_s, value=value, good=np.isfinite(value))
+
+    branches = {name: channel(time_s, shown[name].to_numpy()) for name in BRANCHES}
+    inputs = {"input": channel(time_s[::every], value[::every])}
+    return Drive(vehicle=f"V{seed}", name="d", branches=branches, inputs=inputs)
+
+
+def found(drives: list[Drive]) -> dict[str, str]:
+    layout = Junction(branches=BRANCHES, full_scale_a=400.0).as_database(["input"], PERIOD_S).layout
+    return computed_inputs([shared_noise(drive, ["input", "not recorded"], layout) for drive in drives])
+
+
+def voltage(battery_a: pd.Series) -> pd.Series:
+    """Voltage that sags with the battery's current. [V]"""
+    return 370.0 - 0.08 * battery_a
+
+
+@pytest.mark.parametrize(("make", "every", "branch"), [
+    (lambda m, _: m["battery"] * voltage(m["battery"]), 1, "battery"),
+    (lambda m, _: (m["battery"] * voltage(m["battery"]) / 100.0).round() / 10.0, 1, "battery"),
+    (lambda m, _: m["motor"] * -0.36, 1, "motor"),
+    (lambda m, _: m["heater"] * -360.0, 1, "heater"),
+    (lambda m, _: (m["battery"] * 360.0).shift(4), 1, "battery"),
+    (lambda m, _: m["battery"] * 360.0, 3, "battery"),
+    (lambda m, _: np.repeat(m["battery"].to_numpy()[::2], 2), 1, "battery"),
+    (lambda m, _: 360.0 * (m["battery"] + m["motor"]), 1, "battery"),
+], ids=[
+    "power", "power in steps of 0.1 kW", "motor power", "heater power", "0.4 s late", "sent less often",
+    "held for 0.2 s", "what battery and motor leave",
+])  # fmt: skip
+def test_input_that_is_computed_from_a_current_sensor_is_found(make: Input, every: int, branch: str) -> None:
+    computed = found([drive_with(make, seed, every=every) for seed in range(5)])
+    assert computed == {"input": branch}
+    assert why_computed(computed).startswith(f"input (most like {branch}), computed from current sensors")
+
+
+@pytest.mark.parametrize(("make", "battery_mean"), [
+    (lambda _, t: t["motor"] * -360.0, 1),
+    (lambda _, t: t["heater"] * -360.0, 1),
+    (lambda _, t: t["battery"] * 360.0, 10),  # the battery's mean and the motor differ by a current, which is no noise
+    (lambda _, t: t["motor"] * -360.0, 10),
+    (lambda m, _: np.full(len(m), 5.0), 1),
+], ids=[
+    "exact power", "demand of the heater", "mean of 1 s in the battery", "the same, of the motor", "constant",
+])  # fmt: skip
+def test_input_of_its_own_is_kept_however_well_it_explains_a_current(make: Input, battery_mean: int) -> None:
+    assert found([drive_with(make, seed, battery_mean=battery_mean) for seed in range(5)]) == {}
+
+
+def test_input_that_most_vehicles_do_not_compute_is_kept() -> None:
+    def computed(m: pd.DataFrame, _: pd.DataFrame) -> Array:
+        return np.asarray(m["battery"] * 360.0)
+
+    def own(_: pd.DataFrame, t: pd.DataFrame) -> Array:
+        return np.asarray(t["battery"] * 360.0)
+
+    assert found([drive_with(computed, 0), *(drive_with(own, seed) for seed in range(1, 6))]) == {}
+    assert found([]) == {}
