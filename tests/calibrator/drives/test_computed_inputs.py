@@ -44,6 +44,46 @@ def drive_with(make: Input, seed: int, *, every: int = 1, battery_mean: int = 1)
     return Drive(vehicle=f"V{seed}", name="d", branches=branches, inputs=inputs)
 
 
+def unbalanced_drive(battery: Array, motor: Array, value: Array) -> Drive:
+    """A drive of two branches, between which a current is missing, and an input."""
+    time_s, good = PERIOD_S * np.arange(len(motor)), np.ones(len(motor), bool)
+    noise = np.random.default_rng(7).normal(0.0, 0.1, (2, len(motor)))
+
+    def channel(value: Array) -> Channel:
+        return Channel(time_s=time_s, value=value, good=good)
+
+    branches = {"battery": channel(battery + noise[0]), "motor": channel(motor + noise[1])}
+    return Drive(vehicle="V1", name="d", branches=branches, inputs={"input": channel(value)})
+
+
+def late_battery() -> Drive:
+    """Currents that never rest, and a battery sensor that is a sample late; the input is the motor's exact power."""
+    rng = np.random.default_rng(1)
+    rough = np.convolve(rng.normal(size=20_000), np.ones(3), "same") * np.repeat(rng.uniform(1.0, 4.0, 200), 100)
+    return unbalanced_drive(np.roll(rough, 1), -rough, 360.0 * rough)
+
+
+def ripple_in_battery() -> Drive:
+    """A ripple that the motor's sensor does not show; the input is the battery's voltage, which sags with it."""
+    motor = trip(1)["motor"].to_numpy()
+    battery = -motor + np.random.default_rng(1).normal(0.0, 0.5, len(motor))
+    return unbalanced_drive(battery, motor, 380.0 - 0.1 * battery)
+
+
+def switched_load() -> Drive:
+    """A load without a sensor that is switched every second; the input is the demand of all consumers, with noise."""
+    motor, rng = trip(1)["motor"].to_numpy(), np.random.default_rng(1)
+    load = np.repeat(rng.choice([0.0, 8.0], len(motor) // 10 + 1), 10)[: len(motor)]
+    return unbalanced_drive(load - motor, motor, 360.0 * (load - motor + rng.normal(0.0, 0.2, len(motor))))
+
+
+def switched_branch() -> Drive:
+    """A branch that is switched every three seconds, which the battery shows as a mean; the input is its demand."""
+    switched = np.repeat(np.random.default_rng(1).choice([0.0, 0.4, 1.0], 2000), 30)
+    battery = np.convolve(switched, np.ones(10) / 10.0)[: len(switched)]
+    return unbalanced_drive(20.0 * battery, -20.0 * switched, 7200.0 * switched)
+
+
 def found(drives: list[Drive]) -> dict[str, str]:
     layout = Junction(branches=BRANCHES, full_scale_a=400.0).as_database(["input"], PERIOD_S).layout
     return computed_inputs([shared_noise(drive, ["input", "not recorded"], layout) for drive in drives])
@@ -84,6 +124,11 @@ def test_input_that_is_computed_from_a_current_sensor_is_found(make: Input, ever
 ])  # fmt: skip
 def test_input_of_its_own_is_kept_however_well_it_explains_a_current(make: Input, battery_mean: int) -> None:
     assert found([drive_with(make, seed, battery_mean=battery_mean) for seed in range(5)]) == {}
+
+
+@pytest.mark.parametrize("drive", [late_battery, ripple_in_battery, switched_load, switched_branch])
+def test_current_that_another_branch_misses_is_not_taken_for_noise(drive: Callable[[], Drive]) -> None:
+    assert found([drive()]) == {}
 
 
 def test_input_that_most_vehicles_do_not_compute_is_kept() -> None:
