@@ -305,7 +305,7 @@ def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> s
     vehicle : str
         Identity of the vehicle.
     now : datetime
-        Time of day.
+        Present date and time, with time zone.
 
     Returns
     -------

@@ -135,7 +135,15 @@ def first_prior(branches: int) -> Prior:
 
 
 def known_prior(counts: Array, magnitude: tuple[float, float]) -> Prior:
-    """Make the prior of a fleet whose faults were drawn with known ``counts`` and bounds of sizes, ``magnitude``."""
+    """Make the prior of a fleet whose faults were drawn at random in a known way.
+
+    Parameters
+    ----------
+    counts : ndarray of shape (K + 1, 2K + 1)
+        Probabilities of the numbers of faults, see :class:`Prior`. [1]
+    magnitude : (float, float)
+        Smallest and largest magnitude of a drift [1], and of an offset in fractions of full scale.
+    """
     slab = Slab(low=magnitude[0], high=magnitude[1], tail=1e-6)
     return Prior(counts=counts + 1e-9, gain=slab, offset=slab, load_share=1e-9)
 

@@ -82,7 +82,7 @@ class CommonDrive:
 
     @property
     def record(self) -> dict[str, int | float | str]:
-        """Description, lengths and full scale of the drive, for the record of a result."""
+        """Name of the drive, numbers of its samples, and full scale [A], which a result records."""
         return {
             "drive": self.name,
             "samples": len(self.i_s),

@@ -84,14 +84,17 @@ def bands_of(recordings: Sequence[Sequence[Channel]]) -> Bands:
 def likely_multipliers(
     bands: Bands, price_besides: Callable[[Array], float], *, factors: Sequence[float] = FACTORS, sure: bool = True
 ) -> Array:
-    """Return the multipliers, shape (K,), whose price is least: log (V / N) plus the price of other objections.
+    """Return by what each branch should be multiplied, shape (K,), so that the currents cancel best.
+
+    Least is log (V / N) plus `price_besides`; V is the mean square of the sum of the multiplied currents, N the sum of
+    their mean squares.
 
     Parameters
     ----------
     bands : Bands
         Bands of the K currents.
     price_besides : callable
-        From multipliers (K,) to the price of all other objections to them. [1]
+        From multipliers (K,) to what else speaks against them, as a number to add to log (V / N). [1]
     factors : sequence of float
         Magnitudes that are tried, for one branch or two at a time. [1]
     sure : bool

@@ -53,7 +53,7 @@ class HeardSignal:
         self._spoilt_s = -math.inf
 
     def follow(self, signal: PlacedSignal, frames: Frames) -> None:
-        """Read the signal from ``frames``, to which each new frame of its message is added."""
+        """From now on take values from ``frames``, to which the caller adds each new frame of the signal's message."""
         self.signal, self._frames = signal, frames
 
     def newest_first(self) -> Iterator[tuple[float, int]]:
@@ -194,9 +194,9 @@ class LiveBranch(HeardSignal):
             self._waited_s = max(self._waited_s, expected_since_s)
 
     def activate(self, *, active: bool, doubted: bool) -> None:
-        """Correct the branch if `active` and its fault is applied, else pass it through.
+        """Correct the branch from now on, if `active` and its parameters are to be applied; else pass it through.
 
-        If it is not corrected and `doubted`, its quality is IMPLAUSIBLE.
+        Passed through it has the quality IMPLAUSIBLE if `doubted`, else PASSED_THROUGH.
         """
         corrects = active and self.fault.applied
         self.plan = self._correcting if corrects else self._passing

@@ -440,21 +440,24 @@ _NEARLY = Fraction(98, 100)
 
 
 def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
-    """Raise DatabaseError if a named code amid a signal's values keeps results up to full scale from being written.
+    """Check that no named code cuts off values that the node may have to write.
+
+    Results are limited to the run of codes around 0 that have no name. It must reach up to `largest`, or to 98 % of the
+    outermost value of the signal if that is less.
 
     Parameters
     ----------
     codes : Codes
         Codes of the signal to write.
     largest : Fraction
-        Largest magnitude that must be written, as far as the signal reaches at all. [unit of the codes]
+        Largest magnitude to be written. [unit of the codes]
     where : str
         What the signal is for, for the message of the error.
 
     Raises
     ------
     DatabaseError
-        If results would be clamped to less, though the signal has values beyond.
+        If a named code ends that run earlier, or is the code of 0.
     """
     ends = writable_range(codes, where)
     for end, extreme, inwards in zip(ends, (codes.lowest, codes.highest), (1, -1), strict=True):

@@ -170,7 +170,7 @@ def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, 
     database : VehicleDatabase
         Layout and DBC of the vehicle.
     now : datetime
-        Time of day.
+        Present date and time, with time zone.
     dry_run : bool
         Check everything, change nothing.
 
@@ -182,7 +182,8 @@ def update(folder: Path, source: str, database: VehicleDatabase, now: datetime, 
     Raises
     ------
     UnfitError
-        If there is no state that can be read, or the offer is refused; with the reason.
+        If there is no state that can be read, or the offer is refused; with the reason. Revocations that came with a
+        refused offer take effect all the same, but in a dry run.
     UserError
         If another process holds the lock, or the state cannot be written.
     """

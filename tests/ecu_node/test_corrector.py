@@ -158,7 +158,8 @@ def test_branch_is_missed_after_its_deadline(database: VehicleDatabase, last_s: 
         assert corrector.latched is latched
 
 
-@pytest.mark.parametrize(("fault", "state"), [((0.0, 0.0), State.PASSING_THROUGH), ((0.25, 5.0), State.CORRECTING)])
+@pytest.mark.parametrize(("fault", "state"), [((0.0, 0.0), State.PASSING_THROUGH), ((0.25, 5.0), State.CORRECTING)],
+    ids=["battery has no fault", "battery is corrected"])  # fmt: skip
 def test_node_does_not_wait_for_branches_without_parameters(
     database: VehicleDatabase, fault: tuple[float, float], state: State
 ) -> None:

@@ -56,8 +56,8 @@ LONG = pytest.mark.long
     [
         (6, RecordedCase(branches=2, sparsity=80.0, balanced=True, world=""), 0.5),
         pytest.param(12, RecordedCase(branches=2, sparsity=80.0, balanced=True, world=""), 0.8, marks=LONG),
-        pytest.param(6, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5, marks=LONG),
-        (12, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5),
+        (6, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5),
+        pytest.param(12, RecordedCase(branches=3, sparsity=80.0, balanced=True, world=""), 0.5, marks=LONG),
         pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=True, world=""), 0.01, marks=LONG),
         pytest.param(None, RecordedCase(branches=3, sparsity=60.0, balanced=False, world=""), 0.01, marks=LONG),
     ],

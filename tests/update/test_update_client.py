@@ -174,7 +174,9 @@ def test_expired_set_is_not_used(repo: Repo, state: Path, database: VehicleDatab
     assert read_state(state).ended == "expired"
 
 
-def test_latest_time_is_kept(repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters) -> None:
+def test_expired_offer_stays_refused_if_the_clock_is_set_back(
+    repo: Repo, state: Path, database: VehicleDatabase, other: VehicleParameters
+) -> None:
     now = datetime.now(UTC)
     repo.offer(other, "--days", 1)
     with pytest.raises(TrustError, match="expired at"):

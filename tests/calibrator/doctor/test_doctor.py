@@ -382,7 +382,7 @@ def test_branches_of_opposite_sign_with_exchanged_signals_are_an_error(
     assert "check sign and unit of branch" in said
 
 
-def test_exchanged_signals_of_one_sign_hide_no_wrong_sign_of_another_branch(log: Path, tmp_path: Path) -> None:
+def test_wrong_sign_is_found_though_two_other_branches_are_exchanged(log: Path, tmp_path: Path) -> None:
     layout = write_layout(tmp_path, inverted=("motor",))
     exchange(layout, "HV_Auxiliary.AuxiliaryCurrent", "HV_Dcdc.DcdcCurrent")
     doctor = examined(layout, log)

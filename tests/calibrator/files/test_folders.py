@@ -75,7 +75,7 @@ def fill_while_the_place_is_taken(out: Path) -> None:
         (out / "in the way").write_text("")
 
 
-def test_result_is_kept_if_it_cannot_be_moved_to_its_place(tmp_path: Path) -> None:
+def test_error_says_where_the_new_result_is_if_it_cannot_be_moved_into_place(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match=r"out: cannot be replaced: .*; what was made stands in") as caught:
         fill_while_the_place_is_taken(tmp_path / "out")
     kept = Path(str(caught.value).rpartition("stands in ")[2])

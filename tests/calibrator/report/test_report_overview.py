@@ -48,7 +48,9 @@ def test_overview_counts_vehicles_and_sensors_and_takes_medians(result: Path) ->
     assert found["duration_h"]["median"] == 0.5
 
 
-def test_workshop_list_is_ordered_hardware_sensors_shared_causes(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_workshop_list_has_hardware_first_then_sensors_then_shared_causes(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
     vehicles = six_vehicles(database)
     load = SensorFinding(branch="battery", cause="load", probability=0.99, text="5 A without a sensor.")
     inverted = SensorFinding(branch="motor", cause="inverted", probability=0.9, text="its sign is turned.")

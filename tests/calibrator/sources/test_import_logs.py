@@ -58,7 +58,7 @@ def test_slow_log_is_left_out_and_others_are_read(
 
 def test_unwritable_drive_stops_the_import(two_vehicles: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     """Otherwise all further drives would be left out one by one, with exit code 0."""
-    command = [sys.executable, "-m", "calibrator", "import", str(two_vehicles / "logs"), "--layout", str(LAYOUT)]
+    command = [sys.executable, "-B", "-m", "calibrator", "import", str(two_vehicles / "logs"), "--layout", str(LAYOUT)]
     limited = ["prlimit", "--fsize=1000", *command, "--out", str(tmp_path)]
     unmeasured = {name: value for name, value in os.environ.items() if not name.startswith("COV")}
     found = subprocess.run(limited, env=unmeasured, capture_output=True, text=True, check=False)
