@@ -154,7 +154,7 @@ def why_computed(computed: Mapping[str, str]) -> str:
 def _fresh(time_s: Array, value: Array) -> tuple[Array, Array]:
     """Return the values that differ from the one before, none if these are rare; not too many, see MOST_VALUES."""
     changed = np.diff(value, prepend=np.inf) != 0.0
-    if changed.mean() < LEAST_CHANGING:
+    if changed.sum() < LEAST_CHANGING * len(value):
         return time_s[:0], value[:0]
     if changed.sum() > MOST_VALUES:
         changed &= np.diff(np.floor(time_s / SHORTEST_S), prepend=-1.0) > 0.0
@@ -185,7 +185,8 @@ def _pairs(time_u: Array, time_s: Array) -> Iterator[tuple[NDArray[np.intp], NDA
 
     Each value of the slower one of both is paired with one of the faster one.
     """
-    if min(len(time_u), len(time_s)) <= STRETCH * FEWEST_STRETCHES:
+    least = STRETCH * FEWEST_STRETCHES
+    if min(len(time_u), len(time_s)) <= least:
         return
     is_slow = np.median(np.diff(time_u)) >= np.median(np.diff(time_s))
     slow_s, fast_s = (time_u, time_s) if is_slow else (time_s, time_u)
@@ -193,7 +194,8 @@ def _pairs(time_u: Array, time_s: Array) -> Iterator[tuple[NDArray[np.intp], NDA
     for shift in SHIFTS:
         fast = latest - shift if is_slow else latest + shift
         slow = np.flatnonzero((fast >= 0) & (fast < len(fast_s)))
-        yield (slow, fast[slow]) if is_slow else (fast[slow], slow)
+        if len(slow) > least:
+            yield (slow, fast[slow]) if is_slow else (fast[slow], slow)
 
 
 def _vanishes_with(current_a: Array, u: Array, full_scale_a: float) -> bool:

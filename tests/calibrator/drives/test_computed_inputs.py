@@ -1,6 +1,7 @@
 """Inputs that are computed from a current sensor are recognised by its noise; independent inputs are kept."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -146,4 +147,13 @@ def test_input_is_kept_if_it_is_computed_in_one_vehicle_of_six() -> None:
         return np.asarray(t["battery"] * 360.0)
 
     assert computed_in([drive_with(computed, 0), *(drive_with(own, seed) for seed in range(1, 6))]) == {}
+
+
+def test_input_without_values_or_at_another_time_is_kept() -> None:
+    drive = drive_with(lambda m, _: m["battery"] * 360.0, 0)
+    shown = drive.inputs["input"]
+    unusable = replace(shown, good=np.zeros(len(shown.good), np.bool_))
+    later = replace(shown, time_s=shown.time_s + 1000.0)
+    assert computed_in([drive]) == {"input": "battery"}
+    assert computed_in([replace(drive, inputs={"input": each}) for each in (unusable, later)]) == {}
     assert computed_in([]) == {}
