@@ -142,20 +142,26 @@ def exchanged(junction: RecordedJunction) -> Findings:
 
 
 def _exchanged(junction: RecordedJunction) -> list[tuple[str, str]]:
-    said: dict[str, list[set[str]]] = {}
+    """Return the pairs of branches of which each reads what the other is named after."""
+    named, reads = dict[str, list[set[str]]](), dict[str, list[set[str]]]()
     for branch in junction.database.layout.branch:
         if branch.name in junction.branches and not branch.computed:
-            name, source, own = map(words_of, (branch.name, branch.source, branch.source.rpartition(".")[2]))
-            said[branch.name] = [  # the signal tells more than its message, which may carry several branches
-                places_of(name) | set(POSITIONS).intersection(name),
-                (places_of(own) or places_of(source))
-                | (set(POSITIONS).intersection(own) or set(POSITIONS).intersection(source)),
-            ]
+            signal = branch.source.rpartition(".")[2]
+            named[branch.name] = _place_and_position(branch.name)
+            # the signal tells more than its message, which may carry several branches
+            told = zip(_place_and_position(signal), _place_and_position(branch.source), strict=True)
+            reads[branch.name] = [of_signal or of_all for of_signal, of_all in told]
     return [
         (one, other)
-        for one, other in combinations(said, 2)
-        if said[one][0] != said[one][1] and said[one] == said[other][::-1] and all(said[one])
+        for one, other in combinations(named, 2)
+        if named[one] == reads[other] != named[other] == reads[one] and any(named[one]) and any(named[other])
     ]
+
+
+def _place_and_position(name: str) -> list[set[str]]:
+    """Return what a name says: places, as the battery, and positions, as front."""
+    words = words_of(name)
+    return [places_of(words), set(POSITIONS).intersection(words)]
 
 
 def sum_cancels(junction: RecordedJunction) -> Findings:
