@@ -2,6 +2,7 @@
 
 import logging
 import re
+from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,10 +12,10 @@ import cantools
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
 
-from ecu_node.core.signals import AMPERE, VOLT, WATT, impossible_values, unit_factor
+from ecu_node.core.signals import AMPERE, VOLT, WATT, impossible_values, unit_factor, usual_unit
 from ecu_node.documents import read_user_file, text_digest
 from ecu_node.errors import DatabaseError, LayoutError
-from ecu_node.layout import Layout, SignalName, joint_digest, read_layout, split_signal
+from ecu_node.layout import Branch, Layout, SignalName, joint_digest, read_layout, split_signal
 
 __all__ = [
     "VehicleDatabase",
@@ -157,8 +158,8 @@ def read_database(layout: Layout) -> VehicleDatabase:
     )
     if loaded:
         for branch in layout.branch:
-            if branch.unit is not None:
-                vehicle.signal(branch.source)[1].unit = branch.unit
+            if not branch.computed:
+                _settle_units(vehicle, branch)
         for name in layout.wrong_ranges:
             signal = vehicle.signal(name)[1]
             signal.minimum = signal.maximum = None
@@ -230,6 +231,8 @@ def _load(layout: Layout, file: str) -> tuple[Database, str]:
         raise DatabaseError(f"{path}: the DBC has no message; check that it is the one that {layout.path} needs")
     for message in database.messages:
         _complete_multiplexers(message)
+        for signal in message.signals:
+            _name_codes_as_read(signal)
     return database, text_digest(content)
 
 
@@ -248,6 +251,15 @@ def _complete_multiplexers(message: Message) -> None:
                 signal.multiplexer_signal = min(whole, key=len)
     if wanted:
         message.refresh(strict=False)
+
+
+def _name_codes_as_read(signal: Signal) -> None:
+    """Let names stand for codes as they are read: databases also name 65535 for -1 of a signed signal, or -1 for it."""
+    named, size = dict(signal.choices or {}), 1 << signal.length
+    codes = range(-size // 2, size // 2) if signal.is_signed else range(size)
+    if not signal.is_float and any(code not in codes for code in named):
+        as_read = {(code - codes.start) % size + codes.start: name for code, name in named.items() if abs(code) < size}
+        signal.choices = OrderedDict(as_read | {code: name for code, name in named.items() if code in codes})
 
 
 _ENCODINGS = {"dbc": "cp1252", "sym": "cp1252", "arxml": "utf-8", "kcd": "utf-8", "cdd": "utf-8"}
@@ -281,6 +293,22 @@ def _parsed(content: bytes, suffix: str) -> object:
     names = [(line, re.match(r"VAL_ (\d+) (\w+)", line)) for line in lines]
     known = [line for line, name in names if name is None or name.groups() in signals]
     return cantools.database.load_string("\n".join(known) + "\n", "dbc", strict=False)
+
+
+def _settle_units(vehicle: VehicleDatabase, branch: Branch) -> None:
+    """Give a branch the unit of the layout; its corrected signal, too, where the DBC gives that none or the same."""
+    measured = vehicle.signal(branch.source)[1]
+    corrected = vehicle.signal(branch.corrected)[1] if branch.corrected is not None else None
+    in_dbc = measured.unit or ""
+    if branch.unit is not None:
+        measured.unit = branch.unit
+        if corrected is not None and corrected.unit in {None, "", in_dbc}:
+            corrected.unit = branch.unit
+    elif corrected is not None and not corrected.unit and usual_unit(in_dbc) in {*AMPERE, *WATT} - {"A", "W"}:
+        raise DatabaseError(
+            f"{vehicle.layout.path}: branch {branch.name}: {branch.source} is in {in_dbc}, and {branch.corrected} has "
+            f"no unit in the DBC; give it its unit there"
+        )
 
 
 def _look_everything_up(vehicle: VehicleDatabase) -> None:

@@ -141,8 +141,8 @@ class OwnMessage:
 class _Ways(NamedTuple):
     """What is done with payloads of one length."""
 
-    missing: list[LiveBranch]
-    """Branches that such a payload is too short for."""
+    missing: list[HeardSignal]
+    """Branches and other signals that such a payload is too short for."""
     in_place: _Rewrite
     """For a gateway: makes the payload to be passed on, with corrected currents in place of the measured ones."""
     answers: list[tuple[OwnMessage, _Rewrite]]
@@ -181,7 +181,10 @@ class Source:
     branches : list of LiveBranch
         Branches that are read from it.
     timeout_s : float
-        Frames that are older than this when they are read are not used; infinity for a message without branches. [s]
+        Frames that are older than this when they are read are not used: the least time-out of its branches, infinity if
+        it has none. [s]
+    failed_s : float
+        When the last frame came that failed its end-to-end check; -infinity if none did. [s]
     """
 
     def __init__(
@@ -197,7 +200,8 @@ class Source:
         self._counters, self.targets = counters, tuple(targets)
         self.branches = [part for part, _ in readers if isinstance(part, LiveBranch)]
         self._others = [part for part, _ in readers if not isinstance(part, LiveBranch)]
-        self.timeout_s = max((branch.timeout_s for branch in self.branches), default=math.inf)
+        self.timeout_s = min((branch.timeout_s for branch in self.branches), default=math.inf)
+        self.failed_s = -math.inf
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch in self.branches)])
         self._silent_from_s = math.inf
         self._frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
@@ -290,10 +294,11 @@ class Source:
                 counters.jumped += check is Check.JUMPED
                 counters.gaps += check is Check.LOST
                 if check > _LAST_USABLE:
+                    self.failed_s = now_s
                     return check
         self._frames.append((now_s, payload))
-        for branch in ways.missing:
-            branch.spoil(now_s)
+        for part in ways.missing:
+            part.spoil(now_s)
             counters.short += 1
         return check
 
@@ -306,7 +311,7 @@ class Source:
             return _in_one_word(branches, inside, length, made_length, plain)
 
         return _Ways(
-            missing=[branch for branch in self.branches if branch not in inside],
+            missing=[part for part in (*self.branches, *self._others) if part.signal.end > length],
             in_place=way(inside, length),
             answers=[(target, way(target.branches, len(target.data))) for target in self.targets],
         )
@@ -461,9 +466,11 @@ class Corrector:
     def _see_whether_asleep(self, now_s: float) -> None:
         """Note whether all branches are silent: then the vehicle goes to sleep, which is not a fault.
 
+        It does not while frames come that fail their check.
         Once it sleeps, a branch that was latched as silent or stuck is tried again; what the sums showed stays latched.
         """
         silent = all(branch.is_old(now_s) for branch in self.branches)
+        silent &= all(now_s - source.failed_s > source.timeout_s for source in self.sources.values() if source.branches)
         if not silent:
             self._silent_since_s = math.inf
         elif self._silent_since_s == math.inf:
@@ -484,8 +491,13 @@ class Corrector:
         self.latch(Reason.NONE)
 
     def _is_missed(self, branch: LiveBranch, now_s: float) -> bool:
-        """Whether a branch is stale though another sent after this one's deadline; else the vehicle goes to sleep."""
-        return branch.is_stale(now_s) and any(other.time_s > branch.deadline_s for other in self.branches)
+        """Whether a branch is stale though another sent after this one's deadline; else the vehicle goes to sleep.
+
+        A frame that fails its check was sent, too.
+        """
+        sent_s = [other.time_s for other in self.branches]
+        sent_s += [source.failed_s for source in self.sources.values() if source.branches]
+        return branch.is_stale(now_s) and max(sent_s) > branch.deadline_s
 
     def latch(self, reason: Reason, branches: Sequence[str] = ()) -> None:
         """Pass measured values through for this reason, caused by these branches; NONE: do as the parameters say."""

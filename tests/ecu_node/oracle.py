@@ -154,7 +154,7 @@ class Oracle:
         is_invalid = receiver is not None and receiver.state is E2EState.INVALID
         if self._voltage is not None and self._voltage[0] is message:
             net = self._voltage[1]  # it comes before the branches of the same frame
-            if is_invalid:
+            if is_invalid or (is_new and len(data) < _end(message, net)):
                 self._volts = None
                 for item in self._branches:
                     item.lose_voltage()

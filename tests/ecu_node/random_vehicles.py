@@ -185,6 +185,7 @@ def _draw(rng: Random, kinds: Collection[str]) -> tuple[dict[str, Any], list[Mes
         is_spared = signal.length < 3 or abs(code - codes.zero) <= 1
         branch["no_value"] = [] if is_spared or rng.random() < 0.7 else [code]
         if rng.random() < 0.9:
+            units = [unit for unit in units if unit or signal.unit != "mA"]  # none beside mA is refused
             branch |= _draw_target(rng, name, rng.choice(targets), units)
         branches.append(branch)
         if rng.random() < 0.95:

@@ -458,9 +458,12 @@ def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_datab
     assert heater_w(pair, 0.4) == (4000.0 - 2.0 * 400.0) / 1.25
     assert heater_w(heater, 0.5) == (4000.0 - 2.0 * 500.0) / 1.25
     assert state_at(corrector, 0.5) == (State.CORRECTING, Reason.NONE)
-    assert heater_w(heater, 0.9) == 65535, "the voltage is stale"
-    assert state_at(corrector, 0.9) == (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
-    assert heater_w(pair, 1.5) == 65535, "stale"
+    answers(corrector, Frame(NET, b"\0"), 0.55)
+    assert heater_w(heater, 0.6) == 65535, "a frame came that is too short for the voltage"
+    volts(500.0, 0.65)
+    assert heater_w(heater, 1.2) == 65535, "the voltage is stale"
+    assert state_at(corrector, 1.2) == (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
+    assert heater_w(pair, 1.7) == 65535, "stale"
     assert corrector.counters.saturated == 0
 
 
@@ -582,6 +585,22 @@ def test_any_counter_is_accepted_after_a_silence(database: VehicleDatabase, sile
     for now_s in (0.0, silence_s):
         answers(corrector, battery(database, 3), now_s)
     assert corrector.counters.repeated == repeated
+
+
+@pytest.mark.parametrize("driven_s", [0.0, 1.0])
+def test_vehicle_whose_frames_all_fail_their_check_does_not_sleep(database: VehicleDatabase, driven_s: float) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    drive(database, corrector, 0.0, driven_s)
+    for number in range(200):
+        for frame in (battery(database, number % 15), motor(database, number % 15)):
+            answers(corrector, damaged(frame), driven_s + 0.02 * number)
+        corrector.look(driven_s + 0.02 * number)
+    assert corrector.state() == STALE
+
+
+def test_waiting_frame_is_judged_by_the_least_timeout_of_its_branches(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT.replace('"battery", sign = 1,', '"battery", sign = 1, timeout_s = 0.1,')
+    assert corrector_for(make_database(layout)).sources[PAIR].timeout_s == 0.1
 
 
 def test_gateway_forwards_the_intact_frames_of_an_invalid_message(database: VehicleDatabase) -> None:

@@ -1,9 +1,11 @@
 """Layout and the DBC behind it: good ones are read, bad ones refused with file and place."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
+from ecu_node.bus.wiring import Mode, branch_signals
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import file_digest, read_layout
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, MakeDatabase
@@ -84,6 +86,12 @@ WRONG_DBCS = [
     (SMALL_DBC + "BO_ 258 Old: 2 Node\n", "small.dbc: messages Net and Old have one identifier, 0x102; take out"),
     (SMALL_DBC + BEYOND_ENUM, r"cannot read it \(DBC: \"list index .*\"\), as if an attribute \(BA_\) had a value"),
     (SMALL_DBC + "BO_ 258 Pair: 2 Node\n", "small.dbc: 'Pair' is the name of several messages.*; rename all but one"),
+    (
+        SMALL_DBC.replace('(0.1,0) [-3000|3000] "A"', '(100,0) [-3000000|3000000] "mA"', 1).replace(
+            '(0.1,0) [-3000|3000] "A"', '(0.1,0) [-3000|3000] ""'
+        ),
+        "branch battery: Pair.Battery is in mA, and PairOut.Battery has no unit in the DBC; give it its unit there",
+    ),
     ("this is no dbc", "small.dbc: not a CAN database"),
     ("", "small.dbc: the DBC has no message"),
 ]
@@ -94,6 +102,26 @@ def test_a_dbc_that_lacks_what_the_layout_names_is_refused(make_database: MakeDa
     with pytest.raises(DatabaseError, match=words) as caught:
         make_database(SMALL_LAYOUT, dbc)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("unit", ["", "A"])
+def test_unit_of_a_branch_is_that_of_its_corrected_signal_too(make_database: MakeDatabase, unit: str) -> None:
+    layout = SMALL_LAYOUT.replace('"battery", sign = 1,', '"battery", sign = 1, unit = "mA",')
+    dbc = SMALL_DBC.replace('(0.1,0) [-3000|3000] "A"', f'(100,0) [-3000000|3000000] "{unit}"')
+    signals = branch_signals(database := make_database(layout, dbc), database.layout.branch[0], Mode.OVERLAY)
+    assert signals.source.scale == signals.target.scale == Fraction(1, 10)
+
+
+@pytest.mark.parametrize(("code", "of_battery", "of_power"), [
+    (-1, -1, 65535), (65535, -1, 65535), (-32768, -32768, 32768), (32768, -32768, 32768), (70000, None, None),
+])  # fmt: skip
+def test_named_codes_count_as_they_are_read_whether_written_with_a_sign_or_without(
+    make_database: MakeDatabase, code: int, of_battery: int | None, of_power: int | None
+) -> None:
+    names = f'VAL_ 256 Battery {code} "Error";\nVAL_ 2147484160 Power {code} "Error";\n'
+    database = make_database(SMALL_LAYOUT, SMALL_DBC.replace('VAL_ 256 Battery -32768 "SNA";\n', names))
+    for name, expected in (("Pair.Battery", of_battery), ("Heater.Power", of_power)):
+        assert [*(database.signal(name)[1].choices or {})] == [expected] * (expected is not None)
 
 
 @pytest.mark.filterwarnings("ignore:cantools.database.diagnostics")
