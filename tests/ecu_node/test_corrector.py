@@ -458,12 +458,13 @@ def test_published_power_is_corrected_at_the_voltage_of_its_own_frame(make_datab
     assert heater_w(pair, 0.4) == (4000.0 - 2.0 * 400.0) / 1.25
     assert heater_w(heater, 0.5) == (4000.0 - 2.0 * 500.0) / 1.25
     assert state_at(corrector, 0.5) == (State.CORRECTING, Reason.NONE)
-    answers(corrector, Frame(NET, b"\0"), 0.55)
-    assert heater_w(heater, 0.6) == 65535, "a frame came that is too short for the voltage"
-    volts(500.0, 0.65)
-    assert heater_w(heater, 1.2) == 65535, "the voltage is stale"
-    assert state_at(corrector, 1.2) == (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
-    assert heater_w(pair, 1.7) == 65535, "stale"
+    assert heater_w(heater, 0.9) == 65535, "the voltage is stale"
+    assert state_at(corrector, 0.9) == (State.PARTLY_CORRECTING, Reason.INPUT_MISSING)
+    assert heater_w(pair, 1.5) == 65535, "stale"
+    volts(500.0, 1.6)
+    assert heater_w(heater, 1.7) == (4000.0 - 2.0 * 500.0) / 1.25
+    answers(corrector, Frame(NET, b"\0"), 1.8)
+    assert heater_w(heater, 1.9) == 65535, "a frame came that is too short for the voltage"
     assert corrector.counters.saturated == 0
 
 
