@@ -10,8 +10,8 @@ what the junction law, fitted to the drive, leaves of i_k,
 Each value of the slower of the two is paired with the latest of the faster before it, or one some samples earlier or
 later. Those stretches of a drive count in which the current changes least: there sensors that filter, are late or have
 another gain disagree least with the law. Noise is no larger where the current changes most: if the product is, r holds
-a current that a branch misses, and the input counts as independent. So do inputs that change rarely, as a demand, and
-those that are not 0 at any possible current, as a voltage.
+a current that a branch misses, and the input counts as independent. So do inputs that change rarely, as a demand, that
+are not 0 at any possible current, as a voltage, or that go with no current as a whole, as a torque.
 """
 
 from collections import Counter
@@ -38,7 +38,7 @@ STRETCH, FEWEST_STRETCHES = 30, 8
 """Samples of a stretch, and fewest stretches of a drive that are compared. [1]"""
 QUIET = 0.25
 """Share of the stretches, those in which the current changes least, that counts. [1]"""
-MUCH_MORE, SURELY = 1.5, 2.0
+MUCH_MORE, SURELY = 1.25, 2.0
 """If the mean of Du Dr in the liveliest quarter of the stretches exceeds `MUCH_MORE` times that in the quiet quarter,
 by `SURELY` standard deviations, r holds a current and not noise alone. [1]"""
 SHIFTS = range(-1, 6)
@@ -54,6 +54,9 @@ neighbours share two samples. [1]"""
 LEAST_CORRELATION = 0.3
 """Mean over the drives of the correlation of Du and Dr, from which on an input is computed from a sensor: it is 0.71
 for one of two equal sensors, 0.45 for one of five; of independent inputs 0.25 at most in 100 artificial fleets. [1]"""
+LEAST_LIKENESS = 0.95
+"""Mean over the drives of the correlation of the input itself with the current that it is most like, from which on it
+may be computed from it: a torque has 0.76 to 0.93 on real drives, a power at a varying voltage more than 0.99. [1]"""
 LEAST_SDS = 6.0
 """Standard deviations by which it has to differ from 0, in all drives together. [1]"""
 
@@ -68,14 +71,17 @@ class SharedNoise(NamedTuple):
     lively, lively_sd : float
         Mean product of Du and Dr where the current changes most, over the same two root mean squares as the
         correlation, and its standard deviation. [1]
+    likeness : float
+        Magnitude of the correlation of the input with the current of the branch. [1]
     branch : str
-        Branch whose current is most like the input; the numbers may be of another one, at which the noise is surest.
+        Branch whose current is most like the input; other numbers may be of another one, at which the noise is surest.
     """
 
     correlation: float
     sd: float
     lively: float
     lively_sd: float
+    likeness: float
     branch: str
 
 
@@ -97,7 +103,7 @@ def shared_noise(drive: Drive, inputs: Iterable[str], layout: Layout) -> dict[st
     dict of str to SharedNoise
         For each input the noise at the branch and the shift at which it is surest, and the branch that is most alike.
     """
-    found: dict[str, list[tuple[float, SharedNoise]]] = {name: [] for name in inputs if name in drive.inputs}
+    found: dict[str, list[SharedNoise]] = {name: [] for name in inputs if name in drive.inputs}
     values = {name: _fresh(*good_samples(drive.inputs[name])) for name in found}
     for branch, time_s, current_a, residual_a in _residuals(drive, layout) if found else ():
         for name, (time_u, u) in values.items():
@@ -105,22 +111,23 @@ def shared_noise(drive: Drive, inputs: Iterable[str], layout: Layout) -> dict[st
                 near = (np.diff(at_u) > 0) & (np.diff(at) > 0)
                 near &= np.diff(time_s[at]) < LONGEST_PAUSE * np.median(np.diff(time_s[at]))
                 kept = near[1:] & near[:-1]
-                if _vanishes_with(current_a[at], u[at_u], layout.full_scale_a):
+                if likeness := _likeness(current_a[at], u[at_u], layout.full_scale_a):
                     Du, Di, Dr = (_differences(x)[kept] for x in (u[at_u], current_a[at], residual_a[at]))
-                    found[name] += _compared(branch, Du, Di, Dr)
+                    found[name] += _compared(branch, likeness, Du, Di, Dr)
     noise = dict[str, SharedNoise]()
     for name, items in found.items():
         if items:
-            _, most_alike = max(items, key=lambda item: item[0])
-            surest = max((item for _, item in items), key=lambda item: abs(item.correlation) / item.sd)
-            noise[name] = surest._replace(branch=most_alike.branch)
+            alike = max(items, key=lambda item: item.likeness)
+            surest = max(items, key=lambda item: abs(item.correlation) / item.sd)
+            noise[name] = surest._replace(likeness=alike.likeness, branch=alike.branch)
     return noise
 
 
 def computed_inputs(drives: Sequence[Mapping[str, SharedNoise]]) -> dict[str, str]:
     """Find the inputs that are computed from a current sensor.
 
-    Their mean correlation over the drives is large enough, and not far larger where the current changes most.
+    The mean correlations over the drives are large enough, and that of the noise not far larger where currents change
+    most.
 
     Parameters
     ----------
@@ -140,6 +147,7 @@ def computed_inputs(drives: Sequence[Mapping[str, SharedNoise]]) -> dict[str, st
             np.sqrt(sum(x**2 for x in of)) for of in zip(*((i.sd, i.lively_sd) for i in items), strict=True)
         )
         is_shared = abs(total) >= max(LEAST_CORRELATION * len(items), LEAST_SDS * sd)
+        is_shared &= bool(np.mean([item.likeness for item in items]) >= LEAST_LIKENESS)
         if is_shared and lively * np.sign(total) - MUCH_MORE * abs(total) < SURELY * lively_sd:
             found[name] = Counter(item.branch for item in items).most_common(1)[0][0]
     return found
@@ -148,7 +156,7 @@ def computed_inputs(drives: Sequence[Mapping[str, SharedNoise]]) -> dict[str, st
 def why_computed(computed: Mapping[str, str]) -> str:
     """Say why inputs are not used, from what :func:`computed_inputs` returned."""
     which = few([f"{name} (most like {branch})" for name, branch in computed.items()])
-    return f"{which}, computed from current sensors and so with their noise and their faults"
+    return f"{which}, as if computed from current sensors, with their noise and their faults"
 
 
 def _fresh(time_s: Array, value: Array) -> tuple[Array, Array]:
@@ -198,18 +206,24 @@ def _pairs(time_u: Array, time_s: Array) -> Iterator[tuple[NDArray[np.intp], NDA
             yield (slow, fast[slow]) if is_slow else (fast[slow], slow)
 
 
-def _vanishes_with(current_a: Array, u: Array, full_scale_a: float) -> bool:
-    """Check that the straight line of an input over a current [A] is 0 at one within full scale; a voltage's is not."""
-    (variance, covariance), (_, _) = np.cov(current_a, u)
-    return bool(abs(variance * u.mean() - covariance * current_a.mean()) <= full_scale_a * abs(covariance))
+def _likeness(current_a: Array, u: Array, full_scale_a: float) -> float:
+    """Return the magnitude of the correlation of an input with a current [A]; 0 if both do not vanish together.
+
+    The straight line of the input over the current must be 0 at a current within full scale; that of a voltage is not.
+    """
+    (variance, covariance), (_, square) = np.cov(current_a, u)
+    away = abs(variance * u.mean() - covariance * current_a.mean())
+    if covariance == 0.0 or away > full_scale_a * abs(covariance):
+        return 0.0
+    return float(abs(covariance) / np.sqrt(variance * square))
 
 
 def _differences(values: Array) -> Array:
     return values[1:-1] - 0.5 * (values[:-2] + values[2:])
 
 
-def _compared(branch: str, Du: Array, Di: Array, Dr: Array) -> Iterator[tuple[float, SharedNoise]]:
-    """Yield how like an input is to a current, and the noise that it shares; nothing if there are too few stretches."""
+def _compared(branch: str, likeness: float, Du: Array, Di: Array, Dr: Array) -> Iterator[SharedNoise]:
+    """Yield the noise that an input shares with the residual; nothing if there are too few stretches."""
     count = len(Di) // STRETCH
     if count < FEWEST_STRETCHES:
         return
@@ -217,19 +231,17 @@ def _compared(branch: str, Du: Array, Di: Array, Dr: Array) -> Iterator[tuple[fl
     current_a2 = np.abs((Di * (Di - Dr))[: count * STRETCH].reshape(count, STRETCH).sum(axis=1))
     limits = np.quantile(current_a2, [QUIET, 1.0 - QUIET])
     quiet, lively = (np.repeat(chosen, STRETCH) for chosen in (current_a2 <= limits[0], current_a2 >= limits[1]))
-    Du, Di, Dr = (values[: count * STRETCH] for values in (Du, Di, Dr))
+    Du, Dr = Du[: count * STRETCH], Dr[: count * STRETCH]
     uu, rr = (np.square(_without_wild(values[quiet])).mean() for values in (Du, Dr))
     of_quiet, of_lively = (_without_wild(Du[chosen]) * _without_wild(Dr[chosen]) for chosen in (quiet, lively))
-    if of_quiet.any() and Di.any():
-        yield (
-            float(abs(np.corrcoef(Du, Di)[0, 1])),
-            SharedNoise(
-                correlation=float(of_quiet.mean() / np.sqrt(uu * rr)),
-                sd=_sd_of_mean(of_quiet / np.sqrt(uu * rr)),
-                lively=float(of_lively.mean() / np.sqrt(uu * rr)),
-                lively_sd=_sd_of_mean(of_lively / np.sqrt(uu * rr)),
-                branch=branch,
-            ),
+    if of_quiet.any():
+        yield SharedNoise(
+            correlation=float(of_quiet.mean() / np.sqrt(uu * rr)),
+            sd=_sd_of_mean(of_quiet / np.sqrt(uu * rr)),
+            lively=float(of_lively.mean() / np.sqrt(uu * rr)),
+            lively_sd=_sd_of_mean(of_lively / np.sqrt(uu * rr)),
+            likeness=likeness,
+            branch=branch,
         )
 
 

@@ -85,7 +85,7 @@ def test_inputs_that_are_computed_from_a_current_sensor_are_named(examine: Exami
     assert (finding.subject, finding.severity) == ("torque", "warning")
     assert finding.text.startswith("carries the noise of current sensors, as if computed from the current of motor")
     assert doctor.report["not_ready"]["calibrate"].startswith(
-        "model_inputs torque (most like motor), computed from current sensors"
+        "model_inputs torque (most like motor), as if computed from current sensors"
     )
 
 

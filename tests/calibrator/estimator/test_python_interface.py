@@ -97,7 +97,7 @@ def test_fault_of_a_sensor_from_which_an_input_is_computed_is_not_given_to_anoth
         drive["battery"] *= 1.10 if number == 3 else 1.0
         drive += rng.normal(0.0, 0.3, drive.shape)
         given[f"V{number}"] = drive.assign(pack_w=370.0 * drive["battery"], power=power)
-    with pytest.raises(FleetError, match=r"inputs pack_w \(most like battery\), computed from current sensors"):
+    with pytest.raises(FleetError, match=r"inputs pack_w \(most like battery\), as if computed from current sensors"):
         Fleet.from_frames(given, JUNCTION, inputs=["pack_w"])
     found = FleetCalibrator().fit(Fleet.from_frames(given, JUNCTION))
     assert [notice for notice in found.notices_ if notice.startswith("inputs left out: pack_w (most like battery), ")]

@@ -135,6 +135,6 @@ def test_inputs_that_are_computed_from_a_current_sensor_are_not_used(tmp_path: P
     torque = replace(drive.branches["motor"], value=-0.76 * drive.branches["motor"].value)
     write_drive(tmp_path, replace(drive, inputs={**drive.inputs, "torque": torque}), database.layout)
     found = probe_equipment(find_fleet(tmp_path), database, None)
-    notice = "torque (most like motor), computed from current sensors and so with their noise and their faults"
+    notice = "torque (most like motor), as if computed from current sensors, with their noise and their faults"
     assert f"model inputs left out: {notice}" in found.notices
     assert found.inputs == ("heater_current", "aircon_current", "low_voltage_current")
