@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calibrator.drive import Array, Channel, Drive, Equipment, Mask, Samples
+from calibrator.drive import Array, Channel, Drive, Equipment, Mask, Samples, good_values
 from calibrator.drives.align import align, at_pace, step_seen
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
@@ -39,6 +39,9 @@ LEAST_DURATION_S = 120.0
 COARSEST_PERIOD_S = 5.0
 """Longest time between samples of a fleet; a longer one leaves too few samples in a block of 30 s. [s]"""
 
+QUIETEST, NOISY_STEPS = 0.25, 2.0
+"""A current has noise if this quantile of its third differences exceeds so many steps; with noise of less than half a
+step it does not, and a sensor may then show 0 throughout. [1]"""
 MOST_OVER_FULL_SCALE = 10.0
 """Largest magnitude of a measured current that is believed, in multiples of full scale. [1]"""
 
@@ -253,6 +256,7 @@ def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], datab
     ZeroCurrent
         Offsets of the branches. Their standard deviations include how far an offset wanders: the scatter of the medians
         of pieces of the windows, over the root of the number of windows, as pieces of one window wander together.
+        Nothing is read where a current is 0 throughout and has noise elsewhere: a control unit wrote that, no sensor.
     """
     offset, sd = np.full(len(branches), np.nan), np.full(len(branches), np.nan)
     for k, name in enumerate(branches):
@@ -261,11 +265,24 @@ def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], datab
             medians = [np.median(current.value) for current in windows]
             pieces = np.concatenate([_medians_of_pieces(current) for current in windows])
             noise = np.concatenate([current.value - middle for current, middle in zip(windows, medians, strict=True)])
+            if not (np.any(medians) or noise.any()) and _is_noisy(drives, name, database):
+                continue
             white = np.sqrt(np.pi / 2.0) * noise.std() / np.sqrt(len(noise))
             wander = pieces.std(ddof=1) / np.sqrt(len(windows)) if len(pieces) > 1 else 0.0
             step_a = database.current_step_a(name) / np.sqrt(12.0)
             offset[k], sd[k] = np.mean(medians), np.sqrt(ZERO_RESOLUTION_A**2 + step_a**2 + max(white, wander) ** 2)
     return ZeroCurrent(offset_a=offset, sd_a=sd)
+
+
+def _is_noisy(drives: Sequence[Drive], branch: str, database: VehicleDatabase) -> bool:
+    """Check whether a current that flows has noise beyond its step, by the smaller ones of its third differences."""
+    channels, value = (
+        [drive.branches[branch] for drive in drives if branch in drive.branches],
+        good_values(drives, branch),
+    )
+    step_a = max(step_seen(channel, database.current_step_a(branch)) for channel in channels)
+    third_a = np.abs(np.diff(value[value != 0.0], 3))
+    return bool(len(third_a) and np.quantile(third_a, QUIETEST) > NOISY_STEPS * step_a)
 
 
 def _medians_of_pieces(current: Channel) -> Array:

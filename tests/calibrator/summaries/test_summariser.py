@@ -211,6 +211,18 @@ def test_no_zero_current_window_gives_no_reading(without: Drive) -> None:
     assert np.isnan(zero_current_offsets([without], tuple(OFFSETS_A), DATABASE).offset_a).all()
 
 
+@pytest.mark.parametrize(("noise_a", "step_a", "is_read"), [(0.4, 0.1, False), (0.02, 1.0, True)])
+def test_zeros_that_a_control_unit_writes_while_contactors_are_open_are_no_reading(
+    noise_a: float, step_a: float, is_read: bool
+) -> None:
+    plain, branches = drive(noise_a=noise_a), dict[str, Channel]()
+    for name, current in plain.branches.items():
+        shown_a = step_a * np.round((current.value + 30.0 * np.sin(0.3 * current.time_s)) / step_a)
+        branches[name] = replace(current, value=np.where(current.time_s < 30.0, 0.0, shown_a))
+    found = zero_current_offsets([replace(plain, branches=branches)], tuple(OFFSETS_A), DATABASE)
+    assert np.isfinite(found.offset_a).tolist() == [is_read] * 2
+
+
 def test_disagreeing_zero_current_windows_increase_the_uncertainty() -> None:
     drives = [drive(), shifted(drive(), 1.0)]
     found = zero_current_offsets(drives, tuple(OFFSETS_A), DATABASE)
