@@ -7,6 +7,7 @@ set is put in force, or ``ecu-node clear`` is run.
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from ecu_node.errors import UserError
 from ecu_node.update.state import state_path, time_text
 
 _NAME = "faults.json"
+_CLEARED = "faults.cleared"
+"""Empty file that ``ecu-node clear`` leaves for a running node, which removes it; a fault may be in no file yet."""
 _MOST_FAULTS, _LARGEST_BYTES = 64, 1_000_000
 _LOOK_EVERY_S = 1.0
 """Time between checks whether somebody cleared the memory. [s]"""
@@ -76,6 +79,8 @@ def clear_faults(folder: Path) -> str:
     except UserError:
         found = "a fault memory that could not be read is cleared"
     path.unlink(missing_ok=True)
+    with suppress(FileExistsError):
+        (folder / _CLEARED).touch(exist_ok=False)  # so it follows no link
     return f"{folder}: {found}"
 
 
@@ -162,13 +167,13 @@ class FaultMemory:
         corrector = self._corrector
         if now_s >= self._due_s and (self._written is None or self._written.done()):
             self._due_s = now_s + _LOOK_EVERY_S
-            if self._written is not None and not self._written.result():
-                if now_s - self._tried_s >= _TRY_AGAIN_S:
-                    self._keep(now_s)
-            elif self._faults and self._is_cleared():
-                self._faults = []
+            if self._is_cleared():
+                self._faults, self._written = [], None
                 if corrector.latched:
                     corrector.release()
+                self._before = corrector.latched, corrector.latched_branches
+            elif self._written is not None and not self._written.result() and now_s - self._tried_s >= _TRY_AGAIN_S:
+                self._keep(now_s)
         found = corrector.latched, corrector.latched_branches
         if found != self._before:
             self._before = found
@@ -180,11 +185,13 @@ class FaultMemory:
         self._latch_again()
 
     def _is_cleared(self) -> bool:
-        """Check whether the file of the fault memory is gone."""
+        """Take away the file that ``ecu-node clear`` leaves; return whether it was there."""
         try:
-            return all(path.name != _NAME for path in self._folder.iterdir())
+            (self._folder / _CLEARED).unlink()
+            (self._folder / _NAME).unlink(missing_ok=True)  # it was written at the same time
         except OSError:  # a folder that is gone, or on a broken disk, says nothing
             return False
+        return True
 
     def _keep(self, now_s: float) -> None:
         """Have the entries written in the background."""
