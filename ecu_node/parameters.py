@@ -6,7 +6,9 @@ made from them, which is also in ``ecu_node/parameters.schema.json``. Currents a
 """
 
 import codecs
+import json
 import math
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -221,7 +223,7 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
     Raises
     ------
     UnfitError
-        With reason MALFORMED_PARAMETERS if it is no JSON, or outside the schema.
+        With reason MALFORMED_PARAMETERS if it is no JSON, outside the schema, or has a key twice in one table.
     """
     if not content.strip():
         raise _malformed(where, "it is empty")
@@ -236,10 +238,18 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
     except msgspec.DecodeError as error:
         raise _malformed(where, str(error).partition(" - at `")[0]) from None  # the rest names no key
     try:
-        return msgspec.json.decode(content, type=VehicleParameters)
+        parameters = msgspec.json.decode(content, type=VehicleParameters)
     except msgspec.ValidationError as error:
         steps, what = field_error(error, document, VehicleParameters)
         raise _malformed(where, f"{', '.join(steps)}: {what}" if steps else what) from None
+
+    def require_once(pairs: list[tuple[str, Any]]) -> None:
+        """Refuse a table in which a key stands twice: msgspec takes the last one silently."""
+        if twice := [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]:
+            raise _malformed(where, f"key {shown_name(twice[0])!r} stands twice in one table; leave one of them")
+
+    json.loads(content, object_pairs_hook=require_once)
+    return parameters
 
 
 def _malformed(where: str, why: str) -> UnfitError:
@@ -313,7 +323,7 @@ _LARGEST_DELAY_S = 5.0
 def check_fit(parameters: VehicleParameters, database: "VehicleDatabase", vehicle: str | None) -> None:
     """Check that parameters are for this vehicle, layout and DBC, fit their verdict, and are within limits.
 
-    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Drift and offset of
+    A file whose verdict is another than "corrected" fits only if it corrects no branch. Drift and offset of
     applied branches keep to the layout's limits, the expected sum always to its limit of offsets, and the delay of
     every branch to 5 s. A branch that the layout lacks does not fit.
 
@@ -350,12 +360,12 @@ def check_fit(parameters: VehicleParameters, database: "VehicleDatabase", vehicl
         text = f"parameters for branch {shown_name(name)!r}, which {layout.path} does not have"
         raise UnfitError(Reason.WRONG_LAYOUT, text)
     drift, offset_a, expected_a = layout.limits.drift, layout.offset_limit_a, parameters.junction_residual.expected_a
-    applied = {name: branch for name, branch in parameters.branches.items() if branch.apply}
+    applied = [name for name in parameters.branches if parameters.fault(name).applied]
     texts = []
-    if verdict in {"cannot tell", "not enough data"} and applied:
+    if verdict != "corrected" and applied:
         texts.append(
-            f"verdict {verdict!r}, yet 'apply' is true for {', '.join(map(shown_name, applied))}; nothing was found to "
-            f"apply, calibrate with more drives"
+            f"verdict {verdict!r}, yet 'apply' is true for {', '.join(map(shown_name, applied))}; only 'corrected' "
+            f"goes with that, calibrate anew"
         )
     if not abs(expected_a) <= offset_a:
         beyond = f"beyond the layout's limit of offsets, {offset_a:g} A"

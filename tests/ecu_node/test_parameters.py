@@ -191,8 +191,8 @@ def test_values_beyond_limits_are_unfit(database: VehicleDatabase, change: dict[
     assert caught.value.reason is Reason.IMPLAUSIBLE_PARAMETERS
 
 
-@pytest.mark.parametrize("verdict", ["cannot tell", "not enough data"])
-def test_branch_applied_without_a_decisive_verdict_is_unfit(database: VehicleDatabase, verdict: Verdict) -> None:
+@pytest.mark.parametrize("verdict", ["no sensor fault", "cannot tell", "not enough data"])
+def test_branch_corrected_with_another_verdict_is_unfit(database: VehicleDatabase, verdict: Verdict) -> None:
     parameters = replace(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)), verdict=verdict)
     withheld = {name: replace(branch, apply=False) for name, branch in parameters.branches.items()}
     check_fit(replace(parameters, branches=withheld), database, "v1")
@@ -239,6 +239,8 @@ MALFORMED = [
     *((instead(b"-2.5", number), "") for number in (b"NaN", b"Infinity", b"-Infinity", b"1e999", b"9" * 400)),
     (instead(NUMBER, b'"number":' + b"[" * 100_000 + b"]" * 100_000), "it is nested too deeply"),
     (instead(b'"v1"', b'"' + b"v" * 300 + b'"'), r"vehicle: .*\.\.\. \(300 characters\)"),
+    (instead(NUMBER, NUMBER + b"," + NUMBER), "key 'number' stands twice in one table; leave one of them; correct"),
+    (instead(b'"motor":', b'"motor":{"drift":0.0,"offset_a":0.0,"apply":true},"motor":'), "key 'motor' stands twice"),
     (with_value("x", "branches", "motor", "drift"), 'branches, motor, drift: Expected float, got str, found "x"'),
     (with_value(2, "branches", "motor", "drift"), "branches, motor, drift: Expected float < 1.0, found 2;"),
     (with_value(0, "branches", "motor", "drifts"), "branches, motor: unknown key 'drifts'; did you mean 'drift'"),
