@@ -37,7 +37,7 @@ class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     branches: list[str]
     """Branches that explain it best."""
     parameter_set: int | None
-    """Number of the parameter set in force when it last occurred, modulo 256; None: not known."""
+    """Number of the parameter set in force when it last occurred; None: not known."""
     first: str
     last: str
     """When it occurred first and last; ISO 8601, UTC."""

@@ -20,7 +20,7 @@ from cantools.database.can import Message
 
 from ecu_node.bus.adapters import Settings, connect, filters_of
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault, Signals, correction_plan
-from ecu_node.core.corrector import Corrector, OwnMessage, Source, StatusFields
+from ecu_node.core.corrector import PARAMETER_SETS, Corrector, OwnMessage, Source, StatusFields
 from ecu_node.core.e2e import protection_of
 from ecu_node.core.junction import HeardSignal, JunctionWatch, LiveBranch, Written
 from ecu_node.core.signals import (
@@ -47,8 +47,6 @@ from ecu_node.parameters import NOTHING_EXPECTED, VehicleParameters, check_fit, 
 
 __all__ = ["InForce", "Mode", "branch_plan", "choose_parameters", "open_bus", "put_in_force", "wire"]
 
-PARAMETER_SETS = 256
-"""The status publishes the number of the parameter set modulo this."""
 _NOBODY = "Vector__XXX"
 """How a DBC says that a message has no sender."""
 _CLASSIC_BYTES, _FD_BYTES = 8, 64
@@ -333,7 +331,7 @@ def put_in_force(
         takes.append(take)
     for take in takes:
         take()
-    number = parameters.number % PARAMETER_SETS if parameters is not None else 0
+    number = parameters.number if parameters is not None else 0
     expected = parameters.junction_residual if parameters is not None else NOTHING_EXPECTED
     corrector.begin(reason=in_force.reason, parameter_set=number, expected=expected)
 

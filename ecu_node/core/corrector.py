@@ -22,7 +22,10 @@ from ecu_node.core.signals import BitPlace, Codes, FrameKey, PlacedSignal, as_wr
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.parameters import NOTHING_EXPECTED, JunctionResidual
 
-__all__ = ["OF_ONE_DRIVE", "Corrector", "StatusFields"]
+__all__ = ["OF_ONE_DRIVE", "PARAMETER_SETS", "Corrector", "StatusFields"]
+
+PARAMETER_SETS = 256
+"""The status publishes the number of the parameter set modulo this."""
 
 _OK, _LAST_USABLE = Check.OK, Check.LOST  # looking up members of an enumeration is slow
 _INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
@@ -395,7 +398,7 @@ class Corrector:
         reason : Reason
             Why there are no parameters that fit; NONE if there are.
         parameter_set : int
-            Number of the parameter set as it is published; 0 if there is none.
+            Number of the parameter set; 0 if there is none.
         expected : JunctionResidual, optional
             What the parameters say about the junction's sum.
         """
@@ -450,7 +453,8 @@ class Corrector:
             return None
         payload = bytearray(fields.message.data)
         state, reason = self.state()
-        values = {"state": state, "reason": reason, "parameter_set": self.parameter_set, "alive_counter": self._alive}
+        number = self.parameter_set % PARAMETER_SETS
+        values = {"state": state, "reason": reason, "parameter_set": number, "alive_counter": self._alive}
         for key, place in fields.places.items():
             place.put(payload, values[key] % (place.highest + 1))
         self._alive += 1

@@ -81,7 +81,7 @@ def test_telemetry_line_has_currents_by_vss_name_sums_state_and_counters(make_ou
         "heater": {"measured_a": None, "corrected_a": None, "quality": "NOT_AVAILABLE"},
     }
     assert (line["sum_measured_a"], line["sum_corrected_a"]) == (0.0, -20.0)
-    assert (line["state"], line["reason"], line["parameter_set"]) == ("CORRECTING", "NONE", 300 % 256)
+    assert (line["state"], line["reason"], line["parameter_set"]) == ("CORRECTING", "NONE", 300)
     assert line["counters"].keys() == vars(Counters()).keys()
     assert line["counters"]["frames_in"] == 1
     assert list(line["buses"].values()) == ["open"]

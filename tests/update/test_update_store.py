@@ -153,7 +153,7 @@ def test_running_node_loads_a_set_written_to_its_state(
     with manager.socket, running("run", "--state", str(new), "--layout", str(LAYOUT), *bus) as log:
         write_state(new, replace(read_state(new), in_force=held(parameters, days=36500)))
         said = manager.wait_for("STATUS=parameter set")
-    assert said == "STATUS=parameter set 44 is in force, correcting battery, motor"
+    assert said == "STATUS=parameter set 300 is in force, correcting battery, motor"
     assert any("of vehicle v1 is in force" in line for line in log)
 
 
