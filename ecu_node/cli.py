@@ -75,6 +75,8 @@ def _option(read: Callable[[str], Any], is_right: Callable[[Any], Any], refusal:
 
 
 _NAME = _option(str, str.strip, "a name is expected, such as can0, found {}")
+_FOLDER = _option(lambda text: Path(text) if text.strip() else None, bool, "a folder is expected, found {}")
+_BIT_RATE = _option(int, lambda rate: rate > 0, "{}: expected a number of bit/s, such as 500000")
 _SECONDS = _option(float, lambda s: 0.0 < s <= 86400.0, "{}: expected a number of seconds above 0, at most 86400")
 _VEHICLE = _option(
     str,
@@ -106,11 +108,11 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "--channel": {"required": True, "type": _NAME, "help": "channel of the interface, such as can0 or vcan0"},
     "--fd": {"action": "store_true", "help": "open the bus for CAN FD"},
     "--bitrate": {
-        "type": int,
+        "type": _BIT_RATE,
         "metavar": "BIT_PER_S",
         "help": "bit rate, where the adapter sets it; this and other settings may stand in python-can's can.conf",
     },
-    "--data-bitrate": {"type": int, "metavar": "BIT_PER_S", "help": "the same of the data of CAN FD frames"},
+    "--data-bitrate": {"type": _BIT_RATE, "metavar": "BIT_PER_S", "help": "the same of the data of CAN FD frames"},
     "--listen-only": {
         "action": "store_true",
         "help": "send nothing; adapters that can do so acknowledge no frame either",
@@ -130,7 +132,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "help": "a line of JSON per second, added to a file or sent to udp://HOST:PORT",
     },
     "--summary": {
-        "type": Path,
+        "type": _FOLDER,
         "metavar": "FOLDER",
         "help": "sum up each drive for the calibrator, in FOLDER/VEHICLE: kilobytes per hour in place of logs",
     },
@@ -140,7 +142,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--once": {"type": _SECONDS, "metavar": "SECONDS", "help": "listen this long, print what was seen, and end"},
     "--json": {"action": "store_true", "help": "print JSON"},
-    "--state": {"type": Path, "required": True, "metavar": "FOLDER", "help": "state of this vehicle"},
+    "--state": {"type": _FOLDER, "required": True, "metavar": "FOLDER", "help": "state of this vehicle"},
     "--params": {"type": Path, "required": True, "metavar": "FILE", "help": "parameter file of this vehicle"},
 }
 """Options that commands share; options of a single command are added where the command is."""
@@ -177,7 +179,7 @@ def _parser() -> argparse.ArgumentParser:
         done=_AT_WORK,
     )
     source = run.add_mutually_exclusive_group(required=True)
-    source.add_argument("--state", type=Path, metavar="FOLDER", help="state of this vehicle, with signed parameters")
+    source.add_argument("--state", type=_FOLDER, metavar="FOLDER", help="state of this vehicle, with signed parameters")
     source.add_argument("--params", type=Path, metavar="FILE", help="parameter file that nobody signed; --unsigned")
     command(
         "monitor",
@@ -190,7 +192,7 @@ def _parser() -> argparse.ArgumentParser:
         done=_AT_WORK,
         failed="failed, or with --once no branch was seen",
     )
-    add_update_commands(commands, _VEHICLE)
+    add_update_commands(commands, _VEHICLE, _FOLDER)
     command(
         "faults",
         _faults,

@@ -23,15 +23,17 @@ __all__ = ["add_update_commands"]
 _PLACES = ("in_force", "on_trial", "before", "failed")
 
 
-def add_update_commands(commands: "argparse._SubParsersAction[Any]", vehicle: Callable[[str], str]) -> None:
+def add_update_commands(
+    commands: "argparse._SubParsersAction[Any]", vehicle: Callable[[str], str], folder: Callable[[str], Path]
+) -> None:
     """Add the commands to a parser.
 
     Parameters
     ----------
     commands : argparse's subparsers
         Subparsers of ``ecu-node``; each sets ``command`` to a callable that takes the options.
-    vehicle : callable
-        Reads the identity of a vehicle, as a type for argparse.
+    vehicle, folder : callable
+        Read the identity of a vehicle and the name of a folder, as types for argparse.
     """
     provision = commands.add_parser(
         "provision",
@@ -71,7 +73,7 @@ def add_update_commands(commands: "argparse._SubParsersAction[Any]", vehicle: Ca
     report.add_argument("--key", metavar="KEY", help=words)
     report.set_defaults(command=_report)
     for command in (provision, update, inspect, report):
-        command.add_argument("--state", required=True, type=Path, metavar="FOLDER", help="state of this vehicle")
+        command.add_argument("--state", required=True, type=folder, metavar="FOLDER", help="state of this vehicle")
         if command is not report:
             command.add_argument("--json", action="store_true", help="print JSON")
 
