@@ -7,6 +7,8 @@ another rate: so a missing bit rate is an error.
 
 import configparser
 import errno
+import json
+import os
 import re
 import socket
 from collections.abc import Iterable, Iterator, Mapping
@@ -153,6 +155,9 @@ def bus_config(interface: str, channel: str | None, **settings: Unpack[Settings]
     given: dict[str, Any] = {**settings, "interface": interface, "channel": channel, "fd": settings.get("fd") or None}
     said = {name: value for name, value in given.items() if value is not None and name != "listen_only"}
     try:
+        for name in ("CAN_CONFIG", f"CAN_CONFIG_{channel}"):
+            if not isinstance(json.loads(os.environ.get(name, "{}")), dict):
+                raise ValueError(f'{name} is no JSON object, such as {{"bitrate": 500000}}')
         config: dict[str, Any] = {**load_config(config=said, context=channel)}
     except (can.CanError, ValueError, TypeError, AttributeError, configparser.Error) as error:
         reason = " ".join(str(error).split())

@@ -73,12 +73,14 @@ RATES = [
     ("pcan", {**CLASSIC_TIMING, "bitrate": 500_000}, {}, "500000 contradicts the bit timing .BR: 250_000"),
     ("pcan", {**FD_TIMING, "data_bitrate": 4_000_000}, {"fd": True}, "data_bitrate = 4000000 contradicts"),
     ("ixxat", CLASSIC_TIMING, {}, "python-can cannot set a bit timing there; take f_clock out"),
+    ("virtual", [1], {}, 'CAN_CONFIG is no JSON object, such as {"bitrate": 500000}; see --interface, CAN_CONFIG'),
+    ("virtual", None, {}, "CAN_CONFIG is no JSON object"),
 ]
 
 
 @pytest.mark.parametrize(("interfaces", "config", "settings", "words"), RATES)
-def test_missing_or_contradictory_bit_rate_is_refused(
-    interfaces: str, config: dict[str, object], settings: Any, words: str, monkeypatch: pytest.MonkeyPatch
+def test_missing_or_contradictory_settings_are_refused(
+    interfaces: str, config: object, settings: Any, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAN_CONFIG", json.dumps(config))
     for interface in interfaces.split():
