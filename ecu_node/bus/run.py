@@ -151,6 +151,8 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
             faulty = [
                 branch.name for branch in corrector.branches if branch.fault.applied and branch.name not in hidden
             ]
+            if corrector.latched:  # its reason is in the next line of the log
+                return "correcting nothing"
             sends_nothing = " (only in its figures: --listen-only)" if options.listen_only else ""
             return f"correcting {', '.join(faulty) or 'nothing'}{sends_nothing}"
 

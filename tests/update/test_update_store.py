@@ -8,9 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
+from ecu_node.bus.faults import Fault
 from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
@@ -155,6 +157,19 @@ def test_running_node_loads_a_set_written_to_its_state(
         said = manager.wait_for("STATUS=parameter set")
     assert said == "STATUS=parameter set 300 is in force, correcting battery, motor"
     assert any("of vehicle v1 is in force" in line for line in log)
+
+
+def test_node_that_starts_with_a_latched_fault_says_first_that_it_corrects_nothing(
+    new: Path, parameters: VehicleParameters
+) -> None:
+    write_state(new, replace(read_state(new), in_force=held(parameters, days=36500)))
+    fault = Fault(reason="SUM_IMPLAUSIBLE", branches=[], parameter_set=300, first="", last="")
+    (new / "faults.json").write_bytes(msgspec.json.encode([fault]))
+    options = ["--state", str(new), "--layout", str(LAYOUT), "--interface", "virtual", "--channel", "latched"]
+    with running("run", *options) as log:
+        pass
+    assert log[0] == "ecu-node: running on virtual latched, correcting nothing\n"
+    assert log[1].startswith("ecu-node: passing measured values through until other parameters or 'ecu-node clear': ")
 
 
 def test_writer_waits_while_another_one_changes_the_state(state: Path) -> None:
