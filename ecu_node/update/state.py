@@ -164,7 +164,7 @@ def write_state(folder: Path, state: VehicleState) -> None:
     except OSError as error:
         with suppress(OSError):
             new.unlink(missing_ok=True)
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+        raise UserError(f"{path}: cannot be written: {error.strerror}; the state is as before") from None
     try:
         _sync_folder(folder)
     except OSError as error:

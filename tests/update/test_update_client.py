@@ -25,8 +25,9 @@ from ecu_node.parameters import FileReference, VehicleParameters
 from ecu_node.update.client import update
 from ecu_node.update.signers import public_key_of
 from ecu_node.update.sources import open_source
-from ecu_node.update.state import ParameterSet, add_decision, read_state
+from ecu_node.update.state import ParameterSet, add_decision, read_state, state_path
 from ecu_node.update.store import conclude, end_expired
+from tests.disk import full_disk
 from tests.ecu_node.processes import Done
 from tests.ecu_node.vehicles import LAYOUT
 from tests.update.damage import a_folder, a_pipe, cut, huge, without, zeros
@@ -208,9 +209,12 @@ def test_vehicle_is_provisioned_once_and_with_a_signed_root(repo: Repo, state: P
     refused("cannot read the root: it is a pipe")
     refused("there is a state already; a new root comes with 'ecu-node update'", repo.live("root"), state)
     refused("cannot be made: Not a directory; choose another --state", repo.live("root"), state / "state.json" / "x")
+    assert not place.exists()
+    with full_disk(100):
+        refused("state.json: cannot be written: File too large; the state is as before", repo.live("root"))
+    assert not state_path(place).exists()
     repo.forge("root", lambda _: None, "r1", "mallory", bump=False)
     refused("is expected", repo.live("root"))
-    assert not place.exists()
 
 
 INCONSISTENT = [
