@@ -137,9 +137,14 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
             f"{where}: {', '.join(both)} would be both received and sent; corrected values and status need messages "
             f"of their own"
         )
-    others = {sender for message in read.values() for sender in message.senders} - {_NOBODY}
-    senders = {name: message.name for message in sent.values() for name in message.senders if name != _NOBODY}
-    if len(senders) > 1 or others & senders.keys():
+
+    def only_senders(messages: Iterable[Message]) -> dict[str, str]:
+        """Return messages by their only sender; several senders, as of {SENDRECEIVE} in a SYM file, say nothing."""
+        named = {message.name: set(message.senders) - {_NOBODY} for message in messages}
+        return {sender: name for name, found in named.items() if len(found) == 1 for sender in found}
+
+    senders, others = only_senders(sent.values()), only_senders(read.values())
+    if len(senders) > 1 or others.keys() & senders.keys():
         found = ", ".join(f"{message} by {sender}" for sender, message in senders.items())
         raise LayoutError(
             f"{where}: {database.layout.dbc_path} has {found}; all corrected values and the status need to be sent by "

@@ -523,6 +523,13 @@ def test_layout_disturbing_the_bus_is_refused(make_database: MakeDatabase, layou
         corrector_for(make_database(layout, dbc))
 
 
+def test_messages_that_several_may_send_are_no_contradiction(make_database: MakeDatabase) -> None:
+    """As where they stand under {SENDRECEIVE} in a SYM file."""
+    several = "".join(f"BO_TX_BU_ {identifier} : Node,Corrector;\n" for identifier in (256, 512))
+    corrector = corrector_for(make_database(dbc=SMALL_DBC + several), battery=(0.1, 0.0))
+    assert state_at(corrector, 0.0) == (State.STARTING, Reason.NONE)
+
+
 def test_answer_to_a_frame_without_the_current_repeats_its_last_value_until_stale(make_database: MakeDatabase) -> None:
     page = ' SG_ Page M : 48|8@1+ (1,0) [0|255] "" Node\n'
     database = make_database(dbc=SMALL_DBC.replace(" SG_ Battery : 7", f"{page} SG_ Battery m0 : 7", 1))
