@@ -167,7 +167,7 @@ class CommandParser(argparse.ArgumentParser):
     """
 
     def __init__(self, *, done: str = "done", failed: str = "failed", **settings: Any) -> None:
-        codes = f"Exit codes: 0 {done}, 1 {failed}, 2 wrong use, 70 internal error, 130 interrupted."
+        codes = f"Exit codes: 0 {done}, 1 {failed}, 2 wrong use, 70 internal error, 130 interrupted, 143 SIGTERM."
         super().__init__(epilog=f"{codes} {DEBUG_HINT}", **settings)
 
     def error(self, message: str) -> NoReturn:

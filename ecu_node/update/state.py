@@ -38,7 +38,7 @@ __all__ = [
 
 _LARGEST_STATE_BYTES = 8_000_000
 """Largest state that is read; metadata of a repository of 10^6 vehicles and three parameter files take about 100 kB."""
-_REPLACE = "remove the folder, make it anew with 'ecu-node provision', and update anew"
+_REPLACE = "remove this file alone, then 'ecu-node provision' and 'ecu-node update'"
 _FOLDER = "name a folder made by 'ecu-node provision'"
 _CAREFUL = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """Flags for opening files safely when root writes into the node's folder: no link is followed, no pipe blocks."""
