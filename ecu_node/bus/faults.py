@@ -75,7 +75,7 @@ def clear_faults(folder: Path) -> str:
     path = _of_a_node(folder) / _NAME
     try:
         count = len(_read(path))
-        found = f"{count} fault{'s' * (count > 1)} cleared" if count else "no faults"
+        found = f"{count} fault{'s' * (count > 1)} cleared" if count else "no faults stored"
     except UserError:
         found = "a fault memory that could not be read is cleared"
     path.unlink(missing_ok=True)

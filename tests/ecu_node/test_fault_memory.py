@@ -139,7 +139,7 @@ def test_fault_that_could_not_be_stored_is_cleared(vehicle: Vehicle) -> None:
     away = vehicle.state.rename(vehicle.state.with_name("away"))
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     away.rename(vehicle.state)
-    assert vehicle.clear() == "no faults"
+    assert vehicle.clear() == "no faults stored"
     assert vehicle.latched() is Reason.NONE
     vehicle.latch(Reason.SUM_IMPLAUSIBLE, "battery")
     vehicle.later(3.0)
@@ -168,7 +168,7 @@ def test_cleared_faults_do_not_return(vehicle: Vehicle) -> None:
     vehicle.latch(Reason.BRANCH_STUCK, "battery")
     assert [fault["reason"] for fault in vehicle.faults()] == ["BRANCH_STUCK"]
     assert vehicle.clear() == "1 fault cleared"
-    assert vehicle.clear() == "no faults"
+    assert vehicle.clear() == "no faults stored"
 
 
 DAMAGE = [
@@ -197,7 +197,9 @@ def test_unreadable_fault_memory_lets_values_through(vehicle: Vehicle, old: str,
     assert "'ecu-node clear' begins a new one" in err
     if new is None:
         vehicle.file.rmdir()
-    assert vehicle.clear() == ("no faults" if new is None else "a fault memory that could not be read is cleared")
+    assert vehicle.clear() == (
+        "no faults stored" if new is None else "a fault memory that could not be read is cleared"
+    )
     assert vehicle.latched() is Reason.NONE
     assert vehicle.faults() == []
 
