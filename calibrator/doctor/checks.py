@@ -154,7 +154,7 @@ def values(facts: Facts) -> Findings:
             yield warning("constant", row.name, text, advice, row.low)
 
 
-def computed_inputs(facts: Facts) -> Findings:
+def inputs_of_sensors(facts: Facts) -> Findings:
     """Report inputs that carry the noise of a current sensor, and so its faults."""
     for name, branch in facts.computed_inputs.items():
         text = f"carries the noise of current sensors, as if computed from the current of {branch}"
@@ -197,7 +197,7 @@ def full_scale(facts: Facts) -> Findings:
 
 
 CHECKS: Sequence[Callable[[Facts], Findings]] = (
-    logs_as_a_whole, counted_twice, absent, late, bad_frames, values, computed_inputs, impossible_voltage,
+    logs_as_a_whole, counted_twice, absent, late, bad_frames, values, inputs_of_sensors, impossible_voltage,
     full_scale,
 )  # fmt: skip
 
