@@ -2,8 +2,8 @@
 
 Loop guard: no message that the layout reads may be sent on the same bus, else the node would correct its own output, or
 speak in the name of another control unit. By the DBC, all messages that the node sends must come from one control unit,
-which sends none of the messages that are read. Each bit that the node writes belongs to one signal only. A gateway
-passes the branches' messages on to the other bus; only the status message is its own.
+which sends none of the messages that are read. In each frame a bit that the node writes belongs to one signal only. A
+gateway passes the branches' messages on to the other bus; only the status message is its own.
 """
 
 from collections import defaultdict
@@ -34,6 +34,7 @@ from ecu_node.core.signals import (
     bit_place,
     exact_code,
     not_available_code,
+    overlapping,
     placed_signal,
     read_codes,
     require_reach,
@@ -156,24 +157,27 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
                 f"{database.layout.dbc_path}: message {message.name}, which the node sends, has {message.length} "
                 f"bytes; CAN FD carries at most {_FD_BYTES}"
             )
-    taken: dict[FrameKey, int] = {}
-    for name, purpose, largest, own in _written(database, mode):
+    written = _written(database, mode)
+    signals = [database.signal(item.name)[1] for item in written]
+    for name, purpose, largest, own in written:
         message, signal = database.signal(name)
-        place, what = bit_place(signal), f"{purpose}: signal {message.name}.{signal.name}"
+        place, what = bit_place(signal), f"{where}: {purpose}: signal {message.name}.{signal.name}"
         if place.end > message.length:
             raise DatabaseError(f"{what} ends in byte {place.end}, but the message has {message.length} bytes")
         if own and signal.multiplexer_ids is not None:
             raise DatabaseError(f"{what} is multiplexed; what the node sends in its own name must be in every frame")
         if place.highest < largest:
             raise DatabaseError(f"{what} holds at most {place.highest}; {largest} must fit, widen it in the DBC")
-        protection = protection_of(database, message)
-        used = taken.get(key_of(message), protection.header_mask if protection is not None else 0)
-        if used & place.mask and signal.multiplexer_ids is None:
+        if sum(item is signal for item in signals) > 1:
+            raise LayoutError(f"{what} is written twice; give each value a signal of its own")
+        protection, overlapped = protection_of(database, message), overlapping(message, signal)
+        if protection is not None and protection.header_mask & place.mask:
+            overlapped.append("the E2E header")
+        if overlapped:
             raise LayoutError(
-                f"{where}: {purpose}: {message.name}.{signal.name} is written twice, or overlaps another signal that "
-                f"is written, or the E2E header"
+                f"{what} overlaps {', '.join(overlapped)}, which must keep its bits when the signal is written; "
+                f"correct the places in the DBC"
             )
-        taken[key_of(message)] = used | place.mask
 
 
 def signal_codes(

@@ -288,6 +288,11 @@ def placed_signal(message: Message, signal: Signal) -> PlacedSignal:
         If the signal or one of its multiplexers is a floating-point number or wider than 64 bits, if the message lacks
         one of the multiplexers, or if they multiplex each other in a circle.
     """
+    return PlacedSignal(place=bit_place(signal), above=_multiplexers(message, signal))
+
+
+def _multiplexers(message: Message, signal: Signal) -> tuple[Multiplexer, ...]:
+    """Return the multiplexers above a signal, the nearest one first; errors are those of :func:`placed_signal`."""
     found, inner = list[Multiplexer](), signal
     while inner.multiplexer_ids is not None and inner.multiplexer_signal is not None:
         above = next((item for item in message.signals if item.name == inner.multiplexer_signal), None)
@@ -299,7 +304,32 @@ def placed_signal(message: Message, signal: Signal) -> PlacedSignal:
             )
         found.append(Multiplexer(place=bit_place(above), codes=frozenset(inner.multiplexer_ids)))
         inner = above
-    return PlacedSignal(place=bit_place(signal), above=tuple(found))
+    return tuple(found)
+
+
+def _bits(signal: Signal) -> set[int]:
+    """Return the bits of any signal, also of a floating-point number, each as 8 * byte + bit of the byte."""
+    low = start_bit(signal)
+    from_top = 0 if signal.byte_order == "little_endian" else _BITS_PER_BYTE - 1
+    return {bit ^ from_top for bit in range(low, low + signal.length)}
+
+
+def overlapping(message: Message, signal: Signal) -> list[str]:
+    """Return the names of the other signals of a message that share bits with a signal in one frame.
+
+    Signals that never come in one frame, as a multiplexer chooses between them, may share bits. Errors are those of
+    :func:`placed_signal`.
+    """
+    bits, above = _bits(signal), _multiplexers(message, signal)
+    return [
+        other.name
+        for other in message.signals
+        if other is not signal
+        and bits & _bits(other)
+        and all(
+            one.codes & two.codes for one in above for two in _multiplexers(message, other) if one.place == two.place
+        )
+    ]
 
 
 _NOT_AVAILABLE_NAMES = ("sna", "notavailable", "signalnotavailable", "na", "invalid", "error")

@@ -495,6 +495,7 @@ OTHER_SENDER = (
  SG_ Reason : 8|8@1+ (1,0) [0|255] "" Node
 """
 )
+ONE_SIGNAL = OWN_STATUS.replace('"Reason"', '"State"')
 OWN_SUM = OWN_STATUS + 'sum_measured = "Sum"\n'
 WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1- (0.1,0) [0|0] "A" Node\n'
 
@@ -503,7 +504,11 @@ DISTURBING = [
     (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC.replace(*SPARE), "Pair would be both received and sent"),
     (SMALL_LAYOUT, SMALL_DBC.replace("8 Corrector", "8 Node"), r"small\.dbc has PairOut by Node; all corrected"),
     (SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER, "PairOut by Corrector, Own by Other; all corrected values and the"),
-    (SMALL_LAYOUT, SMALL_DBC.replace("Motor : 16|16", "Motor : 15|16"), "PairOut.Motor is written twice"),
+    (
+        SMALL_LAYOUT,
+        SMALL_DBC.replace("Motor : 16|16", "Motor : 15|16"),
+        "PairOut.Battery overlaps Motor, which must keep",
+    ),
     (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 64|2"), "Quality ends in byte 9"),
     (SMALL_LAYOUT, SMALL_DBC.replace("Out: 8", "Out: 65"), r"small\.dbc: message PairOut, .* has 65 bytes; .* 64"),
     (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
@@ -513,7 +518,8 @@ DISTURBING = [
     (SMALL_LAYOUT + OWN_SUM, WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n', "code 3 of signal Sum means 'SNA', .* beyond 0.2"),
     (SMALL_LAYOUT, SMALL_DBC.replace(*INIT), "motor: code -1 of signal Motor means 'Init', .* beyond 0 could be"),
     (SMALL_LAYOUT, SMALL_DBC.replace(*OFF), r"small\.toml: branch motor: the code of 0 of signal Motor is named 'Off'"),
-    (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery is written twice, or overlaps .*, or the E2E header"),
+    (SMALL_LAYOUT + OWN_E2E, SMALL_DBC, "PairOut.Battery overlaps the E2E header"),
+    (SMALL_LAYOUT + ONE_SIGNAL, WITH_SUM, r"small\.toml: status: signal Own\.State is written twice; give each"),
 ]
 
 

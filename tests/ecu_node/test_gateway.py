@@ -90,8 +90,42 @@ HEADERS = [
 @pytest.mark.parametrize(("profile", "offset", "branch"), HEADERS)
 def test_branch_in_e2e_header_is_refused(make_database: MakeDatabase, profile: str, offset: int, branch: str) -> None:
     layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'
-    with pytest.raises(LayoutError, match=rf"branch {branch}: Pair\.{branch.title()} is written twice, or overlaps"):
+    with pytest.raises(LayoutError, match=rf"branch {branch}: signal Pair\.{branch.title()} overlaps the E2E header"):
         gateway_for(make_database(layout, SMALL_DBC.replace("Pair: 8", "Pair: 24")))
+
+
+PAGE = ' SG_ Page M : 48|8@1+ (1,0) [0|255] "" Node\n'
+FLAG = ' SG_ Flag : 8|1@1+ (1,0) [0|1] "" Node\n'
+PAIR_E2E = '\n[e2e]\nprofile = "P01"\nmessages = ["Pair"]\n'
+
+
+def on_page(code: int, place: str = "7|16", page: str = PAGE) -> str:
+    """The DBC whose battery is multiplexed, with this code and place, and whose motor is so with code 1."""
+    battery, motor = f"{page} SG_ Battery m{code} : {place}@0", " SG_ Motor m1 : 23|16@0"
+    return SMALL_DBC.replace(" SG_ Battery : 7|16@0", battery).replace(" SG_ Motor : 23|16@0", motor)
+
+
+OVERLAPPING = [
+    (PAIR_E2E, on_page(0), "the E2E header"),
+    ("", on_page(0, page=PAGE.replace("48|8", "12|4")), "Page"),
+    ("", on_page(1, "15|16"), "Motor"),
+    ("", SMALL_DBC.replace(" SG_ Battery", FLAG + " SG_ Battery"), "Flag"),
+]
+
+
+@pytest.mark.parametrize(("more", "dbc", "others"), OVERLAPPING)
+def test_current_over_other_bits_of_its_frame_is_refused(
+    make_database: MakeDatabase, more: str, dbc: str, others: str
+) -> None:
+    with pytest.raises(LayoutError, match=f"battery: signal Pair.Battery overlaps {others}, which must keep"):
+        gateway_for(make_database(SMALL_LAYOUT + more, dbc))
+
+
+def test_currents_of_different_multiplexer_codes_may_share_bits(make_database: MakeDatabase) -> None:
+    database = make_database(dbc=on_page(0, "23|16"))
+    frame = frame_of(database, "Pair", Page=0, Battery=100.0)
+    out = passed_on(gateway_for(database, battery=(0.25, 0.0)), frame, 0.0)
+    assert out == frame_of(database, "Pair", Page=0, Battery=80.0).data
 
 
 NET_WITH_CRC = (

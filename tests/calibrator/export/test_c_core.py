@@ -147,7 +147,7 @@ def test_export_refuses_layouts_that_the_gateway_refuses(make_database: MakeData
     database = make_database(SMALL_LAYOUT + '\n[e2e]\nprofile = "P01"\nmessages = ["Pair"]\n')
     checked = checked_with(database, parameters_for(database, battery=(0.05, 2.3)), tmp_path)
     for write in (c_text, lambda item: image_bytes(item, "big")):
-        with pytest.raises(LayoutError, match=r"branch battery: Pair\.Battery is written twice, or overlaps"):
+        with pytest.raises(LayoutError, match=r"branch battery: signal Pair\.Battery overlaps the E2E header"):
             write(checked)
 
 
