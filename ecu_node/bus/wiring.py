@@ -6,6 +6,7 @@ which sends none of the messages that are read. In each frame a bit that the nod
 gateway passes the branches' messages on to the other bus; only the status message is its own.
 """
 
+import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple, Unpack
 
 import can
-from cantools.database.can import Message
+from cantools.database.can import Message, Signal
 
 from ecu_node.bus.adapters import Settings, connect, filters_of
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault, Signals, correction_plan
@@ -103,8 +104,10 @@ class _WrittenSignal(NamedTuple):
 
     name: SignalName
     purpose: str
+    needed: int
+    """The greatest code that it must hold; 0 for a current or power."""
     largest: int
-    """The greatest code that it must hold."""
+    """The greatest code that the node writes, as far as the signal's width holds it; 0 for a current or power."""
     own: bool
     """Whether the node is the sender of the whole message."""
 
@@ -114,12 +117,15 @@ def _written(database: VehicleDatabase, mode: Mode) -> list[_WrittenSignal]:
     own, status = mode is Mode.OVERLAY, database.layout.status
     found = []
     for branch in database.layout.branch:
-        names = {branch.corrected: 0, branch.quality: Quality.INVALID} if own else {branch.source: 0}
-        found += [_WrittenSignal(name, f"branch {branch.name}", most, own) for name, most in names.items() if name]
+        what = f"branch {branch.name}"
+        if target := branch.corrected if own else branch.source:
+            found.append(_WrittenSignal(target, what, 0, 0, own))
+        if own and branch.quality:
+            found.append(_WrittenSignal(branch.quality, what, Quality.INVALID, Quality.IMPLAUSIBLE, own))
     if status is not None:
-        widths = {"state": max(State), "reason": max(Reason), "parameter_set": PARAMETER_SETS - 1}
-        widths["alive_counter"] = 1
-        found += [_WrittenSignal(name, "status", widths.get(key, 0), True) for key, name in status.signals.items()]
+        ends = {"state": max(State), "reason": max(Reason), "parameter_set": PARAMETER_SETS - 1}
+        codes = {key: (end, end) for key, end in ends.items()} | {"alive_counter": (1, sys.maxsize)}
+        found += [_WrittenSignal(name, "status", *codes.get(key, (0, 0)), True) for key, name in status.signals.items()]
     return found
 
 
@@ -159,15 +165,15 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
             )
     written = _written(database, mode)
     signals = [database.signal(item.name)[1] for item in written]
-    for name, purpose, largest, own in written:
+    for name, purpose, needed, largest, own in written:
         message, signal = database.signal(name)
         place, what = bit_place(signal), f"{where}: {purpose}: signal {message.name}.{signal.name}"
         if place.end > message.length:
             raise DatabaseError(f"{what} ends in byte {place.end}, but the message has {message.length} bytes")
         if own and signal.multiplexer_ids is not None:
             raise DatabaseError(f"{what} is multiplexed; what the node sends in its own name must be in every frame")
-        if place.highest < largest:
-            raise DatabaseError(f"{what} holds at most {place.highest}; {largest} must fit, widen it in the DBC")
+        if largest:
+            _check_codes(signal, needed, largest, what)
         if sum(item is signal for item in signals) > 1:
             raise LayoutError(f"{what} is written twice; give each value a signal of its own")
         protection, overlapped = protection_of(database, message), overlapping(message, signal)
@@ -178,6 +184,25 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
                 f"{what} overlaps {', '.join(overlapped)}, which must keep its bits when the signal is written; "
                 f"correct the places in the DBC"
             )
+
+
+def _check_codes(signal: Signal, needed: int, largest: int, what: str) -> None:
+    """Refuse a signal that cannot hold the codes from 0 on, or that gives them other values or none by the DBC."""
+    codes = read_codes(signal, None, what)
+    highest = codes.place.highest
+    largest = min(largest, highest)
+    if highest < needed:
+        raise DatabaseError(f"{what} holds at most {highest}; {needed} must fit, widen it in the DBC")
+    if codes.scale != 1 or codes.offset != 0:
+        raise DatabaseError(
+            f"{what} has factor {signal.scale:g} and offset {signal.offset:g}; the node writes raw codes: give it "
+            f"(1,0) in the DBC"
+        )
+    if codes.lowest > 0 or codes.highest < largest:
+        raise DatabaseError(
+            f"{what} has the range [{signal.minimum:g}|{signal.maximum:g}], but the node writes codes 0 to {largest}; "
+            f"widen the range in the DBC"
+        )
 
 
 def signal_codes(

@@ -498,7 +498,8 @@ OTHER_SENDER = (
 ONE_SIGNAL = OWN_STATUS.replace('"Reason"', '"State"')
 OWN_SUM = OWN_STATUS + 'sum_measured = "Sum"\n'
 WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1- (0.1,0) [0|0] "A" Node\n'
-
+OWN_ALIVE = OWN_STATUS + 'alive_counter = "Alive"\n'
+ALIVE = ' SG_ Alive : 32|4@1+ (1,0) [0|14] "" Node\n'
 
 DISTURBING = [
     (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC.replace(*SPARE), "Pair would be both received and sent"),
@@ -512,6 +513,14 @@ DISTURBING = [
     (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 64|2"), "Quality ends in byte 9"),
     (SMALL_LAYOUT, SMALL_DBC.replace("Out: 8", "Out: 65"), r"small\.dbc: message PairOut, .* has 65 bytes; .* 64"),
     (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
+    (SMALL_LAYOUT, SMALL_DBC.replace("2@1+ (1,0)", "2@1+ (1,1)"), "Quality has factor 1 and offset 1; the node writes"),
+    (SMALL_LAYOUT, SMALL_DBC.replace("2@1+ (1,0)", "2@1+ (2,0)"), "Quality has factor 2 and offset 0; the node writes"),
+    (
+        SMALL_LAYOUT,
+        SMALL_DBC.replace("Quality : 32|2", "Quality : 32|3"),
+        r"range \[0\|3\], but .* writes codes 0 to 4;",
+    ),
+    (SMALL_LAYOUT + OWN_ALIVE, WITH_SUM + ALIVE, r"Own\.Alive has the range \[0\|14\], but .* writes codes 0 to 15"),
     (SMALL_LAYOUT, SMALL_DBC.replace(*PAGE), "PairOut.Quality is multiplexed; what the node sends .* in every frame"),
     (SMALL_LAYOUT, SMALL_DBC.replace(MOTOR_SNA, '512 Motor 32767 "Max"'), "Motor needs a code named SNA"),
     (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
@@ -679,7 +688,7 @@ def test_node_may_send_messages_of_one_dbc_sender_or_of_none(make_database: Make
 
 def test_alive_counter_of_the_status_starts_at_0_and_wraps_at_its_width(make_database: MakeDatabase) -> None:
     dbc = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Alive : 16|2@1+ (1,0) [0|3] "" Node\n'
-    database = make_database(f'{SMALL_LAYOUT}{OWN_STATUS}alive_counter = "Alive"\n', dbc)
+    database = make_database(SMALL_LAYOUT + OWN_ALIVE, dbc)
     corrector = corrector_for(database)
     sent = [bytes(message.data) for _ in range(5) if (message := corrector.status()) is not None]
     found = [decoded(database, "Own", data)["Alive"] for data in sent]
