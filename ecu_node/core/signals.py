@@ -487,9 +487,15 @@ def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
     Raises
     ------
     DatabaseError
-        If a named code ends that run earlier, or is the code of 0.
+        If a named code ends that run earlier, or is the code of 0, or no code stands for 0.
     """
     ends = writable_range(codes, where)
+    if abs(codes.worth(codes.nearest(Fraction(0)))) > abs(codes.scale) / 2:
+        low, high = sorted(float(codes.worth(code)) for code in (codes.lowest, codes.highest))
+        raise DatabaseError(
+            f"{where}: signal {codes.name} holds {low:g} to {high:g}, but the node must be able to write 0; correct "
+            f"its range or offset in the DBC"
+        )
     for end, extreme, inwards in zip(ends, (codes.lowest, codes.highest), (1, -1), strict=True):
         outermost = extreme
         while outermost in codes.named:  # named codes at the ends of the range exclude no value

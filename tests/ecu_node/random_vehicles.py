@@ -236,7 +236,7 @@ def _draw_message(rng: Random, name: str, low: int, kinds: Collection[str], leas
 def _draw_signal(
     rng: Random, name: str, length: int, units: Sequence[str], *, scales: Sequence[str] = _SCALES, named: bool = True
 ) -> Signal:
-    """A signal that has no place yet; names for some codes, but not that of zero or beside it."""
+    """A signal that has no place yet, and can be 0; names for some codes, but not that of zero or beside it."""
     signal = Signal(name, 0, length, is_signed=rng.random() < 0.6, unit=rng.choice(units))
     scale, offset = rng.choice(scales), rng.choice(_OFFSETS if scales is _SCALES else ("0",))
     signal.conversion = BaseConversion.factory(scale=float(scale), offset=float(offset))
@@ -246,7 +246,9 @@ def _draw_signal(
         ends = lowest + rng.randint(0, quarter), highest - rng.randint(0, quarter)
         low, high = sorted(Fraction(scale) * code + Fraction(offset) for code in ends)
         signal.minimum, signal.maximum = float(low), float(high)
-    names, zero = dict[int, str](), Codes(signal).zero
+    names, codes, zero = dict[int, str](), Codes(signal), Codes(signal).zero
+    if abs(codes.worth(zero)) > abs(codes.worth(1) - codes.worth(0)) / 2:
+        return _draw_signal(rng, name, length, units, scales=scales, named=named)  # it cannot be 0
     for number in range(rng.randint(0, 3) if named and length >= 3 else 0):
         code = rng.choice((lowest, highest, rng.randint(lowest, highest), highest - rng.randint(0, 3)))
         if abs(code - zero) > 1:

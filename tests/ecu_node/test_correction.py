@@ -176,6 +176,13 @@ def test_named_code_within_the_measuring_range_is_refused(scale: float, code: in
         require_reach(codes, Fraction(400), "test")
 
 
+@pytest.mark.parametrize("limits", [(100.0, 200.0), (-200.0, -100.0), (0.02, 200.0)])
+def test_range_without_0_a_is_refused(limits: tuple[float, float]) -> None:
+    words = "test: signal I holds {:g} to {:g}, but the node must be able to write 0; correct its range"
+    with pytest.raises(DatabaseError, match=words.format(*limits)):
+        require_reach(current(limits=limits), Fraction(400), "test")
+
+
 def test_named_codes_at_an_end_of_the_range_are_accepted_and_never_written() -> None:
     codes = current(length=8, names=dict.fromkeys([-128, *range(120, 128)], "Reserved"))
     require_reach(codes, Fraction(400), "test")

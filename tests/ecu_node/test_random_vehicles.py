@@ -56,7 +56,7 @@ def test_every_8_bit_code_matches_the_oracle_whatever_the_other_bits_are(
         ("16@1-", f"8@1{sign}"),
         ("-32768", missing),
         ("(0.1,0) [-3000|3000]", f"(0.1,{offset}) [0|0]"),
-        ("(-0.05,0) [-1600|1600]", f"(-0.05,{offset}) [0|0]"),
+        ("(-0.05,0) [-1600|1600]", f"(-0.05,{-float(offset) / 2}) [0|0]"),
     ):
         dbc = dbc.replace(old, new)
     database = make_database(layout, dbc)
