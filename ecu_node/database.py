@@ -97,7 +97,8 @@ class VehicleDatabase:
         return bus, message
 
     def signal(self, name: str) -> tuple[Message, Signal]:
-        """Return message and signal of ``Message.Signal``; raise :class:`DatabaseError` if the DBC lacks one of them.
+        """Return message and signal of ``Message.Signal``; raise :class:`DatabaseError` if the DBC lacks one of them,
+        or the message has two signals of this name.
 
         LayoutError if the name has another form, or a bus that the layout does not have.
         Without a DBC the name is that of a column; its signal is then a float in the unit that the layout gives.
@@ -113,8 +114,14 @@ class VehicleDatabase:
                 f"'Layout' of the documentation"
             )
         message = self.message(message_name)
-        with suppress(KeyError):
-            return message, message.get_signal_by_name(signal_name)
+        found = [item for item in message.signals if item.name == signal_name]
+        if len(found) > 1:
+            raise DatabaseError(
+                f"{self.layout.dbc_path}: message {message_name} has several signals named {signal_name!r}; rename all "
+                f"but one"
+            )
+        if found:
+            return message, found[0]
         raise DatabaseError(
             f"{self.layout.dbc_path}: message {message_name} has no signal {signal_name!r}, which "
             f"{self.layout.path} names; it has {', '.join(signal.name for signal in message.signals)}"
@@ -219,10 +226,11 @@ def _load(layout: Layout, file: str) -> tuple[Database, str]:
         raise DatabaseError(f"{path}: cannot read the DBC: {error.strerror}; {line}") from None
     except (cantools.Error, ValueError, KeyError, TypeError) as error:
         first_line = str(error).splitlines()[0] if str(error) else type(error).__name__
-        if isinstance(error.__cause__, IndexError):
+        if isinstance(error.__cause__, IndexError | KeyError):
             raise DatabaseError(
-                f"{path}: the library cantools cannot read it ({first_line}), as if an attribute (BA_) had a value "
-                f"outside its enumeration (BA_DEF_); open it in a DBC editor, correct that and save it"
+                f"{path}: the library cantools cannot read it ({first_line}), as if an attribute (BA_) were not "
+                f"defined (BA_DEF_) or had a value outside its enumeration; open it in a DBC editor, correct that and "
+                f"save it"
             ) from None
         raise DatabaseError(f"{path}: not a CAN database: {first_line}") from None
     if not isinstance(database, Database):

@@ -84,7 +84,12 @@ WRONG_DBCS = [
     (SMALL_DBC.replace('"V" Node', '"A" Node'), "branch heater: signal Voltage is in 'A'; expected V, mV, kV"),
     (SMALL_DBC.replace('"W" Node', '"V" Node'), "branch heater: signal Power is in 'V'; expected W"),
     (SMALL_DBC + "BO_ 258 Old: 2 Node\n", "small.dbc: messages Net and Old have one identifier, 0x102; take out"),
-    (SMALL_DBC + BEYOND_ENUM, r"cannot read it \(DBC: \"list index .*\"\), as if an attribute \(BA_\) had a value"),
+    (SMALL_DBC + BEYOND_ENUM, r"cannot read it \(DBC: \"list index .*\"\), as if an attribute \(BA_\) were"),
+    (
+        SMALL_DBC + 'BA_ "Cyce" BO_ 256 10;\n',
+        r"cannot read it \(DBC: .*'Cyce'.*\), as if an attribute \(BA_\) were not",
+    ),
+    (SMALL_DBC.replace("SG_ Motor", "SG_ Battery"), "message Pair has several signals named 'Battery'; rename all but"),
     (SMALL_DBC + "BO_ 258 Pair: 2 Node\n", "small.dbc: 'Pair' is the name of several messages.*; rename all but one"),
     (
         SMALL_DBC.replace('(0.1,0) [-3000|3000] "A"', '(100,0) [-3000000|3000000] "mA"', 1).replace(
