@@ -40,6 +40,7 @@ from ecu_node.bus.wiring import (
     rewritten,
     transmitted,
     unpublished,
+    unsealed,
     wire,
 )
 from ecu_node.core.corrector import OF_ONE_DRIVE, Corrector
@@ -303,7 +304,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
     database = node_database(layout)
     in_force = choose_parameters(params, database, vehicle)
     wire(database, in_force, start_s=0.0, mode=mode)
-    warnings = [*unpublished(database, in_force, mode).values(), *narrowed(database, mode)]
+    warnings = [*unpublished(database, in_force, mode).values(), *narrowed(database, mode), *unsealed(database, mode)]
     if names := needs_fd(database, mode):
         warnings.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
     parameters = in_force.parameters

@@ -6,6 +6,7 @@ which sends none of the messages that are read. In each frame a bit that the nod
 gateway passes the branches' messages on to the other bus; only the status message is its own.
 """
 
+import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -328,6 +329,23 @@ def narrowed(database: VehicleDatabase, mode: Mode) -> list[str]:
                 f"{branch.source} {float(low):g} to {float(high):g}; values beyond are sent as the nearest end"
             )
     return found
+
+
+def unsealed(database: VehicleDatabase, mode: Mode) -> list[str]:
+    """Return a warning for each signal that looks like a checksum in a message that is rewritten, but in no [e2e]."""
+    return [
+        f"message {message.name}: signal {signal.name} looks like a checksum, but the message is in no [e2e] of the "
+        f"layout, so that a corrected frame keeps the old one; if it is one, add the message to [e2e]"
+        for message in rewritten(database).values()
+        for signal in message.signals
+        if mode is Mode.GATEWAY and database.layout.protection(message.name) is None and _is_checksum(signal.name)
+    ]
+
+
+def _is_checksum(name: str) -> bool:
+    """Whether CRC, checksum or chk is a word of a signal's name, such as ``BatteryCRC8`` or ``chk_motor``."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])|[^A-Za-z]+", " ", name)
+    return re.search(r"\b(crc|chk|(check|chk) ?sum)\b", words, re.IGNORECASE) is not None
 
 
 def put_in_force(

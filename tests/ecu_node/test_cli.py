@@ -100,6 +100,20 @@ def test_check_warns_of_unapplied_faults_fd_and_narrow_signals(make_database: Ma
     assert "warning: branch battery: PairOut.Battery holds -50 to 50, but Pair.Battery -3000 to 3000; values" in text
 
 
+@pytest.mark.parametrize(("more", "count"), [("", 2), ('\n[e2e]\nprofile = "P05"\noffset = 5\nmessages = ["Pair"]', 0)])
+def test_check_of_a_gateway_warns_of_checksums_without_e2e(
+    make_database: MakeDatabase, tmp_path: Path, more: str, count: int
+) -> None:
+    names = ("PairCRC8", "Pair_CheckSum", "Crcle", "Checked")
+    signals = "".join(f' SG_ {name} : {32 + k}|1@1+ (1,0) [0|1] "" Node\n' for k, name in enumerate(names))
+    database = make_database(SMALL_LAYOUT + more, SMALL_DBC.replace(" SG_ Battery : 7", f"{signals} SG_ Battery : 7"))
+    write_parameters(parameters_for(database, battery=(0.25, 5.0)), tmp_path / "v1.json")
+    options = check(tmp_path / "v1.json", layout=database.layout.path)
+    assert ecu_node(*options).out.count("looks like a checksum") == 0
+    text = ecu_node(*options, "--gateway", "can1").out
+    assert text.count("looks like a checksum") == text.count("warning: message Pair: signal Pair") == count
+
+
 @pytest.mark.parametrize(("load", "expected_a"), [("[unmeasured_load]\nmean_a = 6.1\nsd_a = 1.0\n", 6.1), ("", 0.0)])
 def test_template_expects_the_unmeasured_load(make_database: MakeDatabase, load: str, expected_a: float) -> None:
     database = make_database(f"{SMALL_LAYOUT}{load}")
