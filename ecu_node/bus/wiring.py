@@ -168,7 +168,8 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
     signals = [database.signal(item.name)[1] for item in written]
     for name, purpose, needed, largest, own in written:
         message, signal = database.signal(name)
-        place, what = bit_place(signal), f"{where}: {purpose}: signal {message.name}.{signal.name}"
+        what = f"{where}: {purpose}: signal {message.name}.{signal.name}"
+        place = bit_place(signal, what)
         if place.end > message.length:
             raise DatabaseError(f"{what} ends in byte {place.end}, but the message has {message.length} bytes")
         if own and signal.multiplexer_ids is not None:

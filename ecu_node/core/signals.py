@@ -194,13 +194,15 @@ class BitPlace:
         payload[self.first : self.end] = field.to_bytes(self.end - self.first, self.order)
 
 
-def bit_place(signal: Signal) -> BitPlace:
+def bit_place(signal: Signal, what: str = "") -> BitPlace:
     """Return the place of a signal of the DBC.
 
     Parameters
     ----------
     signal : Signal
         An integer signal; where it is multiplexed, see :func:`placed_signal`.
+    what : str
+        Its use and name, for messages of errors; ``signal NAME`` if not given.
 
     Returns
     -------
@@ -212,13 +214,16 @@ def bit_place(signal: Signal) -> BitPlace:
     DatabaseError
         If the signal is a floating-point number or wider than 64 bits.
     """
+    what = what or f"signal {signal.name}"
     if signal.is_float:
-        raise DatabaseError(f"signal {signal.name} is a floating-point number; the node corrects integer signals only")
+        raise DatabaseError(
+            f"{what} is a floating-point number in the DBC; the node reads and writes integers only: name an integer "
+            f"signal in its place, or leave out what needs it"
+        )
     low = start_bit(signal)  # for a big-endian signal the most significant bit, numbered from the top of its byte
     if low < 0 or not 1 <= signal.length <= _LONGEST:
         raise DatabaseError(
-            f"signal {signal.name} has {signal.length} bits from bit {signal.start} on; 1 to {_LONGEST} bits from 0 on "
-            f"are expected"
+            f"{what} has {signal.length} bits from bit {signal.start} on; 1 to {_LONGEST} bits from 0 on are expected"
         )
     high = low + signal.length - 1
     is_little = signal.byte_order == "little_endian"
@@ -408,7 +413,7 @@ def read_codes(signal: Signal, units: Mapping[str, float] | None, where: str) ->
         If the unit is of another quantity, the scale is 0 or not finite, no code lies in the DBC's range, or the signal
         is a floating-point number or wider than 64 bits.
     """
-    place = bit_place(signal)
+    place = bit_place(signal, f"{where}: signal {signal.name}")
     if signal.scale == 0 or not math.isfinite(signal.scale + signal.offset):
         raise DatabaseError(
             f"{where}: signal {signal.name} has scale {signal.scale:g} and offset {signal.offset:g} in the DBC; finite "

@@ -498,6 +498,8 @@ OTHER_SENDER = (
 ONE_SIGNAL = OWN_STATUS.replace('"Reason"', '"State"')
 OWN_SUM = OWN_STATUS + 'sum_measured = "Sum"\n'
 WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1- (0.1,0) [0|0] "A" Node\n'
+FLOATS = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "0|32@1- (0.01")
+FLOATS = FLOATS.replace("16|16@1-", "16|32@1-").replace("Quality : 32", "Quality : 48")
 OWN_ALIVE = OWN_STATUS + 'alive_counter = "Alive"\n'
 ALIVE = ' SG_ Alive : 32|4@1+ (1,0) [0|14] "" Node\n'
 
@@ -513,6 +515,16 @@ DISTURBING = [
     (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 64|2"), "Quality ends in byte 9"),
     (SMALL_LAYOUT, SMALL_DBC.replace("Out: 8", "Out: 65"), r"small\.dbc: message PairOut, .* has 65 bytes; .* 64"),
     (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
+    (
+        SMALL_LAYOUT,
+        FLOATS + "SIG_VALTYPE_ 258 Voltage : 1;\n",
+        "branch heater: signal Voltage is a floating-point .*: name",
+    ),
+    (
+        SMALL_LAYOUT,
+        FLOATS + "SIG_VALTYPE_ 512 Motor : 1;\n",
+        r"branch motor: signal PairOut\.Motor is a floating-point",
+    ),
     (SMALL_LAYOUT, SMALL_DBC.replace("2@1+ (1,0)", "2@1+ (1,1)"), "Quality has factor 1 and offset 1; the node writes"),
     (SMALL_LAYOUT, SMALL_DBC.replace("2@1+ (1,0)", "2@1+ (2,0)"), "Quality has factor 2 and offset 0; the node writes"),
     (
