@@ -118,7 +118,7 @@ class VehicleDatabase:
         if len(found) > 1:
             raise DatabaseError(
                 f"{self.layout.dbc_path}: message {message_name} has several signals named {signal_name!r}; rename all "
-                f"but one"
+                f"but one in the DBC"
             )
         if found:
             return message, found[0]

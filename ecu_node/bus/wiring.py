@@ -176,7 +176,7 @@ def _check_output(database: VehicleDatabase, mode: Mode) -> None:
             raise DatabaseError(f"{what} is multiplexed; what the node sends in its own name must be in every frame")
         if largest:
             _check_codes(signal, needed, largest, what)
-        if sum(item is signal for item in signals) > 1:
+        if signals.count(signal) > 1:
             raise LayoutError(f"{what} is written twice; give each value a signal of its own")
         protection, overlapped = protection_of(database, message), overlapping(message, signal)
         if protection is not None and protection.header_mask & place.mask:
@@ -416,7 +416,7 @@ def wire(
     ------
     LayoutError
         If nothing is published, a message of a branch or an input would be sent, the DBC says that another control
-        unit sends it, or two signals are written in one place.
+        unit sends it, or a signal that is written shares bits with another one or the E2E header.
     DatabaseError
         If a signal cannot be read or written, or its values do not fit.
     """

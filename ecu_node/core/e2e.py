@@ -247,7 +247,7 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
     Raises
     ------
     LayoutError
-        If the message cannot carry its protection, or has no signal for its counter or CRC.
+        If the message cannot carry its protection, or has no signal for its counter or CRC, or several.
     DatabaseError
         If the signal of its counter or CRC is a floating-point number or wider than 64 bits.
     """
@@ -322,6 +322,8 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str,
     for name in (entry.counter, entry.crc):
         if name not in signals:
             raise LayoutError(f"{where} has no signal {name!r}; it has {', '.join(signals)}")
+        if sum(signal.name == name for signal in message.signals) > 1:
+            raise LayoutError(f"{where} has several signals named {name!r}; rename all but one in the DBC")
     counter_place, crc_place = bit_place(signals[entry.counter]), bit_place(signals[entry.crc])
     modulus, largest_id = entry.counter_modulus or counter_place.highest + 1, (1 << 8 * entry.data_id_bytes) - 1
     data_id = _data_id(entry.data_id, message, largest_id)

@@ -492,7 +492,7 @@ def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
     Raises
     ------
     DatabaseError
-        If a named code ends that run earlier, or is the code of 0, or no code stands for 0.
+        If a named code ends that run earlier, or is the code of 0, or if the signal cannot be 0.
     """
     ends = writable_range(codes, where)
     if abs(codes.worth(codes.nearest(Fraction(0)))) > abs(codes.scale) / 2:

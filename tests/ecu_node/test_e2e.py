@@ -316,6 +316,7 @@ UNFIT = [
     (OEM, "56|8@1+", "57|8@1+", "signal Sum must be one whole byte to be a CRC-8$"),
     (OEM, "36|4@1+", "38|4@1+", "signal Count must be within one byte to be a counter$"),
     (OEM, "36|4@1+", "36|4@1-", "signal Count cannot count from 0 to 7$"),
+    (OEM, "SG_ Sum", "SG_ Count", "has several signals named 'Count'; rename all but one in the DBC$"),
 ]
 
 
