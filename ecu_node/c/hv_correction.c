@@ -148,6 +148,16 @@ static bool is_present(const hv_signal_t *signal, const uint8_t *payload, size_t
     return present;
 }
 
+/* whether a payload is too short for a signal, or to tell whether it has it */
+static bool is_cut(const hv_signal_t *signal, size_t length)
+{
+    bool cut = !is_inside(&signal->place, length);
+    for (size_t k = 0U; !cut && (k < signal->selector_count); k++) {
+        cut = !is_inside(&signal->selectors[k].place, length);
+    }
+    return cut;
+}
+
 static uint8_t crc8(uint8_t crc, uint8_t byte, uint8_t polynomial)
 {
     uint32_t word = (uint32_t)crc ^ byte;
@@ -262,10 +272,14 @@ static hv_result_t forward(const hv_layout_t *layout, const hv_calibration_t *ca
     } else if (calibration->layout == layout->digest) {
         for (size_t k = 0U; k < layout->branch_count; k++) { /* voltages first: a frame may have both */
             const hv_branch_t *const branch = &layout->branches[k];
-            if ((branch->voltage != NULL) && (branch->voltage_message == number) && (received->state != INVALID) &&
-                is_present(branch->voltage, payload, length)) {
+            const bool is_due = (branch->voltage != NULL) && (branch->voltage_message == number);
+            if (is_due && is_cut(branch->voltage, length)) {
+                state->has_voltage[k] = false;
+            } else if (is_due && (received->state != INVALID) && is_present(branch->voltage, payload, length)) {
                 state->voltage[k] = read_code(&branch->voltage->place, payload);
                 state->has_voltage[k] = true;
+            } else {
+                /* as it was */
             }
         }
         for (size_t k = 0U; k < layout->branch_count; k++) {
