@@ -262,7 +262,7 @@ def _complete_multiplexers(message: Message) -> None:
 
 
 def _name_codes_as_read(signal: Signal) -> None:
-    """Let names stand for codes as they are read: databases also name 65535 for -1 of a signed signal, or -1 for it."""
+    """Let names stand for codes as they are read: databases also write 65535 for -1 of a signed one, or the reverse."""
     named, size = dict(signal.choices or {}), 1 << signal.length
     codes = range(-size // 2, size // 2) if signal.is_signed else range(size)
     if not signal.is_float and any(code not in codes for code in named):

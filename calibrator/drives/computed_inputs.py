@@ -52,11 +52,12 @@ OVERLAP = 3.0
 """By about this factor the variance of a sum of products of second differences is larger than if they were independent:
 neighbours share two samples. [1]"""
 LEAST_CORRELATION = 0.3
-"""Mean over the drives of the correlation of Du and Dr, from which on an input is computed from a sensor: it is 0.71
-for one of two equal sensors, 0.45 for one of five; of independent inputs 0.25 at most in 100 artificial fleets. [1]"""
+"""Mean over the drives of the correlation of Du and Dr, from which on an input is computed from a sensor: of one of n
+equal sensors it is the root of 1/n. An exact power has 0.25 beside a sensor that shows means of a second (tests).
+[1]"""
 LEAST_LIKENESS = 0.95
 """Mean over the drives of the correlation of the input itself with the current that it is most like, from which on it
-may be computed from it: a torque has 0.76 to 0.93 on real drives, a power at a varying voltage more than 0.99. [1]"""
+may be computed from it: a torque goes with it at one speed only, a power at any voltage that a battery has. [1]"""
 LEAST_SDS = 6.0
 """Standard deviations by which it has to differ from 0, in all drives together. [1]"""
 
@@ -143,12 +144,11 @@ def computed_inputs(drives: Sequence[Mapping[str, SharedNoise]]) -> dict[str, st
     for name in dict.fromkeys(name for drive in drives for name in drive):
         items = [drive[name] for drive in drives if name in drive]
         total, lively = sum(item.correlation for item in items), sum(item.lively for item in items)
-        sd, lively_sd = (
-            np.sqrt(sum(x**2 for x in of)) for of in zip(*((i.sd, i.lively_sd) for i in items), strict=True)
-        )
+        sd, lively_sd = np.sqrt(sum(i.sd**2 for i in items)), np.sqrt(sum(i.lively_sd**2 for i in items))
+        likeness = sum(item.likeness for item in items) / len(items)
         is_shared = abs(total) >= max(LEAST_CORRELATION * len(items), LEAST_SDS * sd)
-        is_shared &= bool(np.mean([item.likeness for item in items]) >= LEAST_LIKENESS)
-        if is_shared and lively * np.sign(total) - MUCH_MORE * abs(total) < SURELY * lively_sd:
+        grows = lively * np.sign(total) - MUCH_MORE * abs(total) >= SURELY * lively_sd
+        if is_shared and not grows and likeness >= LEAST_LIKENESS:
             found[name] = Counter(item.branch for item in items).most_common(1)[0][0]
     return found
 

@@ -276,11 +276,9 @@ def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], datab
 
 def _is_noisy(drives: Sequence[Drive], branch: str, database: VehicleDatabase) -> bool:
     """Check whether a current that flows has noise beyond its step, by the smaller ones of its third differences."""
-    channels, value = (
-        [drive.branches[branch] for drive in drives if branch in drive.branches],
-        good_values(drives, branch),
-    )
+    channels = [drive.branches[branch] for drive in drives if branch in drive.branches]
     step_a = max(step_seen(channel, database.current_step_a(branch)) for channel in channels)
+    value = good_values(drives, branch)
     third_a = np.abs(np.diff(value[value != 0.0], 3))
     return bool(len(third_a) and np.quantile(third_a, QUIETEST) > NOISY_STEPS * step_a)
 

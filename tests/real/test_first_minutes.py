@@ -50,6 +50,19 @@ def test_documented_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -
     assert imported.returncode == 0, imported.stderr
 
 
+def test_power_from_which_a_current_is_computed_is_the_only_input_that_is_named(tesla: Path) -> None:
+    signals = {
+        "voltage": "ID132HVBattAmpVolt.BattVoltage132", "rear_power": "ID266RearInverterPower.RearPower266",
+        "torque": "ID108DIR_torque.DIR_torqueActual", "speed": "ID108DIR_torque.DIR_axleSpeed",
+    }  # fmt: skip
+    inputs = "".join(f'\n[[input]]\nname = "{name}"\nsignal = "{signal}"\n' for name, signal in signals.items())
+    layout = tesla / "with_power.toml"
+    plain = (tesla / "tesla_model3.toml").read_text()
+    layout.write_text(plain.replace("branch = [", f"model_inputs = {json.dumps([*signals])}\nbranch = [") + inputs)
+    found = examined(layout, tesla / "drive.log.gz").findings("computed input")
+    assert [(each.subject, each.text.rpartition(" ")[2]) for each in found] == [("rear_power", "motor_rear")]
+
+
 @pytest.mark.long
 def test_documented_node_commands_work_with_the_guessed_layout(tesla: Path) -> None:
     """The commands of docs/first_minutes.md that need no bus; before them the load that it names."""
